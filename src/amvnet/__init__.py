@@ -1,0 +1,1 @@
+"""AMVNet: LiDAR semantic segmentation by two views and late fusion."""

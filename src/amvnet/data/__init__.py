@@ -1,0 +1,1 @@
+"""The benchmarks: readers, label tables, catalogue, augmentation."""

@@ -1,0 +1,93 @@
+"""Scans from disk to batches for training: read, augmented by seed, collated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils import data
+
+from amvnet.config import AugmentConfig
+from amvnet.data.augment import augment
+from amvnet.data.records import Dataset, ScanRecord
+from amvnet.errors import InputError
+from amvnet.scan import Scan
+from amvnet.views.points import PointBatch
+
+Key = tuple[int, int]  # epoch, place in the list of scans
+
+
+class ScanSet(data.Dataset[Scan]):
+    """Labelled scans, each augmented by (seed, epoch, place): the same on any number of processes."""
+
+    def __init__(
+        self, dataset: Dataset, records: Sequence[ScanRecord], augment: AugmentConfig | None = None, seed: int = 0
+    ) -> None:
+        self.dataset, self.records, self.augment, self.seed = dataset, list(records), augment, seed
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    def __getitem__(self, key: Key) -> Scan:
+        epoch, place = key
+        scan = self.dataset.read(self.records[place])
+        if scan.labels is None:
+            raise InputError(f"{scan.name}: expected labels to train with, found none; name labelled sequences")
+        if self.augment is None:
+            return scan
+        return augment(scan, self.augment, np.random.default_rng([self.seed, epoch, place]))
+
+
+class EpochSampler(data.Sampler[Key]):
+    """Every scan once an epoch, in an order drawn from (seed, epoch); Lightning tells the epoch."""
+
+    def __init__(self, size: int, seed: int, shuffle: bool) -> None:
+        self.size, self.seed, self.shuffle, self.epoch = size, seed, shuffle, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __iter__(self) -> Iterator[Key]:
+        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
+        return iter([(self.epoch, int(place)) for place in (order if self.shuffle else range(self.size))])
+
+
+def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
+    """Scans -> their valid points, and (P,) int64 train ids."""
+    labels = [scan.labels[scan.valid] for scan in scans if scan.labels is not None]
+    return PointBatch.of(scans), torch.from_numpy(np.concatenate(labels).astype(np.int64))
+
+
+def loader(scans: ScanSet, batch: int, workers: int, shuffle: bool) -> data.DataLoader[tuple[PointBatch, Tensor]]:
+    """Batches of scans; the last one of a training epoch may be smaller."""
+    return data.DataLoader(
+        scans,  # type: ignore[arg-type]  # its keys are pairs, as the sampler gives them
+        batch_size=batch,
+        sampler=EpochSampler(len(scans), scans.seed, shuffle),
+        num_workers=workers,
+        collate_fn=collate,
+        persistent_workers=workers > 0,
+    )
+
+
+def count_classes(dataset: Dataset, records: Sequence[ScanRecord], kept: Path) -> np.ndarray:
+    """(K,) points of each class in some scans; counted once, and kept in a file beside the run."""
+    names = [record.name for record in records]
+    if kept.is_file():
+        with np.load(kept, allow_pickle=False) as file:
+            if file["scans"].tolist() == names:
+                return file["counts"]
+    counts = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
+    for record in records:
+        labels = dataset.read(record).labels
+        if labels is not None:
+            counts += np.bincount(labels, minlength=len(counts))
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(kept, scans=np.array(names), counts=counts[1:])
+    return counts[1:]

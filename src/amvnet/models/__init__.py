@@ -1,0 +1,1 @@
+"""The three networks, the assertions and AMVNet itself."""

@@ -1,0 +1,81 @@
+"""Layers that the two networks share: convolutions that wrap around the sensor."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+
+class RingConv2d(nn.Conv2d):
+    """A convolution whose last axis is the azimuth: padded circularly there, with zeros on the other.
+
+    Input (B, C, H, W), output (B, C', ceil(H / stride), ceil(W / stride)).
+    """
+
+    def __init__(self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)) -> None:
+        super().__init__(channels, out, kernel, stride, padding=(kernel // 2, 0), bias=False)
+        self.wrap = kernel // 2
+
+    def forward(self, input: Tensor) -> Tensor:
+        return super().forward(wrap_width(input, self.wrap, self.wrap))
+
+
+def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
+    """(B, C, H, W) -> (B, C, H, left + W + right), continued circularly; the pads may be wider than W."""
+    if not left and not right:
+        return x
+    width = x.shape[-1]
+    if max(left, right) <= width:  # keeps the memory format, which a gather by index does not
+        return torch.cat([x[..., width - left :], x, x[..., :right]], dim=-1)
+    return x[..., torch.arange(-left, width + right, device=x.device) % width]
+
+
+class ConvBlock(nn.Sequential):
+    """Ring convolution, batch norm, leaky ReLU."""
+
+    def __init__(self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)) -> None:
+        norm, activation = nn.BatchNorm2d(out), nn.LeakyReLU(0.01, inplace=True)
+        super().__init__(RingConv2d(channels, out, kernel, stride), norm, activation)
+
+
+class ResidualBlock(nn.Module):
+    """Two ring convolutions and a skip connection (He et al., 2016)."""
+
+    def __init__(self, channels: int, out: int, stride: tuple[int, int] = (1, 1)) -> None:
+        super().__init__()
+        self.first = ConvBlock(channels, out, stride=stride)
+        self.second = nn.Sequential(RingConv2d(out, out), nn.BatchNorm2d(out))
+        self.skip: nn.Module = nn.Identity()
+        if stride != (1, 1) or channels != out:
+            self.skip = nn.Sequential(RingConv2d(channels, out, 1, stride), nn.BatchNorm2d(out))
+
+    def forward(self, x: Tensor) -> Tensor:  # (B, C, H, W) -> (B, C', H / stride, W / stride)
+        return F.leaky_relu_(self.second(self.first(x)) + self.skip(x), 0.01)
+
+
+class AzimuthGRU(nn.Module):
+    """A GRU that runs once around the sensor over the cells of a map (section 3.1 of the paper).
+
+    The map (B, C, H, W) is read column by column, each from top to bottom, by a unidirectional GRU of hidden
+    size C; its outputs are put back as a map (B, C, H, W). The columns before the first are the last ones, so
+    that the hidden state has seen the other end of the scan; the outputs there are dropped.
+    """
+
+    def __init__(self, channels: int, padding: float) -> None:
+        super().__init__()
+        self.gru = nn.GRU(channels, channels, batch_first=True)
+        self.padding = padding
+
+    def forward(self, x: Tensor) -> Tensor:
+        b, c, h, w = x.shape
+        padding = round(self.padding * w)
+        columns = wrap_width(x, padding, 0).permute(0, 3, 2, 1)  # (B, padding + W, H, C)
+        with torch.autocast(x.device.type, enabled=False):  # a recurrence in bfloat16 loses its state
+            outputs, _ = self.gru(columns.reshape(b, -1, c).float())
+        return outputs.view(b, -1, h, c)[:, padding:].permute(0, 3, 2, 1)  # (B, C, H, W)
+
+
+def upsample(x: Tensor, like: Tensor) -> Tensor:
+    """(B, C, h, w) -> (B, C, H, W) of `like`, each value to the cells that it stands for."""
+    return F.interpolate(x, size=like.shape[-2:], mode="nearest")

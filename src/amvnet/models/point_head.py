@@ -1,0 +1,87 @@
+"""The point head: settles the uncertain points by their neighbourhood (section 3.2 of the paper)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from amvnet.config import PointHeadConfig
+
+POINT_VALUES = 4  # x, y, z, intensity
+
+
+class PointHead(nn.Module):
+    """Uncertain points with their neighbours -> scores before softmax (U, K).
+
+    Input: of U uncertain points their features p_i (U, 2 K + 4) and S_i (U, n, 2 K + 4), as `head_features` makes them.
+    """
+
+    def __init__(self, config: PointHeadConfig, classes: int) -> None:
+        super().__init__()
+        self.config = config
+        width = 2 * classes + POINT_VALUES
+        self.mlp = _mlp((width, *config.hidden))
+        self.fc = nn.Sequential(_mlp((width + config.hidden[-1], config.fc)), nn.Linear(config.fc, classes))
+
+    def forward(self, point: Tensor, rows: Tensor) -> Tensor:
+        u, n, width = rows.shape
+        pooled = self.mlp(rows.reshape(u * n, width)).view(u, n, -1).amax(dim=1)  # (U, hidden)
+        return self.fc(torch.cat([pooled, point], dim=1))
+
+
+def head_features(
+    config: PointHeadConfig, points: Tensor, f: Tensor, g: Tensor, uncertain: Tensor
+) -> tuple[Tensor, Tensor]:
+    """p_i = [f_i, g_i, x_i] of the uncertain points, and the rows [f_k, g_k, x_k - x_i] of their S_i.
+
+    Args:
+        points: (P, 4) of one scan.
+        f, g: (P, K) class probabilities of the two networks.
+        uncertain: (U,) indices of the uncertain points.
+
+    Returns:
+        (U, 2 K + 4) and (U, n, 2 K + 4).
+    """
+    near = nearest_neighbours(points, uncertain, config.neighbours)
+    both = torch.cat([f, g], dim=1)
+    here = points[uncertain]
+    scale = here.new_tensor([config.position_scale] * 3 + [1.0])
+    point = torch.cat([both[uncertain], here * scale], dim=1)
+    rows = torch.cat([both[near], points[near] - here[:, None]], dim=2)
+    return point, rows
+
+
+def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
+    """(U, n) indices of the n nearest other points of each point in `index`, by x, y, z.
+
+    Of a scan with fewer than n other points the last one is repeated; a lone point is its own neighbour.
+    """
+    xyz = points[:, :3].cpu().numpy()
+    own = index.cpu().numpy()
+    if not len(own):
+        return index.new_zeros(0, n)
+    # A tree that is not balanced costs a third to build, and a tenth more to ask.
+    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
+    _, found = tree.query(xyz[own], k=np.arange(1, min(n + 1, len(xyz)) + 1), workers=-1)  # (U, <= n + 1)
+    return torch.from_numpy(_without_own(np.asarray(found), own, n)).to(points.device)
+
+
+def _without_own(found: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
+    """Drop each point from its own neighbours; the farthest where, among points in one place, it is not found."""
+    if found.shape[1] > 1:
+        is_own = found == own[:, None]
+        is_own[~is_own.any(axis=1), -1] = True
+        found = found[~is_own].reshape(len(own), -1)
+    missing = n - found.shape[1]
+    return np.pad(found, ((0, 0), (0, missing)), mode="edge") if missing > 0 else found
+
+
+def _mlp(widths: tuple[int, ...]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for channels, out in pairwise(widths):
+        layers += [nn.Linear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers)

@@ -1,0 +1,68 @@
+"""The range-view network: a fully convolutional ResNet with recurrent layers (section 3.1 of the paper)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from amvnet.config import RangeNetConfig
+from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
+from amvnet.views.range_view import CHANNELS
+
+FIRST_DECODED = 1  # the decoder takes the stages from the second on: width stride 4
+RECURRENT = 2  # so many of the last stages are followed by a GRU
+
+
+class RangeNet(nn.Module):
+    """Range image (B, 6, H, W) -> scores before softmax (B, K, H, W)."""
+
+    def __init__(self, config: RangeNetConfig, classes: int) -> None:
+        super().__init__()
+        c = config
+        self.input_norm = nn.BatchNorm2d(CHANNELS)
+        self.stem = ConvBlock(CHANNELS, c.stem)
+        self.stages = nn.ModuleList(_stages(c))
+        self.recurrent = nn.ModuleList(AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT:] if c.gru)
+        decoded = c.widths[FIRST_DECODED:]
+        self.lateral = nn.ModuleList(ConvBlock(w, c.decoder, 1) for w in decoded)
+        self.decoder = nn.ModuleList(ConvBlock(c.decoder, c.decoder) for _ in decoded)
+        self.last = ConvBlock(c.decoder + c.stem, c.head)
+        self.scores = nn.Conv2d(c.head, classes, 1)
+
+    def forward(self, image: Tensor) -> Tensor:
+        full = self.stem(self.input_norm(image))  # (B, stem, H, W)
+        maps = self.encode(full)
+        decoded = self.decode(maps[FIRST_DECODED:])  # (B, decoder, H, W / 4)
+        merged = torch.cat([upsample(decoded, full), full], dim=1)
+        return self.scores(self.last(merged))
+
+    def encode(self, x: Tensor) -> list[Tensor]:
+        """The maps of width strides 2, 4, 8, ...; the last two have gone around the sensor."""
+        maps = []
+        first_recurrent = len(self.stages) - len(self.recurrent)
+        for index, stage in enumerate(self.stages):
+            x = stage(x)
+            if index >= first_recurrent:
+                x = self.recurrent[index - first_recurrent](x)
+            maps.append(x)
+        return maps
+
+    def decode(self, maps: list[Tensor]) -> Tensor:
+        """From the coarsest map to the finest: upsample, add the lateral map, convolve."""
+        top: Tensor | None = None
+        for x, lateral, conv in reversed(list(zip(maps, self.lateral, self.decoder, strict=True))):
+            side = lateral(x)
+            top = conv(side if top is None else side + upsample(top, side))
+        assert top is not None
+        return top
+
+
+def _stages(c: RangeNetConfig) -> list[nn.Module]:
+    """One stage a width stride; its first block strides, its others do not."""
+    stages: list[nn.Module] = []
+    channels = c.stem
+    for width, blocks, stride in zip(c.widths, c.blocks, c.height_strides, strict=True):
+        rest = [ResidualBlock(width, width) for _ in range(blocks - 1)]
+        stages.append(nn.Sequential(ResidualBlock(channels, width, (stride, 2)), *rest))
+        channels = width
+    return stages

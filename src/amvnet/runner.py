@@ -1,0 +1,200 @@
+"""The run of a training: its folder, its stages in order, and the weights file at its end."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning as L
+import yaml
+from torch import nn
+
+from amvnet import weights as weights_file
+from amvnet.config import Recipe, to_dict
+from amvnet.data.files import whole_file
+from amvnet.data.records import Dataset, ScanRecord
+from amvnet.errors import InputError
+from amvnet.head_training import HeadStage, gather_points, head_loader
+from amvnet.loading import ScanSet, count_classes, loader
+from amvnet.losses import class_weights
+from amvnet.models.amvnet import build_amvnet
+from amvnet.training import KeepWeights, PolarStage, RangeStage, Stage, fit, names_of
+from amvnet.weights import Weights, state_of
+
+StageName = Literal["rv", "bev", "head", "all"]
+PART = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
+
+
+@dataclass
+class Run:
+    """One training run in its folder.
+
+    Attributes:
+        recipe: what to train.
+        dataset: where the scans are.
+        train, val: the scans to learn from, and those to validate with; none may be in both.
+        out: the folder of the run.
+        resume: go on where an earlier run in this folder stopped.
+        say: told what happens, in lines; None shows progress bars.
+    """
+
+    recipe: Recipe
+    dataset: Dataset
+    train: Sequence[ScanRecord]
+    val: Sequence[ScanRecord]
+    out: Path
+    resume: bool = False
+    say: Callable[[str], None] | None = None
+
+    def __post_init__(self) -> None:
+        self.out = Path(self.out)
+        common = {r.name for r in self.train} & {r.name for r in self.val}
+        if common:
+            raise InputError(f"expected validation scans apart from training, found {min(common)} in both; name others")
+        if self.dataset.taxonomy.name != self.recipe.taxonomy:
+            raise InputError(
+                f"expected a data set with the classes of {self.recipe.taxonomy}, found {self.dataset.taxonomy.name}; "
+                "use the recipe of that benchmark"
+            )
+
+    def stages(self, stage: StageName, init: Weights | None = None) -> Path:
+        """Train one stage, or all three; returns the weights file with what is trained so far.
+
+        Raises:
+            InputError: where the head is to be trained and there are no networks to train it for, or the
+                folder holds a run and `resume` is not said.
+        """
+        current = self._start(init)
+        names = ("rv", "bev", "head") if stage == "all" else (stage,)
+        for name in names:
+            current = self._stage(name, current)
+        return weights_file.save(current, self.out / "weights.safetensors")
+
+    def _start(self, init: Weights | None) -> Weights:
+        """Fresh weights, or those that are given; earlier stages of this folder are taken up."""
+        fresh = Weights(self.recipe.model, self.dataset.taxonomy)
+        if init is not None:
+            fresh = dataclasses.replace(init, model=init.model)
+        for name, part in PART.items():
+            kept = self._folder(name) / f"{self.recipe.training.keep}.safetensors"
+            if kept.is_file() and (self._folder(name) / "done").is_file():
+                fresh = fresh.replace_part(part, weights_file.load(kept))
+        self.out.mkdir(parents=True, exist_ok=True)
+        with whole_file(self.out / "recipe.yaml") as path:
+            path.write_text(yaml.safe_dump(to_dict(self.recipe), sort_keys=False))
+        return fresh
+
+    def _folder(self, name: str) -> Path:
+        return self.out / name
+
+    def _stage(self, name: str, current: Weights) -> Weights:
+        done = self._folder(name) / "done"
+        if done.is_file() and self.resume:
+            return current
+        if (self._folder(name) / "last.ckpt").is_file() and not self.resume:
+            raise InputError(f"{self._folder(name)}: expected no earlier run, found one; add --resume or give another")
+        L.seed_everything(self.recipe.training.seed, verbose=False)
+        kept = self._fit_head(current) if name == "head" else self._fit_network(name, current)
+        done.write_text("")
+        return current.replace_part(PART[name], weights_file.load(kept))
+
+    def _fit_network(self, name: str, current: Weights) -> Path:
+        training = self.recipe.training
+        config = training.rv if name == "rv" else training.bev
+        model = build_amvnet(current.model, self.dataset.taxonomy.size)
+        if PART[name] in current.parts:
+            getattr(model, PART[name]).load_state_dict(current.part(PART[name]))
+        weights = class_weights(self._counts()) if config.class_weights else None
+        shared = (config, self.dataset.taxonomy, weights)
+        stage: Stage = (
+            RangeStage(model.range_view, model.range_net, *shared)
+            if name == "rv"
+            else PolarStage(model.polar_view, model.polar_net, *shared)
+        )
+        keep = self._keep(name, current, to_dict(config))
+        part = -(-config.batch // training.accumulate)
+        fit(
+            stage,
+            training,
+            config.epochs,
+            loader(ScanSet(self.dataset, self.train, training.augment, training.seed), part, training.workers, True),
+            loader(ScanSet(self.dataset, self.val), 1, training.workers, False),
+            self._folder(name),
+            keep,
+            self.resume,
+            self.say,
+            training.accumulate,
+            config.clip,
+        )
+        return getattr(keep.kept, training.keep)
+
+    def _fit_head(self, current: Weights) -> Path:
+        training, config = self.recipe.training, self.recipe.training.head
+        missing = [part for part in ("range_net", "polar_net") if part not in current.parts]
+        if missing:
+            raise InputError(f"expected trained networks for the head, found no {missing[0]}; train it, or give --init")
+        sources = self._sources(current)
+        folder = self._folder("head")
+        train = gather_points(sources, self.dataset, training, config.views, folder / "train")
+        val = gather_points([(current, self.val)], self.dataset, training, 0, folder / "val")
+        head = build_amvnet(current.model, self.dataset.taxonomy.size).point_head
+        assert head is not None
+        if "point_head" in current.parts:
+            head.load_state_dict(current.part("point_head"))
+        weights = class_weights(self._counts()) if config.class_weights else None
+        keep = self._keep("head", current, to_dict(config))
+        fit(
+            HeadStage(head, val.certain, val.share, config, self.dataset.taxonomy, weights),
+            dataclasses.replace(training, precision="32-true", accelerator=training.accelerator),
+            config.epochs,
+            head_loader(train, config.batch, training.seed, True),
+            head_loader(val, 64 * config.batch, training.seed, False),
+            folder,
+            keep,
+            self.resume,
+            self.say,
+        )
+        return getattr(keep.kept, training.keep)
+
+    def _sources(self, current: Weights) -> list[tuple[Weights, Sequence[ScanRecord]]]:
+        """Which networks score which training scans for the head: with folds, such as have not seen them."""
+        folds = self.recipe.training.head.folds
+        if folds < 2:
+            return [(current, self.train)]
+        names = names_of(self.train)
+        if len(names) < folds:
+            raise InputError(f"expected at least {folds} training sequences for {folds} folds, found {len(names)}")
+        return [self._fold(index, set(names[index::folds])) for index in range(folds)]
+
+    def _fold(self, index: int, left_out: set[str]) -> tuple[Weights, list[ScanRecord]]:
+        """Networks trained without some sequences, and the scans of these."""
+        seen = [r for r in self.train if r.sequence not in left_out]
+        unseen = [r for r in self.train if r.sequence in left_out]
+        fold = Run(self.recipe, self.dataset, seen, unseen, self.out / "folds" / str(index), True, self.say)
+        fold.stages("rv")
+        return weights_file.load(fold.stages("bev")), unseen
+
+    def _counts(self) -> Any:
+        return count_classes(self.dataset, self.train, self.out / "class_counts.npz")
+
+    def _keep(self, name: str, current: Weights, config: dict[str, Any]) -> KeepWeights:
+        """How the part of a stage is written: with the description of what made it."""
+        part, started = PART[name], time.time()
+        made = {"config": config, "seed": self.recipe.training.seed, "sequences": names_of(self.train),
+                "validated_on": names_of(self.val), "scans": len(self.train)}  # fmt: skip
+
+        def write(module: nn.Module, path: Path, reached: dict[str, float]) -> None:
+            seconds = round(time.time() - started)
+            kept = dataclasses.replace(
+                current,
+                tensors=state_of(part, module),
+                training={part: {**made, "seconds": seconds}},
+                metrics={part: reached},
+            )
+            weights_file.save(kept, path)
+
+        return KeepWeights(write, self._folder(name))

@@ -1,0 +1,140 @@
+"""Classes as SemanticKITTI numbers them, and how each surface answers a laser pulse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+
+class Label(IntEnum):
+    """Raw SemanticKITTI ids of what stands in a simulated street."""
+
+    CAR = 10
+    BICYCLE = 11
+    BUS = 13
+    MOTORCYCLE = 15
+    TRUCK = 18
+    OTHER_VEHICLE = 20
+    PERSON = 30
+    BICYCLIST = 31
+    MOTORCYCLIST = 32
+    ROAD = 40
+    PARKING = 44
+    SIDEWALK = 48
+    OTHER_GROUND = 49
+    BUILDING = 50
+    FENCE = 51
+    OTHER_STRUCTURE = 52
+    LANE_MARKING = 60
+    VEGETATION = 70
+    TRUNK = 71
+    TERRAIN = 72
+    POLE = 80
+    TRAFFIC_SIGN = 81
+    OTHER_OBJECT = 99
+
+
+# The id of the same thing while it moves.
+MOVING = {
+    Label.CAR: 252,
+    Label.BICYCLIST: 253,
+    Label.PERSON: 254,
+    Label.MOTORCYCLIST: 255,
+    Label.BUS: 257,
+    Label.TRUCK: 258,
+    Label.OTHER_VEHICLE: 259,
+}
+
+
+class Surface(IntEnum):
+    """Row of the tables below."""
+
+    ASPHALT = 0
+    PAVING = 1
+    GRASS = 2
+    GRAVEL = 3
+    ROAD_PAINT = 4
+    PLASTER = 5
+    BRICK = 6
+    GLASS = 7
+    WOOD = 8
+    LEAF = 9
+    BARK = 10
+    METAL = 11
+    SIGN_FACE = 12
+    CLOTH = 13
+    SKIN = 14
+    DARK_PAINT = 15
+    LIGHT_PAINT = 16
+    RUBBER = 17
+    PLATE = 18
+    PLASTIC = 19
+    ROOF_TILE = 20
+    WINDOW = 21
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """How one surface answers a pulse."""
+
+    # Intensity of a near, head-on return, 0 to 1.
+    reflectivity: float
+    # Relative standard deviation of the intensity between returns.
+    spread: float = 0.15
+    # Share of the returns that come with intensity 0, as glossy surfaces send most light elsewhere.
+    dark: float = 0.03
+    # Share of the pulses that never come back, whatever the range.
+    drop: float = 0.0
+
+
+REFLECTIONS: dict[Surface, Reflection] = {
+    Surface.ASPHALT: Reflection(0.32, 0.20, 0.09),
+    Surface.PAVING: Reflection(0.36, 0.15, 0.03),
+    Surface.GRASS: Reflection(0.42, 0.14, 0.02),
+    Surface.GRAVEL: Reflection(0.34, 0.22, 0.06),
+    Surface.ROAD_PAINT: Reflection(0.55, 0.20, 0.02),
+    Surface.PLASTER: Reflection(0.44, 0.22, 0.04, 0.01),
+    Surface.BRICK: Reflection(0.36, 0.20, 0.06, 0.01),
+    Surface.GLASS: Reflection(0.10, 0.60, 0.75, 0.65),
+    Surface.WOOD: Reflection(0.37, 0.25, 0.08),
+    Surface.LEAF: Reflection(0.37, 0.28, 0.08, 0.05),
+    Surface.BARK: Reflection(0.38, 0.25, 0.08),
+    Surface.METAL: Reflection(0.26, 0.50, 0.28, 0.03),
+    Surface.SIGN_FACE: Reflection(0.75, 0.25, 0.02),
+    Surface.CLOTH: Reflection(0.44, 0.30, 0.03),
+    Surface.SKIN: Reflection(0.45, 0.20, 0.03),
+    Surface.DARK_PAINT: Reflection(0.14, 0.60, 0.68, 0.12),
+    Surface.LIGHT_PAINT: Reflection(0.34, 0.50, 0.38, 0.05),
+    Surface.RUBBER: Reflection(0.08, 0.50, 0.50, 0.10),
+    Surface.PLATE: Reflection(0.95, 0.10, 0.0),
+    Surface.PLASTIC: Reflection(0.34, 0.30, 0.15, 0.03),
+    Surface.ROOF_TILE: Reflection(0.33, 0.25, 0.05, 0.01),
+    # A house's window shows curtains and frames behind its pane; a car's mostly does not.
+    Surface.WINDOW: Reflection(0.30, 0.40, 0.15, 0.25),
+}
+
+# The surface of each kind of ground, by raw id.
+GROUND_SURFACES: dict[Label, Surface] = {
+    Label.ROAD: Surface.ASPHALT,
+    Label.PARKING: Surface.PAVING,
+    Label.SIDEWALK: Surface.PAVING,
+    Label.OTHER_GROUND: Surface.GRAVEL,
+    Label.LANE_MARKING: Surface.ROAD_PAINT,
+    Label.TERRAIN: Surface.GRASS,
+}
+
+
+def reflection_table() -> np.ndarray:
+    """The reflections as rows by surface: reflectivity, spread, dark, drop. (S, 4) float32."""
+    rows = (REFLECTIONS[surface] for surface in Surface)
+    return np.array([(r.reflectivity, r.spread, r.dark, r.drop) for r in rows], dtype=np.float32)
+
+
+def ground_surface_table() -> np.ndarray:
+    """The surface of each ground id, to be indexed by raw id. (256,) uint8."""
+    table = np.zeros(256, dtype=np.uint8)
+    for label, surface in GROUND_SURFACES.items():
+        table[label] = surface
+    return table

@@ -1,0 +1,229 @@
+"""The training of the two networks, as Lightning modules."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from amvnet.config import HeadTraining, NetworkTraining, TrainingConfig
+from amvnet.data.labels import Taxonomy
+from amvnet.evaluation import confusion, metrics
+from amvnet.losses import polar_view_loss, range_view_loss
+from amvnet.views.points import PointBatch
+from amvnet.views.polar_view import PolarView
+from amvnet.views.range_view import RangeView
+
+Batch = tuple[PointBatch, Tensor]
+LAST = "last.ckpt"  # what --resume goes on from
+
+
+class Stage(L.LightningModule):
+    """What the stages share: class weights, the validation's confusion matrix, the one-cycle schedule."""
+
+    part: str  # the name of the trained part in a weights file
+    trained: nn.Module
+
+    def __init__(self, config: NetworkTraining | HeadTraining, taxonomy: Taxonomy, weights: np.ndarray | None) -> None:
+        super().__init__()
+        self.config, self.taxonomy = config, taxonomy
+        self.class_weights: Tensor | None
+        self.register_buffer("class_weights", None if weights is None else torch.from_numpy(weights), persistent=False)
+        self.matrix = self._empty_matrix()
+
+    def _empty_matrix(self) -> np.ndarray:
+        return np.zeros((self.taxonomy.size + 1,) * 2)
+
+    def on_validation_epoch_start(self) -> None:
+        self.matrix = self._empty_matrix()
+
+    def count(self, labels: Tensor, prediction: Tensor, weight: float = 1) -> None:
+        """Add points to the validation's confusion matrix."""
+        self.matrix += weight * confusion(labels.cpu().numpy(), prediction.cpu().numpy(), self.taxonomy.size)
+
+    def on_validation_epoch_end(self) -> None:
+        found = metrics(self.matrix, self.taxonomy)
+        values = {"val/miou": found["miou"], "val/miou_present": found["miou_present"], "val/acc": found["accuracy"]}
+        self.log_dict({k: v or 0.0 for k, v in values.items()})
+        self.log_dict({f"iou/{name}": value for name, value in found["iou"].items() if value is not None})
+
+    def one_cycle(self, optimizer: torch.optim.Optimizer) -> Any:
+        # A run of very few steps has no room for the cycle, which needs two before its peak.
+        steps = max(int(self.trainer.estimated_stepping_batches), math.ceil(2 / self.config.warmup))
+        cycle = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer, max_lr=self.config.lr, total_steps=steps, pct_start=self.config.warmup
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": cycle, "interval": "step"}}
+
+
+class NetworkStage(Stage):
+    """Training of one of the two networks; which one is said by `logits` and the loss."""
+
+    config: NetworkTraining
+
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Scores and labels (M, K), (M,) of what the loss is over, and scores (P, K) of the points."""
+        raise NotImplementedError
+
+    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
+        raise NotImplementedError
+
+    def training_step(self, batch: Batch, index: int) -> Tensor:
+        logits, labels, _ = self.logits(*batch)
+        loss = self.loss(logits, labels)
+        self.log("train/loss", loss, prog_bar=True, batch_size=batch[0].count)
+        return loss
+
+    def validation_step(self, batch: Batch, index: int) -> None:
+        _, _, points = self.logits(*batch)
+        self.count(batch[1], points.argmax(dim=1) + 1)
+
+    def configure_optimizers(self) -> Any:
+        c = self.config
+        return self.one_cycle(torch.optim.AdamW(self.trained.parameters(), lr=c.lr, weight_decay=c.weight_decay))
+
+
+class RangeStage(NetworkStage):
+    """Stage `rv`: the loss is over the pixels, each labelled as the point that represents it."""
+
+    part = "range_net"
+
+    def __init__(self, view: RangeView, net: nn.Module, *args: Any) -> None:
+        super().__init__(*args)
+        self.view, self.trained = view, net
+
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        view = self.view.project(batch)
+        scores = self.trained(view.image)  # (B, K, H, W)
+        seen = view.nearest >= 0
+        pixels = scores.permute(0, 2, 3, 1).flatten(0, 2)
+        return pixels[seen], labels[view.nearest[seen]], pixels[view.pixel]
+
+    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
+        return range_view_loss(logits, labels, self.class_weights, self.config.region)
+
+
+class PolarStage(NetworkStage):
+    """Stage `bev`: the loss is over the points, each scored as its voxel."""
+
+    part = "polar_net"
+
+    def __init__(self, view: PolarView, net: nn.Module, *args: Any) -> None:
+        super().__init__(*args)
+        self.view, self.trained = view, net
+
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        view = self.view.project(batch)
+        points = view.to_points(self.trained(view))  # (P, K)
+        return points, labels, points
+
+    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
+        return polar_view_loss(logits, labels, self.class_weights, self.config.region)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Where a stage's run keeps its weights, and what they reached."""
+
+    best: Path
+    last: Path
+
+
+class KeepWeights(Callback):
+    """After each epoch writes the trained part as `last`, and as `best` where its mIoU is the highest yet."""
+
+    def __init__(self, write: Callable[[nn.Module, Path, dict[str, float]], None], folder: Path) -> None:
+        self.write, self.kept, self.highest = (
+            write,
+            Kept(folder / "best.safetensors", folder / "last.safetensors"),
+            -1.0,
+        )
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"highest": self.highest}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.highest = state_dict["highest"]
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if trainer.sanity_checking:
+            return
+        assert isinstance(pl_module, Stage)
+        reached = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
+        reached["epoch"] = trainer.current_epoch
+        self.write(pl_module.trained, self.kept.last, reached)
+        if reached["val/miou"] > self.highest:
+            self.highest = reached["val/miou"]
+            self.write(pl_module.trained, self.kept.best, reached)
+
+
+class EpochLines(Callback):
+    """Says one line an epoch, where there is no terminal for a progress bar."""
+
+    def __init__(self, say: Callable[[str], None], name: str) -> None:
+        self.say, self.name = say, name
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if not trainer.sanity_checking:
+            values = {k: float(v) for k, v in trainer.callback_metrics.items()}
+            loss, miou, present = (values.get(k, float("nan")) for k in ("train/loss", "val/miou", "val/miou_present"))
+            self.say(
+                f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: "
+                f"loss {loss:.3f}, val mIoU {miou:.4f} (classes present {present:.4f})"
+            )
+
+
+def fit(
+    stage: Stage,
+    config: TrainingConfig,
+    epochs: int,
+    train: DataLoader[Any],
+    val: DataLoader[Any],
+    folder: Path,
+    keep: KeepWeights,
+    resume: bool,
+    say: Callable[[str], None] | None,
+    batches: int | None = None,
+    clip: float | None = None,
+) -> None:
+    """Train a stage in its folder; with `resume`, on from its last epoch.
+
+    Args:
+        say: told one line an epoch; None shows a progress bar instead.
+        batches: parts of a batch that are accumulated before a step.
+        clip: largest norm of the gradient.
+    """
+    shown: list[Callback] = [EpochLines(say, folder.name)] if say else [RichProgressBar(), LearningRateMonitor()]
+    trainer = L.Trainer(
+        accelerator=config.accelerator,
+        precision=config.precision,
+        max_epochs=epochs,
+        accumulate_grad_batches=batches or 1,
+        gradient_clip_val=clip,
+        default_root_dir=folder,
+        # Weights are kept before the checkpoint is, so that a checkpoint never says more than they hold.
+        callbacks=[keep, ModelCheckpoint(folder, filename="last", enable_version_counter=False), *shown],
+        logger=[TensorBoardLogger(folder, name="", version=""), CSVLogger(folder, name="", version="")],
+        enable_progress_bar=say is None,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        log_every_n_steps=10,
+        use_distributed_sampler=False,
+    )
+    checkpoint = folder / LAST
+    trainer.fit(stage, train, val, ckpt_path=checkpoint if resume and checkpoint.is_file() else None, weights_only=True)
+
+
+def names_of(records: Sequence[Any]) -> list[str]:
+    """The sequences of some scans, for the description of a run."""
+    return sorted({record.sequence for record in records})

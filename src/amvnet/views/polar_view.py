@@ -1,0 +1,88 @@
+"""The bird's-eye view: a scan in a polar grid of pillars, each a column of voxels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from amvnet.config import PolarViewConfig
+from amvnet.views.points import PointBatch
+
+FEATURES = 9  # offset to the voxel's centre (3), polar coordinates (3), x, y, intensity
+
+
+@dataclass(frozen=True)
+class PolarGrid:
+    """A batch of scans in the polar grid, and the way back to the points.
+
+    Attributes:
+        features: (P, 9) float32: offset to the voxel's centre (radius, angle, height), polar
+            coordinates (metres, radians, metres), x, y, intensity.
+        pillar: (P,) int64: each point's pillar, an index into the B * R * A pillars of the batch.
+        voxel: (P,) int64: each point's voxel within its pillar, 0 the lowest.
+        occupied: (M,) int64: the pillars that hold points, ascending.
+        slot: (P,) int64: the place of each point's pillar in `occupied`.
+        shape: (B, R, A, Z): scans, cells along radius, angle and height.
+    """
+
+    features: Tensor
+    pillar: Tensor
+    voxel: Tensor
+    occupied: Tensor
+    slot: Tensor
+    shape: tuple[int, int, int, int]
+
+    def pool(self, features: Tensor) -> Tensor:
+        """Features (P, C) of the points -> (M, C), the maximum over each occupied pillar."""
+        index = self.slot[:, None].expand_as(features)
+        empty = features.new_zeros(len(self.occupied), features.shape[1])
+        return empty.scatter_reduce(0, index, features, "amax", include_self=False)
+
+    def to_map(self, pillars: Tensor) -> Tensor:
+        """Features (M, C) of the occupied pillars -> a map (B, C, R, A), 0 where a pillar is empty."""
+        b, r, a, _ = self.shape
+        dense = pillars.new_zeros(b * r * a, pillars.shape[1]).index_copy(0, self.occupied, pillars)
+        return dense.view(b, r, a, -1).permute(0, 3, 1, 2)
+
+    def to_points(self, scores: Tensor) -> Tensor:
+        """Scores (B, Z * K, R, A) of the voxels, voxel by voxel -> (P, K), every point its voxel's."""
+        vertical = self.shape[3]
+        voxels = scores.permute(0, 2, 3, 1).reshape(-1, scores.shape[1] // vertical)
+        return voxels[self.pillar * vertical + self.voxel]
+
+
+class PolarView:
+    """Sorts the points of scans into the polar grid (section 3.1 of the paper)."""
+
+    def __init__(self, config: PolarViewConfig) -> None:
+        self.config = config
+        self._low = (config.radius_min, -math.pi, config.z_min)
+        self._high = (config.radius_max, math.pi, config.z_max)
+        self._cells = (config.radial, config.angular, config.vertical)
+
+    def project(self, batch: PointBatch) -> PolarGrid:
+        """The polar grids of a batch of scans. Points outside the grid go to the nearest cell."""
+        x, y, z = batch.points[:, :3].double().unbind(1)
+        polar = torch.stack([torch.sqrt(x * x + y * y), torch.atan2(y, x), z], dim=1)
+        low, high, cells = (polar.new_tensor(v) for v in (self._low, self._high, self._cells))
+        # In double precision, so that a point at a cell's border falls the same way on every device.
+        cell = ((polar - low) / (high - low) * cells).floor().clamp_min(0).minimum(cells - 1)
+        centre = low + (cell + 0.5) * (high - low) / cells
+        features = torch.cat([polar - centre, polar], dim=1).float()
+        radius, angle, voxel = cell.long().unbind(1)
+        c = self.config
+        pillar = (batch.scan * c.radial + radius) * c.angular + angle
+        shape = (batch.count, c.radial, c.angular, c.vertical)
+        occupied, slot = _occupied(pillar, math.prod(shape[:3]))
+        features = torch.cat([features, batch.points[:, [0, 1, 3]]], dim=1)
+        return PolarGrid(features, pillar, voxel, occupied, slot, shape)
+
+
+def _occupied(pillar: Tensor, pillars: int) -> tuple[Tensor, Tensor]:
+    """The pillars that hold points, and each point's place among them; as `unique`, without a sort."""
+    seen = torch.zeros(pillars, dtype=torch.bool, device=pillar.device)
+    seen[pillar] = True
+    return seen.nonzero()[:, 0], (seen.cumsum(0) - 1)[pillar]

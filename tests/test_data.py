@@ -1,0 +1,479 @@
+"""Every reader passes one suite; label tables are checked by plain loops; wrong input is named."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from amvnet.data.catalog import Dataset, open_dataset
+from amvnet.data.files import find_scans, read_scan, whole_file, write_labels
+from amvnet.data.labels import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
+from amvnet.data.nuscenes import MINI_TRAIN, MINI_VAL, VAL
+from amvnet.errors import InputError
+
+COUNTS = (7, 5)  # points of the two scans of each sequence
+REAL = os.environ.get("AMVNET_REAL_DATA")
+
+
+@dataclass
+class Layout:
+    """A tiny data set on disk and what is in it."""
+
+    spec: str
+    sequences: tuple[str, str]  # one of val, one of train
+    first_points: Path
+    first_labels: Path
+    truth: list[int]  # train ids of the first scan of the first sequence
+    intensity: list[float]
+
+
+def make_semantickitti(root: Path) -> Layout:
+    rng = np.random.default_rng(1)
+    for sequence in ("08", "00"):
+        for kind in ("velodyne", "labels"):
+            (root / "sequences" / sequence / kind).mkdir(parents=True)
+        for scan, count in enumerate(COUNTS):
+            folder = root / "sequences" / sequence
+            rng.random((count, 4), dtype=np.float32).tofile(folder / f"velodyne/{scan:06d}.bin")
+            raw = np.resize(np.array([252, 40, 99, 81], dtype=np.uint32) | (5 << 16), count)
+            raw.astype(np.uint32).tofile(folder / f"labels/{scan:06d}.label")
+    first = root / "sequences/08"
+    table = np.fromfile(first / "velodyne/000000.bin", np.float32).reshape(-1, 4)
+    return Layout(
+        spec=f"semantickitti:{root}",
+        sequences=("08", "00"),
+        first_points=first / "velodyne/000000.bin",
+        first_labels=first / "labels/000000.label",
+        truth=[1, 9, 0, 19, 1, 9, 0],
+        intensity=table[:, 3].tolist(),
+    )
+
+
+def make_nuscenes(root: Path) -> Layout:
+    categories = ["noise", "vehicle.car", "flat.sidewalk", "vehicle.ego"]
+    tables: dict[str, list[dict[str, object]]] = {
+        "category": [{"token": n, "name": n, "index": i} for i, n in enumerate(categories)],
+        "sensor": [{"token": "l", "channel": "LIDAR_TOP"}, {"token": "c", "channel": "CAM_FRONT"}],
+        "calibrated_sensor": [{"token": "cl", "sensor_token": "l"}, {"token": "cc", "sensor_token": "c"}],
+        "scene": [], "sample": [], "sample_data": [], "lidarseg": [],
+    }  # fmt: skip
+    for folder in ("samples/LIDAR_TOP", "lidarseg/v1.0-mini", "v1.0-mini"):
+        (root / folder).mkdir(parents=True)
+    for scene in ("scene-0103", "scene-0061"):
+        tables["scene"].append({"token": scene, "name": scene})
+        for scan, count in enumerate(COUNTS):
+            token = f"{scene}-{9 - scan}"  # later scans sort first by token, so that the order shows
+            name = f"samples/LIDAR_TOP/{token}.pcd.bin"
+            tables["sample"].append({"token": f"s{token}", "scene_token": scene})
+            data = {"token": token, "sample_token": f"s{token}", "timestamp": scan, "filename": name}
+            key = {**data, "is_key_frame": True, "calibrated_sensor_token": "cl"}
+            sweep = {
+                **key,
+                "token": "w" + token,
+                "is_key_frame": False,
+                "filename": f"sweeps/LIDAR_TOP/{token}.pcd.bin",
+            }
+            camera = {
+                **key,
+                "token": "c" + token,
+                "calibrated_sensor_token": "cc",
+                "filename": "samples/CAM_FRONT/1.jpg",
+            }
+            tables["sample_data"] += [camera, key, sweep]
+            label = f"lidarseg/v1.0-mini/{token}_lidarseg.bin"
+            tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": label})
+            rows = np.array([[1 + i, 2, 3, 51 * (i % 6), i % 32] for i in range(count)], dtype=np.float32)
+            rows.tofile(root / name)
+            np.resize(np.array([1, 2, 0, 3], dtype=np.uint8), count).tofile(root / label)
+    for table, rows_ in tables.items():
+        (root / f"v1.0-mini/{table}.json").write_text(json.dumps(rows_))
+    return Layout(
+        spec=f"nuscenes:{root}",
+        sequences=("scene-0103", "scene-0061"),
+        first_points=root / "samples/LIDAR_TOP/scene-0103-9.pcd.bin",
+        first_labels=root / "lidarseg/v1.0-mini/scene-0103-9_lidarseg.bin",
+        truth=[4, 13, 0, 0, 4, 13, 0],
+        intensity=[0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 0.0],
+    )
+
+
+MAKERS: dict[str, Callable[[Path], Layout]] = {"semantickitti": make_semantickitti, "nuscenes": make_nuscenes}
+
+
+@pytest.fixture(params=MAKERS)
+def layout(request: pytest.FixtureRequest, tmp_path: Path) -> Layout:
+    return MAKERS[request.param](tmp_path / "set")
+
+
+def fails(call: Callable[[], object], *words: object) -> None:
+    """The call raises InputError in one line that has all the words."""
+    with pytest.raises(InputError) as caught:
+        call()
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in words:
+        assert str(word) in message
+
+
+# --- the suite that every reader passes ---
+
+
+def test_splits_are_those_on_disk(layout: Layout) -> None:
+    dataset = open_dataset(layout.spec)
+    assert isinstance(dataset, Dataset)
+    assert dataset.sequences("val") == (layout.sequences[0],)
+    assert dataset.sequences("train") == (layout.sequences[1],)
+    fails(lambda: dataset.sequences("test"), dataset.root, "test")
+    fails(lambda: dataset.sequences("validation"), dataset.root, "'validation'")
+
+
+def test_records_are_in_order_and_unique(layout: Layout) -> None:
+    dataset = open_dataset(layout.spec)
+    records = dataset.records([*layout.sequences, layout.sequences[0]])
+    assert [r.sequence for r in records] == sorted([*layout.sequences, *layout.sequences])
+    assert len({r.name for r in records}) == len({r.prediction for r in records}) == 4
+    assert [len(dataset.read(r)) for r in records] == [*COUNTS, *COUNTS]
+
+
+def test_missing_sequence_lists_what_is_there(layout: Layout) -> None:
+    dataset = open_dataset(layout.spec)
+    fails(lambda: dataset.records(["77"]), dataset.root, "77", *layout.sequences)
+
+
+def test_scan_has_points_labels_and_intensity_in_unit_range(layout: Layout) -> None:
+    dataset = open_dataset(layout.spec)
+    scan = dataset.read(dataset.records(layout.sequences[:1])[0])
+    assert scan.points.dtype == np.float32
+    assert scan.labels is not None
+    assert scan.labels.dtype == np.uint8
+    assert scan.labels.tolist() == layout.truth
+    assert scan.points[:, 3].tolist() == pytest.approx(layout.intensity)
+    assert scan.ring is None or scan.ring.tolist() == list(range(7))
+
+
+def test_labels_are_none_where_not_wanted(layout: Layout) -> None:
+    dataset = open_dataset(layout.spec)
+    assert dataset.read(dataset.records(layout.sequences[:1])[0], labels=False).labels is None
+
+
+def test_predictions_round_trip(layout: Layout, tmp_path: Path) -> None:
+    dataset = open_dataset(layout.spec)
+    record = dataset.records(layout.sequences[:1])[0]
+    ids = np.arange(1, 8)
+    path = dataset.write_prediction(record, tmp_path / "out", ids)
+    assert path == tmp_path / "out" / record.prediction
+    assert [p.name for p in path.parent.iterdir()] == [path.name]  # no temporary file stays
+    back = dataset.read_prediction(record, tmp_path / "out")
+    assert back.dtype == np.uint8
+    assert back.tolist() == ids.tolist()
+    assert path.stat().st_size == 7 * (4 if dataset.taxonomy.name == "semantickitti" else 1)
+
+
+def test_wrong_predictions_are_named(layout: Layout, tmp_path: Path) -> None:
+    dataset = open_dataset(layout.spec)
+    record = dataset.records(layout.sequences[:1])[0]
+    out = tmp_path / "out" / record.prediction
+    fails(lambda: dataset.read_prediction(record, tmp_path / "out"), out)
+    fails(lambda: dataset.write_prediction(record, tmp_path / "out", np.ones(6)), record.points_path, 7)
+    fails(lambda: dataset.write_prediction(record, tmp_path / "out", np.full(7, 20)), "20")
+    assert not out.exists()
+    out.parent.mkdir(parents=True)
+    out.write_bytes(bytes(8 * 4))
+    fails(lambda: dataset.read_prediction(record, tmp_path / "out"), out, "expected 7 labels")
+    out.write_bytes(bytes([200]) * layout.first_labels.stat().st_size)
+    fails(lambda: dataset.read_prediction(record, tmp_path / "out"), out, "raw ids")
+
+
+def test_data_sets_can_be_pickled(layout: Layout) -> None:
+    dataset = open_dataset(layout.spec)
+    copy = pickle.loads(pickle.dumps(dataset))
+    assert copy.records(layout.sequences) == dataset.records(layout.sequences)
+
+
+def test_unusable_points_are_named(layout: Layout) -> None:
+    dataset = open_dataset(layout.spec)
+    record = dataset.records(layout.sequences[:1])[0]
+    whole = layout.first_points.read_bytes()
+    broken = {
+        "truncated": whole[:-3],
+        "0 points": b"",
+        "NaN": np.full(len(whole) // 4, np.nan, dtype=np.float32).tobytes(),
+    }
+    for word, content in broken.items():
+        layout.first_points.write_bytes(content)
+        fails(lambda: dataset.read(record), layout.first_points, word)
+    layout.first_points.unlink()
+    fails(lambda: dataset.read(record), layout.first_points)
+
+
+def test_unusable_labels_are_named(layout: Layout) -> None:
+    dataset = open_dataset(layout.spec)
+    record = dataset.records(layout.sequences[:1])[0]
+    whole = layout.first_labels.read_bytes()
+    layout.first_labels.write_bytes(whole[:4])
+    fails(lambda: dataset.read(record), layout.first_labels, "expected 7 labels")
+    layout.first_labels.write_bytes(b"\xc8" * len(whole))
+    fails(lambda: dataset.read(record), layout.first_labels, "200" if len(whole) == 7 else "51400")
+    layout.first_labels.unlink()
+    fails(lambda: open_dataset(layout.spec).read(record), layout.first_labels)
+
+
+def test_one_lost_return_keeps_its_place(layout: Layout) -> None:
+    values = np.fromfile(layout.first_points, np.float32)
+    values[0] = np.nan
+    values.tofile(layout.first_points)
+    dataset = open_dataset(layout.spec)
+    scan = dataset.read(dataset.records(layout.sequences[:1])[0])
+    assert scan.valid.tolist() == [False] + [True] * 6
+
+
+# --- what only one layout has ---
+
+
+def test_semantickitti_without_labels_has_none(tmp_path: Path) -> None:
+    layout = make_semantickitti(tmp_path)
+    for path in layout.first_labels.parent.iterdir():
+        path.unlink()
+    dataset = open_dataset(layout.spec)
+    record = dataset.records(["08"])[0]
+    assert record.labels_path is None
+    assert dataset.read(record).labels is None
+
+
+def test_semantickitti_opens_at_the_sequences_folder(tmp_path: Path) -> None:
+    make_semantickitti(tmp_path)
+    inner = open_dataset(str(tmp_path / "sequences"))
+    assert [r.name for r in inner.records(["08"])] == ["08/000000", "08/000001"]
+
+
+def test_nuscenes_without_lidarseg_or_sensor_tables(tmp_path: Path) -> None:
+    layout = make_nuscenes(tmp_path)
+    for table in ("lidarseg", "calibrated_sensor", "sensor", "category"):
+        (tmp_path / f"v1.0-mini/{table}.json").unlink()
+    dataset = open_dataset(layout.spec)
+    assert dataset.read(dataset.records(layout.sequences)[0]).labels is None
+
+
+def test_nuscenes_tables_that_cannot_be_used(tmp_path: Path) -> None:
+    layout = make_nuscenes(tmp_path)
+    folder = tmp_path / "v1.0-mini"
+    (folder / "category.json").write_text('[{"token": "a", "name": "a.submarine", "index": 1}]')
+    fails(lambda: open_dataset(layout.spec), folder / "category.json", "a.submarine")
+    (folder / "category.json").write_text('[{"token": "a", "name": "vehicle.car"}]')
+    fails(lambda: open_dataset(layout.spec), folder / "category.json", "index")
+    (folder / "lidarseg.json").unlink()
+    (folder / "sample.json").write_text('[{"token": "a"}]')
+    fails(lambda: open_dataset(layout.spec), folder, "scene_token")
+    (folder / "sample.json").write_text("[")
+    fails(lambda: open_dataset(layout.spec), folder / "sample.json")
+    (folder / "sample.json").unlink()
+    fails(lambda: open_dataset(layout.spec), folder / "sample.json")
+
+
+def test_nuscenes_version_has_to_be_clear(tmp_path: Path) -> None:
+    make_nuscenes(tmp_path)
+    (tmp_path / "v1.0-test").mkdir()
+    fails(lambda: open_dataset(f"nuscenes:{tmp_path}"), tmp_path, "v1.0-mini", "v1.0-test")
+    fails(lambda: open_dataset(f"nuscenes:{tmp_path}@v1.0-trainval"), tmp_path, "v1.0-mini")
+    assert open_dataset(f"nuscenes:{tmp_path}@v1.0-mini").sequences("val") == ("scene-0103",)
+    assert open_dataset(f"{tmp_path}@v1.0-mini").sequences("val") == ("scene-0103",)
+
+
+def test_nuscenes_official_splits_have_their_sizes() -> None:
+    assert (len(VAL), len(MINI_VAL), len(MINI_TRAIN)) == (150, 2, 8)
+    assert {"scene-0103", "scene-0916", "scene-0003", "scene-1073"} <= VAL
+    assert not MINI_VAL & MINI_TRAIN
+
+
+def test_catalog_names_what_it_looked_for(tmp_path: Path) -> None:
+    fails(lambda: open_dataset(str(tmp_path / "no")), tmp_path / "no")
+    fails(lambda: open_dataset(f"nuscenes:{tmp_path / 'no'}"), tmp_path / "no")
+    fails(lambda: open_dataset(str(tmp_path)), tmp_path, "neither", "velodyne", "sample_data.json")
+    fails(lambda: open_dataset(f"semantickitti:{tmp_path}"), tmp_path, "velodyne")
+    fails(lambda: open_dataset(f"nuscenes:{tmp_path}"), tmp_path, "v1.0-")
+    make_semantickitti(tmp_path)
+    fails(lambda: open_dataset(f"semantickitti:{tmp_path}@v1.0-mini"), tmp_path, "v1.0-mini")
+    assert open_dataset(str(tmp_path)).taxonomy is SEMANTICKITTI
+
+
+def test_another_taxonomy_can_be_given(tmp_path: Path) -> None:
+    layout = make_semantickitti(tmp_path)
+    other = Taxonomy("two", ("car", "rest"), ((0, 0, 0),) * 3, {252: 1, 40: 2, 99: 2, 81: 2}, (0, 252, 40), {}, True)
+    scan = open_dataset(layout.spec, other).read(open_dataset(layout.spec, other).records(["08"])[0])
+    assert scan.labels is not None
+    assert scan.labels.tolist() == [1, 2, 2, 2, 1, 2, 2]
+
+
+# --- lone files ---
+
+
+@pytest.mark.parametrize("scale", [1.0, 255.0])
+def test_lone_scans_in_every_format_agree(tmp_path: Path, scale: float) -> None:
+    points = np.random.default_rng(0).random((9, 4)).astype(np.float32)
+    points[0, 3] = 1.0
+    raw = points * np.array([1, 1, 1, scale], dtype=np.float32)
+    ring = np.arange(9, dtype=np.float32)[:, None]
+    raw.tofile(tmp_path / "a.bin")
+    np.save(tmp_path / "b.npy", raw.astype(np.float64))
+    np.save(tmp_path / "c.npy", np.hstack([raw, ring]))
+    np.hstack([points * np.array([1, 1, 1, 255], dtype=np.float32), ring]).tofile(tmp_path / "d.pcd.bin")
+    found = find_scans(tmp_path)
+    assert [path.name for path in found] == ["a.bin", "b.npy", "c.npy", "d.pcd.bin"]
+    for path in found:
+        scan = read_scan(path)
+        np.testing.assert_allclose(scan.points, points, rtol=1e-6)
+        assert (scan.ring is not None) == (path.name[0] in "cd")
+        assert scan.name == str(path)
+
+
+def test_three_columns_get_no_intensity(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.ones((4, 3)))
+    assert read_scan(tmp_path / "a.npy").points.tolist() == [[1, 1, 1, 0]] * 4
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.zeros((0, 4)),
+        np.full((3, 4), np.nan),
+        np.zeros((3, 2)),
+        np.zeros((3, 6)),
+        np.zeros(4),
+        np.zeros((2, 4), dtype=complex),
+        np.zeros(3, dtype=[("x", float), ("y", float), ("z", float)]),
+        np.array([{"x": 1}], dtype=object),
+        np.array([[0, 0, 0, 0, 0.5]]),
+    ],
+)
+def test_unusable_arrays_are_named(tmp_path: Path, array: np.ndarray) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, array, allow_pickle=True)
+    fails(lambda: read_scan(path), path)
+
+
+def test_unusable_files_are_named(tmp_path: Path) -> None:
+    for name, content in {
+        "a.bin": b"",
+        "b.bin": bytes(17),
+        "c.pcd.bin": bytes(16),
+        "d.npy": b"not numpy",
+        "f.npy": b"",
+        "e.xyz": b"1 2 3",
+    }.items():
+        (tmp_path / name).write_bytes(content)
+        fails(lambda path=tmp_path / name: read_scan(path), tmp_path / name)  # type: ignore[misc]
+    fails(lambda: read_scan(tmp_path / "e.xyz"), ".pcd.bin", ".bin", ".npy")
+    fails(lambda: read_scan(tmp_path / "no.bin"), tmp_path / "no.bin")
+    fails(lambda: find_scans(tmp_path / "no"), tmp_path / "no")
+    (tmp_path / "empty").mkdir()
+    fails(lambda: find_scans(tmp_path / "empty"), tmp_path / "empty")
+    assert find_scans(tmp_path / "a.bin") == [tmp_path / "a.bin"]
+
+
+def test_files_appear_whole_or_not_at_all(tmp_path: Path) -> None:
+    target = tmp_path / "deep" / "a.label"
+
+    def stop_halfway() -> None:
+        with whole_file(target) as part:
+            part.write_bytes(b"half")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        stop_halfway()
+    assert list(target.parent.iterdir()) == []
+    write_labels(target, np.array([10, 259], dtype=np.uint32))
+    assert np.fromfile(target, np.uint32).tolist() == [10, 259]
+    fails(lambda: write_labels(target / "b.label", np.zeros(1)), target / "b.label")
+    fails(lambda: write_labels(tmp_path, np.zeros(1)), tmp_path)
+
+
+# --- taxonomies ---
+
+
+@pytest.mark.parametrize("taxonomy", TAXONOMIES.values(), ids=TAXONOMIES)
+def test_raw_and_train_ids_are_inverse(taxonomy: Taxonomy) -> None:
+    ids = np.arange(taxonomy.size + 1)
+    raw = taxonomy.to_raw(ids)
+    assert raw.dtype == np.uint32
+    assert taxonomy.to_train(raw).tolist() == ids.tolist()
+    assert taxonomy.to_train(raw | np.uint32(7 << 16)).tolist() == ids.tolist()
+    assert len(taxonomy.colors) == taxonomy.size + 1
+    fails(lambda: taxonomy.to_train(np.array([400], dtype=np.uint32)), "400", taxonomy.name)
+    fails(lambda: taxonomy.to_raw(np.array([taxonomy.size + 1])), taxonomy.size + 1)
+
+
+def test_lookup_equals_a_plain_loop() -> None:
+    raw = np.random.default_rng(0).choice(list(SEMANTICKITTI.raw_to_train), 200).astype(np.uint32)
+    assert SEMANTICKITTI.to_train(raw).tolist() == [SEMANTICKITTI.raw_to_train[int(r)] for r in raw]
+    assert SEMANTICKITTI.to_train(raw[:0]).shape == (0,)
+
+
+@pytest.mark.parametrize("taxonomy", TAXONOMIES.values(), ids=TAXONOMIES)
+def test_taxonomy_survives_json_and_pickle(taxonomy: Taxonomy) -> None:
+    assert Taxonomy.from_dict(json.loads(json.dumps(taxonomy.to_dict()))) == taxonomy
+    assert pickle.loads(pickle.dumps(taxonomy)) == taxonomy
+    fails(lambda: Taxonomy.from_dict({"name": "a"}), "classes")
+
+
+def test_sizes_of_the_benchmarks() -> None:
+    assert (SEMANTICKITTI.size, NUSCENES.size) == (19, 16)
+    assert (len(SEMANTICKITTI.raw_to_train), len(NUSCENES.raw_to_train)) == (34, 32)
+    assert SEMANTICKITTI.splits["val"] == ("08",)
+
+
+def label_map() -> dict[str, Any]:
+    """SEMANTICKITTI in the format of the benchmark's own YAML file (colours are BGR there)."""
+    raws, forward = SEMANTICKITTI.train_to_raw, SEMANTICKITTI.raw_to_train
+    names = ("unlabeled", *SEMANTICKITTI.classes)
+    train = {ours: [int(s) for s in SEMANTICKITTI.splits[ours]] for ours in ("train", "val", "test")}
+    return {
+        "labels": {raw: names[t] for raw, t in forward.items()},
+        "color_map": {raw: list(SEMANTICKITTI.colors[t])[::-1] for raw, t in forward.items()},
+        "learning_map": dict(forward),
+        "learning_map_inv": dict(enumerate(raws)),
+        "learning_ignore": {t: t == 0 for t in range(20)},
+        "split": {"train": train["train"], "valid": train["val"], "test": train["test"]},
+    }
+
+
+def test_yaml_label_map_is_the_built_in_one(tmp_path: Path) -> None:
+    path = tmp_path / "semantic-kitti.yaml"
+    path.write_text(yaml.safe_dump(label_map()))
+    assert taxonomy_from_yaml(path) == SEMANTICKITTI
+
+
+def test_incomplete_label_maps_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "labels.yaml"
+    fails(lambda: taxonomy_from_yaml(path), path)
+    for key in label_map():
+        path.write_text(yaml.safe_dump({k: v for k, v in label_map().items() if k != key}))
+        fails(lambda: taxonomy_from_yaml(path), path, key)
+    wrong = [{**label_map(), "labels": {0: "unlabeled"}}, {**label_map(), "learning_map": {70_000: 1}}]
+    for content in ("a: [", "[1]", *map(yaml.safe_dump, wrong)):
+        path.write_text(content)
+        fails(lambda: taxonomy_from_yaml(path), path)
+
+
+# --- real data ---
+
+
+@pytest.mark.skipif(not REAL, reason="AMVNET_REAL_DATA does not name a folder")
+@pytest.mark.parametrize(("name", "sequence", "rings"), [("semantickitti", "07", 0), ("nuscenes", "scene-0523", 32)])
+def test_real_scans_open(name: str, sequence: str, rings: int) -> None:
+    dataset = open_dataset(str(Path(REAL or "") / name))
+    records = dataset.records([sequence])
+    scan = dataset.read(records[0])
+    assert len(records) == 10
+    assert len(scan) > 30_000
+    assert 0 <= scan.points[:, 3].min() <= scan.points[:, 3].max() <= 1
+    assert (scan.ring is None) if not rings else (scan.ring is not None and scan.ring.max() == rings - 1)
+    assert (scan.labels is None) == (records[0].labels_path is None)
