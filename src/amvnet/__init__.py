@@ -1,1 +1,46 @@
-"""AMVNet: LiDAR semantic segmentation by two views and late fusion."""
+"""AMVNet: LiDAR semantic segmentation by two views and late fusion.
+
+    segmenter = amvnet.load("sim-hdl64e")
+    result = segmenter(points)
+
+Names are imported when they are first used, so that `import amvnet` is fast.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from amvnet.errors import InputError
+    from amvnet.scan import Scan
+    from amvnet.segmenter import Segmentation, Segmenter, fuse
+    from amvnet.simulation import simulate
+
+__all__ = ["InputError", "Scan", "Segmentation", "Segmenter", "fuse", "load", "simulate"]
+__version__ = version("amvnet")
+
+_HOMES = {
+    "InputError": "amvnet.errors",
+    "Scan": "amvnet.scan",
+    "Segmentation": "amvnet.segmenter",
+    "Segmenter": "amvnet.segmenter",
+    "fuse": "amvnet.segmenter",
+    "simulate": "amvnet.simulation",
+}
+
+
+def load(weights: str, device: str = "cpu", method: str = "amvnet") -> Segmenter:
+    """A segmenter from a weights file, or from built-in weights by name (`sim-hdl64e`).
+
+    Raises:
+        InputError: where there are no such weights, or they lack a part that the method needs.
+    """
+    return import_module("amvnet.segmenter").Segmenter(weights, device, method)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'amvnet' has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
