@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -25,10 +27,32 @@ def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
     """(B, C, H, W) -> (B, C, H, left + W + right), continued circularly; the pads may be wider than W."""
     if not left and not right:
         return x
+    return _WrapWidth.apply(x, left, right) if x.requires_grad else _wrapped(x, left, right)
+
+
+def _wrapped(x: Tensor, left: int, right: int) -> Tensor:
     width = x.shape[-1]
     if max(left, right) <= width:  # keeps the memory format, which a gather by index does not
         return torch.cat([x[..., width - left :], x, x[..., :right]], dim=-1)
     return x[..., torch.arange(-left, width + right, device=x.device) % width]
+
+
+class _WrapWidth(torch.autograd.Function):
+    """`_wrapped` with a gradient that adds the pads in place: autograd's own took a third of a training step."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, left: int, right: int) -> Tensor:
+        ctx.sizes = x.shape[-1], left, right
+        return _wrapped(x, left, right)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        width, left, right = ctx.sizes
+        grad = grads[0]
+        inner = grad[..., left : left + width].clone(memory_format=torch.preserve_format)
+        for pad in [*range(left), *range(left + width, left + width + right)]:
+            inner[..., (pad - left) % width] += grad[..., pad]
+        return inner, None, None
 
 
 class ConvBlock(nn.Sequential):
