@@ -10,7 +10,7 @@ from amvnet.data.records import Dataset, ScanRecord
 from amvnet.data.semantickitti import SemanticKitti
 from amvnet.errors import InputError
 
-__all__ = ["Dataset", "ScanRecord", "open_dataset"]
+__all__ = ["Dataset", "ScanRecord", "is_dataset", "open_dataset"]
 
 KINDS: dict[str, type[SemanticKitti] | type[NuScenes]] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
 
@@ -33,6 +33,13 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
     if not path.is_dir():
         raise InputError(f"{path}: expected the folder of a data set, found none; check the path")
     return _open(KINDS[kind] if kind else _guess(path), path, version, taxonomy)
+
+
+def is_dataset(spec: str) -> bool:
+    """Whether a text names a data set, by its prefix or by the layout of its folder, rather than scan files."""
+    path, version = _split_version(spec)
+    named = spec.partition(":")[0] in KINDS or version is not None
+    return named or (path.is_dir() and any(opener.matches(path) for opener in KINDS.values()))
 
 
 def _split_version(place: str) -> tuple[Path, str | None]:

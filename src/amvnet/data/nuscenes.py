@@ -29,6 +29,7 @@ def _scenes(numbers: str) -> frozenset[str]:
     return frozenset(names)
 
 
+SPLITS = ("train", "val", "test", "all")
 # Official splits. A scene that none of them names is for training.
 MINI_TRAIN = _scenes("61 553 655 757 796 1077 1094 1100")
 MINI_VAL = _scenes("103 916")
@@ -69,12 +70,12 @@ class NuScenes:
         return any(root.glob("v1.0-*/sample_data.json"))
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """The scenes of "train", "val" or "test" that are on disk; raises as `records.Dataset`."""
-        if split not in ("train", "val", "test"):
-            raise InputError(f"{self.root}: expected a split of train, val, test, found {split!r}; give one of them")
+        """The scenes of "train", "val", "test" or "all" that are on disk; raises as `records.Dataset`."""
+        if split not in SPLITS:
+            raise InputError(f"{self.root}: expected a split of {', '.join(SPLITS)}, found {split!r}; give one of them")
         folder = self.root / "samples" / CHANNEL
         present = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        scenes = [scene for scene in sorted(self._by_scene) if self._split(scene).removeprefix("mini_") == split]
+        scenes = [s for s in sorted(self._by_scene) if split in ("all", self._split(s).removeprefix("mini_"))]
         if found := tuple(s for s in scenes if any(r.points_path.name in present for r in self._by_scene[s])):
             return found
         raise InputError(

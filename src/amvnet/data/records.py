@@ -45,7 +45,7 @@ class Dataset(Protocol):
         """The folder that was opened."""
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """The sequences of the official split ("train", "val" or "test") that are on disk.
+        """The sequences of the official split ("train", "val" or "test") that are on disk; of "all", every one.
 
         Raises:
             InputError: where the split is unknown or none of its sequences is there.

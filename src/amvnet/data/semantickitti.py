@@ -44,11 +44,11 @@ class SemanticKitti:
         return any(root.glob("sequences/*/velodyne")) or any(root.glob("*/velodyne"))
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """The sequences of "train", "val" or "test" that are on disk; raises as `records.Dataset`."""
-        splits = self.taxonomy.splits
+        """The sequences of "train", "val", "test" or "all" that are on disk; raises as `records.Dataset`."""
+        present = self._present()
+        splits = {**self.taxonomy.splits, "all": present}
         if split not in splits:
             raise InputError(f"{self.root}: expected a split of {', '.join(splits)}, found {split!r}; give one of them")
-        present = self._present()
         if found := tuple(sequence for sequence in splits[split] if sequence in present):
             return found
         raise InputError(

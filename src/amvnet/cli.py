@@ -1,0 +1,404 @@
+"""The command line: the only place that prints or exits."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_type_hints
+
+import docstring_parser
+from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from amvnet import __version__
+from amvnet.errors import InputError
+
+if TYPE_CHECKING:
+    from amvnet.data.labels import Taxonomy
+    from amvnet.data.records import ScanRecord
+    from amvnet.evaluation import Evaluation
+
+DONE, FAILED, WRONG_INPUT = 0, 1, 2
+MethodName = Literal["rv", "bev", "ensemble", "amvnet"]
+WEIGHTS = "sim-hdl64e"
+SHOWN = 20  # names of sequences in a line
+
+console = Console(highlight=False)
+
+
+class Parser(ArgumentParser):
+    """A parser whose complaint is one line, as all of ours are."""
+
+    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
+        line = " ".join(message.split()) or str(ex)
+        raise InputError(f"{line}; see {self.prog} --help")
+
+
+def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGHTS) -> None:
+    """Simulate streets, segment them, score the result and draw it.
+
+    Args:
+        out: folder for the scans, predictions and pictures.
+        seed: of the streets; by default one that the weights never saw.
+        weights: a weights file, or the name of a built-in one.
+    """
+    from amvnet import jobs
+    from amvnet.data.semantickitti import SemanticKitti
+    from amvnet.segmenter import Segmenter
+    from amvnet.simulation import simulate as write
+
+    segmenter = Segmenter(weights)
+    with progress("simulating") as step:
+        seed = jobs.DEMO_SEED if seed is None else seed
+        write(out / "data", sequences=jobs.DEMO_SEQUENCES, scans=jobs.DEMO_SCANS, seed=seed, progress=step)
+    dataset = SemanticKitti(out / "data")
+    records = jobs.choose_records(dataset, None, "all")
+    with progress("segmenting") as step:
+        jobs.predict([str(out / "data")], segmenter, out / "predictions", progress=step)
+    with progress("scoring") as step:
+        label = jobs.by_weights(dataset, segmenter)
+        found = jobs.evaluate(dataset, records, label, out / "pictures", step)
+    show_evaluation(found, f"simulated streets, seed {seed}", dataset.taxonomy, out / "metrics.json")
+    say(f"labels in {out / 'predictions'}, pictures in {out / 'pictures'}, figures in {out / 'metrics.json'}")
+
+
+def simulate(
+    out: Path,
+    sensor: str = "hdl64e",
+    sequences: int = 1,
+    scans: int = 10,
+    seed: int = 0,
+    first_sequence: int = 0,
+) -> None:
+    """Write labelled scans of simulated streets, in SemanticKITTI's layout.
+
+    Args:
+        out: folder to write to.
+        sensor: name of the LiDAR.
+        sequences: number of sequences; each is another street.
+        scans: number of scans in each sequence.
+        seed: of all randomness; the same seed gives the same bytes.
+        first_sequence: number of the first sequence.
+    """
+    from amvnet.simulation import simulate as write
+
+    with progress("simulating") as step:
+        write(
+            out,
+            sensor=sensor,
+            sequences=sequences,
+            scans=scans,
+            seed=seed,
+            first_sequence=first_sequence,
+            progress=step,
+        )
+    say(f"{sequences * scans} scans in {out}")
+
+
+def train(
+    recipe: Any,
+    data: str,
+    out: Path,
+    stage: Literal["rv", "bev", "head", "all"] = "all",
+    init: str | None = None,
+    resume: bool = False,
+    train_sequences: str | None = None,
+    val_sequences: str | None = None,
+    taxonomy: Path | None = None,
+) -> None:
+    """Train the two networks and the point head.
+
+    Args:
+        recipe: what to train; a built-in recipe's name or a YAML file.
+        data: the data set: semantickitti:PATH, nuscenes:PATH, or a path whose layout says which.
+        out: folder of the run.
+        stage: which part to train; `all` trains one after the other.
+        init: weights to begin with; parts that are not trained are taken from them.
+        resume: go on where an earlier run in the folder stopped.
+        train_sequences: sequences or scenes to train on, with commas; default: the official split.
+        val_sequences: sequences or scenes to validate on, with commas; default: the official split.
+        taxonomy: a semantic-kitti.yaml with other classes.
+    """
+    from amvnet import weights
+    from amvnet.jobs import split_records
+    from amvnet.runner import Run
+
+    dataset = _open(data, taxonomy)
+    learnt, val = split_records(dataset, _names(train_sequences), _names(val_sequences))
+    say(f"training on {_listed(learnt)}; validating on {_listed(val)}")
+    tell = None if on_terminal() else say
+    given = None if init is None else weights.load(init)
+    path = Run(recipe, dataset, learnt, val, out, resume, tell).stages(stage, given)
+    say(f"weights in {path}")
+
+
+def predict(
+    inputs: list[str],
+    weights: str,
+    out: Path,
+    method: MethodName = "amvnet",
+    sequences: str | None = None,
+    scores: bool = False,
+    device: str = "cpu",
+) -> None:
+    """Segment data sets, scans, or folders of scans.
+
+    Args:
+        inputs: data sets, scan files, or folders of scans.
+        weights: a weights file, or the name of a built-in one.
+        out: folder for the labels.
+        method: the whole of AMVNet, or a part of it.
+        sequences: of data sets, which sequences or scenes, with commas; default: all.
+        scores: also write the probabilities of both networks.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from amvnet import jobs
+    from amvnet.segmenter import Segmenter
+
+    segmenter = Segmenter(weights, device, method)
+    with progress("segmenting") as step:
+        written = jobs.predict(inputs, segmenter, out, _names(sequences), scores, step)
+    say(f"{len(written)} label files in {out}")
+
+
+def evaluate(
+    data: str,
+    weights: str | None = None,
+    predictions: Path | None = None,
+    split: Literal["train", "val", "test", "all"] = "val",
+    sequences: str | None = None,
+    json: Path | None = None,
+    pictures: Path | None = None,
+    taxonomy: Path | None = None,
+    device: str = "cpu",
+) -> None:
+    """Score weights, or predictions of any tool, by the benchmark's official formulas.
+
+    Args:
+        data: the data set.
+        weights: a weights file, or the name of a built-in one: all methods are scored.
+        predictions: a folder of predictions in the benchmark's layout, instead of weights.
+        split: the official split to score.
+        sequences: sequences or scenes to score instead, with commas.
+        json: file for all figures.
+        pictures: folder for drawings of some scans from above.
+        taxonomy: a semantic-kitti.yaml with other classes.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from amvnet import jobs
+    from amvnet.segmenter import Segmenter
+
+    if (weights is None) == (predictions is None):
+        raise InputError("expected either --weights or --predictions, found both or neither; give one of them")
+    dataset = _open(data, taxonomy)
+    records = jobs.choose_records(dataset, _names(sequences), split)
+    if predictions is not None:
+        label = jobs.by_files(dataset, predictions)
+    else:
+        label = jobs.by_weights(dataset, Segmenter(str(weights), device, _widest_method(str(weights))))
+    with progress("scoring") as step:
+        found = jobs.evaluate(dataset, records, label, pictures, step)
+    show_evaluation(found, data, dataset.taxonomy, json)
+
+
+def info(weights: str | None = None) -> None:
+    """Say what a weights file is; without one, what is installed.
+
+    Args:
+        weights: a weights file, or the name of a built-in one.
+    """
+    from amvnet import report
+    from amvnet import weights as weights_file
+
+    if weights is not None:
+        console.print(report.weights_table(weights_file.load(weights), weights))
+        return
+    console.print(report.installation_table())
+
+
+def show_evaluation(evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None) -> None:
+    """Print the table, and write the same figures as JSON."""
+    from amvnet.data.files import whole_file
+    from amvnet.report import evaluation_table
+
+    figures = evaluation.report(dataset)
+    console.print(evaluation_table(figures, taxonomy))
+    if path is not None:
+        with whole_file(path) as part:
+            part.write_text(json.dumps(figures, indent=1))
+
+
+def say(line: str) -> None:
+    """A line, left as long as it is: paths are copied from it."""
+    console.print(line, markup=False, soft_wrap=True)
+
+
+def on_terminal() -> bool:
+    return console.is_terminal
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on a terminal, a line every tenth elsewhere; yields what is told (done, in all)."""
+    if not on_terminal():
+        yield lambda done, total: _tenth(title, done, total)
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _tenth(title: str, done: int, total: int) -> None:
+    if done and done * 10 // total != (done - 1) * 10 // total:
+        say(f"{title}: {done} of {total}")
+
+
+def _open(data: str, taxonomy: Path | None) -> Any:
+    from amvnet.data.catalog import open_dataset
+    from amvnet.data.labels import taxonomy_from_yaml
+
+    return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
+
+
+def _listed(records: Sequence[ScanRecord]) -> str:
+    names = sorted({record.sequence for record in records})
+    shown = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
+    return f"{len(records)} scans of {shown}"
+
+
+def _names(text: str | None) -> list[str] | None:
+    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _widest_method(weights: str) -> Any:
+    """The last method, in the order of the paper's tables, that the weights have the parts for."""
+    from amvnet.segmenter import METHODS, NEEDED
+    from amvnet.weights import load
+
+    parts = set(load(weights).parts)
+    found = [method for method in METHODS if set(NEEDED[method]) <= parts]
+    return found[-1] if found else METHODS[-1]
+
+
+VERBS: dict[str, tuple[Callable[..., None], dict[str, dict[str, Any]]]] = {
+    "demo": (demo, {}),
+    "simulate": (simulate, {"out": {"metavar": "OUT", "type": Path}}),
+    "train": (train, {"recipe": {"metavar": "RECIPE"}}),
+    "predict": (predict, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
+    "evaluate": (evaluate, {"data": {"metavar": "DATA"}}),
+    "info": (info, {"weights": {"metavar": "W", "nargs": "?"}}),
+}
+
+
+def parser_of(verb: str, argv: Sequence[str]) -> ArgumentParser:
+    """The parser of a verb; that of `train` knows the values of the recipe that it is given."""
+    function, positional = VERBS[verb]
+    docs = docstring_parser.parse(function.__doc__ or "")
+    help_of = {param.arg_name: param.description for param in docs.params}
+    shown = " ".join(str(options["metavar"]) for options in positional.values())
+    usage = f"amvnet {verb} {shown} [options]".replace("  ", " ")
+    parser = Parser(prog=f"amvnet {verb}", usage=usage, description=docs.short_description)
+    for name, options in positional.items():
+        parser.add_argument(name, help=help_of.get(name), **options)
+    set_parsing_settings(docstring_parse_attribute_docstrings=True)  # the help of a recipe's values
+    hints = get_type_hints(function)
+    for name, parameter in inspect.signature(function).parameters.items():
+        if name not in positional:
+            _add_option(parser, name, hints[name], parameter.default, help_of.get(name))
+    if verb == "train":
+        _add_recipe(parser, argv)
+    return parser
+
+
+def _add_option(parser: ArgumentParser, name: str, kind: Any, default: Any, text: str | None) -> None:
+    """One parameter of a verb's function as an option, with dashes as the shell has them."""
+    flag = "--" + name.replace("_", "-")
+    if kind is bool:
+        parser.add_argument(flag, action="store_true", help=text)
+    elif default is inspect.Parameter.empty:
+        parser.add_argument(flag, type=kind, required=True, help=text)
+    else:
+        parser.add_argument(flag, type=kind, default=default, help=text)
+
+
+def _add_recipe(parser: ArgumentParser, argv: Sequence[str]) -> None:
+    """Every value of the recipe as an option, with dots: --training.rv.epochs 40."""
+    from amvnet.config import ModelConfig, Recipe, TrainingConfig, load_recipe
+
+    named = bool(argv) and not argv[0].startswith("-")
+    recipe = load_recipe(argv[0]) if named else Recipe()
+    parser.add_argument("--model", type=ModelConfig, default=recipe.model)
+    parser.add_argument("--training", type=TrainingConfig, default=recipe.training)
+
+
+def _train_arguments(values: Namespace, parser: ArgumentParser) -> dict[str, Any]:
+    from amvnet.config import Recipe, load_recipe
+
+    made = parser.instantiate_classes(values)
+    given = {key: getattr(made, key) for key in vars(made) if key not in ("model", "training", "recipe")}
+    recipe = Recipe(load_recipe(values.recipe).taxonomy, made.model, made.training)
+    return {"recipe": recipe, **given}
+
+
+USAGE = f"""usage: amvnet VERB ...
+
+  demo       simulate, segment, score, draw: the first thing to run
+  simulate   write labelled scans of simulated streets
+  train      train the networks and the point head
+  predict    segment scans
+  evaluate   score weights or predictions by the official formulas
+  info       what a weights file is, or what is installed
+
+`amvnet VERB --help` says more. Version {__version__}."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb; returns the exit code: 0 done, 2 the input is wrong, 1 anything else."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help"):
+        say(USAGE)
+        return DONE if arguments else WRONG_INPUT
+    if arguments[0] == "--version":
+        say(__version__)
+        return DONE
+    try:
+        run(arguments[0], arguments[1:])
+    except InputError as error:
+        print(f"amvnet: {error}", file=sys.stderr)
+        return WRONG_INPUT
+    except KeyboardInterrupt:
+        print("amvnet: interrupted", file=sys.stderr)
+        return FAILED
+    return DONE
+
+
+def run(verb: str, arguments: Sequence[str]) -> None:
+    """Run one verb.
+
+    Raises:
+        InputError: where the verb, its arguments or what they name cannot be used.
+    """
+    if verb not in VERBS:
+        raise InputError(f"expected a verb of {', '.join(VERBS)}, found {verb!r}; see amvnet --help")
+    parser = parser_of(verb, arguments)
+    values = parser.parse_args(list(arguments))
+    _quiet()
+    call = _train_arguments(values, parser) if verb == "train" else vars(values)
+    VERBS[verb][0](**call)
+
+
+def _quiet() -> None:
+    """Keep the notes that libraries have for their developers from our users."""
+    warnings.filterwarnings("ignore", module="lightning")
+    warnings.filterwarnings("ignore", module="torch")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,228 @@
+"""The jobs behind the verbs: predict, evaluate, demo. They print nothing; `progress` is told how far they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from amvnet.data.catalog import is_dataset, open_dataset
+from amvnet.data.files import find_scans, read_scan, whole_file, write_labels
+from amvnet.data.labels import Taxonomy
+from amvnet.data.records import Dataset, ScanRecord
+from amvnet.errors import InputError
+from amvnet.evaluation import Evaluation
+from amvnet.pictures import draw_scan
+from amvnet.scan import Scan
+from amvnet.segmenter import Segmentation, Segmenter, checked_scan
+
+Progress = Callable[[int, int], None]  # done, in all
+PICTURES = 4  # scans that are drawn, evenly spaced
+
+DEMO_SEED = 20_201_209  # far from the seeds of the streets that the shipped weights were trained on
+DEMO_SCANS = 6
+DEMO_SEQUENCES = 3
+
+
+@dataclass(frozen=True)
+class Task:
+    """One scan to segment: how it is read, and where its labels go."""
+
+    name: str
+    read: Callable[[], Scan]
+    write: Callable[[np.ndarray], Path]
+    scores: Path
+
+
+def predict(
+    inputs: Sequence[str],
+    segmenter: Segmenter,
+    out: Path,
+    sequences: Sequence[str] | None = None,
+    scores: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> list[Path]:
+    """Segment data sets, scan files and folders of them; returns the files of labels.
+
+    Args:
+        inputs: each a data set as `open_dataset` takes it, a scan file, or a folder of scan files.
+        sequences: of data sets, which to segment; None means all.
+        scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` of an `.npz`.
+
+    Raises:
+        InputError: before anything is written where an input is not there; else at the scan that is broken.
+    """
+    tasks = [task for text in inputs for task in _tasks(text, segmenter.taxonomy, Path(out), sequences)]
+    _check_names(tasks)
+    written = []
+    for done, task in enumerate(tasks):
+        progress(done, len(tasks))
+        result = segmenter(task.read())
+        if scores:
+            write_scores(task.scores, result)
+        written.append(task.write(result.labels))
+    progress(len(tasks), len(tasks))
+    return written
+
+
+def write_scores(path: Path, result: Segmentation) -> None:
+    """Both networks' probabilities, (N, K) float16, as `rv` and `bev` of an `.npz`."""
+    found = {name: v.astype(np.float16) for name, v in (("rv", result.rv), ("bev", result.bev)) if v is not None}
+    with whole_file(path) as part:
+        np.savez_compressed(part, allow_pickle=False, **found)
+
+
+def evaluate(
+    dataset: Dataset,
+    records: Sequence[ScanRecord],
+    label: Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]],
+    pictures: Path | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Evaluation:
+    """Score the labels of some scans by the benchmark's formulas.
+
+    Args:
+        label: what a scan's points are taken for: ids by method, and which points are uncertain.
+        pictures: a folder for drawings of some of the scans from above.
+    """
+    evaluation = Evaluation(dataset.taxonomy)
+    drawn = set(np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int).tolist())
+    for done, record in enumerate(records):
+        progress(done, len(records))
+        scan = dataset.read(record)
+        if scan.labels is None:
+            raise InputError(f"{scan.name}: expected labels to compare with, found none; name labelled sequences")
+        found, uncertain = label(record, scan)
+        evaluation.add(scan.points, scan.labels, found, uncertain)
+        if pictures is not None and done in drawn:
+            path = pictures / f"{record.name.replace('/', '_')}.png"
+            draw_scan(path, scan.points, dataset.taxonomy, found, scan.labels, uncertain, record.name)
+    progress(len(records), len(records))
+    return evaluation
+
+
+def by_weights(
+    dataset: Dataset, segmenter: Segmenter
+) -> Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]]:
+    """Labels by every method that the weights have the parts for.
+
+    Raises:
+        InputError: where the weights know other classes than the data set.
+    """
+    if segmenter.taxonomy.classes != dataset.taxonomy.classes:
+        raise InputError(
+            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those of "
+            f"{segmenter.taxonomy.name}; use weights trained on this benchmark"
+        )
+    return lambda record, scan: segmenter.by_method(checked_scan(scan))
+
+
+def by_files(
+    dataset: Dataset, folder: Path
+) -> Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]]:
+    """Labels from a folder of predictions.
+
+    Raises:
+        InputError: where the folder is not there.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
+    return lambda record, scan: ({"predictions": dataset.read_prediction(record, folder)}, None)
+
+
+def choose_records(dataset: Dataset, sequences: Sequence[str] | None, split: str) -> list[ScanRecord]:
+    """The scans of the named sequences, or else of a split."""
+    return dataset.records(sequences if sequences else dataset.sequences(split))
+
+
+def split_records(
+    dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None
+) -> tuple[list[ScanRecord], list[ScanRecord]]:
+    """The scans to train on and those to validate with: as named, else by the official split.
+
+    Of a data set that has no scan of one of the two official splits, the last sequence validates.
+
+    Raises:
+        InputError: where there is just one sequence.
+    """
+    present = dataset.sequences("all")
+    official = {split: _present(dataset, split) for split in ("train", "val")}
+    if not (train or official["train"]) or not (val or official["val"]):
+        official = {"train": present[:-1], "val": present[-1:]}
+    val = val or [s for s in official["val"] if s not in (train or ())]
+    train = train or [s for s in official["train"] if s not in val]
+    if not train or not val:
+        raise InputError(
+            f"{dataset.root}: expected two sequences, one to train on and one to validate with, "
+            f"found {', '.join(present)}; name them"
+        )
+    return dataset.records(train), dataset.records(val)
+
+
+def _present(dataset: Dataset, split: str) -> tuple[str, ...]:
+    try:
+        return dataset.sequences(split)
+    except InputError:
+        return ()
+
+
+def _tasks(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None) -> Iterator[Task]:
+    if is_dataset(text):
+        yield from _dataset_tasks(open_dataset(text), taxonomy, out, sequences)
+        return
+    for path in find_scans(text):
+        yield Task(path.name, _Read(path), _Write(out / f"{stem(path)}.label", taxonomy), out / f"{stem(path)}.npz")
+
+
+def _dataset_tasks(dataset: Dataset, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None) -> Iterator[Task]:
+    if taxonomy.classes != dataset.taxonomy.classes:
+        raise InputError(
+            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those of "
+            f"{taxonomy.name}; use weights trained on this benchmark"
+        )
+    for record in choose_records(dataset, sequences, "all"):
+        yield _record_task(dataset, record, out)
+
+
+def _record_task(dataset: Dataset, record: ScanRecord, out: Path) -> Task:
+    return Task(
+        record.name,
+        lambda: dataset.read(record, labels=False),
+        lambda ids: dataset.write_prediction(record, out, ids),
+        (out / record.prediction).with_suffix(".npz"),
+    )
+
+
+@dataclass(frozen=True)
+class _Read:
+    path: Path
+
+    def __call__(self) -> Scan:
+        return read_scan(self.path)
+
+
+@dataclass(frozen=True)
+class _Write:
+    path: Path
+    taxonomy: Taxonomy
+
+    def __call__(self, ids: np.ndarray) -> Path:
+        return write_labels(self.path, self.taxonomy.to_raw(ids))
+
+
+def stem(path: Path) -> str:
+    """A scan file's name without its ending, `.pcd.bin` included."""
+    return path.name.removesuffix(".pcd.bin") if path.name.endswith(".pcd.bin") else path.stem
+
+
+def _check_names(tasks: Sequence[Task]) -> None:
+    seen: dict[Path, str] = {}
+    for task in tasks:
+        if task.scores in seen:
+            raise InputError(
+                f"expected scans of different names, found {task.name} twice ({task.scores.stem}); "
+                "segment them in two runs with two folders"
+            )
+        seen[task.scores] = task.name
