@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import inspect
 import json
+import logging
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_type_hints
 
 import docstring_parser
-from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
+from jsonargparse import ArgumentParser, set_parsing_settings
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -20,6 +22,7 @@ from amvnet import __version__
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
+    from amvnet.config import Recipe
     from amvnet.data.labels import Taxonomy
     from amvnet.data.records import ScanRecord
     from amvnet.evaluation import Evaluation
@@ -129,6 +132,8 @@ def train(
     from amvnet.jobs import split_records
     from amvnet.runner import Run
 
+    for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
+        logging.getLogger(name).setLevel(logging.ERROR)
     dataset = _open(data, taxonomy)
     learnt, val = split_records(dataset, _names(train_sequences), _names(val_sequences))
     say(f"training on {_listed(learnt)}; validating on {_listed(val)}")
@@ -222,6 +227,30 @@ def info(weights: str | None = None) -> None:
     console.print(report.installation_table())
 
 
+def bench(weights: str = WEIGHTS, scan: Path | None = None, runs: int = 10, device: str = "cpu") -> None:
+    """Time the stages from a scan's file to its labels on this machine.
+
+    Args:
+        weights: a weights file, or the name of a built-in one.
+        scan: the scan to time with; by default a simulated one.
+        runs: how often; the medians are shown.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from amvnet.bench import time_stages
+    from amvnet.data.files import read_scan
+    from amvnet.report import timing_table
+    from amvnet.segmenter import Segmenter
+    from amvnet.simulation import simulate as write
+
+    segmenter = Segmenter(weights, device)
+    with TemporaryDirectory() as folder:
+        if scan is None:
+            write(Path(folder), scans=1)
+        path = scan or Path(folder) / "sequences/00/velodyne/000000.bin"
+        points = read_scan(path)
+        console.print(timing_table(time_stages(segmenter, lambda: read_scan(path), runs), len(points)))
+
+
 def show_evaluation(evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None) -> None:
     """Print the table, and write the same figures as JSON."""
     from amvnet.data.files import whole_file
@@ -274,7 +303,10 @@ def _listed(records: Sequence[ScanRecord]) -> str:
 
 
 def _names(text: str | None) -> list[str] | None:
-    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+    names = None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+    if names == []:
+        raise InputError(f"expected names of sequences with commas, found {text!r}; name some, or leave the option out")
+    return names
 
 
 def _widest_method(weights: str) -> Any:
@@ -293,18 +325,19 @@ VERBS: dict[str, tuple[Callable[..., None], dict[str, dict[str, Any]]]] = {
     "train": (train, {"recipe": {"metavar": "RECIPE"}}),
     "predict": (predict, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
     "evaluate": (evaluate, {"data": {"metavar": "DATA"}}),
+    "bench": (bench, {}),
     "info": (info, {"weights": {"metavar": "W", "nargs": "?"}}),
 }
 
 
-def parser_of(verb: str, argv: Sequence[str]) -> ArgumentParser:
-    """The parser of a verb; that of `train` knows the values of the recipe that it is given."""
+def parser_of(verb: str, recipe: Recipe | None = None) -> ArgumentParser:
+    """The parser of a verb; with a recipe, its values are options too."""
     function, positional = VERBS[verb]
     docs = docstring_parser.parse(function.__doc__ or "")
     help_of = {param.arg_name: param.description for param in docs.params}
     shown = " ".join(str(options["metavar"]) for options in positional.values())
     usage = f"amvnet {verb} {shown} [options]".replace("  ", " ")
-    parser = Parser(prog=f"amvnet {verb}", usage=usage, description=docs.short_description)
+    parser = Parser(prog=f"amvnet {verb}", usage=usage, description=docs.short_description, allow_abbrev=False)
     for name, options in positional.items():
         parser.add_argument(name, help=help_of.get(name), **options)
     set_parsing_settings(docstring_parse_attribute_docstrings=True)  # the help of a recipe's values
@@ -312,8 +345,8 @@ def parser_of(verb: str, argv: Sequence[str]) -> ArgumentParser:
     for name, parameter in inspect.signature(function).parameters.items():
         if name not in positional:
             _add_option(parser, name, hints[name], parameter.default, help_of.get(name))
-    if verb == "train":
-        _add_recipe(parser, argv)
+    if recipe is not None:
+        _add_recipe(parser, recipe)
     return parser
 
 
@@ -328,23 +361,26 @@ def _add_option(parser: ArgumentParser, name: str, kind: Any, default: Any, text
         parser.add_argument(flag, type=kind, default=default, help=text)
 
 
-def _add_recipe(parser: ArgumentParser, argv: Sequence[str]) -> None:
+def _add_recipe(parser: ArgumentParser, recipe: Recipe) -> None:
     """Every value of the recipe as an option, with dots: --training.rv.epochs 40."""
-    from amvnet.config import ModelConfig, Recipe, TrainingConfig, load_recipe
+    from amvnet.config import ModelConfig, TrainingConfig
 
-    named = bool(argv) and not argv[0].startswith("-")
-    recipe = load_recipe(argv[0]) if named else Recipe()
     parser.add_argument("--model", type=ModelConfig, default=recipe.model)
     parser.add_argument("--training", type=TrainingConfig, default=recipe.training)
 
 
-def _train_arguments(values: Namespace, parser: ArgumentParser) -> dict[str, Any]:
-    from amvnet.config import Recipe, load_recipe
+def _train_arguments(arguments: Sequence[str]) -> dict[str, Any]:
+    """The arguments of `train`: read once to find the recipe, and once more with its values as defaults."""
+    from amvnet.config import Recipe
+    from amvnet.recipes import load_recipe
 
-    made = parser.instantiate_classes(values)
-    given = {key: getattr(made, key) for key in vars(made) if key not in ("model", "training", "recipe")}
-    recipe = Recipe(load_recipe(values.recipe).taxonomy, made.model, made.training)
-    return {"recipe": recipe, **given}
+    if {"-h", "--help"} & set(arguments):
+        recipe = Recipe() if arguments[0].startswith("-") else load_recipe(arguments[0])
+    else:
+        recipe = load_recipe(parser_of("train", Recipe()).parse_args(list(arguments)).recipe)
+    parser = parser_of("train", recipe)
+    made = vars(parser.instantiate(parser.parse_args(list(arguments))))
+    return made | {"recipe": Recipe(recipe.taxonomy, made.pop("model"), made.pop("training"))}
 
 
 USAGE = f"""usage: amvnet VERB ...
@@ -354,6 +390,7 @@ USAGE = f"""usage: amvnet VERB ...
   train      train the networks and the point head
   predict    segment scans
   evaluate   score weights or predictions by the official formulas
+  bench      time per stage on this machine
   info       what a weights file is, or what is installed
 
 `amvnet VERB --help` says more. Version {__version__}."""
@@ -387,10 +424,8 @@ def run(verb: str, arguments: Sequence[str]) -> None:
     """
     if verb not in VERBS:
         raise InputError(f"expected a verb of {', '.join(VERBS)}, found {verb!r}; see amvnet --help")
-    parser = parser_of(verb, arguments)
-    values = parser.parse_args(list(arguments))
     _quiet()
-    call = _train_arguments(values, parser) if verb == "train" else vars(values)
+    call = _train_arguments(arguments) if verb == "train" else vars(parser_of(verb).parse_args(list(arguments)))
     VERBS[verb][0](**call)
 
 

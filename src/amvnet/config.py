@@ -6,47 +6,85 @@ user's own) states only what differs from them.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass, field
-from importlib import resources
-from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_type_hints
-
-import yaml
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 from amvnet.errors import InputError
 
-T = TypeVar("T")
+
+@dataclass(frozen=True)
+class Range:
+    """The numbers that a value may have, for `Annotated`."""
+
+    low: float
+    high: float = math.inf
+    open: bool = False  # without its ends
+
+    def __contains__(self, value: Any) -> bool:
+        return self.low < value < self.high if self.open else self.low <= value <= self.high
+
+    def __repr__(self) -> str:
+        low, high = ("above", "below") if self.open else ("at least", "at most")
+        return f"{low} {self.low:g}" + ("" if math.isinf(self.high) else f" and {high} {self.high:g}")
+
+
+Count = Annotated[int, Range(1)]
+NotNegative = Annotated[float, Range(0)]
+Positive = Annotated[float, Range(0, open=True)]
+Share = Annotated[float, Range(0, 1)]
+
+
+class Checked:
+    """A dataclass that refuses numbers out of their ranges."""
+
+    def __post_init__(self) -> None:
+        """Raises InputError on the first value out of its range."""
+        for name, kind in get_type_hints(type(self), include_extras=True).items():
+            value = getattr(self, name)
+            if isinstance(value, tuple):
+                kind = get_args(kind)[0]
+            for allowed in getattr(kind, "__metadata__", ()):
+                if wrong := [v for v in (value if isinstance(value, tuple) else (value,)) if v not in allowed]:
+                    raise InputError(f"{name}: expected a number {allowed}, found {wrong[0]}; correct the value")
+
+    def check(self, holds: bool, expected: str, found: str) -> None:
+        """Raises InputError unless something holds."""
+        if not holds:
+            raise InputError(f"expected {expected}, found {found}; correct the values")
 
 
 @dataclass(frozen=True)
-class RangeViewConfig:
+class RangeViewConfig(Checked):
     """The range image (section 3.1 of the paper)."""
 
     rows: Literal["elevation", "ring"] = "elevation"
     """What a point's row is: its elevation within the field of view, or the index of its laser."""
-    height: int = 64
+    height: Count = 64
     """Rows of the range image; the lasers of the sensor."""
-    width: int = 4096
+    width: Count = 4096
     """Columns of the range image, over 360 degrees."""
     fov_up: float = 3.0
     """Upper end of the field of view, degrees above the horizon; row 0."""
     fov_down: float = -25.0
     """Lower end of the field of view, degrees above the horizon; the last row."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check(self.fov_up > self.fov_down, "fov_up above fov_down", f"{self.fov_up} and {self.fov_down}")
+
 
 @dataclass(frozen=True)
-class PolarViewConfig:
+class PolarViewConfig(Checked):
     """The polar grid (section 3.1 of the paper; PolarNet, section 3)."""
 
-    radial: int = 480
+    radial: Count = 480
     """Cells along the radius."""
-    angular: int = 360
+    angular: Count = 360
     """Cells around the sensor."""
-    vertical: int = 32
+    vertical: Count = 32
     """Cells along the height: the voxels of a pillar."""
-    radius_min: float = 3.0
+    radius_min: NotNegative = 3.0
     """Inner radius of the grid, metres; nearer points go to the innermost cells."""
     radius_max: float = 50.0
     """Outer radius of the grid, metres; farther points go to the outermost cells."""
@@ -55,47 +93,66 @@ class PolarViewConfig:
     z_max: float = 1.5
     """Upper end of the grid, metres above the sensor."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        radii, heights = (self.radius_min, self.radius_max), (self.z_min, self.z_max)
+        self.check(radii[0] < radii[1], "radius_min below radius_max", f"{radii[0]} and {radii[1]}")
+        self.check(heights[0] < heights[1], "z_min below z_max", f"{heights[0]} and {heights[1]}")
+
 
 @dataclass(frozen=True)
-class RangeNetConfig:
+class RangeNetConfig(Checked):
     """The range-view network (section 3.1 of the paper; its widths are open)."""
 
-    stem: int = 32
+    stem: Count = 32
     """Channels at full resolution."""
-    widths: tuple[int, ...] = (64, 96, 160, 256, 256, 256, 256)
+    widths: tuple[Count, ...] = (64, 96, 160, 256, 256, 256, 256)
     """Channels at the width strides 2, 4, 8, ..., one entry a stride."""
-    blocks: tuple[int, ...] = (2, 4, 4, 4, 2, 2, 2)
+    blocks: tuple[Count, ...] = (2, 4, 4, 4, 2, 2, 2)
     """Residual blocks at each of these strides."""
-    height_strides: tuple[int, ...] = (1, 1, 1, 1, 2, 2, 2)
+    height_strides: tuple[Count, ...] = (1, 1, 1, 1, 2, 2, 2)
     """By what each of these stages divides the height: only the later ones do."""
-    decoder: int = 128
+    decoder: Count = 128
     """Channels of the decoder."""
-    head: int = 64
+    head: Count = 64
     """Channels of the last layers, at full resolution."""
+    dropout: Annotated[float, Range(0, 0.99)] = 0.0
+    """Probability of dropping a channel of the decoder's maps, in training (open)."""
     gru: bool = True
     """GRU layers over the maps of the last two strides; off for the ablation (Table 5)."""
-    gru_padding: float = 0.25
+    gru_padding: NotNegative = 0.25
     """Share of the map's width that pads it circularly before the GRU runs over it."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        stages = len(self.widths), len(self.blocks), len(self.height_strides)
+        fit = len(set(stages)) == 1 and stages[0] > 1
+        self.check(fit, "as many widths, blocks and height_strides, two or more", "{}, {} and {}".format(*stages))
+
 
 @dataclass(frozen=True)
-class PolarNetConfig:
+class PolarNetConfig(Checked):
     """The bird's-eye-view network: PolarNet (Zhang et al., CVPR 2020)."""
 
-    point_widths: tuple[int, ...] = (64, 128, 256, 512)
+    point_widths: tuple[Count, ...] = (64, 128, 256, 512)
     """Channels of the shared MLP over the points of a pillar."""
-    pillar: int = 32
+    pillar: Count = 32
     """Channels of a pillar after pooling."""
-    widths: tuple[int, ...] = (64, 128, 256, 512, 512)
+    widths: tuple[Count, ...] = (64, 128, 256, 512, 512)
     """Channels of the U-Net, from the full grid down."""
-    dropblock: float = 0.5
+    dropblock: Annotated[float, Range(0, 0.99)] = 0.5
     """Probability of DropBlock in the decoder, in training."""
-    dropblock_size: int = 7
+    dropblock_size: Count = 7
     """Side of the squares that DropBlock drops, cells."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check(len(self.point_widths) > 1, "two or more point_widths", str(len(self.point_widths)))
+        self.check(len(self.widths) > 0, "one or more widths", "none")
 
 
 @dataclass(frozen=True)
-class AssertionConfig:
+class AssertionConfig(Checked):
     """Which points are uncertain (section 3.2 of the paper)."""
 
     name: Literal["disagreement", "entropy", "loss"] = "disagreement"
@@ -105,21 +162,25 @@ class AssertionConfig:
 
 
 @dataclass(frozen=True)
-class PointHeadConfig:
+class PointHeadConfig(Checked):
     """The point head (section 3.2 of the paper)."""
 
-    neighbours: int = 15
+    neighbours: Count = 15
     """n: nearest neighbours of an uncertain point, among all raw points."""
-    hidden: tuple[int, ...] = (64, 32, 32)
+    hidden: tuple[Count, ...] = (64, 32, 32)
     """Channels of the shared MLP over the neighbours."""
-    fc: int = 128
+    fc: Count = 128
     """Channels of the fully connected layer before the scores."""
     position_scale: float = 0.05
     """By what a point's own x, y, z in metres are multiplied, to be of the order of its scores."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check(len(self.hidden) > 0, "one or more hidden layers", "none")
+
 
 @dataclass(frozen=True)
-class ModelConfig:
+class ModelConfig(Checked):
     """The whole of AMVNet."""
 
     range_view: RangeViewConfig = RangeViewConfig()
@@ -137,70 +198,78 @@ class ModelConfig:
 
 
 @dataclass(frozen=True)
-class AugmentConfig:
+class AugmentConfig(Checked):
     """Augmentation of the points in training (section 4.1 of the paper names the kinds)."""
 
-    scale: float = 0.05
+    scale: Annotated[float, Range(0, 0.99)] = 0.05
     """Scaling by 1 +- this, one factor a scan."""
-    flip: float = 0.5
+    flip: Share = 0.5
     """Probability of mirroring x, and of mirroring y."""
-    jitter: float = 0.01
+    jitter: NotNegative = 0.01
     """Standard deviation of the noise on each coordinate, metres."""
-    yaw: float = 180.0
+    yaw: NotNegative = 180.0
     """Rotation about the vertical by up to +- this, degrees."""
+    height: NotNegative = 0.0
+    """Shift of all points up or down by up to +- this, metres: sensors are not mounted alike (open)."""
+    intensity: Annotated[float, Range(0, 0.99)] = 0.0
+    """Scaling of the intensity by 1 +- this, one factor a scan: sensors are not calibrated alike (open)."""
+    no_intensity: Share = 0.0
+    """Probability that a scan has no intensity at all (open)."""
+    drop: Annotated[float, Range(0, 0.99)] = 0.0
+    """Greatest share of the points that a scan loses at random (open)."""
 
 
 @dataclass(frozen=True)
-class NetworkTraining:
+class NetworkTraining(Checked):
     """Training of one of the two networks: AdamW, one-cycle (section 4.1 of the paper)."""
 
-    epochs: int
+    epochs: Count
     """Passes over the training scans."""
-    batch: int
+    batch: Count
     """Scans of one optimizer step."""
-    lr: float
+    lr: Positive
     """Peak of the one-cycle learning rate (open)."""
-    weight_decay: float = 0.01
+    weight_decay: NotNegative = 0.01
     """AdamW's weight decay (open)."""
-    warmup: float = 0.2
+    warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the learning rate's peak (open)."""
-    region: float = 1.0
+    region: NotNegative = 1.0
     """Weight of the region loss (Dice or Lovász-softmax) beside cross-entropy (open)."""
     class_weights: bool = True
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
-    clip: float = 5.0
+    clip: Positive = 5.0
     """Largest norm of the gradient (open)."""
 
 
 @dataclass(frozen=True)
-class HeadTraining:
+class HeadTraining(Checked):
     """Training of the point head: SGD, one-cycle, the networks frozen (section 4.1 of the paper)."""
 
-    epochs: int = 20
+    epochs: Count = 20
     """Passes over the uncertain points of the training scans."""
-    batch: int = 256
+    batch: Count = 256
     """Uncertain points of one optimizer step, drawn at random."""
-    lr: float = 0.1
+    lr: Positive = 0.1
     """Peak of the one-cycle learning rate (open)."""
-    momentum: float = 0.9
+    momentum: Annotated[float, Range(0, 0.999)] = 0.9
     """SGD's momentum (open)."""
-    weight_decay: float = 1e-4
+    weight_decay: NotNegative = 1e-4
     """SGD's weight decay (open)."""
-    warmup: float = 0.2
+    warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the learning rate's peak (open)."""
     class_weights: bool = False
     """Weight the classes as the networks' losses do (the paper has plain cross-entropy)."""
-    views: int = 0
+    views: Annotated[int, Range(0)] = 0
     """Times that each training scan is scored for the head, each time augmented anew; 0: once, as it is."""
-    points_per_scan: int = 4096
+    points_per_scan: Count = 4096
     """Most uncertain points that are kept of a scan, drawn at random; 1.3 kB of disk each for K = 19, n = 15."""
-    folds: int = 1
+    folds: Count = 1
     """From 2: score each training scan by networks trained without its sequence (cross-fitting); 1: by the
     final networks, as in the paper."""
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
+class TrainingConfig(Checked):
     """The three stages of training."""
 
     rv: NetworkTraining = NetworkTraining(epochs=160, batch=32, lr=4e-3)
@@ -213,16 +282,21 @@ class TrainingConfig:
     """Augmentation of the points."""
     keep: Literal["best", "last"] = "best"
     """Which weights of a stage are used in the end: of the highest validation mIoU, or of the last epoch."""
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Seed of the weights, of the order of the scans and of the augmentation."""
-    workers: int = 0
+    workers: Annotated[int, Range(0)] = 0
     """Processes that read and augment beside the training; 0: none."""
     precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
     """Arithmetic of the forward and backward passes, in Lightning's words."""
     accelerator: str = "auto"
     """Lightning's accelerator: auto, cpu, gpu."""
-    accumulate: int = 1
+    accumulate: Count = 1
     """Parts a batch is split into where it does not fit into memory."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for batch in (self.rv.batch, self.bev.batch):
+            self.check(batch % self.accumulate == 0, f"batches of a multiple of {self.accumulate}", str(batch))
 
 
 @dataclass(frozen=True)
@@ -235,106 +309,3 @@ class Recipe:
     """The networks and their sizes."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
     """The three stages."""
-
-
-def recipe_names() -> tuple[str, ...]:
-    """The built-in recipes."""
-    files = resources.files("amvnet.recipes").iterdir()
-    return tuple(sorted(f.name.removesuffix(".yaml") for f in files if f.name.endswith(".yaml")))
-
-
-def load_recipe(name_or_path: str) -> Recipe:
-    """A built-in recipe by name, or a user's YAML file that states only what differs.
-
-    The key `base` names the recipe that a file builds on; without it, the paper's sizes.
-
-    Raises:
-        InputError: where there is no such recipe, or a key or value in it is not one of ours.
-    """
-    return from_dict(Recipe, _recipe_tree(name_or_path), name_or_path)
-
-
-def _recipe_tree(name_or_path: str) -> dict[str, Any]:
-    if name_or_path in recipe_names():
-        text = (resources.files("amvnet.recipes") / f"{name_or_path}.yaml").read_text()
-    elif Path(name_or_path).is_file():
-        text = Path(name_or_path).read_text()
-    else:
-        raise InputError(
-            f"expected a recipe's name or a YAML file, found {name_or_path!r}; "
-            f"the built-in ones are {', '.join(recipe_names())}"
-        )
-    try:
-        tree = yaml.safe_load(text) or {}
-    except yaml.YAMLError as error:
-        raise InputError(f"{name_or_path}: expected YAML, found {str(error).splitlines()[0]}; mend the file") from None
-    if not isinstance(tree, dict):
-        raise InputError(f"{name_or_path}: expected keys and values, found {type(tree).__name__}; mend the file")
-    base = tree.pop("base", None)
-    return merge_trees(_recipe_tree(base), tree) if base else tree
-
-
-def merge_trees(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with every leaf that `over` names replaced."""
-    merged = dict(base)
-    for key, value in over.items():
-        below = merged.get(key)
-        both = isinstance(value, Mapping) and isinstance(below, Mapping)
-        merged[key] = merge_trees(cast(Mapping[str, Any], below), value) if both else value
-    return merged
-
-
-def from_dict(cls: type[T], tree: Mapping[str, Any], where: str = "configuration") -> T:
-    """A dataclass of this module from nested dictionaries; what is not named keeps its default.
-
-    Raises:
-        InputError: on a key that is not there, or a value of another kind than the default's.
-    """
-    default = _default(cls, tree, where)
-    return _replace(default, tree, where)
-
-
-def _default(cls: type[T], tree: Mapping[str, Any], where: str) -> T:
-    needed = [f.name for f in dataclasses.fields(cast(Any, cls)) if _has_no_default(f)]
-    missing = [name for name in needed if name not in tree]
-    if missing:
-        raise InputError(f"{where}: expected the key {missing[0]!r}, found none; add it")
-    return cls(**{name: tree[name] for name in needed})
-
-
-def _has_no_default(f: dataclasses.Field[Any]) -> bool:
-    return f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
-
-
-def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
-    kinds = get_type_hints(type(default))
-    changes = {}
-    for key, value in tree.items():
-        if key not in kinds:
-            raise InputError(f"{where}: expected one of {', '.join(kinds)}, found {key!r}; correct the key")
-        changes[key] = _value(getattr(default, key), value, kinds[key], f"{where}: {key}")
-    return dataclasses.replace(cast(Any, default), **changes)
-
-
-def _value(default: Any, value: Any, kind: Any, where: str) -> Any:
-    if dataclasses.is_dataclass(default):
-        if isinstance(value, Mapping):
-            return _replace(default, value, where)
-    elif isinstance(default, tuple):
-        if isinstance(value, list | tuple) and all(isinstance(v, int) for v in value):
-            return tuple(value)
-    elif allowed := getattr(kind, "__args__", None):
-        if value in allowed:
-            return value
-        raise InputError(f"{where}: expected one of {', '.join(allowed)}, found {value!r}; correct the value")
-    elif isinstance(default, float) and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
-    elif type(value) is type(default):
-        return value
-    raise InputError(f"{where}: expected a value like {default!r}, found {value!r}; correct the value")
-
-
-def to_dict(config: Any) -> dict[str, Any]:
-    """Nested dictionaries and lists, as YAML and JSON hold them."""
-    return {k: list(v) if isinstance(v, tuple) else to_dict(v) if dataclasses.is_dataclass(v) else v
-            for k, v in vars(config).items()}  # fmt: skip

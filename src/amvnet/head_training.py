@@ -20,7 +20,7 @@ from amvnet.errors import InputError
 from amvnet.evaluation import confusion
 from amvnet.loading import ScanSet, collate
 from amvnet.models.amvnet import AMVNet, geometric_mean
-from amvnet.models.point_head import PointHead, head_features
+from amvnet.models.point_head import PointHead, head_features, nearest_neighbours
 from amvnet.training import Stage
 from amvnet.views.points import PointBatch
 from amvnet.weights import Weights
@@ -101,7 +101,8 @@ class PointSampler(data.Sampler[np.ndarray]):
     def __iter__(self) -> Iterator[np.ndarray]:
         rng = np.random.default_rng([self.seed, self.epoch])
         order = rng.permutation(self.size) if self.shuffle else np.arange(self.size)
-        return (order[i * self.batch : (i + 1) * self.batch] for i in range(len(self)))
+        for i in range(len(self)):
+            yield order[i * self.batch : (i + 1) * self.batch]
 
 
 def head_loader(points: HeadPoints, batch: int, seed: int, shuffle: bool) -> data.DataLoader[HeadBatch]:
@@ -166,7 +167,8 @@ def _gather_scan(
     index = uncertain.nonzero()[:, 0]
     chosen = rng.permutation(len(index))[:most]
     index = index[torch.from_numpy(np.sort(chosen))]
-    point, rows = head_features(config, batch.points, f, g, index)
+    near = nearest_neighbours(batch.points, index, config.neighbours)
+    point, rows = head_features(config, batch.points, f, g, index, near)
     columns = {"point": point.numpy(), "rows": rows.numpy(), "labels": labels[index].numpy()}
     return columns, matrix, int(uncertain.sum())
 

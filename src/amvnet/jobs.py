@@ -71,7 +71,7 @@ def write_scores(path: Path, result: Segmentation) -> None:
     """Both networks' probabilities, (N, K) float16, as `rv` and `bev` of an `.npz`."""
     found = {name: v.astype(np.float16) for name, v in (("rv", result.rv), ("bev", result.bev)) if v is not None}
     with whole_file(path) as part:
-        np.savez_compressed(part, allow_pickle=False, **found)
+        np.savez_compressed(part, **found)  # type: ignore[arg-type]  # of the arrays, none is an option
 
 
 def evaluate(
@@ -134,7 +134,7 @@ def by_files(
 
 def choose_records(dataset: Dataset, sequences: Sequence[str] | None, split: str) -> list[ScanRecord]:
     """The scans of the named sequences, or else of a split."""
-    return dataset.records(sequences if sequences else dataset.sequences(split))
+    return dataset.records(dataset.sequences(split) if sequences is None else sequences)
 
 
 def split_records(

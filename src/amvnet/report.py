@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from amvnet.config import recipe_names
+from amvnet.bench import FUSION
 from amvnet.data.labels import Taxonomy
+from amvnet.recipes import recipe_names
 from amvnet.weights import Weights, built_in
 
 TITLES = {"rv": "RV", "bev": "BEV", "ensemble": "ensemble", "amvnet": "AMVNet"}
@@ -70,6 +71,21 @@ def weights_table(weights: Weights, name: str) -> Table:
         table.add_row(part, f"{count:,} values")
         for key, value in {**weights.training.get(part, {}), **weights.metrics.get(part, {})}.items():
             table.add_row(f"  {key}", _plain(value))
+    return table
+
+
+def timing_table(seconds: Mapping[str, float], points: int) -> Table:
+    """Time per stage of one scan, in all, and the fusion's share of it."""
+    total = sum(seconds.values())
+    table = Table(title=f"{points:,} points", show_edge=False)
+    for title in ("stage", "ms", "share"):
+        table.add_column(title, justify="left" if title == "stage" else "right")
+    for stage, value in seconds.items():
+        table.add_row(stage, f"{1e3 * value:.1f}", f"{value / total:.1%}")
+    table.add_section()
+    table.add_row("all", f"{1e3 * total:.1f}", "")
+    fusion = sum(seconds[stage] for stage in FUSION)
+    table.add_row("fusion", f"{1e3 * fusion:.1f}", f"{fusion / total:.1%}")
     return table
 
 

@@ -14,15 +14,17 @@ import yaml
 from torch import nn
 
 from amvnet import weights as weights_file
-from amvnet.config import Recipe, to_dict
+from amvnet.config import Recipe
 from amvnet.data.files import whole_file
+from amvnet.data.labels import NUSCENES, SEMANTICKITTI
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.head_training import HeadStage, gather_points, head_loader
 from amvnet.loading import ScanSet, count_classes, loader
 from amvnet.losses import class_weights
-from amvnet.models.amvnet import build_amvnet
+from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.training import KeepWeights, PolarStage, RangeStage, Stage, fit, names_of
+from amvnet.trees import to_dict
 from amvnet.weights import Weights, state_of
 
 StageName = Literal["rv", "bev", "head", "all"]
@@ -55,7 +57,8 @@ class Run:
         common = {r.name for r in self.train} & {r.name for r in self.val}
         if common:
             raise InputError(f"expected validation scans apart from training, found {min(common)} in both; name others")
-        if self.dataset.taxonomy.name != self.recipe.taxonomy:
+        benchmarks = {SEMANTICKITTI.name, NUSCENES.name}  # a user's own classes fit any recipe
+        if self.dataset.taxonomy.name in benchmarks - {self.recipe.taxonomy}:
             raise InputError(
                 f"expected a data set with the classes of {self.recipe.taxonomy}, found {self.dataset.taxonomy.name}; "
                 "use the recipe of that benchmark"
@@ -76,17 +79,21 @@ class Run:
 
     def _start(self, init: Weights | None) -> Weights:
         """Fresh weights, or those that are given; earlier stages of this folder are taken up."""
-        fresh = Weights(self.recipe.model, self.dataset.taxonomy)
+        current = Weights(self.recipe.model, self.dataset.taxonomy)
         if init is not None:
-            fresh = dataclasses.replace(init, model=init.model)
+            current = dataclasses.replace(current, sensor=init.sensor)
+            for part in init.parts:
+                current = current.replace_part(part, init)
         for name, part in PART.items():
             kept = self._folder(name) / f"{self.recipe.training.keep}.safetensors"
             if kept.is_file() and (self._folder(name) / "done").is_file():
-                fresh = fresh.replace_part(part, weights_file.load(kept))
+                current = current.replace_part(part, weights_file.load(kept))
+        if self.out.is_file():
+            raise InputError(f"{self.out}: expected a folder for the run, found a file; give another")
         self.out.mkdir(parents=True, exist_ok=True)
         with whole_file(self.out / "recipe.yaml") as path:
             path.write_text(yaml.safe_dump(to_dict(self.recipe), sort_keys=False))
-        return fresh
+        return current
 
     def _folder(self, name: str) -> Path:
         return self.out / name
@@ -98,16 +105,28 @@ class Run:
         if (self._folder(name) / "last.ckpt").is_file() and not self.resume:
             raise InputError(f"{self._folder(name)}: expected no earlier run, found one; add --resume or give another")
         L.seed_everything(self.recipe.training.seed, verbose=False)
+        current = current.resized(PART[name], self.recipe.model)
         kept = self._fit_head(current) if name == "head" else self._fit_network(name, current)
+        current = current.replace_part(PART[name], weights_file.load(kept))
         done.write_text("")
-        return current.replace_part(PART[name], weights_file.load(kept))
+        return current
+
+    def _module(self, part: str, current: Weights) -> AMVNet:
+        """A model whose part to be trained begins as in the weights, where they have it."""
+        model = build_amvnet(current.model, self.dataset.taxonomy.size)
+        if part in current.parts:
+            try:
+                getattr(model, part).load_state_dict(current.part(part))
+            except RuntimeError:
+                raise InputError(
+                    f"expected weights whose {part} has the recipe's sizes, found others; use the recipe of the weights"
+                ) from None
+        return model
 
     def _fit_network(self, name: str, current: Weights) -> Path:
         training = self.recipe.training
         config = training.rv if name == "rv" else training.bev
-        model = build_amvnet(current.model, self.dataset.taxonomy.size)
-        if PART[name] in current.parts:
-            getattr(model, PART[name]).load_state_dict(current.part(PART[name]))
+        model = self._module(PART[name], current)
         weights = class_weights(self._counts()) if config.class_weights else None
         shared = (config, self.dataset.taxonomy, weights)
         stage: Stage = (
@@ -116,7 +135,7 @@ class Run:
             else PolarStage(model.polar_view, model.polar_net, *shared)
         )
         keep = self._keep(name, current, to_dict(config))
-        part = -(-config.batch // training.accumulate)
+        part = config.batch // training.accumulate
         fit(
             stage,
             training,
@@ -141,10 +160,8 @@ class Run:
         folder = self._folder("head")
         train = gather_points(sources, self.dataset, training, config.views, folder / "train")
         val = gather_points([(current, self.val)], self.dataset, training, 0, folder / "val")
-        head = build_amvnet(current.model, self.dataset.taxonomy.size).point_head
+        head = self._module(PART["head"], current).point_head
         assert head is not None
-        if "point_head" in current.parts:
-            head.load_state_dict(current.part("point_head"))
         weights = class_weights(self._counts()) if config.class_weights else None
         keep = self._keep("head", current, to_dict(config))
         fit(

@@ -9,10 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from amvnet.config import AssertionConfig
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import Scores, geometric_mean, merge, refine
-from amvnet.models.assertions import Disagreement
+from amvnet.models.assertions import Assertion, Disagreement, build_assertion
 from amvnet.models.point_head import PointHead
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
@@ -123,7 +124,7 @@ def fuse(
     f: np.ndarray,
     g: np.ndarray,
     head: PointHead | Weights | str | None = None,
-    tau: float = Disagreement.tau,
+    tau: float | None = None,
 ) -> np.ndarray:
     """The late fusion alone, for any two models' scores (section 3.2 of the paper).
 
@@ -131,7 +132,8 @@ def fuse(
         points: (N, 4) x, y, z in metres and intensity in [0, 1].
         f, g: (N, K) class probabilities of the two models.
         head: a trained point head, or weights that hold one; None gives the ensemble.
-        tau: points whose scores have a cosine similarity of at most this are uncertain.
+        tau: points whose scores have a cosine similarity of at most this are uncertain; by default the
+            threshold that weights were trained with, or else the paper's.
 
     Returns:
         (N,) uint8 train ids, 1..K; 0 where a point is not finite.
@@ -145,10 +147,13 @@ def fuse(
             f"expected two arrays of scores of shape ({len(scan)}, K), found {f.shape} and {g.shape}; "
             "give both models' scores of this scan"
         )
-    module = _head(head)
+    module, assertion = _head(head, tau)
+    classes = None if module is None else module.fc[-1].out_features
+    if classes not in (None, f.shape[1]):
+        raise InputError(f"expected scores of the head's {classes} classes, found {f.shape[1]}; use a head for them")
     with torch.inference_mode():
         x, a, b = (torch.from_numpy(np.asarray(v, dtype=np.float32)[scan.valid]) for v in (scan.points, f, g))
-        uncertain = Disagreement(tau)(a, b, x)
+        uncertain = assertion(a, b, x)
         h = None if module is None else refine(module, x, a, b, uncertain)
         return _in_place(scan.valid, Scores(a, b, merge(a, b, uncertain, h), uncertain)).labels
 
@@ -166,14 +171,17 @@ def checked_scan(points: np.ndarray | Scan) -> Scan:
     return scan
 
 
-def _head(head: PointHead | Weights | str | None) -> PointHead | None:
+def _head(head: PointHead | Weights | str | None, tau: float | None) -> tuple[PointHead | None, Assertion]:
+    """The head, and the assertion that chooses its points."""
     if isinstance(head, str):
         head = load(head)
+    config = AssertionConfig()
     if isinstance(head, Weights):
         if "point_head" not in head.parts:
             raise InputError("expected weights with a point head, found none; train one with --stage head")
-        return head.build().point_head
-    return None if head is None else head.eval()
+        config, head = head.model.assertion, head.build().point_head
+    assertion = build_assertion(config) if tau is None else Disagreement(tau)
+    return None if head is None else head.eval(), assertion
 
 
 def _checked_method(method: Method, weights: Weights) -> Method:

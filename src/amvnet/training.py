@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,12 +13,15 @@ import lightning as L
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, RichProgressBar
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from amvnet.config import HeadTraining, NetworkTraining, TrainingConfig
+from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
+from amvnet.errors import InputError
 from amvnet.evaluation import confusion, metrics
 from amvnet.losses import polar_view_loss, range_view_loss
 from amvnet.views.points import PointBatch
@@ -156,8 +160,6 @@ class KeepWeights(Callback):
         self.highest = state_dict["highest"]
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if trainer.sanity_checking:
-            return
         assert isinstance(pl_module, Stage)
         reached = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
         reached["epoch"] = trainer.current_epoch
@@ -167,6 +169,38 @@ class KeepWeights(Callback):
             self.write(pl_module.trained, self.kept.best, reached)
 
 
+class Curves(Callback):
+    """Keeps the figures of each epoch in a table, one row an epoch; those of a resumed run go on in it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        now = {"epoch": trainer.current_epoch, **{k: float(v) for k, v in trainer.callback_metrics.items()}}
+        rows = [row for row in self._kept() if int(row["epoch"]) < now["epoch"]] + [now]
+        with whole_file(self.path) as part, part.open("w", newline="") as file:
+            table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
+            table.writeheader()
+            table.writerows(rows)
+
+    def _kept(self) -> list[dict[str, Any]]:
+        if not self.path.is_file():
+            return []
+        with self.path.open(newline="") as file:
+            return list(csv.DictReader(file))
+
+
+class SeedBatches(Callback):
+    """Seeds torch anew for each batch, so that a resumed run draws what an uninterrupted one does."""
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, index: int) -> None:
+        place = np.random.SeedSequence([self.seed, trainer.current_epoch, index])
+        torch.manual_seed(int(place.generate_state(1)[0]))
+
+
 class EpochLines(Callback):
     """Says one line an epoch, where there is no terminal for a progress bar."""
 
@@ -174,13 +208,12 @@ class EpochLines(Callback):
         self.say, self.name = say, name
 
     def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        if not trainer.sanity_checking:
-            values = {k: float(v) for k, v in trainer.callback_metrics.items()}
-            loss, miou, present = (values.get(k, float("nan")) for k in ("train/loss", "val/miou", "val/miou_present"))
-            self.say(
-                f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: "
-                f"loss {loss:.3f}, val mIoU {miou:.4f} (classes present {present:.4f})"
-            )
+        values = {k: float(v) for k, v in trainer.callback_metrics.items()}
+        loss, miou, present = (values.get(k, float("nan")) for k in ("train/loss", "val/miou", "val/miou_present"))
+        self.say(
+            f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: "
+            f"loss {loss:.3f}, val mIoU {miou:.4f} (classes present {present:.4f})"
+        )
 
 
 def fit(
@@ -204,24 +237,36 @@ def fit(
         clip: largest norm of the gradient.
     """
     shown: list[Callback] = [EpochLines(say, folder.name)] if say else [RichProgressBar(), LearningRateMonitor()]
-    trainer = L.Trainer(
-        accelerator=config.accelerator,
-        precision=config.precision,
-        max_epochs=epochs,
-        accumulate_grad_batches=batches or 1,
-        gradient_clip_val=clip,
-        default_root_dir=folder,
-        # Weights are kept before the checkpoint is, so that a checkpoint never says more than they hold.
-        callbacks=[keep, ModelCheckpoint(folder, filename="last", enable_version_counter=False), *shown],
-        logger=[TensorBoardLogger(folder, name="", version=""), CSVLogger(folder, name="", version="")],
-        enable_progress_bar=say is None,
-        enable_model_summary=False,
-        num_sanity_val_steps=0,
-        log_every_n_steps=10,
-        use_distributed_sampler=False,
-    )
+    # Weights and curves are kept before the checkpoint is, so that a checkpoint never says more than they hold.
+    kept: list[Callback] = [keep, Curves(folder / "metrics.csv"), SeedBatches(config.seed)]
+    try:
+        trainer = L.Trainer(
+            accelerator=config.accelerator,
+            precision=config.precision,
+            max_epochs=epochs,
+            accumulate_grad_batches=batches or 1,
+            gradient_clip_val=clip,
+            default_root_dir=folder,
+            callbacks=[*kept, ModelCheckpoint(folder, filename="last", enable_version_counter=False), *shown],
+            logger=TensorBoardLogger(folder, name="", version=""),
+            enable_progress_bar=say is None,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            log_every_n_steps=10,
+            use_distributed_sampler=False,
+        )
+    except (ValueError, MisconfigurationException):
+        raise InputError(
+            f"expected an accelerator of this machine, found {config.accelerator!r}; use auto or cpu"
+        ) from None
     checkpoint = folder / LAST
-    trainer.fit(stage, train, val, ckpt_path=checkpoint if resume and checkpoint.is_file() else None, weights_only=True)
+    if not (resume and checkpoint.is_file()):
+        trainer.fit(stage, train, val)
+        return
+    done = torch.load(checkpoint, map_location="cpu", weights_only=True)["epoch"] + 1
+    # Lightning tells the sampler its epoch only after the reading processes have begun to draw.
+    train.sampler.set_epoch(done)  # type: ignore[attr-defined]
+    trainer.fit(stage, train, val, ckpt_path=checkpoint, weights_only=True)
 
 
 def names_of(records: Sequence[Any]) -> list[str]:

@@ -15,13 +15,19 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from amvnet.config import ModelConfig, from_dict, to_dict
+from amvnet.config import ModelConfig
 from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.trees import from_dict, to_dict
 
-PARTS = ("range_net", "polar_net", "point_head")
+SIZES = {
+    "range_net": ("range_view", "range_net"),
+    "polar_net": ("polar_view", "polar_net"),
+    "point_head": ("assertion", "point_head"),
+}  # the parts of the method, and what of the configuration each rests on
+PARTS = tuple(SIZES)
 FORMAT = 1
 KEY = "amvnet"  # of the description in the file's metadata
 
@@ -69,16 +75,18 @@ class Weights:
                 f"expected weights for the classes of {self.taxonomy.name}, found those of {other.taxonomy.name}; "
                 "train that part on this benchmark"
             )
-        sizes = {"range_net": ("range_view", "range_net"), "polar_net": ("polar_view", "polar_net")}
-        changed = {key: getattr(other.model, key) for key in sizes.get(name, ("point_head", "assertion"))}
         kept = {k: v for k, v in self.tensors.items() if not k.startswith(f"{name}.")}
         return dataclasses.replace(
-            self,
-            model=dataclasses.replace(self.model, **changed),
+            self.resized(name, other.model),
             tensors={**kept, **{f"{name}.{k}": v for k, v in other.part(name).items()}},
             training={**self.training, **_only(other.training, name)},
             metrics={**self.metrics, **_only(other.metrics, name)},
         )
+
+    def resized(self, name: str, model: ModelConfig) -> Weights:
+        """The same with the sizes that concern one part taken from another configuration."""
+        changed = {key: getattr(model, key) for key in SIZES[name]}
+        return dataclasses.replace(self, model=dataclasses.replace(self.model, **changed))
 
     def build(self) -> AMVNet:
         """The model, in evaluation mode; parts that are not there have fresh weights, but no head is no head.
@@ -141,8 +149,11 @@ def load(name_or_path: str | Path) -> Weights:
         raise InputError(f"{path}: expected a safetensors file, found something else; give AMVNet weights") from None
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise InputError(f"{path}: expected weights with AMVNet's description inside, found none; give AMVNet weights")
+    for key, kind in (("model", dict), ("taxonomy", dict), ("sensor", str), ("training", dict), ("metrics", dict)):
+        if not isinstance(description.get(key), kind):
+            raise InputError(f"{path}: expected a description with {key}, found {description.get(key)!r}; train anew")
     return Weights(
-        model=from_dict(ModelConfig, description["model"], str(path)),
+        model=from_dict(ModelConfig, description["model"], f"{path}: model"),
         taxonomy=Taxonomy.from_dict(description["taxonomy"]),
         sensor=description["sensor"],
         tensors=tensors,

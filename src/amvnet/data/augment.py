@@ -11,17 +11,28 @@ from amvnet.scan import Scan
 
 
 def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan:
-    """Scale, mirror, jitter and turn the points of a scan; labels, rings and intensity stay.
+    """Scale, mirror, jitter, turn and lift the points of a scan, change its intensity, and lose some of its points.
 
     The same generator state gives the same scan.
     """
+    if config.drop:
+        kept = rng.random(len(scan)) >= rng.uniform(0, config.drop)
+        scan = _only(scan, kept if kept.any() else ~kept)
     xyz = scan.points[:, :3] * (1 + rng.uniform(-config.scale, config.scale))
     mirrored = rng.random(2) < config.flip
     xyz[:, :2] *= np.where(mirrored, -1, 1)
     if config.jitter:
         xyz += rng.standard_normal(xyz.shape, dtype=np.float32) * config.jitter
     xyz[:, :2] = xyz[:, :2] @ rotation(np.radians(rng.uniform(-config.yaw, config.yaw))).T
-    return dataclasses.replace(scan, points=np.column_stack([xyz, scan.points[:, 3:]]).astype(np.float32))
+    xyz[:, 2] += rng.uniform(-config.height, config.height)
+    gain = 0.0 if rng.random() < config.no_intensity else 1 + rng.uniform(-config.intensity, config.intensity)
+    intensity = np.minimum(scan.points[:, 3:] * gain, 1)
+    return dataclasses.replace(scan, points=np.column_stack([xyz, intensity]).astype(np.float32))
+
+
+def _only(scan: Scan, kept: np.ndarray) -> Scan:
+    labels, ring = (None if v is None else v[kept] for v in (scan.labels, scan.ring))
+    return dataclasses.replace(scan, points=scan.points[kept], labels=labels, ring=ring)
 
 
 def rotation(yaw: float) -> np.ndarray:

@@ -137,7 +137,7 @@ class Taxonomy:
         """The taxonomy that `to_dict` wrote, equal in every field.
 
         Raises:
-            InputError: where a field is missing.
+            InputError: where a field is missing or of another kind.
         """
         try:
             return cls(
@@ -149,9 +149,10 @@ class Taxonomy:
                 splits={split: tuple(sequences) for split, sequences in values["splits"].items()},
                 counts_absent=bool(values["counts_absent"]),
             )
-        except KeyError as error:
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
-                f"taxonomy: expected the field {error}, found {sorted(values)}; use a weights file of this package"
+                f"taxonomy: expected its fields as this package writes them, found {error!r}; "
+                "use a weights file of this package"
             ) from None
 
 

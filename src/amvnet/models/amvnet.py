@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from amvnet.config import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
-from amvnet.models.point_head import PointHead, head_features
+from amvnet.models.point_head import PointHead, head_features, nearest_neighbours
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.views.points import PointBatch
@@ -74,7 +74,8 @@ def refine(head: PointHead, points: Tensor, f: Tensor, g: Tensor, uncertain: Ten
     index = uncertain.nonzero()[:, 0]
     if not len(index):
         return f.new_zeros(0, f.shape[1])
-    return head(*head_features(head.config, points, f, g, index)).softmax(dim=1)
+    near = nearest_neighbours(points, index, head.config.neighbours)
+    return head(*head_features(head.config, points, f, g, index, near)).softmax(dim=1)
 
 
 def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:

@@ -72,10 +72,14 @@ class ResidualBlock(nn.Module):
         self.second = nn.Sequential(RingConv2d(out, out), nn.BatchNorm2d(out))
         self.skip: nn.Module = nn.Identity()
         if stride != (1, 1) or channels != out:
-            self.skip = nn.Sequential(RingConv2d(channels, out, 1, stride), nn.BatchNorm2d(out))
+            self.skip = nn.Sequential(RingConv2d(channels, out, 1), nn.BatchNorm2d(out))
+        self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:  # (B, C, H, W) -> (B, C', H / stride, W / stride)
-        return F.leaky_relu_(self.second(self.first(x)) + self.skip(x), 0.01)
+        # Strided here and not in the convolution: torch's own of one cell on few channels writes out of bounds
+        # on a CPU.
+        kept = x[..., :: self.stride[0], :: self.stride[1]]
+        return F.leaky_relu_(self.second(self.first(x)) + self.skip(kept), 0.01)
 
 
 class AzimuthGRU(nn.Module):

@@ -34,7 +34,7 @@ class PointHead(nn.Module):
 
 
 def head_features(
-    config: PointHeadConfig, points: Tensor, f: Tensor, g: Tensor, uncertain: Tensor
+    config: PointHeadConfig, points: Tensor, f: Tensor, g: Tensor, uncertain: Tensor, near: Tensor
 ) -> tuple[Tensor, Tensor]:
     """p_i = [f_i, g_i, x_i] of the uncertain points, and the rows [f_k, g_k, x_k - x_i] of their S_i.
 
@@ -42,11 +42,11 @@ def head_features(
         points: (P, 4) of one scan.
         f, g: (P, K) class probabilities of the two networks.
         uncertain: (U,) indices of the uncertain points.
+        near: (U, n) indices of their nearest neighbours.
 
     Returns:
         (U, 2 K + 4) and (U, n, 2 K + 4).
     """
-    near = nearest_neighbours(points, uncertain, config.neighbours)
     both = torch.cat([f, g], dim=1)
     here = points[uncertain]
     scale = here.new_tensor([config.position_scale] * 3 + [1.0])

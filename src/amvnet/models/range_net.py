@@ -26,6 +26,7 @@ class RangeNet(nn.Module):
         decoded = c.widths[FIRST_DECODED:]
         self.lateral = nn.ModuleList(ConvBlock(w, c.decoder, 1) for w in decoded)
         self.decoder = nn.ModuleList(ConvBlock(c.decoder, c.decoder) for _ in decoded)
+        self.drop = nn.Dropout2d(c.dropout)
         self.last = ConvBlock(c.decoder + c.stem, c.head)
         self.scores = nn.Conv2d(c.head, classes, 1)
 
@@ -52,7 +53,7 @@ class RangeNet(nn.Module):
         top: Tensor | None = None
         for x, lateral, conv in reversed(list(zip(maps, self.lateral, self.decoder, strict=True))):
             side = lateral(x)
-            top = conv(side if top is None else side + upsample(top, side))
+            top = self.drop(conv(side if top is None else side + upsample(top, side)))
         assert top is not None
         return top
 

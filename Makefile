@@ -1,0 +1,33 @@
+# Everything runs in a virtual environment of its own, .venv.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test test-slow lint format clean
+
+demo: .venv/installed  ## simulate streets, segment, score and draw them
+	$(BIN)/amvnet demo --out demo
+
+test: .venv/installed lint  ## style, types and the tests
+	$(BIN)/python -m pytest
+
+test-slow: .venv/installed  ## the tests that take minutes, too
+	$(BIN)/python -m pytest -m "slow or not slow"
+
+lint: .venv/installed
+	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/ruff format --check src tests benchmarks
+	$(BIN)/mypy
+
+format: .venv/installed
+	$(BIN)/ruff check --fix src tests benchmarks
+	$(BIN)/ruff format src tests benchmarks
+
+# torch first and by itself: pinned, so that no other build is drawn in.
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[simulate,test]"
+	touch $@
+
+clean:
+	rm -rf .venv demo

@@ -1,0 +1,25 @@
+"""Fixtures that several test files share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from amvnet.scan import Scan
+
+LASERS = 16
+
+
+def _random_scan(count: int, seed: int = 0) -> Scan:
+    """Points all around the sensor, some outside every field of view, with labels and rings."""
+    rng = np.random.default_rng(seed)
+    xyz = rng.normal(0, (20, 20, 3), (count, 3))
+    points = np.column_stack([xyz, rng.random(count)]).astype(np.float32)
+    return Scan(points, rng.integers(0, 20, count).astype(np.uint8), rng.integers(0, LASERS, count))
+
+
+@pytest.fixture
+def random_scan() -> Callable[..., Scan]:
+    return _random_scan

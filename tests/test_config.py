@@ -1,0 +1,183 @@
+"""Configurations go to dictionaries and back; a wrong key or value is named; a recipe states only what differs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from amvnet.config import ModelConfig, Recipe
+from amvnet.errors import InputError
+from amvnet.recipes import load_recipe, recipe_names
+from amvnet.trees import from_dict, merge_trees, to_dict
+
+
+def write(folder: Path, text: str) -> str:
+    path = folder / "mine.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+def leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_a_recipe_survives_the_way_to_json_and_yaml_and_back(name: str) -> None:
+    recipe = load_recipe(name)
+    tree = to_dict(recipe)
+    assert json.loads(json.dumps(tree)) == tree
+    assert from_dict(Recipe, json.loads(json.dumps(tree))) == recipe
+    assert from_dict(Recipe, yaml.safe_load(yaml.safe_dump(tree))) == recipe
+    assert from_dict(ModelConfig, tree["model"]) == recipe.model
+
+
+def test_every_builtin_recipe_is_there() -> None:
+    names = {"semantickitti", "nuscenes", "simulated"}
+    assert set(recipe_names()) == names | {f"{name}-compact" for name in names}
+
+
+def test_the_recipes_hold_the_papers_numbers() -> None:
+    kitti, nuscenes = load_recipe("semantickitti"), load_recipe("nuscenes")
+    view, grid = kitti.model.range_view, kitti.model.polar_view
+    assert (view.rows, view.height, view.width, view.fov_up, view.fov_down) == ("elevation", 64, 4096, 3.0, -25.0)
+    assert (grid.radial, grid.angular, grid.vertical, grid.radius_max) == (480, 360, 32, 50.0)
+    assert (grid.z_min, grid.z_max) == (-3.0, 1.5)
+    assert (kitti.model.assertion.threshold, kitti.model.point_head.neighbours) == (0.85, 15)
+    assert [(s.epochs, s.batch) for s in (kitti.training.rv, kitti.training.bev)] == [(160, 32), (40, 8)]
+    view, grid = nuscenes.model.range_view, nuscenes.model.polar_view
+    assert (view.rows, view.height, view.width, grid.z_min, grid.z_max) == ("ring", 32, 1920, -2.0, 4.0)
+    assert [(s.epochs, s.batch) for s in (nuscenes.training.rv, nuscenes.training.bev)] == [(400, 64), (40, 8)]
+    assert nuscenes.taxonomy == "nuscenes"
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_a_recipes_stages_fit_each_other(name: str) -> None:
+    net = load_recipe(name).model.range_net
+    assert len(net.widths) == len(net.blocks) == len(net.height_strides)
+
+
+def test_an_empty_tree_gives_the_defaults() -> None:
+    assert from_dict(Recipe, {}) == Recipe()
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("modle: {}", "modle"),
+        ("model: {range_view: {hieght: 3}}", "hieght"),
+        ("training: {rv: {epoch: 3}}", "epoch"),
+        ("model: {range_view: {height: tall}}", "height.*tall"),
+        ("model: {range_view: {height: 64.5}}", "height"),
+        ("model: {range_view: {height: true}}", "height"),
+        ("model: {range_view: {fov_up: up}}", "fov_up"),
+        ("model: {range_view: {fov_up: true}}", "fov_up"),
+        ("model: {range_view: {rows: colour}}", "rows.*elevation, ring.*colour"),
+        ("model: {range_view: {rows: [ring]}}", "rows"),
+        ("model: {range_net: {gru: 1}}", "gru"),
+        ("model: {range_net: {widths: 64}}", "widths"),
+        ("model: {range_net: {widths: [64, wide]}}", "widths"),
+        ("model: {range_net: 3}", "range_net"),
+        ("model:", "model"),
+        ("taxonomy: cityscapes", "taxonomy.*cityscapes"),
+        ("training: {accelerator: 3}", "accelerator"),
+        ("7: seven", "7"),
+    ],
+)
+def test_a_wrong_key_or_value_is_an_input_error_that_names_it(tmp_path: Path, text: str, named: str) -> None:
+    with pytest.raises(InputError, match=f"mine.yaml.*{named}") as caught:
+        load_recipe(write(tmp_path, text))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["- a\n- b", "just words", "a: [1, 2", "a: b: c"])
+def test_a_file_that_is_no_mapping_is_an_input_error(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError, match=r"mine\.yaml"):
+        load_recipe(write(tmp_path, text))
+
+
+def test_an_unknown_recipe_is_an_input_error_that_lists_the_known_ones() -> None:
+    with pytest.raises(InputError, match=r"'kitti'.*nuscenes-compact.*simulated"):
+        load_recipe("kitti")
+
+
+@pytest.mark.parametrize("base", ["nothing-like-it", "3", "[nuscenes]", "{a: 1}"])
+def test_a_base_that_is_no_recipe_is_an_input_error(tmp_path: Path, base: str) -> None:
+    with pytest.raises(InputError):
+        load_recipe(write(tmp_path, f"base: {base}"))
+
+
+def test_a_recipe_that_is_its_own_base_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError):
+        load_recipe(write(tmp_path, f"base: {tmp_path / 'mine.yaml'}"))
+
+
+def test_a_binary_file_is_an_input_error(tmp_path: Path) -> None:
+    path = tmp_path / "scan.bin"
+    path.write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match=r"scan\.bin"):
+        load_recipe(str(path))
+
+
+def test_a_list_of_booleans_is_no_list_of_numbers(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="widths"):
+        load_recipe(write(tmp_path, "model: {range_net: {widths: [true, false]}}"))
+
+
+@pytest.mark.parametrize("base", ["nuscenes-compact", "semantickitti"])
+def test_a_users_file_overrides_just_what_it_states(tmp_path: Path, base: str) -> None:
+    text = f"base: {base}\nmodel: {{range_view: {{width: 96}}}}\ntraining: {{rv: {{lr: 1}}, keep: last}}"
+    found, original = leaves(to_dict(load_recipe(write(tmp_path, text)))), leaves(to_dict(load_recipe(base)))
+    changed = {key: value for key, value in found.items() if value != original[key]}
+    assert changed == {"model.range_view.width": 96, "training.rv.lr": 1.0, "training.keep": "last"}
+    assert isinstance(found["training.rv.lr"], float)
+
+
+def test_a_users_file_without_a_base_builds_on_the_papers_sizes(tmp_path: Path) -> None:
+    recipe = load_recipe(write(tmp_path, "training: {seed: 5}"))
+    assert recipe == dataclasses.replace(Recipe(), training=dataclasses.replace(Recipe().training, seed=5))
+
+
+def test_a_users_file_may_build_on_another_users_file(tmp_path: Path) -> None:
+    (tmp_path / "first.yaml").write_text("base: nuscenes\ntraining: {seed: 5, workers: 2}")
+    training = load_recipe(write(tmp_path, f"base: {tmp_path / 'first.yaml'}\ntraining: {{seed: 6}}")).training
+    assert (training.seed, training.workers, training.rv.epochs) == (6, 2, 400)
+
+
+def test_merging_trees_leaves_both_as_they_were() -> None:
+    base, over = {"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}}
+    assert merge_trees(base, over) == {"a": {"b": 4, "c": 2}, "d": 3}
+    assert (base, over) == ({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "model: {range_view: {width: 0}}",
+        "model: {range_view: {fov_up: -30}}",
+        "model: {polar_view: {radius_min: 60}}",
+        "model: {polar_view: {z_min: 9}}",
+        "model: {range_net: {widths: [16, 16]}}",
+        "model: {range_net: {widths: [64, 96, 0, 256, 256, 256, 256]}}",
+        "model: {range_net: {dropout: 1}}",
+        "model: {polar_net: {point_widths: [8]}}",
+        "model: {polar_net: {widths: []}}",
+        "model: {point_head: {hidden: []}}",
+        "training: {rv: {epochs: 0}}",
+        "training: {bev: {lr: 0}}",
+        "training: {head: {warmup: 1}}",
+        "training: {accumulate: 3}",
+        "training: {seed: -1}",
+        "training: {augment: {flip: 1.5}}",
+    ],
+)
+def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError, match=r"mine\.yaml: .*expected .* found .*correct the value"):
+        load_recipe(write(tmp_path, text))

@@ -1,0 +1,186 @@
+"""The losses equal plain loops from their definitions; ignored points have no part in them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from amvnet.losses import FREQUENCY_FLOOR, class_weights, dice, lovasz_softmax, polar_view_loss, range_view_loss
+
+K = 5
+LOSSES = pytest.mark.parametrize("loss", [range_view_loss, polar_view_loss])
+Loss = Callable[[Tensor, Tensor, Tensor | None, float], Tensor]
+
+
+def example(points: int = 60, seed: int = 0, classes: int = K) -> tuple[Tensor, Tensor]:
+    """(P, K) logits and (P,) labels of which some are 0 and one class is absent."""
+    generator = torch.Generator().manual_seed(seed)
+    logits = torch.randn(points, classes, generator=generator) * 2
+    return logits, torch.randint(0, classes, (points,), generator=generator)
+
+
+def cross_entropy_by_loop(logits: Tensor, labels: Tensor, weights: list[float]) -> float:
+    total = weight = 0.0
+    for row, label in zip(logits.double().tolist(), labels.tolist(), strict=True):
+        if label:
+            own = math.exp(row[label - 1]) / sum(math.exp(v) for v in row)
+            total -= weights[label - 1] * math.log(own)
+            weight += weights[label - 1]
+    return total / weight
+
+
+def dice_by_loop(probabilities: list[list[float]], target: list[int]) -> float:
+    scores = []
+    for c in set(target):
+        overlap = sum(row[c] for row, t in zip(probabilities, target, strict=True) if t == c)
+        scores.append(2 * overlap / (sum(row[c] for row in probabilities) + target.count(c)))
+    return 1 - sum(scores) / len(scores)
+
+
+def jaccard_loss(wrong: set[int], members: set[int]) -> float:
+    """1 - |truth and prediction| / |truth or prediction| of a class whose points `wrong` are mispredicted."""
+    prediction = members ^ wrong
+    return 1 - len(members & prediction) / len(members | prediction)
+
+
+def lovasz_by_sets(probabilities: list[list[float]], target: list[int]) -> float:
+    """The Lovász extension as it is defined: the errors, largest first, times what each adds to the set function."""
+    losses = []
+    for c in set(target):
+        members = {i for i, t in enumerate(target) if t == c}
+        errors = [1 - row[c] if i in members else row[c] for i, row in enumerate(probabilities)]
+        wrong: set[int] = set()
+        loss = 0.0
+        for i in sorted(range(len(errors)), key=lambda i, errors=errors: -errors[i]):
+            before = jaccard_loss(wrong, members)
+            wrong.add(i)
+            loss += errors[i] * (jaccard_loss(wrong, members) - before)
+        losses.append(loss)
+    return sum(losses) / len(losses)
+
+
+@LOSSES
+@pytest.mark.parametrize("weights", [None, [1.0, 0.2, 3.0, 0.7, 2.0]])
+def test_without_the_region_part_a_loss_is_weighted_cross_entropy(loss: Loss, weights: list[float] | None) -> None:
+    logits, labels = example()
+    found = loss(logits, labels, None if weights is None else torch.tensor(weights), 0.0)
+    assert found.item() == pytest.approx(cross_entropy_by_loop(logits, labels, weights or [1.0] * K), rel=1e-5)
+
+
+@pytest.mark.parametrize(("loss", "region_loss"), [(range_view_loss, dice), (polar_view_loss, lovasz_softmax)])
+def test_a_loss_is_cross_entropy_plus_its_region_part(loss: Loss, region_loss: Callable[..., Tensor]) -> None:
+    logits, labels = example()
+    kept = labels > 0
+    region = region_loss(logits[kept].softmax(dim=1), labels[kept] - 1)
+    both = loss(logits, labels, None, 0.0) + 1.5 * region
+    torch.testing.assert_close(loss(logits, labels, None, 1.5), both)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_dice_equals_a_loop(seed: int) -> None:
+    logits, target = example(seed=seed)
+    probabilities = logits.softmax(dim=1)
+    expected = dice_by_loop(probabilities.tolist(), target.tolist())
+    assert dice(probabilities, target).item() == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("sharpness", [0.5, 2.0, 8.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_lovasz_softmax_equals_its_definition_by_sets(seed: int, sharpness: float) -> None:
+    logits, target = example(seed=seed)
+    probabilities = (logits * sharpness).softmax(dim=1)
+    expected = lovasz_by_sets(probabilities.tolist(), target.tolist())
+    assert lovasz_softmax(probabilities, target).item() == pytest.approx(expected, abs=2e-3)
+
+
+def test_lovasz_softmax_sees_errors_of_a_few_percent() -> None:
+    logits, target = example()
+    probabilities = (logits / 4 + 5 * torch.nn.functional.one_hot(target, K)).softmax(dim=1)
+    expected = lovasz_by_sets(probabilities.tolist(), target.tolist())
+    assert expected < 0.05
+    assert lovasz_softmax(probabilities, target).item() == pytest.approx(expected, abs=2e-3)
+
+
+def test_lovasz_softmax_of_hard_predictions_is_the_jaccard_loss() -> None:
+    target = torch.tensor([0, 0, 0, 1, 1])
+    hard = torch.nn.functional.one_hot(torch.tensor([0, 0, 1, 1, 0]), 3).float()
+    assert lovasz_softmax(hard, target).item() == pytest.approx(1 - (2 / 4 + 1 / 3) / 2)
+
+
+@LOSSES
+def test_a_perfect_prediction_costs_nothing_and_a_wrong_one_does(loss: Loss) -> None:
+    labels = torch.tensor([1, 2, 3, 3, 0])
+    right = torch.nn.functional.one_hot((labels - 1).clamp_min(0), K) * 40.0
+    assert loss(right, labels, None, 1.0).item() == pytest.approx(0, abs=1e-5)
+    assert loss(right.roll(1, dims=1), labels, None, 1.0).item() > 1
+
+
+@LOSSES
+def test_ignored_points_carry_no_gradient_and_the_others_do(loss: Loss) -> None:
+    logits, labels = example()
+    logits.requires_grad_()
+    loss(logits, labels, torch.rand(K), 1.0).backward()
+    assert (labels == 0).any()
+    assert (logits.grad[labels == 0] == 0).all()
+    assert logits.grad[labels > 0].any(dim=1).all()
+
+
+@LOSSES
+def test_the_scores_of_ignored_points_do_not_change_the_loss(loss: Loss) -> None:
+    logits, labels = example()
+    changed = torch.where((labels == 0)[:, None], torch.randn_like(logits) * 50, logits)
+    assert torch.equal(loss(logits, labels, None, 1.0), loss(changed, labels, None, 1.0))
+
+
+@LOSSES
+@pytest.mark.parametrize("points", [0, 7])
+def test_where_every_point_is_ignored_loss_and_gradient_are_zero(loss: Loss, points: int) -> None:
+    logits = torch.randn(points, K, requires_grad=True)
+    found = loss(logits, torch.zeros(points, dtype=torch.uint8), torch.ones(K), 1.0)
+    found.backward()
+    assert found.item() == 0
+    assert torch.equal(logits.grad, torch.zeros(points, K))
+
+
+@LOSSES
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_for_extreme_scores_the_loss_is_in_float32_and_its_gradient_finite(loss: Loss, dtype: torch.dtype) -> None:
+    logits, labels = example()
+    logits = (logits * 1000).to(dtype).requires_grad_()
+    found = loss(logits, labels.to(torch.uint8), None, 1.0)
+    found.backward()
+    assert found.dtype == torch.float32
+    assert logits.grad.isfinite().all()
+
+
+@LOSSES
+def test_a_step_down_the_gradient_lowers_the_loss(loss: Loss) -> None:
+    logits, labels = example()
+    logits.requires_grad_()
+    before = loss(logits, labels, None, 1.0)
+    before.backward()
+    assert loss(logits - 0.5 * logits.grad, labels, None, 1.0) < before
+
+
+def test_class_weights_go_as_the_square_root_of_the_inverse_frequency() -> None:
+    weights = class_weights(np.array([100, 400, 2500]))
+    assert weights.dtype == np.float32
+    assert weights[0] / weights[1] == pytest.approx(math.sqrt(400 / 100))
+    assert weights[1] / weights[2] == pytest.approx(math.sqrt(2500 / 400))
+    assert weights.mean() == pytest.approx(1)
+
+
+def test_a_class_that_is_absent_or_nearly_weighs_as_one_at_the_floor() -> None:
+    weights = class_weights(np.array([10**9, 0, 3, round(FREQUENCY_FLOOR * 10**9)]))
+    assert np.isfinite(weights).all()
+    np.testing.assert_allclose(weights[1:], weights[1], rtol=1e-3)
+    assert weights[1] / weights[0] == pytest.approx(math.sqrt(1 / FREQUENCY_FLOOR), rel=1e-3)
+
+
+def test_class_weights_without_any_point_are_equal() -> None:
+    np.testing.assert_allclose(class_weights(np.zeros(4, np.int64)), 1, rtol=1e-6)

@@ -1,0 +1,259 @@
+"""Training through the command line: what it leaves behind, that it learns, repeats, resumes and keeps scans apart."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from worlds import GOLDEN, amvnet, files, make_streets, write_recipe
+
+from amvnet import runner
+from amvnet.training import KeepWeights
+from amvnet.weights import PARTS, Weights, load
+
+STILL = ("--training.augment.yaw", 0, "--training.augment.scale", 0, "--training.augment.flip", 0)
+FOLDERS = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
+
+
+def train(world: Path, out: Path, *options: object) -> Weights:
+    """The weights of a run that must succeed."""
+    code, error = amvnet("train", world / "recipe.yaml", "--data", world / "data", "--out", out, *options)
+    assert code == 0, error
+    return load(out / "weights.safetensors")
+
+
+def differing(a: Weights, b: Weights) -> set[str]:
+    """The parts that are not bitwise equal."""
+    assert set(a.tensors) == set(b.tensors)
+    return {name.split(".")[0] for name in a.tensors if not torch.equal(a.tensors[name], b.tensors[name])}
+
+
+def column(run: Path, stage: str, name: str) -> list[float]:
+    with (run / stage / "metrics.csv").open() as file:
+        return [float(row[name]) for row in csv.DictReader(file) if row.get(name)]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("world")
+    make_streets(root / "data")
+    write_recipe(root / "recipe.yaml")
+    return root
+
+
+@pytest.fixture(scope="module")
+def run(world: Path) -> Path:
+    """One uninterrupted training of all stages."""
+    train(world, world / "run")
+    return world / "run"
+
+
+def test_a_run_ends_with_all_three_parts(run: Path) -> None:
+    assert load(run / "weights.safetensors").parts == PARTS
+
+
+@pytest.mark.parametrize("stage", FOLDERS)
+def test_a_stage_keeps_its_best_and_last_weights_and_its_curves(run: Path, stage: str) -> None:
+    kept = files(run / stage)
+    assert {"best.safetensors", "last.safetensors", "metrics.csv"} <= kept
+    assert any(name.startswith("events.out.tfevents") for name in kept)
+    assert len(column(run, stage, "val/miou")) == (2 if stage == "head" else 3)
+
+
+@pytest.mark.parametrize("stage", FOLDERS)
+def test_the_best_weights_are_those_of_the_highest_validation_miou(run: Path, stage: str) -> None:
+    values = column(run, stage, "val/miou")
+    reached = load(run / stage / "best.safetensors").metrics[FOLDERS[stage]]
+    assert reached["epoch"] == int(np.argmax(values))
+    assert reached["val/miou"] == pytest.approx(max(values), abs=1e-6)
+
+
+def test_class_counts_kept_beside_the_run_are_those_of_the_training_scans(world: Path, run: Path) -> None:
+    with np.load(run / "class_counts.npz") as kept:
+        counts = kept["counts"]
+        assert kept["scans"].tolist() == ["00/000000", "00/000001", "01/000000", "01/000001"]
+    raw = [np.fromfile(p, np.uint32) for s in ("00", "01") for p in world.glob(f"data/sequences/{s}/labels/*.label")]
+    classes = {0: 10, 8: 40, 10: 48, 12: 50}  # score column -> raw id: car, road, sidewalk, building
+    for c, count in enumerate(counts):
+        assert count == np.count_nonzero(np.concatenate(raw) == classes.get(c, -1))
+
+
+def test_the_weights_say_how_they_came_about(run: Path) -> None:
+    weights = load(run / "weights.safetensors")
+    for part in PARTS:
+        said = weights.training[part]
+        assert (said["sequences"], said["validated_on"], said["seed"]) == (["00", "01"], ["08"], 0)
+    assert weights.training["range_net"]["config"]["epochs"] == 3
+    assert weights.model.range_view.width == 64
+
+
+def test_a_run_leaves_no_temporary_files(run: Path) -> None:
+    assert not [name for name in files(run) if ".part" in name]
+
+
+def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: Path) -> None:
+    options = ("--stage", "rv", "--training.rv.epochs", 1, "--model.range_net.decoder", 24, "--training.seed", 7)
+    weights = train(world, tmp_path / "run", *options)
+    said = weights.training["range_net"]
+    assert (said["config"]["epochs"], said["seed"], said["config"]["lr"]) == (1, 7, 0.02)
+    assert weights.model.range_net.decoder == 24
+    assert weights.parts == ("range_net",)
+    assert yaml.safe_load((tmp_path / "run/recipe.yaml").read_text())["training"]["rv"]["epochs"] == 1
+
+
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+def test_a_network_learns_a_tiny_data_set_by_heart(world: Path, tmp_path: Path, stage: str) -> None:
+    train(world, tmp_path / "run", "--stage", stage, f"--training.{stage}.epochs", 20, *STILL)
+    losses = column(tmp_path / "run", stage, "train/loss")
+    assert losses[-1] < 0.5 * losses[0]
+    assert max(column(tmp_path / "run", stage, "val/acc")) > 0.6
+
+
+def test_the_same_seed_gives_the_same_weights(world: Path, run: Path, tmp_path: Path) -> None:
+    assert not differing(train(world, tmp_path / "again"), load(run))
+
+
+def test_another_seed_gives_other_weights(world: Path, run: Path, tmp_path: Path) -> None:
+    assert differing(train(world, tmp_path / "other", "--training.seed", 1), load(run)) == set(PARTS)
+
+
+def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: object) -> None:
+    """A run that stops in the validation of an epoch of a stage, before its weights are kept."""
+    keep = KeepWeights.on_validation_end
+
+    def stop(self: KeepWeights, trainer: Any, module: Any) -> None:
+        if self.kept.last.parent.name == stage and trainer.current_epoch == epoch:
+            raise RuntimeError("the power is gone")
+        keep(self, trainer, module)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(KeepWeights, "on_validation_end", stop)
+        with pytest.raises(RuntimeError, match="power"):
+            train(world, out, *options)
+
+
+@pytest.mark.parametrize(("stage", "epoch"), [("rv", 0), ("rv", 2), ("bev", 1), ("head", 1)])
+def test_an_interrupted_run_resumes_to_the_same_weights(
+    world: Path, run: Path, tmp_path: Path, stage: str, epoch: int
+) -> None:
+    train_interrupted(stage, epoch, world, tmp_path / "run")
+    resumed = train(world, tmp_path / "run", "--resume")
+    assert not differing(resumed, load(run))
+    for kept in ("best", "last"):
+        path = f"{stage}/{kept}.safetensors"
+        assert not differing(load(tmp_path / "run" / path), load(run / path))
+
+
+def test_processes_that_read_beside_the_training_change_nothing_resumed_or_not(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    options = ("--stage", "rv", "--training.workers", 1)
+    train_interrupted("rv", 2, world, tmp_path / "run", *options)
+    before, all_along = (load(folder / "rv/last.safetensors") for folder in (tmp_path / "run", run))
+    assert before.metrics["range_net"]["val/acc"] == pytest.approx(column(run, "rv", "val/acc")[1], abs=1e-6)
+    train(world, tmp_path / "run", *options, "--resume")
+    assert not differing(load(tmp_path / "run/rv/last.safetensors"), all_along)
+
+
+def test_a_resumed_run_keeps_the_curves_of_its_earlier_epochs(world: Path, tmp_path: Path) -> None:
+    train_interrupted("rv", 2, world, tmp_path / "run", "--stage", "rv")
+    train(world, tmp_path / "run", "--stage", "rv", "--resume")
+    assert set(column(tmp_path / "run", "rv", "epoch")) == {0.0, 1.0, 2.0}
+
+
+def test_resuming_a_finished_run_changes_nothing(world: Path, run: Path, tmp_path: Path) -> None:
+    before = train(world, tmp_path / "run")
+    assert not differing(train(world, tmp_path / "run", "--resume"), before)
+
+
+def test_an_existing_run_is_not_overwritten_without_resume(world: Path, run: Path) -> None:
+    before = (run / "weights.safetensors").read_bytes(), (run / "rv/last.safetensors").read_bytes()
+    code, error = amvnet("train", world / "recipe.yaml", "--data", world / "data", "--out", run)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "--resume" in error
+    assert before == ((run / "weights.safetensors").read_bytes(), (run / "rv/last.safetensors").read_bytes())
+
+
+def test_the_head_stage_leaves_the_networks_bitwise_unchanged(world: Path, run: Path, tmp_path: Path) -> None:
+    before = load(run)
+    after = train(world, tmp_path / "head", "--stage", "head", "--init", run, "--training.seed", 5)
+    assert differing(before, after) == {"point_head"}
+
+
+def test_a_stage_takes_the_other_parts_from_init(world: Path, run: Path, tmp_path: Path) -> None:
+    after = train(world, tmp_path / "rv", "--stage", "rv", "--init", run, "--training.rv.epochs", 1)
+    assert differing(load(run), after) == {"range_net"}
+    assert after.training["range_net"]["config"]["epochs"] == 1
+    assert after.training["polar_net"] == load(run).training["polar_net"]
+
+
+def test_stages_one_by_one_equal_all_at_once(world: Path, run: Path, tmp_path: Path) -> None:
+    for stage in FOLDERS:
+        weights = train(world, tmp_path / "run", "--stage", stage)
+    assert not differing(weights, load(run))
+
+
+def test_folds_score_no_sequence_that_they_learnt_from(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gathered = []
+    gather = runner.gather_points
+
+    def spy(sources: Any, *rest: Any) -> Any:
+        gathered.append(sources)
+        return gather(sources, *rest)
+
+    monkeypatch.setattr(runner, "gather_points", spy)
+    weights = train(world, tmp_path / "run", "--training.head.folds", 2, "--training.rv.epochs", 1)
+    scored = []
+    for networks, records in gathered[0]:
+        for part in ("range_net", "polar_net"):
+            assert not set(networks.training[part]["sequences"]) & {record.sequence for record in records}
+        scored += [record.name for record in records]
+    assert sorted(scored) == ["00/000000", "00/000001", "01/000000", "01/000001"]
+    assert weights.training["point_head"]["config"]["folds"] == 2
+    assert weights.training["range_net"]["sequences"] == ["00", "01"]
+
+
+def test_nuscenes_trains_predicts_and_is_scored(tmp_path: Path) -> None:
+    recipe = write_recipe(tmp_path / "recipe.yaml", "nuscenes-compact")
+    data, out, run = GOLDEN / "nuscenes", tmp_path / "out", tmp_path / "run"
+    scenes = ("--train-sequences", "scene-0103", "--val-sequences", "scene-0916")
+    assert amvnet("train", recipe, "--data", data, "--out", run, *scenes)[0] == 0
+    assert load(run).model.range_view.rows == "ring"
+    assert amvnet("predict", data, "--weights", run, "--out", out, "--sequences", "scene-0916")[0] == 0
+    labels = [np.fromfile(path, np.uint8) for path in sorted((out / "lidarseg/mini_val").glob("*_lidarseg.bin"))]
+    assert sorted(map(len, labels)) == [2622, 2683]
+    assert all(1 <= ids.min() <= ids.max() <= 16 for ids in labels)
+    assert amvnet("evaluate", data, "--predictions", out, "--sequences", "scene-0916")[0] == 0
+    assert amvnet("evaluate", data, "--weights", run, "--sequences", "scene-0916")[0] == 0
+
+
+def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_path: Path) -> None:
+    """Networks that agree everywhere leave the head nothing to learn; the libraries' own notes stay out of stderr."""
+    arguments = [world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run"]
+    command = [sys.executable, "-m", "amvnet.cli", "train", *map(str, arguments), "--model.assertion.threshold=-1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "raise the threshold" in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+
+
+def test_networks_of_few_channels_train_without_a_crash() -> None:
+    """Torch 2.13 corrupts the heap in the backward pass of a 1x1 convolution with stride (1, 2) of < 16 channels."""
+    code = """
+import torch
+from amvnet.models.layers import ResidualBlock
+block = ResidualBlock(8, 8, (1, 2))
+for _ in range(100):
+    image = torch.randn(2, 32, 64, 8).permute(0, 3, 1, 2).requires_grad_()
+    block(image).sum().backward()
+"""
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
