@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from amvnet.config import AugmentConfig
-from amvnet.data.augment import augment, rotation
+from amvnet.data.augment import augment, mix, rotation
 from amvnet.scan import Scan
 
 RandomScan = Callable[..., Scan]
@@ -173,3 +173,25 @@ def test_some_scans_have_no_intensity(random_scan: RandomScan) -> None:
     sums = [augmented(scan, replace(STILL, no_intensity=0.3), seed).points[:, 3].sum() for seed in range(100)]
     assert set(np.round(sums, 3)) == {0, np.round(scan.points[:, 3].sum(), 3)}
     assert 15 < sums.count(0) < 45
+
+
+def test_a_mixed_scan_is_one_sector_of_another_and_the_rest_of_its_own(random_scan: RandomScan) -> None:
+    scan, other = random_scan(2000, 1), random_scan(1500, 2)
+    where = {tuple(row): (s, i) for s in (scan, other) for i, row in enumerate(s.points.tolist())}
+    widths = []
+    for seed in range(30):
+        mixed = mix(scan, other, np.random.default_rng(seed))
+        assert mixed.labels is not None
+        assert mixed.ring is not None
+        drawn = []
+        for row, label, ring in zip(mixed.points.tolist(), mixed.labels, mixed.ring, strict=True):
+            source, i = where[tuple(row)]
+            assert source.labels is not None
+            assert source.ring is not None
+            assert (label, ring) == (source.labels[i], source.ring[i])
+            drawn.append((math.atan2(row[1], row[0]), source is other))
+        drawn.sort()
+        assert sum(a != b for (_, a), (_, b) in zip(drawn, drawn[1:] + drawn[:1], strict=True)) == 2
+        widths.append(sum(foreign for _, foreign in drawn) / len(other))
+    assert 0.2 < min(widths) < 0.4
+    assert 0.6 < max(widths) < 0.8

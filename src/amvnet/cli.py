@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import logging
 import sys
@@ -11,14 +10,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal
 
-import docstring_parser
-from jsonargparse import ArgumentParser, set_parsing_settings
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from amvnet import __version__
+from amvnet.arguments import Parser, Positional, parser_of
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,14 +31,6 @@ WEIGHTS = "sim-hdl64e"
 SHOWN = 20  # names of sequences in a line
 
 console = Console(highlight=False)
-
-
-class Parser(ArgumentParser):
-    """A parser whose complaint is one line, as all of ours are."""
-
-    def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        line = " ".join(message.split()) or str(ex)
-        raise InputError(f"{line}; see {self.prog} --help")
 
 
 def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGHTS) -> None:
@@ -319,7 +309,7 @@ def _widest_method(weights: str) -> Any:
     return found[-1] if found else METHODS[-1]
 
 
-VERBS: dict[str, tuple[Callable[..., None], dict[str, dict[str, Any]]]] = {
+VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "demo": (demo, {}),
     "simulate": (simulate, {"out": {"metavar": "OUT", "type": Path}}),
     "train": (train, {"recipe": {"metavar": "RECIPE"}}),
@@ -330,43 +320,8 @@ VERBS: dict[str, tuple[Callable[..., None], dict[str, dict[str, Any]]]] = {
 }
 
 
-def parser_of(verb: str, recipe: Recipe | None = None) -> ArgumentParser:
-    """The parser of a verb; with a recipe, its values are options too."""
-    function, positional = VERBS[verb]
-    docs = docstring_parser.parse(function.__doc__ or "")
-    help_of = {param.arg_name: param.description for param in docs.params}
-    shown = " ".join(str(options["metavar"]) for options in positional.values())
-    usage = f"amvnet {verb} {shown} [options]".replace("  ", " ")
-    parser = Parser(prog=f"amvnet {verb}", usage=usage, description=docs.short_description, allow_abbrev=False)
-    for name, options in positional.items():
-        parser.add_argument(name, help=help_of.get(name), **options)
-    set_parsing_settings(docstring_parse_attribute_docstrings=True)  # the help of a recipe's values
-    hints = get_type_hints(function)
-    for name, parameter in inspect.signature(function).parameters.items():
-        if name not in positional:
-            _add_option(parser, name, hints[name], parameter.default, help_of.get(name))
-    if recipe is not None:
-        _add_recipe(parser, recipe)
-    return parser
-
-
-def _add_option(parser: ArgumentParser, name: str, kind: Any, default: Any, text: str | None) -> None:
-    """One parameter of a verb's function as an option, with dashes as the shell has them."""
-    flag = "--" + name.replace("_", "-")
-    if kind is bool:
-        parser.add_argument(flag, action="store_true", help=text)
-    elif default is inspect.Parameter.empty:
-        parser.add_argument(flag, type=kind, required=True, help=text)
-    else:
-        parser.add_argument(flag, type=kind, default=default, help=text)
-
-
-def _add_recipe(parser: ArgumentParser, recipe: Recipe) -> None:
-    """Every value of the recipe as an option, with dots: --training.rv.epochs 40."""
-    from amvnet.config import ModelConfig, TrainingConfig
-
-    parser.add_argument("--model", type=ModelConfig, default=recipe.model)
-    parser.add_argument("--training", type=TrainingConfig, default=recipe.training)
+def _parser(verb: str, recipe: Recipe | None = None) -> Parser:
+    return parser_of(verb, *VERBS[verb], recipe)
 
 
 def _train_arguments(arguments: Sequence[str]) -> dict[str, Any]:
@@ -377,8 +332,8 @@ def _train_arguments(arguments: Sequence[str]) -> dict[str, Any]:
     if {"-h", "--help"} & set(arguments):
         recipe = Recipe() if arguments[0].startswith("-") else load_recipe(arguments[0])
     else:
-        recipe = load_recipe(parser_of("train", Recipe()).parse_args(list(arguments)).recipe)
-    parser = parser_of("train", recipe)
+        recipe = load_recipe(_parser("train", Recipe()).parse_args(list(arguments)).recipe)
+    parser = _parser("train", recipe)
     made = vars(parser.instantiate(parser.parse_args(list(arguments))))
     return made | {"recipe": Recipe(recipe.taxonomy, made.pop("model"), made.pop("training"))}
 
@@ -425,7 +380,7 @@ def run(verb: str, arguments: Sequence[str]) -> None:
     if verb not in VERBS:
         raise InputError(f"expected a verb of {', '.join(VERBS)}, found {verb!r}; see amvnet --help")
     _quiet()
-    call = _train_arguments(arguments) if verb == "train" else vars(parser_of(verb).parse_args(list(arguments)))
+    call = _train_arguments(arguments) if verb == "train" else vars(_parser(verb).parse_args(list(arguments)))
     VERBS[verb][0](**call)
 
 

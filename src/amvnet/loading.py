@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils import data
 
 from amvnet.config import AugmentConfig
-from amvnet.data.augment import augment
+from amvnet.data.augment import augment, mix
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -33,12 +33,21 @@ class ScanSet(data.Dataset[Scan]):
 
     def __getitem__(self, key: Key) -> Scan:
         epoch, place = key
+        scan = self._read(place)
+        if self.augment is None:
+            return scan
+        rng = np.random.default_rng([self.seed, epoch, place])
+        scan = augment(scan, self.augment, rng)
+        if rng.random() >= self.augment.mix:
+            return scan
+        other = augment(self._read(int(rng.integers(len(self)))), self.augment, rng)
+        return mix(scan, other, rng)
+
+    def _read(self, place: int) -> Scan:
         scan = self.dataset.read(self.records[place])
         if scan.labels is None:
             raise InputError(f"{scan.name}: expected labels to train with, found none; name labelled sequences")
-        if self.augment is None:
-            return scan
-        return augment(scan, self.augment, np.random.default_rng([self.seed, epoch, place]))
+        return scan
 
 
 class EpochSampler(data.Sampler[Key]):

@@ -30,6 +30,25 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
     return dataclasses.replace(scan, points=np.column_stack([xyz, intensity]).astype(np.float32))
 
 
+def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
+    """A scan with a sector of a quarter to three quarters of the circle from another one (Xiao et al., 2022)."""
+    start, width = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 1.5) * np.pi
+    parts = [_only(s, _in_sector(s, start, width) == (s is other)) for s in (scan, other)]
+    points, labels, ring = (_joined([getattr(p, name) for p in parts]) for name in ("points", "labels", "ring"))
+    assert points is not None
+    return dataclasses.replace(scan, points=points, labels=labels, ring=ring) if len(points) else scan
+
+
+def _in_sector(scan: Scan, start: float, width: float) -> np.ndarray:
+    azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+    return (azimuth - start) % (2 * np.pi) < width
+
+
+def _joined(values: list[np.ndarray | None]) -> np.ndarray | None:
+    present = [v for v in values if v is not None]
+    return np.concatenate(present) if len(present) == len(values) else None
+
+
 def _only(scan: Scan, kept: np.ndarray) -> Scan:
     labels, ring = (None if v is None else v[kept] for v in (scan.labels, scan.ring))
     return dataclasses.replace(scan, points=scan.points[kept], labels=labels, ring=ring)
