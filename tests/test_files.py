@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import pickle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
-from worlds import fails
+from worlds import fails, label_map
 
 from amvnet.data.files import find_scans, read_scan, whole_file, write_labels
 from amvnet.data.labels import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
@@ -130,21 +129,6 @@ def test_sizes_of_the_benchmarks() -> None:
     assert (SEMANTICKITTI.size, NUSCENES.size) == (19, 16)
     assert (len(SEMANTICKITTI.raw_to_train), len(NUSCENES.raw_to_train)) == (34, 32)
     assert SEMANTICKITTI.splits["val"] == ("08",)
-
-
-def label_map() -> dict[str, Any]:
-    """SEMANTICKITTI in the format of the benchmark's own YAML file (colours are BGR there)."""
-    raws, forward = SEMANTICKITTI.train_to_raw, SEMANTICKITTI.raw_to_train
-    names = ("unlabeled", *SEMANTICKITTI.classes)
-    train = {ours: [int(s) for s in SEMANTICKITTI.splits[ours]] for ours in ("train", "val", "test")}
-    return {
-        "labels": {raw: names[t] for raw, t in forward.items()},
-        "color_map": {raw: list(SEMANTICKITTI.colors[t])[::-1] for raw, t in forward.items()},
-        "learning_map": dict(forward),
-        "learning_map_inv": dict(enumerate(raws)),
-        "learning_ignore": {t: t == 0 for t in range(20)},
-        "split": {"train": train["train"], "valid": train["val"], "test": train["test"]},
-    }
 
 
 def test_yaml_label_map_is_the_built_in_one(tmp_path: Path) -> None:

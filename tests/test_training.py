@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from worlds import GOLDEN, amvnet, files, make_streets, write_recipe
+from worlds import GOLDEN, amvnet, files, label_map, make_streets, write_recipe
 
 from amvnet import runner
 from amvnet.training import KeepWeights
@@ -234,6 +234,15 @@ def test_nuscenes_trains_predicts_and_is_scored(tmp_path: Path) -> None:
     assert all(1 <= ids.min() <= ids.max() <= 16 for ids in labels)
     assert amvnet("evaluate", data, "--predictions", out, "--sequences", "scene-0916")[0] == 0
     assert amvnet("evaluate", data, "--weights", run, "--sequences", "scene-0916")[0] == 0
+
+
+def test_a_label_map_of_ones_own_is_learnt(world: Path, tmp_path: Path) -> None:
+    classes = label_map()
+    classes["learning_ignore"][19] = True  # one class less than the benchmark
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(classes))
+    options = ("--stage", "rv", "--taxonomy", tmp_path / "mine.yaml", "--training.rv.epochs", 1)
+    taxonomy = train(world, tmp_path / "run", *options).taxonomy
+    assert (taxonomy.name, taxonomy.size) == ("mine", 18)
 
 
 def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_path: Path) -> None:

@@ -134,3 +134,18 @@ def fails(call: Callable[[], object], *words: object) -> None:
     assert "\n" not in message
     for word in words:
         assert str(word) in message
+
+
+def label_map() -> dict[str, Any]:
+    """SEMANTICKITTI in the format of the benchmark's own YAML file (colours are BGR there)."""
+    raws, forward = SEMANTICKITTI.train_to_raw, SEMANTICKITTI.raw_to_train
+    names = ("unlabeled", *SEMANTICKITTI.classes)
+    train = {ours: [int(s) for s in SEMANTICKITTI.splits[ours]] for ours in ("train", "val", "test")}
+    return {
+        "labels": {raw: names[t] for raw, t in forward.items()},
+        "color_map": {raw: list(SEMANTICKITTI.colors[t])[::-1] for raw, t in forward.items()},
+        "learning_map": dict(forward),
+        "learning_map_inv": dict(enumerate(raws)),
+        "learning_ignore": {t: t == 0 for t in range(20)},
+        "split": {"train": train["train"], "valid": train["val"], "test": train["test"]},
+    }
