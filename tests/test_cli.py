@@ -104,6 +104,8 @@ MISTAKES = {
     "image without columns": TRAIN + " --stage rv --model.range_view.width 0",
     "sizes that do not fit each other": TRAIN + " --stage rv --model.range_net.widths [16,16]",
     "unknown sensor": "simulate {out} --sensor eye",
+    "nothing to time": "bench --weights {w}/w.safetensors --scan {w}/lone.bin --runs 0",
+    "no head to time": "bench --weights {w}/headless.safetensors --scan {w}/lone.bin",
     "no scans": "simulate {out} --scans 0",
 }
 
@@ -284,3 +286,12 @@ def test_info_says_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None
     assert main(["info"]) == 0
     shown = capsys.readouterr().out
     assert all(word in shown for word in ("torch", "lightning", "semantickitti-compact", "cpu"))
+
+
+# ---- bench
+
+
+def test_bench_times_every_stage(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "--weights", f"{world}/w.safetensors", "--scan", f"{world}/lone.bin", "--runs", "1"]) == 0
+    shown = capsys.readouterr().out
+    assert all(stage in shown for stage in ("300 points", "read", "RV", "BEV", "neighbours", "head", "fusion"))

@@ -2,6 +2,7 @@
 
 import hashlib
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,9 @@ import pytest
 
 from amvnet.errors import InputError
 from amvnet.simulation import SENSORS, Drive, drive_street, simulate
+from amvnet.simulation.lidar import RayScene, receive, trace
+from amvnet.simulation.materials import Label, Surface
+from amvnet.simulation.mesh import part
 
 RAW_IDS = {10, 11, 13, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 52, 60, 70, 71, 72, 80, 81, 99}
 MOVING_IDS = {252, 253, 254, 255, 257, 258, 259}
@@ -89,6 +93,34 @@ def test_values_are_in_range(scans):
         assert distance.max() < HDL64E.max_range + 0.1
 
 
+def test_the_own_car_hides_what_is_behind_its_parts(scans):
+    x, y, z = scans[0].points[:, :3].T
+    azimuth, elevation = np.degrees(np.arctan2(y, x)), np.degrees(np.arctan2(z, np.hypot(x, y)))
+    behind = np.abs(azimuth) > 170
+    assert elevation[behind].min() > -18.5
+    assert elevation[~behind].min() < -23
+
+
+def test_some_returns_at_edges_lie_in_between():
+    scene = RayScene(_wall_in_front_of_a_wall())
+    sensor = replace(HDL64E, range_noise=0.0, drop=0.0)
+    found = []
+    for mixed in (0.0, 0.5):
+        device = replace(sensor, mixed=mixed)
+        hits = trace([scene], device, np.eye(4), lambda x, y: np.zeros(len(x), dtype=np.uint16))
+        points, _ = receive(hits, device, np.random.default_rng(0))
+        found.append(np.count_nonzero((points[:, 0] > 10.05) & (points[:, 0] < 11.95)))
+    assert found[0] == 0
+    assert found[1] > 10
+
+
+def _wall_in_front_of_a_wall():
+    """A wall at x = 10 to the left of the sensor's axis, one at x = 12 behind it."""
+    near = np.array([[[10, 0, -5], [10, 9, -5], [10, 9, 5]], [[10, 0, -5], [10, 9, 5], [10, 0, 5]]])
+    far = np.array([[[12, -9, -5], [12, 9, -5], [12, 9, 5]], [[12, -9, -5], [12, 9, 5], [12, -9, 5]]])
+    return part(np.concatenate([near, far]), Surface.PLASTER, Label.BUILDING)
+
+
 def test_raw_ids_are_official_and_many(scans):
     seen = set(np.unique(np.concatenate([scan.labels for scan in scans]) & 0xFFFF).tolist())
     assert seen <= RAW_IDS | MOVING_IDS
@@ -108,7 +140,8 @@ def test_only_things_have_instances_and_each_has_one_class(scans):
 def test_a_car_is_as_small_as_a_car(scans):
     for scan in scans:
         for one in np.unique(scan.labels[np.isin(scan.labels & 0xFFFF, [10, 252])]):
-            extent = np.ptp(scan.points[scan.labels == one, :3], axis=0)
+            # Without the few returns that mix with what is behind.
+            extent = np.ptp(np.quantile(scan.points[scan.labels == one, :3], (0.04, 0.96), axis=0), axis=0)
             assert np.linalg.norm(extent[:2]) < 6.5
             assert extent[2] < 2.5
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from statistics import median
 
 import torch
 
+from amvnet.errors import InputError
 from amvnet.models.amvnet import merge
 from amvnet.models.point_head import head_features, nearest_neighbours
 from amvnet.scan import Scan
@@ -19,14 +21,32 @@ STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merg
 FUSION = ("compare", "neighbours", "head", "merge")
 
 
-def time_stages(segmenter: Segmenter, read: Callable[[], Scan], runs: int = 10) -> dict[str, float]:
-    """Median seconds of each stage for one scan, after two runs that only warm up."""
+@dataclass(frozen=True)
+class Timing:
+    """Median seconds of each stage for one scan, how many points it has, and how many of them are uncertain."""
+
+    seconds: dict[str, float]
+    points: int
+    uncertain: int
+
+
+def time_stages(segmenter: Segmenter, read: Callable[[], Scan], runs: int = 10) -> Timing:
+    """Time the stages for one scan, after two runs that only warm up.
+
+    Raises:
+        InputError: where there is no run to time, or the weights have no point head.
+    """
+    if runs < 1:
+        raise InputError(f"expected one run or more, found {runs}; give a number from 1")
+    if segmenter.method != "amvnet":
+        raise InputError(f"expected the whole of AMVNet to time, found the method {segmenter.method}; use amvnet")
     timed = [_run(segmenter, read) for _ in range(runs + 2)][2:]
-    return {stage: median(run[stage] for run in timed) for stage in STAGES}
+    seconds = {stage: median(run.seconds[stage] for run in timed) for stage in STAGES}
+    return Timing(seconds, timed[0].points, timed[0].uncertain)
 
 
 @torch.inference_mode()
-def _run(segmenter: Segmenter, read: Callable[[], Scan]) -> dict[str, float]:
+def _run(segmenter: Segmenter, read: Callable[[], Scan]) -> Timing:
     """The steps of `AMVNet.forward`, each with a clock beside it."""
     model, device = segmenter.model, segmenter.device
     head = model.point_head
@@ -50,7 +70,7 @@ def _run(segmenter: Segmenter, read: Callable[[], Scan]) -> dict[str, float]:
         h = head(*head_features(head.config, batch.points, f, g, index, near)).softmax(dim=1)
     with clock("merge"):
         merge(f, g, uncertain, h).argmax(dim=1).cpu()
-    return clock.seconds
+    return Timing(clock.seconds, len(f), len(index))
 
 
 class _Clock:

@@ -237,8 +237,7 @@ def bench(weights: str = WEIGHTS, scan: Path | None = None, runs: int = 10, devi
         if scan is None:
             write(Path(folder), scans=1)
         path = scan or Path(folder) / "sequences/00/velodyne/000000.bin"
-        points = read_scan(path)
-        console.print(timing_table(time_stages(segmenter, lambda: read_scan(path), runs), len(points)))
+        console.print(timing_table(time_stages(segmenter, lambda: read_scan(path), runs)))
 
 
 def show_evaluation(evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from amvnet.bench import FUSION
+from amvnet.bench import FUSION, Timing
 from amvnet.data.labels import Taxonomy
 from amvnet.recipes import recipe_names
 from amvnet.weights import Weights, built_in
@@ -74,10 +74,11 @@ def weights_table(weights: Weights, name: str) -> Table:
     return table
 
 
-def timing_table(seconds: Mapping[str, float], points: int) -> Table:
+def timing_table(timing: Timing) -> Table:
     """Time per stage of one scan, in all, and the fusion's share of it."""
-    total = sum(seconds.values())
-    table = Table(title=f"{points:,} points", show_edge=False)
+    seconds, total = timing.seconds, sum(timing.seconds.values())
+    share = f"{timing.uncertain / timing.points:.1%} of them uncertain"
+    table = Table(title=f"{timing.points:,} points, {share}", show_edge=False)
     for title in ("stage", "ms", "share"):
         table.add_column(title, justify="left" if title == "stage" else "right")
     for stage, value in seconds.items():

@@ -13,6 +13,8 @@ from amvnet.errors import InputError
 from amvnet.simulation.materials import ground_surface_table, reflection_table
 from amvnet.simulation.mesh import Mesh
 
+MIXED_FROM, MIXED_TO = 0.3, 3.0  # metres: steps in depth within which one pulse gives one return in between
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -33,21 +35,102 @@ class Sensor:
     drop: float
     # Range in metres at which half the returns of a white, head-on surface are lost.
     reach: float
-    # The own car as a box in the sensor's frame: (lower corner, upper corner); rays through it are lost.
-    car: tuple[tuple[float, float, float], tuple[float, float, float]]
+    # Share of the returns at an edge in depth that lie somewhere between the two surfaces.
+    mixed: float
+    # What the own car and its racks hide: azimuth from and to, elevation from and to, in degrees.
+    shadow: tuple[tuple[float, float, float, float], ...]
 
 
-# Upper block from +2 degrees in steps of a third, lower block from -8.83 in steps of a half.
+# The elevations are medians over points of KITTI's scans, laser by laser; so are the places that its car hides.
 HDL64E = Sensor(
-    elevations=tuple(2.0 - i / 3 for i in range(32)) + tuple(-8.83 - i * 0.515 for i in range(32)),
-    azimuth_steps=2083,
+    elevations=(
+        2.59,
+        2.20,
+        1.96,
+        1.51,
+        1.22,
+        0.81,
+        0.54,
+        0.17,
+        -0.18,
+        -0.59,
+        -0.89,
+        -1.23,
+        -1.58,
+        -1.89,
+        -2.17,
+        -2.52,
+        -2.84,
+        -3.25,
+        -3.51,
+        -3.92,
+        -4.22,
+        -4.56,
+        -4.89,
+        -5.18,
+        -5.54,
+        -5.85,
+        -6.14,
+        -6.41,
+        -6.77,
+        -7.14,
+        -7.38,
+        -7.76,
+        -8.38,
+        -8.90,
+        -9.35,
+        -9.74,
+        -10.20,
+        -10.80,
+        -11.30,
+        -11.72,
+        -12.17,
+        -12.60,
+        -13.12,
+        -13.64,
+        -14.21,
+        -14.64,
+        -15.14,
+        -15.51,
+        -16.13,
+        -16.66,
+        -17.21,
+        -17.67,
+        -18.16,
+        -18.58,
+        -19.01,
+        -19.58,
+        -20.07,
+        -20.71,
+        -21.17,
+        -21.59,
+        -22.01,
+        -22.67,
+        -23.13,
+        -23.64,
+    ),
+    azimuth_steps=2180,
     height=1.73,
     min_range=1.5,
     max_range=80.0,
     range_noise=0.015,
     drop=0.01,
     reach=560.0,
-    car=((-2.1, -0.45, -1.73), (1.9, 0.45, -0.82)),
+    mixed=0.06,
+    shadow=(
+        (-14, 14, -90, -20.9),
+        (14, 20, -90, -21.9),
+        (28, 32, -90, -22.9),
+        (132, 142, -90, -19.7),
+        (159, 167, -90, -13.0),
+        (196, 206, -90, -13.0),
+        (160, 208, -90, -18.1),
+        (150, 214, -90, -22.4),
+        (230, 240, -90, -19.7),
+        (284, 304, -22.9, -15.8),
+        (328, 332, -90, -21.9),
+        (336, 340, -90, -21.9),
+    ),
 )
 SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}
 
@@ -118,18 +201,19 @@ def fired(sensor: Sensor) -> np.ndarray:
     azimuth = (np.arange(sensor.azimuth_steps) + skew) * 2 * np.pi / sensor.azimuth_steps
     level = np.cos(elevation)
     rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1)
-    rays = rays.reshape(-1, 3)
-    rays = rays[~_through(rays, *sensor.car)].astype(np.float32)
+    rays = rays.reshape(-1, 3)[~_hidden(sensor)].astype(np.float32)
     rays.flags.writeable = False
     return rays
 
 
-def _through(rays: np.ndarray, low: Sequence[float], high: Sequence[float]) -> np.ndarray:
-    """True where a ray from the origin passes through a box."""
-    with np.errstate(divide="ignore"):
-        first, second = np.array(low) / rays, np.array(high) / rays
-    enter = np.minimum(first, second).max(axis=1)
-    return (np.maximum(first, second).min(axis=1) > enter) & (enter > 0)
+def _hidden(sensor: Sensor) -> np.ndarray:
+    """(R,) True where the own car stops a shot; laser by laser."""
+    elevation = np.array(sensor.elevations)[:, None]
+    azimuth = np.arange(sensor.azimuth_steps) * 360 / sensor.azimuth_steps
+    hidden = np.zeros((len(elevation), sensor.azimuth_steps), dtype=bool)
+    for start, end, low, high in sensor.shadow:
+        hidden |= ((azimuth - start) % 360 < end - start) & (elevation > low) & (elevation < high)
+    return hidden.ravel()
 
 
 GroundLabel = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -169,8 +253,8 @@ def receive(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> tuple[np.nd
     # The received power falls with the square of the range; the return is lost where it drowns in noise.
     reach = sensor.reach * np.sqrt(reflectivity * np.maximum(hits.cosine, 1e-3))
     kept = 1 / (1 + (hits.distance / reach) ** 6) * (1 - drop) * (1 - sensor.drop)
-    kept[(hits.distance < sensor.min_range) | (hits.distance > sensor.max_range)] = 0
-    distance = hits.distance + rng.normal(scale=sensor.range_noise, size=count)
+    distance = _mixed(hits, sensor, rng) + rng.normal(scale=sensor.range_noise, size=count)
+    kept[(distance < sensor.min_range) | (distance > sensor.max_range)] = 0
     # The device evens out range and incidence, but not wholly.
     shade = np.maximum(hits.cosine, 1e-3) ** 0.12 * (1 - 0.2 * hits.distance / sensor.max_range)
     intensity = reflectivity * shade * (1 + spread * rng.normal(size=count))
@@ -180,3 +264,11 @@ def receive(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> tuple[np.nd
     points = np.column_stack([hits.direction * distance[:, None], intensity])[back].astype(np.float32)
     label = hits.label[back].astype(np.uint32) | hits.instance[back].astype(np.uint32) << np.uint32(16)
     return points, label
+
+
+def _mixed(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
+    """(N,) distances, of which some at edges lie between both surfaces: a beam is as wide as the step to the next."""
+    step = np.diff(hits.distance, append=hits.distance[-1:])
+    neighbours = (hits.direction * np.roll(hits.direction, -1, axis=0)).sum(axis=1) > np.cos(np.radians(0.5))
+    edge = neighbours & (np.abs(step) > MIXED_FROM) & (np.abs(step) < MIXED_TO) & (rng.random(len(step)) < sensor.mixed)
+    return hits.distance + np.where(edge, rng.random(len(step)) * step, 0)

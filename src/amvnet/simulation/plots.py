@@ -41,7 +41,7 @@ def _house(site: Site, side: int, x: float, width: float) -> None:
     if rng.random() < 0.5:
         site.put(fixtures.steps(rng), middle, side * (front + setback), 0.0 if side > 0 else np.pi)
     _bushes(site, side, x, width, rng.poisson(4.5 * style.green), setback)
-    for _ in range(rng.poisson(0.9 * style.green)):
+    for _ in range(rng.poisson(0.6 * style.green)):
         spot = side * (front + rng.uniform(1, setback + 1))
         site.put(any_tree(rng, rng.uniform(3, 8)), x + rng.uniform(0, width), spot)
     if rng.random() < 0.45 * style.green:
@@ -52,7 +52,7 @@ def _house(site: Site, side: int, x: float, width: float) -> None:
 def _drive(site: Site, side: int, x: float, depth: float) -> None:
     """A paved way to a garage, with a car on it now and then."""
     rng, front = site.rng, site.ground.front(side)
-    label = Label.PARKING if rng.random() < 0.5 else Label.SIDEWALK
+    label = Label.PARKING if rng.random() < 0.3 else Label.SIDEWALK
     near, far = sorted((side * front, side * (front + depth)))
     site.ground.patches.append(Patch((x, x + 3.0), (near, far), label))
     if rng.random() < 0.4:
@@ -64,7 +64,7 @@ def _drive(site: Site, side: int, x: float, depth: float) -> None:
 def _boundary(site: Site, side: int, x: float, width: float, gap: float) -> None:
     """A hedge, wall or fence along a plot's front, open at its drive."""
     rng, offset = site.rng, site.ground.front(side) + 0.5
-    kind, height, length = rng.choice(4, p=[0.6, 0.12, 0.14, 0.14]), rng.uniform(0.7, 1.9), 2.5
+    kind, height, length = rng.choice(4, p=[0.40, 0.16, 0.26, 0.18]), rng.uniform(0.7, 1.9), 2.5
     for spot in np.arange(x + length / 2, x + width, length):
         if gap - length / 2 < spot < gap + 3.0 + length / 2:
             continue
@@ -107,11 +107,11 @@ def _row(site: Site, side: int, x: float, width: float) -> None:
 def _wood(site: Site, side: int, x: float, width: float) -> None:
     """Trees and undergrowth, denser or lighter."""
     rng, front = site.rng, site.ground.front(side)
-    deep, density = rng.uniform(12, 28), rng.uniform(0.006, 0.025)
+    deep, density = rng.uniform(12, 28), rng.uniform(0.006, 0.022)
     for _ in range(rng.poisson(density * width * deep)):
         site.put(any_tree(rng, rng.uniform(4, 13)), x + rng.uniform(0, width), side * (front + rng.uniform(1.5, deep)))
     _bushes(site, side, x, width, rng.poisson(density * width * 14), deep)
-    if rng.random() < 0.8:
+    if rng.random() < 0.9:
         thickets(site, side, x, width, front + rng.uniform(1.5, 7))
     if rng.random() < 0.5:
         for spot in np.arange(x, x + width, 3.0):
@@ -131,7 +131,7 @@ def thickets(site: Site, side: int, x: float, width: float, t: float) -> None:
 def _field(site: Site, side: int, x: float, width: float) -> None:
     """Open ground: a meadow or gravel, perhaps fenced, a few bushes and a barn."""
     rng, front = site.rng, site.ground.front(side)
-    if rng.random() < 0.2:
+    if rng.random() < 0.35:
         near, far = sorted((side * (front + 1), side * (front + rng.uniform(6, 25))))
         site.ground.patches.append(Patch((x, x + width), (near, far), Label.OTHER_GROUND))
     if rng.random() < site.ground.style.fenced * 0.6:

@@ -52,7 +52,7 @@ def _roadside(site: Site, side: int) -> None:
     if np.isfinite(style.trees):
         for spot in np.arange(rng.uniform(0, style.trees), ground.length, style.trees):
             site.put(any_tree(rng, rng.uniform(4, 9)), spot + rng.normal(), back, margin=2.0)
-    makers = ((fixtures.sign, 3.0), (fixtures.post, 0.8), (fixtures.clutter, 1.6), (fixtures.shelter, 0.15))
+    makers = ((fixtures.sign, 3.0), (fixtures.post, 0.5), (fixtures.clutter, 1.6), (fixtures.shelter, 0.15))
     for make, per_100 in makers:
         for _ in range(rng.poisson(per_100 * ground.length / 100)):
             site.put(make(rng), rng.uniform(0, ground.length), kerb if make is fixtures.sign else back, turn)
