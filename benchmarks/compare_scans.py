@@ -15,8 +15,8 @@ from rich.table import Table
 from amvnet.data.catalog import open_dataset
 from amvnet.data.labels import Taxonomy
 
-RANGES = (0, 5, 10, 15, 20, 30, 40, 50, 80)  # metres
-ELEVATIONS = np.arange(-26, 4, 2)  # degrees
+RANGES = (0, 1, 5, 10, 15, 20, 30, 40, 50, 80)  # metres
+ELEVATIONS = np.arange(-32, 14, 2)  # degrees
 
 
 @dataclass
@@ -32,23 +32,22 @@ class Figures:
 
 
 def measure(spec: str) -> Figures:
-    """Read every labelled scan once."""
+    """Read every scan once; the points of one without labels count as unlabelled."""
     dataset = open_dataset(spec)
     rng = np.random.default_rng(0)
     found = Figures(dataset.taxonomy)
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record)
-        if scan.labels is None:
-            continue
+        ids = np.zeros(len(scan), dtype=np.uint8) if scan.labels is None else scan.labels
         xyz, count = scan.points[:, :3], len(scan)
         distance = np.linalg.norm(xyz, axis=1)
         elevation = np.degrees(np.arctan2(xyz[:, 2], np.linalg.norm(xyz[:, :2], axis=1)))
         found.points.append(count)
         found.ranges.append(np.histogram(distance, RANGES)[0] / count)
         found.elevations.append(np.histogram(elevation, ELEVATIONS)[0] / count)
-        found.shares.append(np.bincount(scan.labels, minlength=dataset.taxonomy.size + 1) / count)
+        found.shares.append(np.bincount(ids, minlength=dataset.taxonomy.size + 1) / count)
         some = rng.choice(count, min(count, 20_000), replace=False)
-        columns = (scan.labels[some], scan.points[some, 3], scan.points[some, 2], distance[some])
+        columns = (ids[some], scan.points[some, 3], scan.points[some, 2], distance[some])
         found.values.append(np.column_stack(columns).astype(np.float32))
     return found
 

@@ -10,6 +10,7 @@ import pytest
 
 from amvnet.errors import InputError
 from amvnet.simulation import SENSORS, Drive, drive_street, simulate
+from amvnet.simulation.layouts import semantickitti_ids
 from amvnet.simulation.lidar import RayScene, receive, trace
 from amvnet.simulation.materials import Label, Surface
 from amvnet.simulation.mesh import part
@@ -108,7 +109,7 @@ def test_some_returns_at_edges_lie_in_between():
     for mixed in (0.0, 0.5):
         device = replace(sensor, mixed=mixed)
         hits = trace([scene], device, np.eye(4), lambda x, y: np.zeros(len(x), dtype=np.uint16))
-        points, _ = receive(hits, device, np.random.default_rng(0))
+        points, _, _ = receive(hits, device, np.random.default_rng(0))
         found.append(np.count_nonzero((points[:, 0] > 10.05) & (points[:, 0] < 11.95)))
     assert found[0] == 0
     assert found[1] > 10
@@ -122,7 +123,8 @@ def _wall_in_front_of_a_wall():
 
 
 def test_raw_ids_are_official_and_many(scans):
-    seen = set(np.unique(np.concatenate([scan.labels for scan in scans]) & 0xFFFF).tolist())
+    raw = semantickitti_ids(np.concatenate([scan.labels for scan in scans]))
+    seen = set(np.unique(raw & 0xFFFF).tolist())
     assert seen <= RAW_IDS | MOVING_IDS
     assert seen & MOVING_IDS
     assert {10, 40, 48, 50, 51, 70, 71, 72, 80, 81} <= seen
@@ -131,7 +133,7 @@ def test_raw_ids_are_official_and_many(scans):
 def test_only_things_have_instances_and_each_has_one_class(scans):
     things = {10, 11, 13, 15, 18, 20, 30, 31, 32} | MOVING_IDS
     for scan in scans:
-        label, instance = scan.labels & 0xFFFF, scan.labels >> 16
+        label, instance = semantickitti_ids(scan.labels) & 0xFFFF, scan.labels >> 16
         assert np.array_equal(instance > 0, np.isin(label, list(things)))
         pairs = np.unique(scan.labels[instance > 0])
         assert len(np.unique(pairs >> 16)) == len(pairs)
@@ -182,11 +184,12 @@ def test_flat_ground_has_the_ranges_of_the_textbook():
     pose = np.eye(4)
     pose[:3, 3] = (3.0, -2.0, HDL64E.height)
     hits = trace([RayScene(part(corners, Surface.GRASS, 0))], HDL64E, pose, lambda x, y: np.full(len(x), Label.ROAD))
-    points, labels = receive(hits, HDL64E, np.random.default_rng(0))
+    points, labels, ring = receive(hits, HDL64E, np.random.default_rng(0))
     assert (labels == Label.ROAD).all()
     distance = np.linalg.norm(points[:, :3].astype(float), axis=1)
     beams = np.array(HDL64E.elevations)
     elevation = beams[np.abs(np.degrees(np.arcsin(points[:, 2] / distance))[:, None] - beams).argmin(axis=1)]
+    assert np.array_equal(elevation, beams[::-1][ring])
     error = distance - HDL64E.height / np.sin(np.radians(-elevation))
     assert abs(error.mean()) < 0.001
     assert error.std() == pytest.approx(HDL64E.range_noise, rel=0.05)

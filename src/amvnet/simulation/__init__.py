@@ -1,6 +1,8 @@
 """Simulated LiDAR scans of procedural streets, labelled without a mistake."""
 
-from amvnet.simulation.drive import Drive, SimulatedScan, drive_street, simulate, simulate_scan
-from amvnet.simulation.lidar import SENSORS, Sensor
+from amvnet.simulation.drive import Drive, drive_street
+from amvnet.simulation.layouts import SimulatedScan
+from amvnet.simulation.sensors import SENSORS, Sensor
+from amvnet.simulation.writing import simulate, simulate_scan
 
 __all__ = ["SENSORS", "Drive", "Sensor", "SimulatedScan", "drive_street", "simulate", "simulate_scan"]

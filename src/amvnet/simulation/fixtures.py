@@ -101,6 +101,20 @@ def guard_rail(length: float) -> Mesh:
     return part(np.concatenate([beam, box((0.12, 0.12, 0.7), (0, 0.08, 0))]), Surface.METAL, Label.FENCE)
 
 
+def barrier(length: float) -> Mesh:
+    """A segment of the concrete wall that closes off a work zone."""
+    half = [(-0.3, 0), (0.3, 0), (0.3, 0.08), (0.12, 0.35), (0.08, 0.8), (-0.08, 0.8), (-0.12, 0.35), (-0.3, 0.08)]
+    across = prism(half, length)[..., [1, 0, 2]]  # its side view is across the street
+    return part(across, Surface.PLASTER, Label.BARRIER)
+
+
+def traffic_cone(rng: np.random.Generator) -> Mesh:
+    """A cone on its foot."""
+    height = rng.uniform(0.5, 0.9)
+    cone = np.concatenate([box((0.36, 0.36, 0.04)), tube((0, 0, 0.04), (0, 0, height), 0.15, 0.03)])
+    return part(cone, Surface.SIGN_FACE, Label.TRAFFIC_CONE)
+
+
 def hedge(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """A clipped hedge: a twiggy core in leaves."""
     depth = rng.uniform(0.5, 1.0)

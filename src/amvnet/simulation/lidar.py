@@ -12,127 +12,9 @@ import numpy as np
 from amvnet.errors import InputError
 from amvnet.simulation.materials import ground_surface_table, reflection_table
 from amvnet.simulation.mesh import Mesh
+from amvnet.simulation.sensors import Sensor
 
 MIXED_FROM, MIXED_TO = 0.3, 3.0  # metres: steps in depth within which one pulse gives one return in between
-
-
-@dataclass(frozen=True)
-class Sensor:
-    """A LiDAR as a table of numbers."""
-
-    # Elevation of each laser in degrees, from the top down: the order in which points are written.
-    elevations: tuple[float, ...]
-    # Shots of each laser per turn.
-    azimuth_steps: int
-    # Height above the ground in metres.
-    height: float
-    # Nearest and farthest range that is measured, in metres.
-    min_range: float
-    max_range: float
-    # Standard deviation of the range in metres.
-    range_noise: float
-    # Share of the returns that are lost whatever they hit.
-    drop: float
-    # Range in metres at which half the returns of a white, head-on surface are lost.
-    reach: float
-    # Share of the returns at an edge in depth that lie somewhere between the two surfaces.
-    mixed: float
-    # What the own car and its racks hide: azimuth from and to, elevation from and to, in degrees.
-    shadow: tuple[tuple[float, float, float, float], ...]
-
-
-# The elevations are medians over points of KITTI's scans, laser by laser; so are the places that its car hides.
-HDL64E = Sensor(
-    elevations=(
-        2.59,
-        2.20,
-        1.96,
-        1.51,
-        1.22,
-        0.81,
-        0.54,
-        0.17,
-        -0.18,
-        -0.59,
-        -0.89,
-        -1.23,
-        -1.58,
-        -1.89,
-        -2.17,
-        -2.52,
-        -2.84,
-        -3.25,
-        -3.51,
-        -3.92,
-        -4.22,
-        -4.56,
-        -4.89,
-        -5.18,
-        -5.54,
-        -5.85,
-        -6.14,
-        -6.41,
-        -6.77,
-        -7.14,
-        -7.38,
-        -7.76,
-        -8.38,
-        -8.90,
-        -9.35,
-        -9.74,
-        -10.20,
-        -10.80,
-        -11.30,
-        -11.72,
-        -12.17,
-        -12.60,
-        -13.12,
-        -13.64,
-        -14.21,
-        -14.64,
-        -15.14,
-        -15.51,
-        -16.13,
-        -16.66,
-        -17.21,
-        -17.67,
-        -18.16,
-        -18.58,
-        -19.01,
-        -19.58,
-        -20.07,
-        -20.71,
-        -21.17,
-        -21.59,
-        -22.01,
-        -22.67,
-        -23.13,
-        -23.64,
-    ),
-    azimuth_steps=2180,
-    height=1.73,
-    min_range=1.5,
-    max_range=80.0,
-    range_noise=0.015,
-    drop=0.01,
-    reach=560.0,
-    mixed=0.06,
-    shadow=(
-        (-14, 14, -90, -20.9),
-        (14, 20, -90, -21.9),
-        (28, 32, -90, -22.9),
-        (132, 142, -90, -19.7),
-        (159, 167, -90, -13.0),
-        (196, 206, -90, -13.0),
-        (160, 208, -90, -18.1),
-        (150, 214, -90, -22.4),
-        (230, 240, -90, -19.7),
-        (284, 304, -22.9, -15.8),
-        (328, 332, -90, -21.9),
-        (336, 340, -90, -21.9),
-    ),
-)
-SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}
 
 
 def require_embree() -> tuple[ModuleType, ModuleType]:
@@ -180,8 +62,10 @@ class Hits:
         distance: (N,) metres.
         cosine: (N,) of the angle between ray and surface normal.
         surface: (N,) rows of the reflection table.
-        label: (N,) raw class ids.
+        label: (N,) class ids.
         instance: (N,) instance ids.
+        ring: (N,) index of the laser, 0 = lowest.
+        shots: number of shots of the turn.
     """
 
     direction: np.ndarray
@@ -190,20 +74,29 @@ class Hits:
     surface: np.ndarray
     label: np.ndarray
     instance: np.ndarray
+    ring: np.ndarray
+    shots: int
 
 
 @lru_cache(maxsize=4)
-def fired(sensor: Sensor) -> np.ndarray:
-    """Directions of all shots that the own car lets out, laser by laser from the top, azimuth from +x. (R, 3)."""
+def fired(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of all shots that the own car lets out, laser by laser from the top, azimuth from +x, and rings.
+
+    Returns:
+        (R, 3) float32 and (R,) uint8, 0 = lowest.
+    """
     elevation = np.radians(np.array(sensor.elevations))[:, None]
     # The lasers of a real device do not sit on one line: each is turned by a little of its own.
     skew = ((np.arange(len(elevation)) * 0.618) % 1.0)[:, None]
     azimuth = (np.arange(sensor.azimuth_steps) + skew) * 2 * np.pi / sensor.azimuth_steps
     level = np.cos(elevation)
     rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1)
-    rays = rays.reshape(-1, 3)[~_hidden(sensor)].astype(np.float32)
-    rays.flags.writeable = False
-    return rays
+    free = ~_hidden(sensor)
+    rays = rays.reshape(-1, 3)[free].astype(np.float32)
+    ring = np.repeat(np.arange(len(sensor.elevations), dtype=np.uint8)[::-1], sensor.azimuth_steps)[free]
+    for array in (rays, ring):
+        array.flags.writeable = False
+    return rays, ring
 
 
 def _hidden(sensor: Sensor) -> np.ndarray:
@@ -221,7 +114,7 @@ GroundLabel = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 def trace(scenes: Sequence[RayScene], sensor: Sensor, pose: np.ndarray, ground_label: GroundLabel) -> Hits:
     """What each shot hits first; pose (4, 4) maps the sensor's frame to the street's."""
-    rays = fired(sensor)
+    rays, ring = fired(sensor)
     turned = (rays @ pose[:3, :3].T.astype(np.float32)).astype(np.float32)
     distance = np.full(len(rays), np.inf)
     cosine, surface = np.zeros(len(rays)), np.zeros(len(rays), dtype=np.uint8)
@@ -239,14 +132,16 @@ def trace(scenes: Sequence[RayScene], sensor: Sensor, pose: np.ndarray, ground_l
     spot = pose[:2, 3] + turned[ground, :2] * distance[ground, None]
     label[ground] = ground_label(spot[:, 0], spot[:, 1])
     surface[ground] = ground_surface_table()[label[ground]]
-    return Hits(rays[seen], distance[seen], cosine[seen], surface[seen], label[seen], instance[seen])
+    shots = len(sensor.elevations) * sensor.azimuth_steps
+    return Hits(rays[seen], distance[seen], cosine[seen], surface[seen], label[seen], instance[seen], ring[seen], shots)
 
 
-def receive(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def receive(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The points and labels that come back from the hits: noise, brightness, lost returns.
 
     Returns:
-        (N, 4) float32 x, y, z, intensity and (N,) uint32 raw labels with the instance in the upper half.
+        (N, 4) float32 x, y, z, intensity, (N,) uint32 class ids with the instance in the upper half, and (N,)
+        uint8 rings.
     """
     reflectivity, spread, dark, drop = reflection_table()[hits.surface].T
     count = len(hits.distance)
@@ -259,11 +154,29 @@ def receive(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> tuple[np.nd
     shade = np.maximum(hits.cosine, 1e-3) ** 0.12 * (1 - 0.2 * hits.distance / sensor.max_range)
     intensity = reflectivity * shade * (1 + spread * rng.normal(size=count))
     intensity[rng.random(count) < dark] = 0
-    intensity = np.round(np.clip(intensity, 0, 0.99), 2)
+    intensity = np.clip(np.round(sensor.gain * intensity, 2 if sensor.gain == 1 else 3), 0, 0.99)
     back = rng.random(count) < kept
     points = np.column_stack([hits.direction * distance[:, None], intensity])[back].astype(np.float32)
     label = hits.label[back].astype(np.uint32) | hits.instance[back].astype(np.uint32) << np.uint32(16)
-    return points, label
+    if not sensor.keeps_lost:
+        return points, label, hits.ring[back]
+    lost, rings = _lost(hits, sensor, hits.ring[back], rng)
+    zeros = np.zeros(len(lost), dtype=np.uint32)
+    return np.concatenate([points, lost]), np.concatenate([label, zeros]), np.concatenate([hits.ring[back], rings])
+
+
+def _lost(hits: Hits, sensor: Sensor, back: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that nuScenes has for shots without a return: near the sensor, most of them behind its right side."""
+    missing = sensor.azimuth_steps - np.bincount(back, minlength=len(sensor.elevations))
+    ring = np.repeat(np.arange(len(missing), dtype=np.uint8), missing)
+    one_side = rng.random(len(ring)) < 0.65
+    azimuth = np.where(one_side, rng.normal(np.radians(165), 0.15, len(ring)), rng.uniform(-np.pi, np.pi, len(ring)))
+    distance = np.minimum(rng.exponential(0.25, len(ring)), 0.99)
+    elevation = rng.normal(-0.3, 0.3, len(ring))
+    level = np.cos(elevation)
+    direction = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
+    bright = np.where(rng.random(len(ring)) < 0.1, 0.2, 0.008)
+    return np.column_stack([distance[:, None] * direction, bright]).astype(np.float32), ring
 
 
 def _mixed(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Label(IntEnum):
-    """Raw SemanticKITTI ids of what stands in a simulated street."""
+    """What stands in a simulated street: raw SemanticKITTI ids, and from 300 on what only nuScenes tells apart."""
 
     CAR = 10
     BICYCLE = 11
@@ -34,6 +34,10 @@ class Label(IntEnum):
     POLE = 80
     TRAFFIC_SIGN = 81
     OTHER_OBJECT = 99
+    BARRIER = 300
+    TRAFFIC_CONE = 301
+    CONSTRUCTION_VEHICLE = 302
+    TRAILER = 303
 
 
 # The id of the same thing while it moves.
@@ -45,6 +49,45 @@ MOVING = {
     Label.BUS: 257,
     Label.TRUCK: 258,
     Label.OTHER_VEHICLE: 259,
+}
+
+# The raw SemanticKITTI ids of what only nuScenes tells apart.
+SEMANTICKITTI_IDS = {
+    Label.BARRIER: Label.OTHER_STRUCTURE,
+    Label.TRAFFIC_CONE: Label.OTHER_OBJECT,
+    Label.CONSTRUCTION_VEHICLE: Label.OTHER_VEHICLE,
+    Label.TRAILER: Label.OTHER_VEHICLE,
+}
+
+# The category of nuScenes-lidarseg of everything.
+NUSCENES_CATEGORIES = {
+    Label.CAR: "vehicle.car",
+    Label.BICYCLE: "vehicle.bicycle",
+    Label.BUS: "vehicle.bus.rigid",
+    Label.MOTORCYCLE: "vehicle.motorcycle",
+    Label.TRUCK: "vehicle.truck",
+    Label.OTHER_VEHICLE: "vehicle.trailer",
+    Label.PERSON: "human.pedestrian.adult",
+    Label.BICYCLIST: "vehicle.bicycle",  # nuScenes counts riders with what they ride
+    Label.MOTORCYCLIST: "vehicle.motorcycle",
+    Label.ROAD: "flat.driveable_surface",
+    Label.PARKING: "flat.driveable_surface",
+    Label.SIDEWALK: "flat.sidewalk",
+    Label.OTHER_GROUND: "flat.other",
+    Label.BUILDING: "static.manmade",
+    Label.FENCE: "static.manmade",
+    Label.OTHER_STRUCTURE: "static.manmade",
+    Label.LANE_MARKING: "flat.driveable_surface",
+    Label.VEGETATION: "static.vegetation",
+    Label.TRUNK: "static.vegetation",
+    Label.TERRAIN: "flat.terrain",
+    Label.POLE: "static.manmade",
+    Label.TRAFFIC_SIGN: "static.manmade",
+    Label.OTHER_OBJECT: "static.other",
+    Label.BARRIER: "movable_object.barrier",
+    Label.TRAFFIC_CONE: "movable_object.trafficcone",
+    Label.CONSTRUCTION_VEHICLE: "vehicle.construction",
+    Label.TRAILER: "vehicle.trailer",
 }
 
 

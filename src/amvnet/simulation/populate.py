@@ -9,6 +9,8 @@ from amvnet.simulation.plots import any_tree, fill_plots, thickets
 from amvnet.simulation.site import Site
 from amvnet.simulation.streets import Ground
 
+WORKS_PER_100 = 0.25  # work zones per 100 m of street
+
 
 def populate(ground: Ground, rng: np.random.Generator, ego_speed: float, ego_x: float) -> Site:
     """All that stands and moves in a street, kept clear of the sensor's own car, which is at `ego_x` at time 0."""
@@ -21,6 +23,7 @@ def populate(ground: Ground, rng: np.random.Generator, ego_speed: float, ego_x: 
     _side_roads(site)
     _traffic(site, ego_speed, ego_x)
     _people(site)
+    _works(site)
     return site
 
 
@@ -125,3 +128,17 @@ def _people(site: Site) -> None:
         side = int(rng.choice([-1, 1]))
         body = vehicles.bicycle(rng) if rng.random() < 0.7 else vehicles.motorcycle(rng)
         site.put(body, rng.uniform(0, ground.length), side * (ground.front(side) - 0.4), rng.normal(scale=0.2), True)
+
+
+def _works(site: Site) -> None:
+    """Work zones at the road's edge: a row of barriers or cones, and a digger behind it now and then."""
+    rng, ground, style = site.rng, site.ground, site.ground.style
+    for _ in range(rng.poisson(WORKS_PER_100 * ground.length / 100)):
+        side, start = int(rng.choice([-1, 1])), rng.uniform(0, ground.length)
+        edge = side * (style.road / 2 + style.parking[int(side > 0)] - 0.4)
+        barriers, length = rng.random() < 0.5, rng.uniform(8, 25)
+        for spot in np.arange(start, start + length, 2.05 if barriers else 3.0):
+            site.put(fixtures.barrier(2.0) if barriers else fixtures.traffic_cone(rng), spot, edge)
+        if rng.random() < 0.5:
+            middle = side * (ground.front(side) + 2.5)
+            site.put(vehicles.excavator(rng), start + length / 2, middle, rng.uniform(0, 6.3), True, margin=3.0)

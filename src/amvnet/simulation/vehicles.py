@@ -132,8 +132,21 @@ def trailer(rng: np.random.Generator) -> Mesh:
     length, height = rng.uniform(2.5, 5.5), rng.choice([0.6, 1.9])
     hull = box((length, 2.0, height), (0, 0, 0.5), (0.95, 0.97))
     bar = tube((length / 2, 0, 0.5), (length / 2 + 1.0, 0, 0.45), 0.06)
-    pieces = [part(np.concatenate([hull, bar]), Surface.LIGHT_PAINT, Label.OTHER_VEHICLE)]
-    return join(pieces + _wheels(Label.OTHER_VEHICLE, length, 2.0, 0.33, (-0.05,)))
+    pieces = [part(np.concatenate([hull, bar]), Surface.LIGHT_PAINT, Label.TRAILER)]
+    return join(pieces + _wheels(Label.TRAILER, length, 2.0, 0.33, (-0.05,)))
+
+
+def excavator(rng: np.random.Generator) -> Mesh:
+    """A digger on tracks, its arm raised or lowered."""
+    turn, reach = rng.uniform(-0.6, 0.6), rng.uniform(2.5, 4.0)
+    tracks = [box((3.4, 0.5, 0.8), (0, side * 1.1, 0)) for side in (-1, 1)]
+    elbow = (1.2 + reach * 0.5, turn * reach * 0.5, rng.uniform(2.8, 4.0))
+    hand = (1.2 + reach, turn * reach, rng.uniform(0.3, 1.5))
+    arm = [tube((0.9, 0.3, 1.4), elbow, 0.22), tube(elbow, hand, 0.16), box((0.7, 0.9, 0.5), (hand[0], hand[1], 0.2))]
+    solid = np.concatenate([*tracks, box((2.8, 2.3, 1.0), (-0.5, 0, 0.9)), *arm])
+    cab = box((1.4, 1.0, 1.5), (0.3, 0.6, 1.5), (0.9, 0.9))
+    pieces = [(solid, Surface.LIGHT_PAINT), (cab, Surface.GLASS)]
+    return join([part(triangles, surface, Label.CONSTRUCTION_VEHICLE) for triangles, surface in pieces])
 
 
 def _figure(rng: np.random.Generator, label: Label, hip: Vector, feet: tuple[Vector, Vector], lean: float) -> Mesh:
