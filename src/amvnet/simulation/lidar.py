@@ -172,7 +172,7 @@ def _lost(hits: Hits, sensor: Sensor, back: np.ndarray, rng: np.random.Generator
     one_side = rng.random(len(ring)) < 0.65
     azimuth = np.where(one_side, rng.normal(np.radians(165), 0.15, len(ring)), rng.uniform(-np.pi, np.pi, len(ring)))
     distance = np.minimum(rng.exponential(0.25, len(ring)), 0.99)
-    elevation = rng.normal(-0.3, 0.3, len(ring))
+    elevation = np.where(one_side, rng.normal(-0.04, 0.03, len(ring)), rng.normal(-0.3, 0.3, len(ring)))
     level = np.cos(elevation)
     direction = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
     bright = np.where(rng.random(len(ring)) < 0.1, 0.2, 0.008)
