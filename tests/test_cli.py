@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save(fresh_weights(), root / "w.safetensors")
     save(fresh_weights(NUSCENES), root / "nuscenes.safetensors")
     save(without(fresh_weights(), "point_head"), root / "headless.safetensors")
+    model = fresh_weights().model
+    loss = replace(model, assertion=replace(model.assertion, name="loss"))
+    save(replace(fresh_weights(), model=loss), root / "loss.safetensors")
     street(7, 300)[0].tofile(root / "lone.bin")
     (root / "empty.bin").write_bytes(b"")
     np.full((5, 4), np.nan, np.float32).tofile(root / "nan.bin")
@@ -103,6 +107,10 @@ MISTAKES = {
     "unknown accelerator": TRAIN + " --stage rv --training.accelerator abacus",
     "image without columns": TRAIN + " --stage rv --model.range_view.width 0",
     "sizes that do not fit each other": TRAIN + " --stage rv --model.range_net.widths [16,16]",
+    "run below a file": "train {w}/recipe.yaml --data {w}/data --stage rv --out {w}/w.safetensors/run",
+    "figures below a file": "evaluate {w}/data --weights {w}/w.safetensors --json {w}/lone.bin/m.json",
+    "assertion that needs labels": "predict {w}/lone.bin --weights {w}/loss.safetensors --out {out}",
+    "device without numbers": PREDICT + " --device meta",
     "unknown sensor": "simulate {out} --sensor eye",
     "nothing to time": "bench --weights {w}/w.safetensors --scan {w}/lone.bin --runs 0",
     "no head to time": "bench --weights {w}/headless.safetensors --scan {w}/lone.bin",

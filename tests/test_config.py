@@ -140,6 +140,11 @@ def test_a_users_file_overrides_just_what_it_states(tmp_path: Path, base: str) -
     assert isinstance(found["training.rv.lr"], float)
 
 
+@pytest.mark.parametrize(("text", "value"), [("2e-3", 2e-3), ("1E-4", 1e-4), ("5", 5.0)])
+def test_numbers_with_an_exponent_are_numbers(tmp_path: Path, text: str, value: float) -> None:
+    assert load_recipe(write(tmp_path, f"training: {{rv: {{lr: {text}}}}}")).training.rv.lr == value
+
+
 def test_a_users_file_without_a_base_builds_on_the_papers_sizes(tmp_path: Path) -> None:
     recipe = load_recipe(write(tmp_path, "training: {seed: 5}"))
     assert recipe == dataclasses.replace(Recipe(), training=dataclasses.replace(Recipe().training, seed=5))

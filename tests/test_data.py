@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from worlds import fails
 
-from amvnet.data.catalog import Dataset, open_dataset
+from amvnet.data.catalog import Dataset, is_dataset, open_dataset
 from amvnet.data.labels import SEMANTICKITTI, Taxonomy
 from amvnet.data.nuscenes import MINI_TRAIN, MINI_VAL, VAL
 
@@ -279,6 +279,14 @@ def test_nuscenes_official_splits_have_their_sizes() -> None:
     assert (len(VAL), len(MINI_VAL), len(MINI_TRAIN)) == (150, 2, 8)
     assert {"scene-0103", "scene-0916", "scene-0003", "scene-1073"} <= VAL
     assert not MINI_VAL & MINI_TRAIN
+
+
+def test_a_scan_below_a_folder_with_an_at_sign_is_a_scan(tmp_path: Path) -> None:
+    scan = tmp_path / "a@b" / "c.bin"
+    scan.parent.mkdir()
+    np.zeros((3, 4), np.float32).tofile(scan)
+    assert not is_dataset(str(scan))
+    assert is_dataset("nuscenes:somewhere@v1.0-mini")
 
 
 def test_catalog_names_what_it_looked_for(tmp_path: Path) -> None:

@@ -93,7 +93,7 @@ def test_files_appear_whole_or_not_at_all(tmp_path: Path) -> None:
     assert list(target.parent.iterdir()) == []
     write_labels(target, np.array([10, 259], dtype=np.uint32))
     assert np.fromfile(target, np.uint32).tolist() == [10, 259]
-    fails(lambda: write_labels(target / "b.label", np.zeros(1)), target / "b.label")
+    fails(lambda: write_labels(target / "b.label", np.zeros(1)), target, "folder")
     fails(lambda: write_labels(tmp_path, np.zeros(1)), tmp_path)
 
 

@@ -222,6 +222,13 @@ def test_dropblock_drops_its_share_and_keeps_the_mean(probability: float, size: 
     assert torch.equal(found[:, 0], found[:, 1])
 
 
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32])
+def test_dropblock_keeps_the_mean_of_a_large_map_in_any_precision(kind: torch.dtype) -> None:
+    torch.manual_seed(0)
+    dropped = DropBlock(0.3, 7).train()(torch.ones(1, 2, 480, 360, dtype=kind))
+    assert dropped.float().mean() == pytest.approx(1, abs=0.02)
+
+
 def test_dropblock_drops_squares() -> None:
     torch.manual_seed(0)
     dropped = (DropBlock(0.02, 5).train()(torch.ones(1, 1, 60, 60)) == 0)[0, 0]

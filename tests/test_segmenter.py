@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
-from worlds import THRESHOLD, fresh_weights, street, without
+from worlds import THRESHOLD, fails, fresh_weights, street, without
 
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
 from amvnet.data.labels import NUSCENES
 from amvnet.segmenter import METHODS
+from amvnet.weights import save
 
 K = 19
 POINTS = street(5, 600)[0]
@@ -76,7 +78,57 @@ def test_lost_points_stay_in_place_and_change_nothing(method: str) -> None:
     assert np.array_equal(with_lost.scores[~gone], without_lost.scores)
     assert np.array_equal(with_lost.uncertain[~gone], without_lost.uncertain)
     for values in (with_lost.labels, with_lost.uncertain, with_lost.scores, with_lost.rv, with_lost.bev):
-        assert not values[gone].any()
+        assert values is None or not values[gone].any()
+
+
+@pytest.mark.parametrize(("method", "asked"), [("rv", {"rv"}), ("bev", {"bev"}), ("ensemble", {"rv", "bev"})])
+def test_only_the_networks_that_were_asked_have_scores(method: str, asked: set[str]) -> None:
+    result = Segmenter(WEIGHTS, method=method)(POINTS)
+    assert {name for name in ("rv", "bev") if getattr(result, name) is not None} == asked
+
+
+@pytest.mark.parametrize("far", [1e20, 3e38, -1e30])
+def test_one_absurd_point_changes_nothing_for_the_others(
+    segmenter: Segmenter, result: Segmentation, far: float
+) -> None:
+    points = np.concatenate([POINTS, [[far, 1, 1, 0.5]]]).astype(np.float32)
+    found = segmenter(points)
+    assert np.array_equal(found.scores[:-1], result.scores)
+    assert found.labels[-1] == 0
+
+
+def test_models_that_are_sure_of_different_classes_do_not_fuse_to_a_third() -> None:
+    f, g = (np.eye(19, dtype=np.float32)[np.full(len(POINTS), c)] for c in (5, 8))
+    assert set(fuse(POINTS, f, g).tolist()) <= {6, 9}
+
+
+def test_scores_that_are_no_numbers_are_refused() -> None:
+    f = np.full((len(POINTS), 19), 1 / 19, np.float32)
+    fails(lambda: fuse(POINTS, f, np.full_like(f, np.nan)), "finite")
+
+
+def test_by_method_is_what_each_method_gives_alone(segmenter: Segmenter) -> None:
+    found, uncertain = segmenter.by_method(Scan(POINTS))
+    for method, labels in found.items():
+        assert np.array_equal(labels, Segmenter(WEIGHTS, method=method)(POINTS).labels)
+    assert np.array_equal(uncertain, segmenter(POINTS).uncertain)
+    assert set(found) == {"rv", "bev", "ensemble", "amvnet"}
+
+
+def test_weights_may_be_given_as_a_path(tmp_path: Path) -> None:
+    path = save(WEIGHTS, tmp_path / "w.safetensors")
+    assert np.array_equal(Segmenter(path)(POINTS).labels, Segmenter(str(path))(POINTS).labels)
+    f = np.full((len(POINTS), 19), 1 / 19, np.float32)
+    assert len(fuse(POINTS, f, f, head=path)) == len(POINTS)
+
+
+def test_fusing_leaves_the_callers_head_as_it_was() -> None:
+    head = WEIGHTS.build().point_head
+    assert head is not None
+    head.train()
+    f = np.full((len(POINTS), 19), 1 / 19, np.float32)
+    fuse(POINTS, f, f, head=head)
+    assert head.training
 
 
 def test_permuted_points_have_permuted_labels(segmenter: Segmenter, result: Segmentation) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -90,7 +91,7 @@ def test_the_weights_say_how_they_came_about(run: Path) -> None:
     for part in PARTS:
         said = weights.training[part]
         assert (said["sequences"], said["validated_on"], said["seed"]) == (["00", "01"], ["08"], 0)
-    assert weights.training["range_net"]["config"]["epochs"] == 3
+    assert weights.training["range_net"]["rv"]["epochs"] == 3
     assert weights.model.range_view.width == 64
 
 
@@ -102,7 +103,7 @@ def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: P
     options = ("--stage", "rv", "--training.rv.epochs", 1, "--model.range_net.decoder", 24, "--training.seed", 7)
     weights = train(world, tmp_path / "run", *options)
     said = weights.training["range_net"]
-    assert (said["config"]["epochs"], said["seed"], said["config"]["lr"]) == (1, 7, 0.02)
+    assert (said["rv"]["epochs"], said["seed"], said["rv"]["lr"]) == (1, 7, 0.02)
     assert weights.model.range_net.decoder == 24
     assert weights.parts == ("range_net",)
     assert yaml.safe_load((tmp_path / "run/recipe.yaml").read_text())["training"]["rv"]["epochs"] == 1
@@ -168,6 +169,56 @@ def test_a_resumed_run_keeps_the_curves_of_its_earlier_epochs(world: Path, tmp_p
     assert set(column(tmp_path / "run", "rv", "epoch")) == {0.0, 1.0, 2.0}
 
 
+def test_a_refused_run_leaves_the_recipe_of_the_run_that_is_there(world: Path, run: Path) -> None:
+    before = (run / "recipe.yaml").read_bytes()
+    code, _ = amvnet("train", world / "recipe.yaml", "--data", world / "data", "--out", run, "--training.seed", 9)
+    assert code == 2
+    assert (run / "recipe.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "other", [("--training.rv.epochs", 5), ("--model.range_net.decoder", 24), ("--training.seed", 4)]
+)
+def test_a_run_is_not_resumed_with_other_values(world: Path, run: Path, other: tuple[str, object]) -> None:
+    arguments = ("--data", world / "data", "--out", run, "--resume", *other)
+    code, error = amvnet("train", world / "recipe.yaml", *arguments)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "stage.yaml" in error
+
+
+def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
+    train_interrupted("rv", 2, world, tmp_path, "--stage", "rv")
+    checkpoint = tmp_path / "rv/last.ckpt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    arguments = ("--data", world / "data", "--out", tmp_path, "--stage", "rv", "--resume")
+    code, error = amvnet("train", world / "recipe.yaml", *arguments)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "last.ckpt" in error
+
+
+def test_broken_class_counts_are_counted_anew(world: Path, run: Path, tmp_path: Path) -> None:
+    (tmp_path / "class_counts.npz").write_bytes((run / "class_counts.npz").read_bytes()[:100])
+    train(world, tmp_path, "--stage", "rv", "--training.rv.epochs", 1)
+    with np.load(tmp_path / "class_counts.npz") as found, np.load(run / "class_counts.npz") as expected:
+        assert np.array_equal(found["counts"], expected["counts"])
+
+
+def test_a_broken_label_file_is_one_line_from_a_reading_process_too(world: Path, tmp_path: Path) -> None:
+    shutil.copytree(world / "data", tmp_path / "data")
+    label = tmp_path / "data/sequences/00/labels/000001.label"
+    np.full(500, 10, np.uint32)[:499].tofile(label)
+    options = ("--stage", "rv", "--training.rv.class_weights", "false", "--training.workers", 1)
+    code, error = amvnet(
+        "train", world / "recipe.yaml", "--data", tmp_path / "data", "--out", tmp_path / "run", *options
+    )
+    assert (code, error.count("\n")) == (2, 1), error
+    assert "499" in error
+
+
+def test_the_points_of_the_head_are_removed_when_it_is_trained(run: Path) -> None:
+    assert not {name for name in files(run / "head") if name.startswith(("train/", "val/"))}
+
+
 def test_resuming_a_finished_run_changes_nothing(world: Path, run: Path, tmp_path: Path) -> None:
     before = train(world, tmp_path / "run")
     assert not differing(train(world, tmp_path / "run", "--resume"), before)
@@ -190,7 +241,7 @@ def test_the_head_stage_leaves_the_networks_bitwise_unchanged(world: Path, run: 
 def test_a_stage_takes_the_other_parts_from_init(world: Path, run: Path, tmp_path: Path) -> None:
     after = train(world, tmp_path / "rv", "--stage", "rv", "--init", run, "--training.rv.epochs", 1)
     assert differing(load(run), after) == {"range_net"}
-    assert after.training["range_net"]["config"]["epochs"] == 1
+    assert after.training["range_net"]["rv"]["epochs"] == 1
     assert after.training["polar_net"] == load(run).training["polar_net"]
 
 
@@ -218,7 +269,7 @@ def test_folds_score_no_sequence_that_they_learnt_from(
             assert not set(networks.training[part]["sequences"]) & {record.sequence for record in records}
         scored += [record.name for record in records]
     assert sorted(scored) == ["00/000000", "00/000001", "01/000000", "01/000001"]
-    assert weights.training["point_head"]["config"]["folds"] == 2
+    assert weights.training["point_head"]["head"]["folds"] == 2
     assert weights.training["range_net"]["sequences"] == ["00", "01"]
 
 
@@ -243,6 +294,10 @@ def test_a_label_map_of_ones_own_is_learnt(world: Path, tmp_path: Path) -> None:
     options = ("--stage", "rv", "--taxonomy", tmp_path / "mine.yaml", "--training.rv.epochs", 1)
     taxonomy = train(world, tmp_path / "run", *options).taxonomy
     assert (taxonomy.name, taxonomy.size) == ("mine", 18)
+    predicted = tmp_path / "predicted"
+    weights = ("--weights", tmp_path / "run", "--method", "rv")
+    assert amvnet("predict", world / "data", *weights, "--out", predicted, "--sequences", "08") == (0, "")
+    assert amvnet("evaluate", world / "data", "--weights", tmp_path / "run")[0] == 0
 
 
 def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def degenerate_scans() -> dict[str, Scan]:
         "only the origin": scan_of((0, 0, 0)),
         "seam": scan_of((-5, 0.0, 0), (-5, -0.0, 0), (-7, 1e-6, 0), (-7, -1e-6, 0), (-9, west, 0)),
         "straight up and down": scan_of((0, 0, 4), (0, 0, -4)),
-        "far away": scan_of((1e6, 2e6, 3e6), (-1e6, 2e5, -3e6)),
+        "far away": scan_of((1e3, 2e3, 3e3), (-1e3, 2e2, -3e3)),
         "no point": Scan(np.zeros((0, 4), np.float32), ring=np.zeros(0, np.int64)),
     }
 

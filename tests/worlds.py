@@ -37,7 +37,7 @@ MODEL: dict[str, Any] = {
 TRAINING: dict[str, Any] = {
     "rv": {"epochs": 3, "batch": 2, "lr": 0.02},
     "bev": {"epochs": 3, "batch": 2, "lr": 0.02},
-    "head": {"epochs": 2, "batch": 64, "lr": 0.05, "points_per_scan": 200},
+    "head": {"epochs": 2, "batch": 64, "lr": 0.05, "points": 800},
     "precision": "32-true",
     "accelerator": "cpu",
 }

@@ -58,9 +58,9 @@ def _run(segmenter: Segmenter, read: Callable[[], Scan]) -> Timing:
         batch = PointBatch.of([scan]).to(device)
         image, grid = model.range_view.project(batch), model.polar_view.project(batch)
     with clock("RV"):
-        f = image.to_points(model.range_net(image.image)).softmax(dim=1)
+        f = image.to_points(model.range_net(image.image)).float().softmax(dim=1)
     with clock("BEV"):
-        g = grid.to_points(model.polar_net(grid)).softmax(dim=1)
+        g = grid.to_points(model.polar_net(grid)).float().softmax(dim=1)
     with clock("compare"):
         uncertain = model.assertion(f, g, batch.points)
         index = uncertain.nonzero()[:, 0]

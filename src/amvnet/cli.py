@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import os
@@ -131,9 +132,8 @@ def train(
     dataset = _open(data, taxonomy)
     learnt, val = split_records(dataset, _names(train_sequences), _names(val_sequences))
     say(f"training on {_listed(learnt)}; validating on {_listed(val)}")
-    tell = None if on_terminal() else say
     given = None if init is None else weights.load(init)
-    path = Run(recipe, dataset, learnt, val, out, resume, tell).stages(stage, given)
+    path = Run(recipe, dataset, learnt, val, out, resume, say, on_terminal()).stages(stage, given)
     say(f"weights in {path}")
 
 
@@ -191,16 +191,22 @@ def evaluate(
         device: cpu, cuda, cuda:1, ...
     """
     from amvnet import jobs
-    from amvnet.segmenter import Segmenter
+    from amvnet.data.files import make_folder
+    from amvnet.segmenter import Segmenter, widest_method
+    from amvnet.weights import load
 
     if (weights is None) == (predictions is None):
         raise InputError("expected either --weights or --predictions, found both or neither; give one of them")
-    dataset = _open(data, taxonomy)
+    given = None if weights is None else load(weights)
+    dataset = _open(data, taxonomy, None if given is None else jobs.own_classes(given.taxonomy))
     records = jobs.choose_records(dataset, _names(sequences), split)
-    if predictions is not None:
-        label = jobs.by_files(dataset, predictions)
+    if given is not None:
+        label = jobs.by_weights(dataset, Segmenter(given, device, widest_method(given)))
     else:
-        label = jobs.by_weights(dataset, Segmenter(str(weights), device, _widest_method(str(weights))))
+        label = jobs.by_files(dataset, Path(str(predictions)))
+    for path in (json, pictures):  # so that nothing is scored in vain
+        if path is not None:
+            make_folder(path.parent)
     with progress("scoring") as step:
         found = jobs.evaluate(dataset, records, label, pictures, step)
     show_evaluation(found, data, dataset.taxonomy, json)
@@ -282,11 +288,11 @@ def _tenth(title: str, done: int, total: int) -> None:
         say(f"{title}: {done} of {total}")
 
 
-def _open(data: str, taxonomy: Path | None) -> Any:
+def _open(data: str, taxonomy: Path | None, otherwise: Taxonomy | None = None) -> Any:
     from amvnet.data.catalog import open_dataset
     from amvnet.data.labels import taxonomy_from_yaml
 
-    return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
+    return open_dataset(data, otherwise if taxonomy is None else taxonomy_from_yaml(taxonomy))
 
 
 def _listed(records: Sequence[ScanRecord]) -> str:
@@ -300,16 +306,6 @@ def _names(text: str | None) -> list[str] | None:
     if names == []:
         raise InputError(f"expected names of sequences with commas, found {text!r}; name some, or leave the option out")
     return names
-
-
-def _widest_method(weights: str) -> Any:
-    """The last method, in the order of the paper's tables, that the weights have the parts for."""
-    from amvnet.segmenter import METHODS, NEEDED
-    from amvnet.weights import load
-
-    parts = set(load(weights).parts)
-    found = [method for method in METHODS if set(NEEDED[method]) <= parts]
-    return found[-1] if found else METHODS[-1]
 
 
 VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
@@ -338,7 +334,7 @@ def _train_arguments(arguments: Sequence[str]) -> dict[str, Any]:
         recipe = load_recipe(_parser("train", Recipe()).parse_args(list(arguments)).recipe)
     parser = _parser("train", recipe)
     made = vars(parser.instantiate(parser.parse_args(list(arguments))))
-    return made | {"recipe": Recipe(recipe.taxonomy, made.pop("model"), made.pop("training"))}
+    return made | {"recipe": dataclasses.replace(recipe, model=made.pop("model"), training=made.pop("training"))}
 
 
 USAGE = f"""usage: amvnet VERB ...

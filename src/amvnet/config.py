@@ -211,8 +211,8 @@ class HeadTraining(Checked):
     """Uncertain points of one optimizer step, drawn at random."""
     lr: Positive = 0.1
     """Peak of the one-cycle learning rate (open)."""
-    momentum: Annotated[float, Range(0, 0.999)] = 0.9
-    """SGD's momentum (open)."""
+    momentum: Annotated[float, Range(0.1, 0.999)] = 0.95
+    """SGD's greatest momentum; the one-cycle schedule lowers it by 0.1 where the learning rate peaks (open)."""
     weight_decay: NotNegative = 1e-4
     """SGD's weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
@@ -221,8 +221,8 @@ class HeadTraining(Checked):
     """Weight the classes as the networks' losses do (the paper has plain cross-entropy)."""
     views: Annotated[int, Range(0)] = 0
     """Times that each training scan is scored for the head, each time augmented anew; 0: once, as it is."""
-    points_per_scan: Count = 4096
-    """Most uncertain points that are kept of a scan, drawn at random; 1.3 kB of disk each for K = 19, n = 15."""
+    points: Count = 300_000
+    """Most uncertain points that are kept, as many of each scan, drawn at random; 1.3 kB of disk each (K = 19)."""
     folds: Count = 1
     """From 2: score each training scan by networks trained without its sequence (cross-fitting); 1: by the
     final networks, as in the paper."""
@@ -265,6 +265,8 @@ class Recipe:
 
     taxonomy: Literal["semantickitti", "nuscenes"] = "semantickitti"
     """The benchmark whose classes are learnt."""
+    sensor: str = "hdl64e"
+    """Name of the sensor of the scans, for the weights file."""
     model: ModelConfig = ModelConfig()
     """The networks and their sizes."""
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,13 @@ from amvnet.evaluation import confusion
 from amvnet.loading import ScanSet, collate
 from amvnet.models.amvnet import AMVNet, geometric_mean
 from amvnet.models.point_head import PointHead, head_features, nearest_neighbours
+from amvnet.scan import Scan
 from amvnet.training import Stage
-from amvnet.views.points import PointBatch
 from amvnet.weights import Weights
 
-COLUMNS = {"point": np.float16, "rows": np.float16, "labels": np.uint8}
-HeadBatch = tuple[Tensor, Tensor, Tensor]  # p_i (U, 2 K + 4), S_i (U, n, 2 K + 4), train ids (U,)
+COLUMNS = {"point": np.float16, "rows": np.float16, "labels": np.uint8, "stands_for": np.float32}
+# p_i (U, 2 K + 4), S_i (U, n, 2 K + 4), train ids (U,), and for how many points of its scan each stands (U,)
+HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 class HeadStage(Stage):
@@ -35,12 +36,12 @@ class HeadStage(Stage):
     part = "point_head"
     config: HeadTraining
 
-    def __init__(self, head: PointHead, certain: np.ndarray, share: float, *args: Any) -> None:
+    def __init__(self, head: PointHead, certain: np.ndarray, *args: Any) -> None:
         super().__init__(*args)
-        self.trained, self.certain, self.share = head, certain, share
+        self.trained, self.certain = head, certain
 
-    def training_step(self, batch: HeadBatch, _: int) -> Tensor:
-        point, rows, labels = batch
+    def training_step(self, batch: HeadBatch, index: int) -> Tensor:
+        point, rows, labels, _ = batch
         loss = F.cross_entropy(self.trained(point, rows), labels - 1, self.class_weights)
         self.log("train/loss", loss, prog_bar=True, batch_size=len(labels))
         return loss
@@ -48,14 +49,17 @@ class HeadStage(Stage):
     def on_validation_epoch_start(self) -> None:
         self.matrix = self.certain.astype(float)
 
-    def validation_step(self, batch: HeadBatch, _: int) -> None:
-        point, rows, labels = batch
-        self.count(labels, self.trained(point, rows).argmax(dim=1) + 1, self.share)
+    def validation_step(self, batch: HeadBatch, index: int) -> None:
+        point, rows, labels, stands_for = batch
+        found = self.trained(point, rows).argmax(dim=1) + 1
+        size = len(self.matrix)
+        place = (labels * size + found).cpu().numpy()
+        self.matrix += np.bincount(place, stands_for.cpu().numpy(), size**2).reshape(size, size)
 
     def configure_optimizers(self) -> Any:
         c = self.config
         parameters = self.trained.parameters()
-        return self.one_cycle(torch.optim.SGD(parameters, c.lr, c.momentum, weight_decay=c.weight_decay))
+        return self.one_cycle(torch.optim.SGD(parameters, c.lr, c.momentum, weight_decay=c.weight_decay), c.momentum)
 
 
 @dataclass(frozen=True)
@@ -65,13 +69,11 @@ class HeadPoints:
     Attributes:
         folder: holds p_i, S_i and labels of U points, column by column, on disk.
         certain: (K + 1, K + 1) confusion matrix of the ensemble over the points that are certain.
-        share: how many uncertain points each kept one stands for.
         shapes: of each column.
     """
 
     folder: Path
     certain: np.ndarray
-    share: float
     shapes: dict[str, tuple[int, ...]]
 
     def __len__(self) -> int:
@@ -79,10 +81,11 @@ class HeadPoints:
 
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
         """The points of some indices, in this order."""
-        point, rows, labels = (
-            np.memmap(self.folder / name, kind, "r", shape=self.shapes[name])[index] for name, kind in COLUMNS.items()
+        point, rows, labels, stands_for = (
+            torch.from_numpy(np.memmap(self.folder / name, kind, "r", shape=self.shapes[name])[index])
+            for name, kind in COLUMNS.items()
         )
-        return torch.from_numpy(point).float(), torch.from_numpy(rows).float(), torch.from_numpy(labels).long()
+        return point.float(), rows.float(), labels.long(), stands_for
 
 
 class PointSampler(data.Sampler[np.ndarray]):
@@ -117,6 +120,7 @@ def gather_points(
     training: TrainingConfig,
     views: int,
     folder: Path,
+    say: Callable[[str], None] = lambda line: None,
 ) -> HeadPoints:
     """Score scans by frozen networks, and keep on disk what the head needs of their uncertain points.
 
@@ -124,6 +128,7 @@ def gather_points(
         sources: networks, and the scans that they score.
         views: how often each scan is scored, each time augmented anew; 0: once, as it is.
         folder: is made anew.
+        say: told how far it is.
 
     Raises:
         InputError: where the networks agree everywhere.
@@ -131,46 +136,50 @@ def gather_points(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     size = dataset.taxonomy.size
-    certain, found = np.zeros((size + 1, size + 1), dtype=np.int64), 0
+    certain, done = np.zeros((size + 1, size + 1), dtype=np.int64), 0
+    total = max(views, 1) * sum(len(records) for _, records in sources)
+    most = -(-training.head.points // total)
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(COLUMNS, (0,))
     for weights, records in sources:
-        model = weights.build()
+        model = weights.build().to(_device(training.accelerator))
         scans = ScanSet(dataset, records, training.augment if views else None, training.seed)
         for epoch, place in np.ndindex(max(views, 1), len(scans)):
             rng = np.random.default_rng([training.seed, epoch, place])
-            batch, labels = collate([scans[epoch, place]])
-            columns, matrix, uncertain = _gather_scan(
-                model, weights.model.point_head, batch, labels, training.head.points_per_scan, size, rng
-            )
+            columns, matrix = _gather_scan(model, weights.model.point_head, scans[epoch, place], most, size, rng)
             shapes = {name: _append(folder / name, values, shapes[name]) for name, values in columns.items()}
-            certain, found = certain + matrix, found + uncertain
-    if not found:
+            certain, done = certain + matrix, done + 1
+            if done * 10 // total != (done - 1) * 10 // total:
+                say(f"head: scored {done} of {total} scans")
+    if shapes["labels"][0] < 2:
         raise InputError(f"{folder}: expected points that the networks disagree on, found none; raise the threshold")
-    return HeadPoints(folder, certain, found / shapes["labels"][0], shapes)
+    return HeadPoints(folder, certain, shapes)
+
+
+def _device(accelerator: str) -> str:
+    """Where the networks score for the head, by Lightning's name of the accelerator."""
+    return "cuda" if accelerator in ("auto", "gpu", "cuda") and torch.cuda.is_available() else "cpu"
 
 
 @torch.inference_mode()
 def _gather_scan(
-    model: AMVNet,
-    config: PointHeadConfig,
-    batch: PointBatch,
-    labels: Tensor,
-    most: int,
-    size: int,
-    rng: np.random.Generator,
-) -> tuple[dict[str, np.ndarray], np.ndarray, int]:
-    """The columns of one scan's kept points, the confusion of its certain ones, the number of uncertain ones."""
+    model: AMVNet, config: PointHeadConfig, scan: Scan, most: int, size: int, rng: np.random.Generator
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The columns of one scan's kept points, and the confusion of its certain ones."""
+    device = next(model.parameters()).device
+    batch, labels = collate([scan])
+    batch, labels = batch.to(device), labels.to(device)
     f, g = model.score_range_view(batch), model.score_polar_view(batch)
     uncertain = model.assertion(f, g, batch.points, labels) & (labels > 0)
     agreed = geometric_mean(f, g).argmax(dim=1) + 1
-    matrix = confusion(labels[~uncertain].numpy(), agreed[~uncertain].numpy(), size)
+    matrix = confusion(labels[~uncertain].cpu().numpy(), agreed[~uncertain].cpu().numpy(), size)
     index = uncertain.nonzero()[:, 0]
     chosen = rng.permutation(len(index))[:most]
-    index = index[torch.from_numpy(np.sort(chosen))]
+    stands_for = np.full(len(chosen), len(index) / max(len(chosen), 1))
+    index = index[torch.from_numpy(np.sort(chosen)).to(device)]
     near = nearest_neighbours(batch.points, index, config.neighbours)
     point, rows = head_features(config, batch.points, f, g, index, near)
-    columns = {"point": point.numpy(), "rows": rows.numpy(), "labels": labels[index].numpy()}
-    return columns, matrix, int(uncertain.sum())
+    found = {"point": point, "rows": rows, "labels": labels[index]}
+    return {**{name: values.cpu().numpy() for name, values in found.items()}, "stands_for": stands_for}, matrix
 
 
 def _append(path: Path, values: np.ndarray, shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from amvnet.data.catalog import is_dataset, open_dataset
 from amvnet.data.files import find_scans, read_scan, whole_file, write_labels
-from amvnet.data.labels import Taxonomy
+from amvnet.data.labels import TAXONOMIES, Taxonomy
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation
@@ -111,11 +111,7 @@ def by_weights(
     Raises:
         InputError: where the weights know other classes than the data set.
     """
-    if segmenter.taxonomy.classes != dataset.taxonomy.classes:
-        raise InputError(
-            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those of "
-            f"{segmenter.taxonomy.name}; use weights trained on this benchmark"
-        )
+    _check_classes(dataset, segmenter.taxonomy)
     return lambda record, scan: segmenter.by_method(checked_scan(scan))
 
 
@@ -130,6 +126,19 @@ def by_files(
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
     return lambda record, scan: ({"predictions": dataset.read_prediction(record, folder)}, None)
+
+
+def own_classes(taxonomy: Taxonomy) -> Taxonomy | None:
+    """A user's own classes, with which a data set has to be read; None for those of a benchmark."""
+    return taxonomy if taxonomy.name not in TAXONOMIES else None
+
+
+def _check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
+    if taxonomy.classes != dataset.taxonomy.classes:
+        raise InputError(
+            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those of "
+            f"{taxonomy.name}; use weights trained on this benchmark"
+        )
 
 
 def choose_records(dataset: Dataset, sequences: Sequence[str] | None, split: str) -> list[ScanRecord]:
@@ -170,18 +179,14 @@ def _present(dataset: Dataset, split: str) -> tuple[str, ...]:
 
 def _tasks(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None) -> Iterator[Task]:
     if is_dataset(text):
-        yield from _dataset_tasks(open_dataset(text), taxonomy, out, sequences)
+        yield from _dataset_tasks(open_dataset(text, own_classes(taxonomy)), taxonomy, out, sequences)
         return
     for path in find_scans(text):
-        yield Task(path.name, _Read(path), _Write(out / f"{stem(path)}.label", taxonomy), out / f"{stem(path)}.npz")
+        yield _file_task(path, taxonomy, out)
 
 
 def _dataset_tasks(dataset: Dataset, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None) -> Iterator[Task]:
-    if taxonomy.classes != dataset.taxonomy.classes:
-        raise InputError(
-            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those of "
-            f"{taxonomy.name}; use weights trained on this benchmark"
-        )
+    _check_classes(dataset, taxonomy)
     for record in choose_records(dataset, sequences, "all"):
         yield _record_task(dataset, record, out)
 
@@ -195,21 +200,13 @@ def _record_task(dataset: Dataset, record: ScanRecord, out: Path) -> Task:
     )
 
 
-@dataclass(frozen=True)
-class _Read:
-    path: Path
-
-    def __call__(self) -> Scan:
-        return read_scan(self.path)
-
-
-@dataclass(frozen=True)
-class _Write:
-    path: Path
-    taxonomy: Taxonomy
-
-    def __call__(self, ids: np.ndarray) -> Path:
-        return write_labels(self.path, self.taxonomy.to_raw(ids))
+def _file_task(path: Path, taxonomy: Taxonomy, out: Path) -> Task:
+    return Task(
+        path.name,
+        lambda: read_scan(path),
+        lambda ids: write_labels(out / f"{stem(path)}.label", taxonomy.to_raw(ids)),
+        out / f"{stem(path)}.npz",
+    )
 
 
 def stem(path: Path) -> str:

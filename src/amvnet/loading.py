@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -12,6 +14,7 @@ from torch.utils import data
 
 from amvnet.config import AugmentConfig
 from amvnet.data.augment import augment, mix
+from amvnet.data.files import whole_file
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -47,6 +50,8 @@ class ScanSet(data.Dataset[Scan]):
         scan = self.dataset.read(self.records[place])
         if scan.labels is None:
             raise InputError(f"{scan.name}: expected labels to train with, found none; name labelled sequences")
+        if scan.valid.sum() < 2:  # of one point batch norm has no variance
+            raise InputError(f"{scan.name}: expected points to train with, found fewer than two; leave the scan out")
         return scan
 
 
@@ -87,16 +92,15 @@ def loader(scans: ScanSet, batch: int, workers: int, shuffle: bool) -> data.Data
 
 def count_classes(dataset: Dataset, records: Sequence[ScanRecord], kept: Path) -> np.ndarray:
     """(K,) points of each class in some scans; counted once, and kept in a file beside the run."""
-    names = [record.name for record in records]
-    if kept.is_file():
-        with np.load(kept, allow_pickle=False) as file:
-            if file["scans"].tolist() == names:
-                return file["counts"]
+    made = {"scans": [record.name for record in records], "classes": list(dataset.taxonomy.classes)}
+    with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(kept, allow_pickle=False) as file:
+        if all(file[key].tolist() == value for key, value in made.items()):
+            return file["counts"]
     counts = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
     for record in records:
         labels = dataset.read(record).labels
         if labels is not None:
             counts += np.bincount(labels, minlength=len(counts))
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(kept, scans=np.array(names), counts=counts[1:])
+    with whole_file(kept) as part:
+        np.savez(part, counts=counts[1:], scans=np.array(made["scans"]), classes=np.array(made["classes"]))
     return counts[1:]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,11 +24,12 @@ from amvnet.head_training import HeadStage, gather_points, head_loader
 from amvnet.loading import ScanSet, count_classes, loader
 from amvnet.losses import class_weights
 from amvnet.models.amvnet import AMVNet, build_amvnet
-from amvnet.training import KeepWeights, PolarStage, RangeStage, Stage, fit, names_of
+from amvnet.training import LAST, KeepWeights, PolarStage, RangeStage, Stage, fit, names_of
 from amvnet.trees import to_dict
-from amvnet.weights import Weights, state_of
+from amvnet.weights import SIZES, Weights, state_of
 
 StageName = Literal["rv", "bev", "head", "all"]
+SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with
 PART = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 
 
@@ -41,7 +43,8 @@ class Run:
         train, val: the scans to learn from, and those to validate with; none may be in both.
         out: the folder of the run.
         resume: go on where an earlier run in this folder stopped.
-        say: told what happens, in lines; None shows progress bars.
+        say: told what happens, in lines.
+        bars: show progress bars instead of a line an epoch.
     """
 
     recipe: Recipe
@@ -50,7 +53,8 @@ class Run:
     val: Sequence[ScanRecord]
     out: Path
     resume: bool = False
-    say: Callable[[str], None] | None = None
+    say: Callable[[str], None] = lambda line: None
+    bars: bool = False
 
     def __post_init__(self) -> None:
         self.out = Path(self.out)
@@ -71,26 +75,24 @@ class Run:
             InputError: where the head is to be trained and there are no networks to train it for, or the
                 folder holds a run and `resume` is not said.
         """
-        current = self._start(init)
         names = ("rv", "bev", "head") if stage == "all" else (stage,)
+        for name in names:
+            self._check_earlier(name)
+        current = self._start(init)
         for name in names:
             current = self._stage(name, current)
         return weights_file.save(current, self.out / "weights.safetensors")
 
     def _start(self, init: Weights | None) -> Weights:
         """Fresh weights, or those that are given; earlier stages of this folder are taken up."""
-        current = Weights(self.recipe.model, self.dataset.taxonomy)
+        current = Weights(self.recipe.model, self.dataset.taxonomy, self.recipe.sensor)
         if init is not None:
-            current = dataclasses.replace(current, sensor=init.sensor)
             for part in init.parts:
                 current = current.replace_part(part, init)
         for name, part in PART.items():
             kept = self._folder(name) / f"{self.recipe.training.keep}.safetensors"
             if kept.is_file() and (self._folder(name) / "done").is_file():
                 current = current.replace_part(part, weights_file.load(kept))
-        if self.out.is_file():
-            raise InputError(f"{self.out}: expected a folder for the run, found a file; give another")
-        self.out.mkdir(parents=True, exist_ok=True)
         with whole_file(self.out / "recipe.yaml") as path:
             path.write_text(yaml.safe_dump(to_dict(self.recipe), sort_keys=False))
         return current
@@ -98,12 +100,28 @@ class Run:
     def _folder(self, name: str) -> Path:
         return self.out / name
 
+    def _settings(self, name: str) -> dict[str, Any]:
+        """What the weights of a stage depend on, apart from the data."""
+        tree = to_dict(self.recipe)
+        training = {key: tree["training"][key] for key in (name, "augment", "seed", "precision", "accumulate")}
+        return {"model": {key: tree["model"][key] for key in SIZES[PART[name]]}, "training": training}
+
+    def _check_earlier(self, name: str) -> None:
+        """Raises InputError where the folder holds this stage of a run that is not to be resumed, or of another."""
+        folder = self._folder(name)
+        if not (folder / LAST).is_file():
+            return
+        if not self.resume:
+            raise InputError(f"{folder}: expected no earlier run, found one; add --resume or give another")
+        begun = yaml.safe_load((folder / SETTINGS).read_text()) if (folder / SETTINGS).is_file() else {}
+        if begun != self._settings(name):
+            raise InputError(f"{folder}: expected the values that it was begun with ({SETTINGS}), found others; "
+                             "resume it with those, or give another folder")  # fmt: skip
+
     def _stage(self, name: str, current: Weights) -> Weights:
         done = self._folder(name) / "done"
         if done.is_file() and self.resume:
             return current
-        if (self._folder(name) / "last.ckpt").is_file() and not self.resume:
-            raise InputError(f"{self._folder(name)}: expected no earlier run, found one; add --resume or give another")
         L.seed_everything(self.recipe.training.seed, verbose=False)
         current = current.resized(PART[name], self.recipe.model)
         kept = self._fit_head(current) if name == "head" else self._fit_network(name, current)
@@ -134,7 +152,7 @@ class Run:
             if name == "rv"
             else PolarStage(model.polar_view, model.polar_net, *shared)
         )
-        keep = self._keep(name, current, to_dict(config))
+        keep = self._keep(name, current)
         part = config.batch // training.accumulate
         fit(
             stage,
@@ -146,6 +164,7 @@ class Run:
             keep,
             self.resume,
             self.say,
+            self.bars,
             training.accumulate,
             config.clip,
         )
@@ -158,15 +177,15 @@ class Run:
             raise InputError(f"expected trained networks for the head, found no {missing[0]}; train it, or give --init")
         sources = self._sources(current)
         folder = self._folder("head")
-        train = gather_points(sources, self.dataset, training, config.views, folder / "train")
+        train = gather_points(sources, self.dataset, training, config.views, folder / "train", self.say)
         val = gather_points([(current, self.val)], self.dataset, training, 0, folder / "val")
         head = self._module(PART["head"], current).point_head
         assert head is not None
         weights = class_weights(self._counts()) if config.class_weights else None
-        keep = self._keep("head", current, to_dict(config))
+        keep = self._keep("head", current)
         fit(
-            HeadStage(head, val.certain, val.share, config, self.dataset.taxonomy, weights),
-            dataclasses.replace(training, precision="32-true", accelerator=training.accelerator),
+            HeadStage(head, val.certain, config, self.dataset.taxonomy, weights),
+            dataclasses.replace(training, precision="32-true"),
             config.epochs,
             head_loader(train, config.batch, training.seed, True),
             head_loader(val, 64 * config.batch, training.seed, False),
@@ -174,7 +193,10 @@ class Run:
             keep,
             self.resume,
             self.say,
+            self.bars,
         )
+        for points in (train, val):
+            shutil.rmtree(points.folder)
         return getattr(keep.kept, training.keep)
 
     def _sources(self, current: Weights) -> list[tuple[Weights, Sequence[ScanRecord]]]:
@@ -191,17 +213,17 @@ class Run:
         """Networks trained without some sequences, and the scans of these."""
         seen = [r for r in self.train if r.sequence not in left_out]
         unseen = [r for r in self.train if r.sequence in left_out]
-        fold = Run(self.recipe, self.dataset, seen, unseen, self.out / "folds" / str(index), True, self.say)
+        fold = Run(self.recipe, self.dataset, seen, unseen, self.out / "folds" / str(index), True, self.say, self.bars)
         fold.stages("rv")
         return weights_file.load(fold.stages("bev")), unseen
 
     def _counts(self) -> Any:
         return count_classes(self.dataset, self.train, self.out / "class_counts.npz")
 
-    def _keep(self, name: str, current: Weights, config: dict[str, Any]) -> KeepWeights:
+    def _keep(self, name: str, current: Weights) -> KeepWeights:
         """How the part of a stage is written: with the description of what made it."""
         part, started = PART[name], time.time()
-        made = {"config": config, "seed": self.recipe.training.seed, "sequences": names_of(self.train),
+        made = {**self._settings(name)["training"], "sequences": names_of(self.train),
                 "validated_on": names_of(self.val), "scans": len(self.train)}  # fmt: skip
 
         def write(module: nn.Module, path: Path, reached: dict[str, float]) -> None:
@@ -213,5 +235,7 @@ class Run:
                 metrics={part: reached},
             )
             weights_file.save(kept, path)
+            with whole_file(path.parent / SETTINGS) as file:
+                file.write_text(yaml.safe_dump(self._settings(name), sort_keys=False))
 
         return KeepWeights(write, self._folder(name))

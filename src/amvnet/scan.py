@@ -8,6 +8,8 @@ import numpy as np
 
 from amvnet.errors import InputError
 
+FARTHEST = 10_000.0  # metres: no LiDAR sees so far, and squares of much larger numbers overflow
+
 
 @dataclass(frozen=True)
 class Scan:
@@ -15,7 +17,8 @@ class Scan:
 
     Attributes:
         points: (N, 4) float32: x, y, z in metres and intensity in [0, 1]. A row with a
-            non-finite coordinate is a return that was lost: it keeps its place and gets id 0.
+            non-finite coordinate, or one farther than any LiDAR sees, is a return that was lost: it keeps its
+            place and gets id 0.
         labels: (N,) uint8 train ids (0 = ignored, 1..K), or None where nothing is labelled.
         ring: (N,) int64 index of the laser (0 = lowest), or None where the format has none.
         name: where the scan comes from, for messages.
@@ -47,5 +50,5 @@ class Scan:
 
     @property
     def valid(self) -> np.ndarray:
-        """(N,) bool: the points whose four values are all finite."""
-        return np.isfinite(self.points).all(axis=1)
+        """(N,) bool: the points whose four values are all finite, and nearer than `FARTHEST` along each axis."""
+        return np.isfinite(self.points).all(axis=1) & (np.abs(self.points[:, :3]) < FARTHEST).all(axis=1)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -27,6 +29,9 @@ NEEDED: dict[str, tuple[str, ...]] = {
     "ensemble": ("range_net", "polar_net"),
     "amvnet": ("range_net", "polar_net", "point_head"),
 }
+
+
+SURE = 1e-7  # two models that are wholly sure of different classes have a product of 0 for every class
 
 
 @dataclass(frozen=True)
@@ -62,16 +67,13 @@ class Segmenter:
         InputError: where the weights lack a part that the method needs, or there is no such device.
     """
 
-    def __init__(self, weights: Weights | str, device: str = "cpu", method: Method = "amvnet") -> None:
-        self.weights = load(weights) if isinstance(weights, str) else weights
+    def __init__(self, weights: Weights | Path | str, device: str = "cpu", method: Method = "amvnet") -> None:
+        self.weights = weights if isinstance(weights, Weights) else load(weights)
         self.method = _checked_method(method, self.weights)
-        try:
-            self.model = self.weights.build().to(device)
-        except (RuntimeError, AssertionError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"expected a device of this machine, found {device!r}; use cpu") from None
-        self.device = device
+        if self.weights.model.assertion.name == "loss":
+            raise InputError("expected an assertion that needs no labels, found loss; train the head with another one")
+        self.device = _checked_device(device)
+        self.model = self.weights.build().to(device)
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -88,20 +90,24 @@ class Segmenter:
         scores = self._scores(PointBatch.of([scan]).to(self.device))
         return _in_place(scan.valid, scores)
 
+    @torch.inference_mode()
     def by_method(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """The (N,) train ids by each method that the weights have the parts for, and which points are uncertain."""
-        parts = self.weights.parts
-        methods = [m for m in METHODS if set(NEEDED[m]) <= set(parts)]
-        found = dict.fromkeys(methods, self) if len(methods) == 1 else {}
-        if found:
-            return {m: s(scan).labels for m, s in found.items()}, None
-        result = self(scan)
-        assert result.rv is not None
-        assert result.bev is not None
-        scores = {"rv": result.rv, "bev": result.bev, "ensemble": np.sqrt(result.rv * result.bev)}
-        if "amvnet" in methods:
-            scores["amvnet"] = result.scores
-        return {name: _labels(values, scan.valid) for name, values in scores.items()}, result.uncertain
+        model, parts, batch = self.model, self.weights.parts, PointBatch.of([scan]).to(self.device)
+        found: dict[str, Tensor] = {}
+        if "range_net" in parts:
+            found["rv"] = model.score_range_view(batch)
+        if "polar_net" in parts:
+            found["bev"] = model.score_polar_view(batch)
+        uncertain = None
+        if len(found) == 2:
+            f, g = found["rv"], found["bev"]
+            uncertain = model.assertion(f, g, batch.points)
+            found["ensemble"] = geometric_mean(f, g)
+            if "point_head" in parts:
+                found["amvnet"] = merge(f, g, uncertain, model.refine(batch, f, g, uncertain))
+        labels = {name: _labels(_full(scores, scan.valid), scan.valid) for name, scores in found.items()}
+        return labels, None if uncertain is None else _full(uncertain, scan.valid)
 
     @torch.inference_mode()
     def _scores(self, batch: PointBatch) -> Scores:
@@ -111,19 +117,19 @@ class Segmenter:
         none = torch.zeros(len(batch.points), dtype=torch.bool, device=batch.points.device)
         if self.method == "rv":
             f = model.score_range_view(batch)
-            return Scores(f, f, f, none)
+            return Scores(f, none, f, None)
         g = model.score_polar_view(batch)
         if self.method == "bev":
-            return Scores(g, g, g, none)
+            return Scores(g, none, None, g)
         f = model.score_range_view(batch)
-        return Scores(f, g, geometric_mean(f, g), model.assertion(f, g, batch.points))
+        return Scores(geometric_mean(f, g), model.assertion(f, g, batch.points), f, g)
 
 
 def fuse(
     points: np.ndarray,
     f: np.ndarray,
     g: np.ndarray,
-    head: PointHead | Weights | str | None = None,
+    head: PointHead | Weights | Path | str | None = None,
     tau: float | None = None,
 ) -> np.ndarray:
     """The late fusion alone, for any two models' scores (section 3.2 of the paper).
@@ -153,9 +159,12 @@ def fuse(
         raise InputError(f"expected scores of the head's {classes} classes, found {f.shape[1]}; use a head for them")
     with torch.inference_mode():
         x, a, b = (torch.from_numpy(np.asarray(v, dtype=np.float32)[scan.valid]) for v in (scan.points, f, g))
+        if not (a.isfinite().all() and b.isfinite().all()):
+            raise InputError("expected finite scores, found NaN or infinity among them; give probabilities")
+        a, b = a.clamp_min(SURE), b.clamp_min(SURE)
         uncertain = assertion(a, b, x)
         h = None if module is None else refine(module, x, a, b, uncertain)
-        return _in_place(scan.valid, Scores(a, b, merge(a, b, uncertain, h), uncertain)).labels
+        return _in_place(scan.valid, Scores(merge(a, b, uncertain, h), uncertain, None, None)).labels
 
 
 def checked_scan(points: np.ndarray | Scan) -> Scan:
@@ -171,9 +180,9 @@ def checked_scan(points: np.ndarray | Scan) -> Scan:
     return scan
 
 
-def _head(head: PointHead | Weights | str | None, tau: float | None) -> tuple[PointHead | None, Assertion]:
+def _head(head: PointHead | Weights | Path | str | None, tau: float | None) -> tuple[PointHead | None, Assertion]:
     """The head, and the assertion that chooses its points."""
-    if isinstance(head, str):
+    if isinstance(head, str | Path):
         head = load(head)
     config = AssertionConfig()
     if isinstance(head, Weights):
@@ -181,7 +190,7 @@ def _head(head: PointHead | Weights | str | None, tau: float | None) -> tuple[Po
             raise InputError("expected weights with a point head, found none; train one with --stage head")
         config, head = head.model.assertion, head.build().point_head
     assertion = build_assertion(config) if tau is None else Disagreement(tau)
-    return None if head is None else head.eval(), assertion
+    return None if head is None else copy.deepcopy(head).cpu().eval(), assertion
 
 
 def _checked_method(method: Method, weights: Weights) -> Method:
@@ -196,20 +205,36 @@ def _checked_method(method: Method, weights: Weights) -> Method:
     return method
 
 
+def _checked_device(name: str) -> str:
+    """The name of a device of this machine."""
+    try:
+        torch.zeros(1, device=name).item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise InputError(f"expected a device of this machine, found {name!r}; use cpu") from None
+    return name
+
+
+def widest_method(weights: Weights) -> Method:
+    """The last method, in the order of the paper's tables, that the weights have the parts for."""
+    found = [method for method in METHODS if set(NEEDED[method]) <= set(weights.parts)]
+    return found[-1] if found else METHODS[-1]
+
+
 def _in_place(valid: np.ndarray, scores: Scores) -> Segmentation:
     """Put what was found for the valid points back among all points."""
+    merged = _full(scores.merged, valid)
+    rv, bev = (None if values is None else _full(values, valid) for values in (scores.rv, scores.bev))
+    return Segmentation(_labels(merged, valid), _full(scores.uncertain, valid), merged, rv, bev)
 
-    def full(values: Tensor) -> np.ndarray:
-        if valid.all():
-            return values.cpu().numpy()
-        out = np.zeros((len(valid), *values.shape[1:]), dtype=values.cpu().numpy().dtype)
-        out[valid] = values.cpu().numpy()
-        return out
 
-    merged = full(scores.merged)
-    return Segmentation(
-        _labels(merged, valid), full(scores.uncertain), merged, rv=full(scores.rv), bev=full(scores.bev)
-    )
+def _full(values: Tensor, valid: np.ndarray) -> np.ndarray:
+    """(P, ...) of the valid points -> (N, ...) of all, zeros for the others."""
+    found = values.cpu().numpy()
+    if valid.all():
+        return found
+    out = np.zeros((len(valid), *found.shape[1:]), dtype=found.dtype)
+    out[valid] = found
+    return out
 
 
 def _labels(scores: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,6 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, RichProgressBar
 from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
@@ -29,6 +29,7 @@ from amvnet.views.polar_view import PolarView
 from amvnet.views.range_view import RangeView
 
 Batch = tuple[PointBatch, Tensor]
+MOMENTUM_CYCLE = 0.1  # by so much the one-cycle schedule lowers the momentum
 LAST = "last.ckpt"  # what --resume goes on from
 
 
@@ -51,9 +52,9 @@ class Stage(L.LightningModule):
     def on_validation_epoch_start(self) -> None:
         self.matrix = self._empty_matrix()
 
-    def count(self, labels: Tensor, prediction: Tensor, weight: float = 1) -> None:
+    def count(self, labels: Tensor, prediction: Tensor) -> None:
         """Add points to the validation's confusion matrix."""
-        self.matrix += weight * confusion(labels.cpu().numpy(), prediction.cpu().numpy(), self.taxonomy.size)
+        self.matrix += confusion(labels.cpu().numpy(), prediction.cpu().numpy(), self.taxonomy.size)
 
     def on_validation_epoch_end(self) -> None:
         found = metrics(self.matrix, self.taxonomy)
@@ -61,11 +62,17 @@ class Stage(L.LightningModule):
         self.log_dict({k: v or 0.0 for k, v in values.items()})
         self.log_dict({f"iou/{name}": value for name, value in found["iou"].items() if value is not None})
 
-    def one_cycle(self, optimizer: torch.optim.Optimizer) -> Any:
+    def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
+        """The schedule of the learning rate and, the other way round, of SGD's momentum or AdamW's first beta."""
         # A run of very few steps has no room for the cycle, which needs two before its peak.
         steps = max(int(self.trainer.estimated_stepping_batches), math.ceil(2 / self.config.warmup))
         cycle = torch.optim.lr_scheduler.OneCycleLR(
-            optimizer, max_lr=self.config.lr, total_steps=steps, pct_start=self.config.warmup
+            optimizer,
+            max_lr=self.config.lr,
+            total_steps=steps,
+            pct_start=self.config.warmup,
+            base_momentum=momentum - MOMENTUM_CYCLE,
+            max_momentum=momentum,
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": cycle, "interval": "step"}}
 
@@ -225,48 +232,74 @@ def fit(
     folder: Path,
     keep: KeepWeights,
     resume: bool,
-    say: Callable[[str], None] | None,
-    batches: int | None = None,
+    say: Callable[[str], None],
+    bars: bool,
+    batches: int = 1,
     clip: float | None = None,
 ) -> None:
     """Train a stage in its folder; with `resume`, on from its last epoch.
 
     Args:
-        say: told one line an epoch; None shows a progress bar instead.
+        say: told one line an epoch.
+        bars: show a progress bar instead.
         batches: parts of a batch that are accumulated before a step.
         clip: largest norm of the gradient.
     """
-    shown: list[Callback] = [EpochLines(say, folder.name)] if say else [RichProgressBar(), LearningRateMonitor()]
+    shown: list[Callback] = [RichProgressBar() if bars else EpochLines(say, folder.name), LearningRateMonitor()]
     # Weights and curves are kept before the checkpoint is, so that a checkpoint never says more than they hold.
     kept: list[Callback] = [keep, Curves(folder / "metrics.csv"), SeedBatches(config.seed)]
-    try:
-        trainer = L.Trainer(
-            accelerator=config.accelerator,
-            precision=config.precision,
-            max_epochs=epochs,
-            accumulate_grad_batches=batches or 1,
-            gradient_clip_val=clip,
-            default_root_dir=folder,
-            callbacks=[*kept, ModelCheckpoint(folder, filename="last", enable_version_counter=False), *shown],
-            logger=TensorBoardLogger(folder, name="", version=""),
-            enable_progress_bar=say is None,
-            enable_model_summary=False,
-            num_sanity_val_steps=0,
-            log_every_n_steps=10,
-            use_distributed_sampler=False,
-        )
-    except (ValueError, MisconfigurationException):
-        raise InputError(
-            f"expected an accelerator of this machine, found {config.accelerator!r}; use auto or cpu"
-        ) from None
+    trainer = L.Trainer(
+        accelerator=_accelerator(config.accelerator),
+        devices=1,
+        precision=config.precision,
+        max_epochs=epochs,
+        accumulate_grad_batches=batches,
+        gradient_clip_val=clip,
+        default_root_dir=folder,
+        callbacks=[*kept, ModelCheckpoint(folder, filename="last", enable_version_counter=False), *shown],
+        logger=TensorBoardLogger(folder, name="", version=""),
+        enable_progress_bar=bars,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        log_every_n_steps=10,
+        use_distributed_sampler=False,
+    )
     checkpoint = folder / LAST
-    if not (resume and checkpoint.is_file()):
-        trainer.fit(stage, train, val)
-        return
-    done = torch.load(checkpoint, map_location="cpu", weights_only=True)["epoch"] + 1
-    # Lightning tells the sampler its epoch only after the reading processes have begun to draw.
-    train.sampler.set_epoch(done)  # type: ignore[attr-defined]
-    trainer.fit(stage, train, val, ckpt_path=checkpoint, weights_only=True)
+    begun = checkpoint if resume and checkpoint.is_file() else None
+    if begun is not None:
+        # Lightning tells the sampler its epoch only after the reading processes have begun to draw.
+        train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
+    try:
+        trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
+    except InputError as error:  # from a reading process it comes with that process's traceback
+        raise InputError(str(error).splitlines()[-1].removeprefix(f"{InputError.__module__}.InputError: ")) from None
+
+
+def _accelerator(name: str) -> str:
+    """Lightning's name of an accelerator of this machine.
+
+    Raises:
+        InputError: where it is none.
+    """
+    there = ["auto", "cpu", *(["gpu", "cuda"] if torch.cuda.is_available() else [])]
+    there += ["mps"] if torch.backends.mps.is_available() else []
+    if name not in there:
+        raise InputError(
+            f"expected an accelerator of this machine ({', '.join(there)}), found {name!r}; use one of them"
+        )
+    return name
+
+
+def _epochs_done(checkpoint: Path) -> int:
+    """The epochs that a checkpoint has behind it.
+
+    Raises:
+        InputError: where the file is broken.
+    """
+    try:
+        return torch.load(checkpoint, map_location="cpu", weights_only=True)["epoch"] + 1
+    except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError):
+        raise InputError(f"{checkpoint}: expected a checkpoint, found a broken file; delete it to train anew") from None
 
 
 def names_of(records: Sequence[Any]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast, get_args, get_type_hints
@@ -62,8 +63,9 @@ def _value(default: Any, value: Any, kind: Any, where: str) -> Any:
         if value in allowed:
             return value
         raise InputError(f"{where}: expected one of {', '.join(allowed)}, found {value!r}; correct the value")
-    elif isinstance(default, float) and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+    elif isinstance(default, float) and isinstance(value, int | float | str) and not isinstance(value, bool):
+        with contextlib.suppress(ValueError):
+            return float(value)  # YAML takes 2e-3 for text
     elif type(value) is type(default):
         return value
     raise InputError(f"{where}: expected a value like {default!r}, found {value!r}; correct the value")

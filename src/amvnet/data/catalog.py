@@ -43,9 +43,9 @@ def is_dataset(spec: str) -> bool:
 
 
 def _split_version(place: str) -> tuple[Path, str | None]:
-    """Split PATH@v1.0-mini; a folder whose own name has an @ stays whole."""
+    """Split PATH@v1.0-mini; other names with an @ stay whole."""
     path, at, version = place.rpartition("@")
-    if not at or Path(place).is_dir():
+    if not at or not version.startswith("v1.0-") or Path(place).exists():
         return Path(place).expanduser(), None
     return Path(path).expanduser(), version
 

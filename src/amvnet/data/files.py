@@ -30,12 +30,7 @@ def whole_file(path: Path | str) -> Iterator[Path]:
         InputError: where the folder cannot be made or the file not be written.
     """
     path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{path}: expected a folder that can be written, found {error.strerror}; give another output"
-        ) from None
+    make_folder(path.parent)
     part = path.with_name(f".{uuid.uuid4().hex}.part{path.suffix}")
     try:
         yield part
@@ -152,6 +147,18 @@ def read_labels(path: Path, dtype: DTypeLike, count: int, to_train: Callable[[np
         raise InputError(f"{path}: {error}") from None
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it.
+
+    Raises:
+        InputError: where it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: expected a folder to write to, found {error.strerror}; give another") from None
+
+
 def write_labels(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint32) -> Path:
     """Write (N,) raw ids as `dtype` (uint32 is the official `.label`), whole or not at all."""
     with whole_file(path) as part:
@@ -182,7 +189,7 @@ def _ring(values: np.ndarray, path: Path) -> np.ndarray:
 def _scaled(points: np.ndarray) -> np.ndarray:
     """Bring intensities of 0..255 to [0, 1]; one value above 1 says that they are."""
     intensity = points[:, 3]
-    if (intensity > 1).any():
+    if (intensity[np.isfinite(intensity)] > 1).any():
         intensity /= FULL_INTENSITY
     return points
 

@@ -19,12 +19,12 @@ from amvnet.views.range_view import RangeView
 
 @dataclass(frozen=True)
 class Scores:
-    """What AMVNet finds for P points: rv and bev (f and g), merged: (P, K); uncertain: (P,) bool."""
+    """What AMVNet finds for P points: merged, and f and g of the networks that were asked: (P, K); uncertain: (P,)."""
 
-    rv: Tensor
-    bev: Tensor
     merged: Tensor
     uncertain: Tensor
+    rv: Tensor | None
+    bev: Tensor | None
 
 
 class AMVNet(nn.Module):
@@ -49,7 +49,7 @@ class AMVNet(nn.Module):
         g = self.score_polar_view(batch)
         uncertain = self.assertion(f, g, batch.points)
         h = self.refine(batch, f, g, uncertain)
-        return Scores(f, g, merge(f, g, uncertain, h), uncertain)
+        return Scores(merge(f, g, uncertain, h), uncertain, f, g)
 
     def score_range_view(self, batch: PointBatch) -> Tensor:
         """f: (P, K) class probabilities by the range view."""
@@ -72,8 +72,6 @@ class AMVNet(nn.Module):
 def refine(head: PointHead, points: Tensor, f: Tensor, g: Tensor, uncertain: Tensor) -> Tensor:
     """h: (U, K) class probabilities of one scan's uncertain points, from themselves and their neighbours."""
     index = uncertain.nonzero()[:, 0]
-    if not len(index):
-        return f.new_zeros(0, f.shape[1])
     near = nearest_neighbours(points, index, head.config.neighbours)
     return head(*head_features(head.config, points, f, g, index, near)).softmax(dim=1)
 

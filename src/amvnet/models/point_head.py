@@ -29,7 +29,7 @@ class PointHead(nn.Module):
 
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
-        pooled = self.mlp(rows.reshape(u * n, width)).view(u, n, -1).amax(dim=1)  # (U, hidden)
+        pooled = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1]).amax(dim=1)  # (U, hidden)
         return self.fc(torch.cat([pooled, point], dim=1))
 
 

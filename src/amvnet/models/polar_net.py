@@ -58,7 +58,8 @@ class DropBlock(nn.Module):
         rate = 1 - (1 - self.probability) ** (1 / size**2)
         centres = (torch.rand(x.shape[0], 1, *x.shape[-2:], device=x.device) < rate).to(x.dtype)
         kept = 1 - F.max_pool2d(centres, size, stride=1, padding=size // 2)
-        return x * kept * (kept.numel() / kept.sum().clamp_min(1))
+        share = kept.mean(dtype=torch.float32).clamp_min(1 / kept.numel())  # a sum would overflow half precision
+        return x * (kept / share).to(x.dtype)
 
 
 def _double(channels: int, out: int) -> nn.Sequential:
