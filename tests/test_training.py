@@ -16,7 +16,7 @@ import yaml
 from worlds import GOLDEN, amvnet, files, label_map, make_streets, write_recipe
 
 from amvnet import runner
-from amvnet.training import KeepWeights
+from amvnet.callbacks import KeepWeights
 from amvnet.weights import PARTS, Weights, load
 
 STILL = ("--training.augment.yaw", 0, "--training.augment.scale", 0, "--training.augment.flip", 0)

@@ -15,6 +15,7 @@ import yaml
 from torch import nn
 
 from amvnet import weights as weights_file
+from amvnet.callbacks import KeepWeights
 from amvnet.config import Recipe
 from amvnet.data.files import whole_file
 from amvnet.data.labels import NUSCENES, SEMANTICKITTI
@@ -24,7 +25,7 @@ from amvnet.head_training import HeadStage, gather_points, head_loader
 from amvnet.loading import ScanSet, count_classes, loader
 from amvnet.losses import class_weights
 from amvnet.models.amvnet import AMVNet, build_amvnet
-from amvnet.training import LAST, KeepWeights, PolarStage, RangeStage, Stage, fit, names_of
+from amvnet.training import LAST, PolarStage, RangeStage, Stage, fit, names_of
 from amvnet.trees import to_dict
 from amvnet.weights import SIZES, Weights, state_of
 
