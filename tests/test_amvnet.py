@@ -23,6 +23,7 @@ from amvnet.config import (
 )
 from amvnet.models.amvnet import AMVNet, arithmetic_mean, build_amvnet, geometric_mean, maximum, merge
 from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
+from amvnet.models.layers import fold_batch_norms
 from amvnet.models.point_head import PointHead, head_features, nearest_neighbours
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
@@ -68,6 +69,17 @@ def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> No
         changed[:, neighbour] += 10
         assert (head(point, changed) != expected).any()
     assert (head(point + 1, rows) != expected).any(dim=1).all()
+
+
+def test_folded_batch_norms_change_no_output_of_the_point_head() -> None:
+    torch.manual_seed(0)
+    head = point_head(TINY.point_head, K)
+    point, rows = torch.randn(20, 2 * K + 4), torch.randn(20, 3, 2 * K + 4)
+    head.train()(point, rows)  # statistics that are not the initial ones
+    before = head.eval()(point, rows)
+    fold_batch_norms(head)
+    torch.testing.assert_close(head(point, rows), before, rtol=1e-4, atol=1e-5)
+    assert not any(isinstance(m, nn.BatchNorm1d) for m in head.modules())
 
 
 def neighbours_by_loop(points: Tensor, own: int) -> list[tuple[float, int]]:

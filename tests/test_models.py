@@ -16,7 +16,7 @@ from amvnet.config import (
     PolarViewConfig,
     RangeNetConfig,
 )
-from amvnet.models.layers import AzimuthGRU, RingConv2d, upsample, wrap_width
+from amvnet.models.layers import AzimuthGRU, RingConv2d, fold_batch_norms, upsample, wrap_width
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.scan import Scan
@@ -203,6 +203,18 @@ def test_upsample_gives_each_value_to_the_cells_it_stands_for(height: int, width
     for row in range(height):
         for column in range(width):
             assert torch.equal(found[:, :, row, column], coarse[:, :, row // factor, column // factor])
+
+
+def norms_of(net: nn.Module) -> int:
+    return sum(isinstance(m, nn.BatchNorm1d | nn.BatchNorm2d) for m in net.modules())
+
+
+def test_folded_batch_norms_change_no_output_of_a_network(case: Case) -> None:
+    net = case.in_eval()
+    before, norms = case.run(net, 3), norms_of(net)
+    fold_batch_norms(net)
+    torch.testing.assert_close(case.run(net, 3), before, rtol=1e-4, atol=1e-4)
+    assert norms_of(net) == 1 < norms  # that of the input stays: no layer is before it
 
 
 def test_dropblock_is_identity_in_eval_and_at_probability_zero() -> None:

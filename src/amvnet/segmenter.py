@@ -16,6 +16,7 @@ from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import Scores, geometric_mean, merge, refine
 from amvnet.models.assertions import Assertion, Disagreement, build_assertion
+from amvnet.models.layers import fold_batch_norms
 from amvnet.models.point_head import PointHead
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
@@ -74,6 +75,7 @@ class Segmenter:
             raise InputError("expected an assertion that needs no labels, found loss; train the head with another one")
         self.device = _checked_device(device)
         self.model = self.weights.build().to(device)
+        fold_batch_norms(self.model)
 
     @property
     def taxonomy(self) -> Taxonomy:

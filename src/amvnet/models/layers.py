@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
 
 class RingConv2d(nn.Conv2d):
@@ -107,3 +108,13 @@ class AzimuthGRU(nn.Module):
 def upsample(x: Tensor, like: Tensor) -> Tensor:
     """(B, C, h, w) -> (B, C, H, W) of `like`, each value to the cells that it stands for."""
     return F.interpolate(x, size=like.shape[-2:], mode="nearest")
+
+
+def fold_batch_norms(module: nn.Module) -> None:
+    """Put the batch norms of a module that is in evaluation into the layers before them: as exact, and faster."""
+    for layers in [m for m in module.modules() if isinstance(m, nn.Sequential)]:
+        for place, (layer, norm) in enumerate(zip(list(layers), list(layers)[1:], strict=False)):
+            if isinstance(layer, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+                layers[place], layers[place + 1] = fuse_conv_bn_eval(layer, norm), nn.Identity()
+            elif isinstance(layer, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
+                layers[place], layers[place + 1] = fuse_linear_bn_eval(layer, norm), nn.Identity()
