@@ -11,8 +11,8 @@ from statistics import median
 import torch
 
 from amvnet.errors import InputError
-from amvnet.models.amvnet import merge
-from amvnet.models.point_head import head_features, nearest_neighbours
+from amvnet.models.amvnet import merge, settle
+from amvnet.models.point_head import nearest_neighbours
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter
 from amvnet.views.points import PointBatch
@@ -67,7 +67,7 @@ def _run(segmenter: Segmenter, read: Callable[[], Scan]) -> Timing:
     with clock("neighbours"):
         near = nearest_neighbours(batch.points, index, head.config.neighbours)
     with clock("head"):
-        h = head(*head_features(head.config, batch.points, f, g, index, near)).softmax(dim=1)
+        h = settle(head, batch.points, f, g, index, near)
     with clock("merge"):
         merge(f, g, uncertain, h).argmax(dim=1).cpu()
     return Timing(clock.seconds, len(f), len(index))

@@ -16,6 +16,8 @@ from amvnet.views.points import PointBatch
 from amvnet.views.polar_view import PolarView
 from amvnet.views.range_view import RangeView
 
+PART = 2048  # uncertain points that the head settles at a time
+
 
 @dataclass(frozen=True)
 class Scores:
@@ -73,7 +75,15 @@ def refine(head: PointHead, points: Tensor, f: Tensor, g: Tensor, uncertain: Ten
     """h: (U, K) class probabilities of one scan's uncertain points, from themselves and their neighbours."""
     index = uncertain.nonzero()[:, 0]
     near = nearest_neighbours(points, index, head.config.neighbours)
-    return head(*head_features(head.config, points, f, g, index, near)).softmax(dim=1)
+    return settle(head, points, f, g, index, near)
+
+
+def settle(head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
+    """h: (U, K) of the points with these indices (U,), whose neighbours are (U, n)."""
+    # Part by part, each of which stays in a processor's cache.
+    parts = zip(index.split(PART), near.split(PART), strict=True)
+    h = torch.cat([head(*head_features(head.config, points, f, g, i, n)) for i, n in parts])
+    return h.softmax(dim=1)
 
 
 def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
