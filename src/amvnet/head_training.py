@@ -20,6 +20,7 @@ from amvnet.errors import InputError
 from amvnet.evaluation import confusion
 from amvnet.loading import ScanSet, collate
 from amvnet.models.amvnet import AMVNet, geometric_mean
+from amvnet.models.assertions import Assertion
 from amvnet.models.point_head import PointHead, head_features, nearest_neighbours
 from amvnet.scan import Scan
 from amvnet.training import Stage
@@ -130,9 +131,35 @@ def gather_points(
         folder: is made anew.
         say: told how far it is.
 
+    Where the networks agree everywhere, as they do before they have learnt anything, points are drawn from all.
+
     Raises:
-        InputError: where the networks agree everywhere.
+        InputError: where the scans have no labelled points.
     """
+    found = _gather(sources, dataset, training, views, folder, say, lambda model: model.assertion)
+    if len(found) < 2:
+        say("head: the networks agree everywhere; it learns from points drawn from all")
+        found = _gather(sources, dataset, training, views, folder, say, lambda model: _everywhere)
+    if len(found) < 2:  # batch norm needs two
+        raise InputError(f"{folder}: expected labelled points to train the head with, found none; name other scans")
+    return found
+
+
+def _everywhere(f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
+    """The assertion that doubts every point."""
+    return torch.ones(len(f), dtype=torch.bool, device=f.device)
+
+
+def _gather(
+    sources: Sequence[tuple[Weights, Sequence[ScanRecord]]],
+    dataset: Dataset,
+    training: TrainingConfig,
+    views: int,
+    folder: Path,
+    say: Callable[[str], None],
+    assertion_of: Callable[[AMVNet], Assertion],
+) -> HeadPoints:
+    """As `gather_points`, of the points that an assertion doubts."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     size = dataset.taxonomy.size
@@ -145,13 +172,12 @@ def gather_points(
         scans = ScanSet(dataset, records, training.augment if views else None, training.seed)
         for epoch, place in np.ndindex(max(views, 1), len(scans)):
             rng = np.random.default_rng([training.seed, epoch, place])
-            columns, matrix = _gather_scan(model, weights.model.point_head, scans[epoch, place], most, size, rng)
+            config, assertion = weights.model.point_head, assertion_of(model)
+            columns, matrix = _gather_scan(model, config, assertion, scans[epoch, place], most, size, rng)
             shapes = {name: _append(folder / name, values, shapes[name]) for name, values in columns.items()}
             certain, done = certain + matrix, done + 1
             if done * 10 // total != (done - 1) * 10 // total:
                 say(f"head: scored {done} of {total} scans")
-    if shapes["labels"][0] < 2:
-        raise InputError(f"{folder}: expected points that the networks disagree on, found none; raise the threshold")
     return HeadPoints(folder, certain, shapes)
 
 
@@ -162,14 +188,20 @@ def _device(accelerator: str) -> str:
 
 @torch.inference_mode()
 def _gather_scan(
-    model: AMVNet, config: PointHeadConfig, scan: Scan, most: int, size: int, rng: np.random.Generator
+    model: AMVNet,
+    config: PointHeadConfig,
+    assertion: Assertion,
+    scan: Scan,
+    most: int,
+    size: int,
+    rng: np.random.Generator,
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """The columns of one scan's kept points, and the confusion of its certain ones."""
     device = next(model.parameters()).device
     batch, labels = collate([scan])
     batch, labels = batch.to(device), labels.to(device)
     f, g = model.score_range_view(batch), model.score_polar_view(batch)
-    uncertain = model.assertion(f, g, batch.points, labels) & (labels > 0)
+    uncertain = assertion(f, g, batch.points, labels) & (labels > 0)
     agreed = geometric_mean(f, g).argmax(dim=1) + 1
     matrix = confusion(labels[~uncertain].cpu().numpy(), agreed[~uncertain].cpu().numpy(), size)
     index = uncertain.nonzero()[:, 0]

@@ -79,10 +79,11 @@ class Run:
         names = ("rv", "bev", "head") if stage == "all" else (stage,)
         for name in names:
             self._check_earlier(name)
-        current = self._start(init)
+        current, path = self._start(init), self.out / "weights.safetensors"
         for name in names:
             current = self._stage(name, current)
-        return weights_file.save(current, self.out / "weights.safetensors")
+            weights_file.save(current, path)  # after each stage, so that one that fails takes nothing with it
+        return path
 
     def _start(self, init: Weights | None) -> Weights:
         """Fresh weights, or those that are given; earlier stages of this folder are taken up."""
