@@ -24,7 +24,7 @@ from amvnet.config import (
 from amvnet.models.amvnet import AMVNet, arithmetic_mean, build_amvnet, geometric_mean, maximum, merge
 from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
 from amvnet.models.layers import fold_batch_norms
-from amvnet.models.point_head import PointHead, head_features, nearest_neighbours
+from amvnet.models.point_head import PointHead, head_features, nearest_neighbours, point_table
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
 
@@ -135,7 +135,7 @@ def head_features_by_loop(points: Tensor, f: Tensor, g: Tensor, own: int) -> tup
 def test_head_features_equal_a_loop() -> None:
     points, (f, g), index = torch.randn(12, 4) * 10, torch.rand(2, 12, K), torch.tensor([3, 11])
     near = nearest_neighbours(points, index, TINY.point_head.neighbours)
-    found = head_features(TINY.point_head, points, f, g, index, near)
+    found = head_features(TINY.point_head, point_table(points, f, g), index, near)
     expected = [head_features_by_loop(points, f, g, own) for own in index.tolist()]
     torch.testing.assert_close(found[0], torch.tensor([point for point, _ in expected]))
     torch.testing.assert_close(found[1], torch.tensor([rows for _, rows in expected]))

@@ -21,7 +21,7 @@ from amvnet.evaluation import confusion
 from amvnet.loading import ScanSet, collate
 from amvnet.models.amvnet import AMVNet, geometric_mean
 from amvnet.models.assertions import Assertion
-from amvnet.models.point_head import PointHead, head_features, nearest_neighbours
+from amvnet.models.point_head import PointHead, head_features, nearest_neighbours, point_table
 from amvnet.scan import Scan
 from amvnet.training import Stage
 from amvnet.weights import Weights
@@ -209,7 +209,7 @@ def _gather_scan(
     stands_for = np.full(len(chosen), len(index) / max(len(chosen), 1))
     index = index[torch.from_numpy(np.sort(chosen)).to(device)]
     near = nearest_neighbours(batch.points, index, config.neighbours)
-    point, rows = head_features(config, batch.points, f, g, index, near)
+    point, rows = head_features(config, point_table(batch.points, f, g), index, near)
     found = {"point": point, "rows": rows, "labels": labels[index]}
     return {**{name: values.cpu().numpy() for name, values in found.items()}, "stands_for": stands_for}, matrix
 

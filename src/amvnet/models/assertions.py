@@ -8,7 +8,6 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from amvnet.config import AssertionConfig
 
@@ -31,7 +30,8 @@ class Disagreement:
     tau: float = 0.85
 
     def __call__(self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
-        return F.cosine_similarity(f, g, dim=1) <= self.tau
+        both, length = torch.linalg.vecdot(f, g), torch.linalg.vecdot(f, f) * torch.linalg.vecdot(g, g)
+        return both / length.clamp_min(TINY).sqrt() <= self.tau
 
 
 @dataclass(frozen=True)

@@ -33,25 +33,25 @@ class PointHead(nn.Module):
         return self.fc(torch.cat([pooled, point], dim=1))
 
 
-def head_features(
-    config: PointHeadConfig, points: Tensor, f: Tensor, g: Tensor, uncertain: Tensor, near: Tensor
-) -> tuple[Tensor, Tensor]:
+def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
+    """[f, g, x] of all points of a scan, (P, 2 K + 4), from which `head_features` takes its rows."""
+    return torch.cat([f, g, points], dim=1)
+
+
+def head_features(config: PointHeadConfig, table: Tensor, uncertain: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
     """p_i = [f_i, g_i, x_i] of the uncertain points, and the rows [f_k, g_k, x_k - x_i] of their S_i.
 
     Args:
-        points: (P, 4) of one scan.
-        f, g: (P, K) class probabilities of the two networks.
+        table: (P, 2 K + 4) of one scan, from `point_table`.
         uncertain: (U,) indices of the uncertain points.
         near: (U, n) indices of their nearest neighbours.
 
     Returns:
         (U, 2 K + 4) and (U, n, 2 K + 4).
     """
-    both = torch.cat([f, g], dim=1)
-    here = points[uncertain]
-    scale = here.new_tensor([config.position_scale] * 3 + [1.0])
-    point = torch.cat([both[uncertain], here * scale], dim=1)
-    rows = torch.cat([both[near], points[near] - here[:, None]], dim=2)
+    point, rows = table[uncertain], table[near]
+    rows[..., -POINT_VALUES:] -= point[:, None, -POINT_VALUES:]
+    point[:, -POINT_VALUES:-1] *= config.position_scale
     return point, rows
 
 
