@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +60,27 @@ def test_a_stopped_simulation_goes_on_to_the_same_bytes(
     assert contents(tmp_path) == contents(nuscenes)
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks Linux which processes there are")
+def test_no_process_outlives_one_that_was_killed(tmp_path: Path) -> None:
+    command = ["simulate", str(tmp_path), "--sequences", "2", "--scans", "1000", "--processes", "2"]
+    parent = subprocess.Popen([sys.executable, "-m", "amvnet.cli", *command], stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.rglob("*.bin")) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    children = [int(pid) for pid in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()]
+    assert len(children) >= 2
+    parent.kill()
+    parent.wait()
+    while any(_runs(pid) for pid in children) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not [pid for pid in children if _runs(pid)]
+
+
+def _runs(pid: int) -> bool:
+    stat = Path(f"/proc/{pid}/stat")
+    return stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
 def test_a_finished_simulation_is_left_as_it_is(nuscenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(writing, "drive_street", lambda *_: pytest.fail("was simulated again"))
     before = contents(nuscenes)
@@ -79,7 +103,9 @@ def test_simulated_nuscenes_is_read_as_the_real_one(nuscenes: Path) -> None:
         assert scan.labels is not None
         elevation = np.degrees(np.arctan2(scan.points[:, 2], np.hypot(*scan.points[:, :2].T)))
         near = np.linalg.norm(scan.points[:, :3], axis=1) < 1
-        assert np.abs(elevation - (-30.66 + scan.ring * 4 / 3))[~near].max() < 0.1
+        off = np.abs(elevation - (-30.66 + scan.ring * 4 / 3))[~near]
+        assert np.median(off) < 0.1
+        assert off.max() < 2  # the sensor moves during its turn, which the files have corrected
         assert (scan.labels[near] == 0).all()
         assert (np.bincount(scan.ring) == 1084).all()  # a row for each shot, as nuScenes has it
         seen |= set(scan.labels.tolist())

@@ -8,9 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from amvnet.simulation.layouts import SimulatedScan
-from amvnet.simulation.lidar import RayScene, receive, trace
+from amvnet.simulation.lidar import RayScene, trace
 from amvnet.simulation.mesh import join
 from amvnet.simulation.populate import populate
+from amvnet.simulation.returns import laser_gains, receive
 from amvnet.simulation.sensors import Sensor
 from amvnet.simulation.streets import Ground
 from amvnet.simulation.styles import draw_style
@@ -55,7 +56,7 @@ def _drive_block(sensor: Sensor, scans: int, rng: np.random.Generator, drive: Dr
     speed = float(rng.uniform(*drive.speed))
     site = populate(ground, rng, speed, drive.margin)
     standing = RayScene(join([ground.mesh(), *site.fixed]))
-    sway = rng.uniform(-0.4, 0.4)
+    sway, gains = rng.uniform(-0.4, 0.4), laser_gains(sensor, rng)
     first: np.ndarray | None = None
     for index in range(scans):
         x, time = drive.margin + index * drive.spacing, index * drive.spacing / speed
@@ -64,7 +65,7 @@ def _drive_block(sensor: Sensor, scans: int, rng: np.random.Generator, drive: Dr
         )
         scenes = [standing, RayScene(moving)] if len(moving) else [standing]
         pose = _pose(ground, sensor, x, -style.road / 4 + sway * np.sin(index * 0.7), rng)
-        points, labels, ring = receive(trace(scenes, sensor, pose, ground.label), sensor, rng)
+        points, labels, ring = receive(trace(scenes, sensor, pose, ground, rng, speed), sensor, gains, rng)
         first = pose if first is None else first
         yield SimulatedScan(points, labels, ring, np.linalg.inv(first) @ pose, time)
 

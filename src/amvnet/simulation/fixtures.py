@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh, box, join, leaf_ball, leaf_box, part, prism, tube
+from amvnet.simulation.mesh import Mesh, box, hull, join, part, prism, tube
 
 
 def _openings(rng: np.random.Generator, width: float, depth: float, height: float) -> np.ndarray:
@@ -115,36 +115,38 @@ def traffic_cone(rng: np.random.Generator) -> Mesh:
     return part(cone, Surface.SIGN_FACE, Label.TRAFFIC_CONE)
 
 
+def _leaves(hulls: list[np.ndarray], depth: float) -> Mesh:
+    """Foliage that pulses enter as far as `depth` metres on average."""
+    return part(np.concatenate(hulls), Surface.LEAF, Label.VEGETATION, depth)
+
+
 def hedge(rng: np.random.Generator, length: float, height: float) -> Mesh:
-    """A clipped hedge: a twiggy core in leaves."""
-    depth = rng.uniform(0.5, 1.0)
-    leaves = leaf_box(rng, (length, depth, height), int(160 * length * height), 0.07)
-    core = box((length, depth * 0.4, height * 0.85))
-    return part(np.concatenate([leaves, core]), Surface.LEAF, Label.VEGETATION)
+    """A clipped hedge."""
+    radii = (length * 0.55, rng.uniform(0.25, 0.5), height * 0.55)
+    return _leaves([hull(rng, (0, 0, height * 0.5), radii, square=0.5)], rng.uniform(0.02, 0.06))
 
 
 def bush(rng: np.random.Generator, radius: float) -> Mesh:
     """A bush, from knee-high to taller than a man."""
     height = radius * rng.uniform(0.7, 1.4)
-    count = int(350 * (1 + radius * radius))
-    leaves = leaf_ball(rng, (0, 0, height * 0.8), (radius, radius * rng.uniform(0.7, 1.3), height), count, 0.09)
-    return part(leaves, Surface.LEAF, Label.VEGETATION)
+    radii = (radius, radius * rng.uniform(0.7, 1.3), height)
+    return _leaves([hull(rng, (0, 0, height * 0.8), radii)], rng.uniform(0.03, 0.25))
 
 
 def tall_grass(rng: np.random.Generator, length: float) -> Mesh:
     """A strip of weeds and tall grass, which is labelled vegetation."""
-    leaves = leaf_box(rng, (length, rng.uniform(0.6, 2.0), rng.uniform(0.2, 0.6)), int(60 * length), 0.10)
-    return part(leaves, Surface.LEAF, Label.VEGETATION)
+    radii = (length * 0.55, rng.uniform(0.3, 1.0), rng.uniform(0.2, 0.6))
+    return _leaves([hull(rng, (0, 0, 0), radii, square=0.7)], rng.uniform(0.05, 0.12))
 
 
 def thicket(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """A length of wild, dense undergrowth: clumps of leaves that bulge out and up."""
-    leaves = []
+    clumps = []
     for x in np.arange(-length / 2, length / 2, 1.3):
-        tall, wide = height * rng.uniform(0.35, 0.6), rng.uniform(0.9, 1.6)
+        tall, wide = height * rng.uniform(0.35, 0.6), rng.uniform(0.7, 1.4)
         spot = (x + rng.normal(scale=0.3), rng.normal(scale=0.5), tall * 0.85)
-        leaves.append(leaf_ball(rng, spot, (1.2, wide, tall), int(130 * (1 + tall * wide)), 0.14))
-    return part(np.concatenate(leaves), Surface.LEAF, Label.VEGETATION)
+        clumps.append(hull(rng, spot, (1.1, wide, tall)))
+    return _leaves(clumps, rng.uniform(0.04, 0.3))
 
 
 def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
@@ -154,27 +156,37 @@ def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
     wide = height * rng.uniform(0.18, 0.32)
     lean = rng.normal(scale=0.02 * height, size=2)
     fork = (lean[0], lean[1], clear)
-    bars = [tube((0, 0, -0.5), fork, thick, thick * 0.8)]
-    leaves, clumps = [], int(rng.integers(2, 6)) if fine else 1
+    boughs, crown, clumps = [], [], int(rng.integers(3, 8)) if fine else 2
     for _ in range(clumps):
-        spot = (*(lean + rng.normal(scale=wide * 0.4, size=2)), rng.uniform(clear * 1.1 + wide * 0.5, height * 0.8))
-        bars.append(tube(fork, spot, thick * 0.6, 0.03, sides=5))
-        radii = (wide, wide, (height - clear) * 0.5) if clumps == 1 else (wide * 0.75, wide * 0.75, wide * 0.7)
-        count, size = (int(110 * wide * wide) + 150, 0.13) if fine else (int(40 * wide * wide) + 120, 0.22)
-        leaves.append(leaf_ball(rng, spot, radii, count, size))
-    wood = part(np.concatenate(bars), Surface.BARK, Label.TRUNK)
-    return join([wood, part(np.concatenate(leaves), Surface.LEAF, Label.VEGETATION)])
+        spot = (*(lean + rng.normal(scale=wide * 0.45, size=2)), rng.uniform(clear * 1.1 + wide * 0.4, height * 0.85))
+        boughs.append(tube(fork, spot, thick * 0.6, 0.03, sides=5))
+        share = rng.uniform(0.45, 0.75)
+        crown.append(hull(rng, spot, (wide * share, wide * share, wide * share * 0.9), fine=fine))
+    # The benchmark's trunks end where the boughs begin.
+    return join(
+        [
+            part(tube((0, 0, -0.5), fork, thick, thick * 0.8), Surface.BARK, Label.TRUNK),
+            part(np.concatenate(boughs), Surface.BARK, Label.VEGETATION),
+            _leaves(crown, rng.uniform(0.05, 0.7)),
+        ]
+    )
 
 
 def conifer(rng: np.random.Generator, height: float) -> Mesh:
-    """A fir: leafy rings that narrow upwards, nearly down to the ground."""
-    trunk = part(tube((0, 0, -0.5), (0, 0, height * 0.9), 0.018 * height, 0.03), Surface.BARK, Label.TRUNK)
-    rise = rng.uniform(0.08, 1.0, size=(int(150 * height), 1))
-    angle = rng.uniform(0, 2 * np.pi, size=len(rise))
-    reach = (1.05 - rise[:, 0]) * height * rng.uniform(0.16, 0.24) * np.sqrt(rng.random(len(rise)))
-    middle = np.column_stack([reach * np.cos(angle), reach * np.sin(angle), rise[:, 0] * height])
-    leaves = middle[:, None] + rng.normal(scale=0.13, size=(len(rise), 3, 3))
-    return join([trunk, part(leaves, Surface.LEAF, Label.VEGETATION)])
+    """A fir: narrower upwards, nearly down to the ground."""
+    trunk = part(tube((0, 0, -0.5), (0, 0, height * 0.5), 0.018 * height, 0.03), Surface.BARK, Label.TRUNK)
+    wide = height * rng.uniform(0.13, 0.2)
+    body = hull(rng, (0, 0, height * 0.55), (wide, wide, height * 0.47), taper=0.75)
+    return join([trunk, _leaves([body], rng.uniform(0.05, 0.25))])
+
+
+def copse(rng: np.random.Generator, length: float, height: float) -> Mesh:
+    """The edge of a wood, seen from far away."""
+    crowns = [
+        hull(rng, (x, rng.normal(scale=2), height * 0.45), (3.5, 3.0, height * rng.uniform(0.4, 0.6)), fine=False)
+        for x in np.arange(-length / 2, length / 2, 4.5)
+    ]
+    return _leaves(crowns, rng.uniform(0.2, 0.6))
 
 
 def lamp(rng: np.random.Generator) -> Mesh:

@@ -1,20 +1,24 @@
-"""A spinning LiDAR: which rays it fires, what they hit, and which returns come back how bright."""
+"""A spinning LiDAR: which rays it fires, and what they hit."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from types import ModuleType
+from typing import Protocol
 
 import numpy as np
 
 from amvnet.errors import InputError
-from amvnet.simulation.materials import ground_surface_table, reflection_table
+from amvnet.simulation.materials import ground_surface_table
 from amvnet.simulation.mesh import Mesh
 from amvnet.simulation.sensors import Sensor
 
-MIXED_FROM, MIXED_TO = 0.3, 3.0  # metres: steps in depth within which one pulse gives one return in between
+SHADOW_EDGE = 6.0  # degrees by which the edges of the car's shadow differ between lasers
+CROWNS = 6  # clumps of leaves that a pulse may pass
+BEYOND = 0.002  # metres behind a surface where a ray goes on
+LEAF_COSINE = 0.5  # leaves look every way
 
 
 def require_embree() -> tuple[ModuleType, ModuleType]:
@@ -43,14 +47,39 @@ class RayScene:
         self._kept = meshes.TriangleMesh(self._scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
         edges = mesh.triangles[:, 1:] - mesh.triangles[:, :1]
         normals = np.cross(edges[:, 0], edges[:, 1])
-        self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        length = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        self.normals = (normals / length).astype(np.float32)
 
     def cast(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance and triangle of the first hit of each ray; infinite and -1 where there is none. (R,), (R,)."""
-        origins = np.broadcast_to(origin.astype(np.float32), directions.shape).copy()
-        found = self._scene.run(origins, directions, output=1)
+        found = self._scene.run(origin, directions, output=1)
         triangle = found["primID"].astype(np.int64)
         return np.where(triangle >= 0, found["tfar"], np.inf), triangle
+
+
+class GroundLook(Protocol):
+    """What the ground, whose triangles have no class, looks like at places x, y; all arrays are (N,)."""
+
+    def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Raw class ids."""
+
+    def tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
+        """How bright, as in `Mesh`."""
+
+
+@dataclass(frozen=True)
+class Rays:
+    """The shots of one turn that the own car lets out, in the sensor's frame; laser by laser, azimuth from +x.
+
+    Attributes:
+        direction: (R, 3) float32 unit vectors.
+        ring: (R,) uint8 index of the laser, 0 = lowest.
+        time: (R,) float32 seconds from the moment when the sensor looks ahead.
+    """
+
+    direction: np.ndarray
+    ring: np.ndarray
+    time: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -62,126 +91,142 @@ class Hits:
         distance: (N,) metres.
         cosine: (N,) of the angle between ray and surface normal.
         surface: (N,) rows of the reflection table.
+        tint: (N,) as in `Mesh`.
         label: (N,) class ids.
         instance: (N,) instance ids.
         ring: (N,) index of the laser, 0 = lowest.
-        shots: number of shots of the turn.
+        shift: (N, 3) metres that the sensor had moved when it fired.
     """
 
     direction: np.ndarray
     distance: np.ndarray
     cosine: np.ndarray
     surface: np.ndarray
+    tint: np.ndarray
     label: np.ndarray
     instance: np.ndarray
     ring: np.ndarray
-    shots: int
+    shift: np.ndarray
 
 
 @lru_cache(maxsize=4)
-def fired(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
-    """Directions of all shots that the own car lets out, laser by laser from the top, azimuth from +x, and rings.
-
-    Returns:
-        (R, 3) float32 and (R,) uint8, 0 = lowest.
-    """
+def fired(sensor: Sensor) -> Rays:
+    """The shots of one turn."""
     elevation = np.radians(np.array(sensor.elevations))[:, None]
     # The lasers of a real device do not sit on one line: each is turned by a little of its own.
     skew = ((np.arange(len(elevation)) * 0.618) % 1.0)[:, None]
-    azimuth = (np.arange(sensor.azimuth_steps) + skew) * 2 * np.pi / sensor.azimuth_steps
-    level = np.cos(elevation)
+    turned = (np.arange(sensor.azimuth_steps) + skew) / sensor.azimuth_steps
+    azimuth, level = 2 * np.pi * turned, np.cos(elevation)
     rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1)
+    ring = np.repeat(np.arange(len(sensor.elevations), dtype=np.uint8)[::-1], sensor.azimuth_steps)
+    # The sensor turns clockwise.
+    time = sensor.turn * (0.5 - (turned + 0.5) % 1)
     free = ~_hidden(sensor)
-    rays = rays.reshape(-1, 3)[free].astype(np.float32)
-    ring = np.repeat(np.arange(len(sensor.elevations), dtype=np.uint8)[::-1], sensor.azimuth_steps)[free]
-    for array in (rays, ring):
+    columns = rays.reshape(-1, 3)[free].astype(np.float32), ring[free], time.ravel()[free].astype(np.float32)
+    for array in columns:
         array.flags.writeable = False
-    return rays, ring
+    return Rays(*columns)
 
 
 def _hidden(sensor: Sensor) -> np.ndarray:
     """(R,) True where the own car stops a shot; laser by laser."""
     elevation = np.array(sensor.elevations)[:, None]
     azimuth = np.arange(sensor.azimuth_steps) * 360 / sensor.azimuth_steps
+    # The edges differ between lasers, which look out of the device at several places.
+    azimuth = azimuth + SHADOW_EDGE * ((np.arange(len(elevation)) * 0.382) % 1.0 - 0.5)[:, None]
     hidden = np.zeros((len(elevation), sensor.azimuth_steps), dtype=bool)
     for start, end, low, high in sensor.shadow:
         hidden |= ((azimuth - start) % 360 < end - start) & (elevation > low) & (elevation < high)
     return hidden.ravel()
 
 
-GroundLabel = Callable[[np.ndarray, np.ndarray], np.ndarray]
+class _Front:
+    """How far some rays have come: the nearest hit of each over all scenes.
 
-
-def trace(scenes: Sequence[RayScene], sensor: Sensor, pose: np.ndarray, ground_label: GroundLabel) -> Hits:
-    """What each shot hits first; pose (4, 4) maps the sensor's frame to the street's."""
-    rays, ring = fired(sensor)
-    turned = (rays @ pose[:3, :3].T.astype(np.float32)).astype(np.float32)
-    distance = np.full(len(rays), np.inf)
-    cosine, surface = np.zeros(len(rays)), np.zeros(len(rays), dtype=np.uint8)
-    label, instance = np.zeros((2, len(rays)), dtype=np.uint16)
-    for scene in scenes:
-        far, triangle = scene.cast(pose[:3, 3], turned)
-        hit = np.flatnonzero(far < distance)
-        struck = triangle[hit]
-        distance[hit] = far[hit]
-        cosine[hit] = np.abs((scene.normals[struck] * turned[hit]).sum(axis=1))
-        surface[hit], label[hit] = scene.mesh.surface[struck], scene.mesh.label[struck]
-        instance[hit] = scene.mesh.instance[struck]
-    seen = np.isfinite(distance)
-    ground = np.flatnonzero(seen & (label == 0))
-    spot = pose[:2, 3] + turned[ground, :2] * distance[ground, None]
-    label[ground] = ground_label(spot[:, 0], spot[:, 1])
-    surface[ground] = ground_surface_table()[label[ground]]
-    shots = len(sensor.elevations) * sensor.azimuth_steps
-    return Hits(rays[seen], distance[seen], cosine[seen], surface[seen], label[seen], instance[seen], ring[seen], shots)
-
-
-def receive(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The points and labels that come back from the hits: noise, brightness, lost returns.
-
-    Returns:
-        (N, 4) float32 x, y, z, intensity, (N,) uint32 class ids with the instance in the upper half, and (N,)
-        uint8 rings.
+    Attributes:
+        distance: (R,) float32 metres; infinite where there is none.
+        facing: (R,) product of ray and normal, negative where the ray comes from outside.
+        surface, label, instance, depth, tint: (R,) as in `Mesh`, of what was hit.
     """
-    reflectivity, spread, dark, drop = reflection_table()[hits.surface].T
-    count = len(hits.distance)
-    # The received power falls with the square of the range; the return is lost where it drowns in noise.
-    reach = sensor.reach * np.sqrt(reflectivity * np.maximum(hits.cosine, 1e-3))
-    kept = 1 / (1 + (hits.distance / reach) ** 6) * (1 - drop) * (1 - sensor.drop)
-    distance = _mixed(hits, sensor, rng) + rng.normal(scale=sensor.range_noise, size=count)
-    kept[(distance < sensor.min_range) | (distance > sensor.max_range)] = 0
-    # The device evens out range and incidence, but not wholly.
-    shade = np.maximum(hits.cosine, 1e-3) ** 0.12 * (1 - 0.2 * hits.distance / sensor.max_range)
-    intensity = reflectivity * shade * (1 + spread * rng.normal(size=count))
-    intensity[rng.random(count) < dark] = 0
-    intensity = np.clip(np.round(sensor.gain * intensity, 2 if sensor.gain == 1 else 3), 0, 0.99)
-    back = rng.random(count) < kept
-    points = np.column_stack([hits.direction * distance[:, None], intensity])[back].astype(np.float32)
-    label = hits.label[back].astype(np.uint32) | hits.instance[back].astype(np.uint32) << np.uint32(16)
-    if not sensor.keeps_lost:
-        return points, label, hits.ring[back]
-    lost, rings = _lost(hits, sensor, hits.ring[back], rng)
-    zeros = np.zeros(len(lost), dtype=np.uint32)
-    return np.concatenate([points, lost]), np.concatenate([label, zeros]), np.concatenate([hits.ring[back], rings])
+
+    def __init__(self, scenes: Sequence[RayScene], origin: np.ndarray, direction: np.ndarray) -> None:
+        self.distance = np.full(len(direction), np.inf, dtype=np.float32)
+        self.facing = np.zeros(len(direction), dtype=np.float32)
+        self.depth, self.tint = np.zeros((2, len(direction)), dtype=np.float32)
+        self.surface = np.zeros(len(direction), dtype=np.uint8)
+        self.label, self.instance = np.zeros((2, len(direction)), dtype=np.uint16)
+        for scene in scenes:
+            far, triangle = scene.cast(origin, direction)
+            hit = np.flatnonzero(far < self.distance)
+            struck, mesh = triangle[hit], scene.mesh
+            self.distance[hit] = far[hit]
+            self.facing[hit] = np.einsum("ij,ij->i", scene.normals[struck], direction[hit])
+            for name in _OF_TRIANGLES:
+                getattr(self, name)[hit] = getattr(mesh, name)[struck]
+
+    def move(self, index: np.ndarray, to: _Front, rows: np.ndarray, gone: np.ndarray) -> None:
+        """Let some rays, which had gone so far, arrive where some rows of another front are."""
+        self.distance[index] = gone + to.distance[rows]
+        for name in ("facing", *_OF_TRIANGLES):
+            getattr(self, name)[index] = getattr(to, name)[rows]
 
 
-def _lost(hits: Hits, sensor: Sensor, back: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """The rows that nuScenes has for shots without a return: near the sensor, most of them behind its right side."""
-    missing = sensor.azimuth_steps - np.bincount(back, minlength=len(sensor.elevations))
-    ring = np.repeat(np.arange(len(missing), dtype=np.uint8), missing)
-    one_side = rng.random(len(ring)) < 0.65
-    azimuth = np.where(one_side, rng.normal(np.radians(165), 0.15, len(ring)), rng.uniform(-np.pi, np.pi, len(ring)))
-    distance = np.minimum(rng.exponential(0.25, len(ring)), 0.99)
-    elevation = np.where(one_side, rng.normal(-0.04, 0.03, len(ring)), rng.normal(-0.3, 0.3, len(ring)))
-    level = np.cos(elevation)
-    direction = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
-    bright = np.where(rng.random(len(ring)) < 0.1, 0.2, 0.008)
-    return np.column_stack([distance[:, None] * direction, bright]).astype(np.float32), ring
+_OF_TRIANGLES = ("surface", "label", "instance", "depth", "tint")
 
 
-def _mixed(hits: Hits, sensor: Sensor, rng: np.random.Generator) -> np.ndarray:
-    """(N,) distances, of which some at edges lie between both surfaces: a beam is as wide as the step to the next."""
-    step = np.diff(hits.distance, append=hits.distance[-1:])
-    neighbours = (hits.direction * np.roll(hits.direction, -1, axis=0)).sum(axis=1) > np.cos(np.radians(0.5))
-    edge = neighbours & (np.abs(step) > MIXED_FROM) & (np.abs(step) < MIXED_TO) & (rng.random(len(step)) < sensor.mixed)
-    return hits.distance + np.where(edge, rng.random(len(step)) * step, 0)
+def trace(
+    scenes: Sequence[RayScene],
+    sensor: Sensor,
+    pose: np.ndarray,
+    ground: GroundLook,
+    rng: np.random.Generator,
+    speed: float = 0.0,
+) -> Hits:
+    """What each shot hits first, or where in foliage it ends.
+
+    Args:
+        scenes: what there is, in the street's frame.
+        sensor: which shots are fired.
+        pose: (4, 4) from the sensor's frame to the street's, when it looks ahead.
+        ground: what triangles of class 0 are.
+        rng: decides how deep pulses go into foliage.
+        speed: of the sensor along its x, metres per second.
+    """
+    rays = fired(sensor)
+    turn = pose[:3, :3].astype(np.float32)
+    direction = rays.direction @ turn.T
+    shift = np.zeros_like(direction)
+    shift[:, 0] = speed * rays.time
+    origin = (pose[:3, 3] + shift @ turn.T).astype(np.float32)
+    front = _Front(scenes, origin, direction)
+    _enter_foliage(front, scenes, origin, direction, rng)
+    seen = np.flatnonzero(np.isfinite(front.distance))
+    distance, label, surface, tint = (x[seen] for x in (front.distance, front.label, front.surface, front.tint))
+    bare = np.flatnonzero(label == 0)
+    x, y = (origin[seen[bare], :2] + direction[seen[bare], :2] * distance[bare, None]).T
+    label[bare] = ground.label(x, y)
+    surface[bare], tint[bare] = ground_surface_table()[label[bare]], ground.tint(x, y, label[bare])
+    cosine = np.where(front.depth[seen] > 0, LEAF_COSINE, np.abs(front.facing[seen]))
+    kept = rays.direction[seen], distance, cosine, surface, tint, label, front.instance[seen], rays.ring[seen]
+    return Hits(*kept, shift[seen])
+
+
+def _enter_foliage(
+    front: _Front, scenes: Sequence[RayScene], origin: np.ndarray, direction: np.ndarray, rng: np.random.Generator
+) -> None:
+    """Move rays that hit foliage on to the leaf that they end at, or through to what is behind it."""
+    inside = np.flatnonzero(front.depth > 0)
+    for _ in range(CROWNS):
+        if not len(inside):
+            return
+        start = front.distance[inside]
+        on = start + BEYOND
+        beyond = _Front(scenes, origin[inside] + direction[inside] * on[:, None], direction[inside])
+        free = rng.standard_exponential(len(inside), dtype=np.float32) * front.depth[inside]
+        free[front.facing[inside] > 0] = np.inf  # on the way out
+        stopped = free < beyond.distance
+        front.distance[inside[stopped]] += free[stopped]
+        through = np.flatnonzero(~stopped)
+        inside = inside[through]
+        front.move(inside, beyond, through, on[through])
+        inside = inside[front.depth[inside] > 0]

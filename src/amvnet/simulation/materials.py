@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
 
@@ -120,42 +121,46 @@ class Surface(IntEnum):
 
 @dataclass(frozen=True)
 class Reflection:
-    """How one surface answers a pulse."""
+    """How one surface answers a pulse; figures as in KITTI's scans."""
 
     # Intensity of a near, head-on return, 0 to 1.
     reflectivity: float
     # Relative standard deviation of the intensity between returns.
-    spread: float = 0.15
+    spread: float
+    # Standard deviation of the intensity's logarithm between things.
+    shade: float
     # Share of the returns that come with intensity 0, as glossy surfaces send most light elsewhere.
-    dark: float = 0.03
+    dark: float = 0.02
     # Share of the pulses that never come back, whatever the range.
     drop: float = 0.0
+    # Mean height in metres of the relief that is too small for triangles.
+    rough: float = 0.0
 
 
 REFLECTIONS: dict[Surface, Reflection] = {
-    Surface.ASPHALT: Reflection(0.32, 0.20, 0.09),
-    Surface.PAVING: Reflection(0.36, 0.15, 0.03),
-    Surface.GRASS: Reflection(0.42, 0.14, 0.02),
-    Surface.GRAVEL: Reflection(0.34, 0.22, 0.06),
-    Surface.ROAD_PAINT: Reflection(0.55, 0.20, 0.02),
-    Surface.PLASTER: Reflection(0.44, 0.28, 0.04, 0.01),
-    Surface.BRICK: Reflection(0.36, 0.28, 0.06, 0.01),
-    Surface.GLASS: Reflection(0.10, 0.60, 0.75, 0.65),
-    Surface.WOOD: Reflection(0.37, 0.25, 0.08),
-    Surface.LEAF: Reflection(0.37, 0.28, 0.08, 0.05),
-    Surface.BARK: Reflection(0.38, 0.25, 0.08),
-    Surface.METAL: Reflection(0.26, 0.50, 0.28, 0.03),
-    Surface.SIGN_FACE: Reflection(0.55, 0.55, 0.06),
-    Surface.CLOTH: Reflection(0.44, 0.30, 0.03),
-    Surface.SKIN: Reflection(0.45, 0.20, 0.03),
-    Surface.DARK_PAINT: Reflection(0.14, 0.60, 0.68, 0.12),
-    Surface.LIGHT_PAINT: Reflection(0.34, 0.50, 0.38, 0.05),
-    Surface.RUBBER: Reflection(0.08, 0.50, 0.50, 0.10),
-    Surface.PLATE: Reflection(0.95, 0.10, 0.0),
-    Surface.PLASTIC: Reflection(0.34, 0.30, 0.15, 0.03),
-    Surface.ROOF_TILE: Reflection(0.33, 0.25, 0.05, 0.01),
+    Surface.ASPHALT: Reflection(0.30, spread=0.11, shade=0.14, dark=0.004),
+    Surface.PAVING: Reflection(0.33, spread=0.09, shade=0.12, dark=0.003),
+    Surface.GRASS: Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.022),
+    Surface.GRAVEL: Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004),
+    Surface.ROAD_PAINT: Reflection(0.55, spread=0.20, shade=0.15),
+    Surface.PLASTER: Reflection(0.44, spread=0.10, shade=0.25, drop=0.01),
+    Surface.BRICK: Reflection(0.38, spread=0.12, shade=0.25, drop=0.01, rough=0.002),
+    Surface.GLASS: Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65),
+    Surface.WOOD: Reflection(0.38, spread=0.13, shade=0.25, rough=0.003),
+    Surface.LEAF: Reflection(0.38, spread=0.28, shade=0.15, dark=0.06, drop=0.03),
+    Surface.BARK: Reflection(0.40, spread=0.25, shade=0.15, dark=0.04, rough=0.008),
+    Surface.METAL: Reflection(0.28, spread=0.22, shade=0.50, dark=0.12, drop=0.03),
+    Surface.SIGN_FACE: Reflection(0.42, spread=0.20, shade=0.40),
+    Surface.CLOTH: Reflection(0.46, spread=0.20, shade=0.25, rough=0.006),
+    Surface.SKIN: Reflection(0.45, spread=0.20, shade=0.10, dark=0.03),
+    Surface.DARK_PAINT: Reflection(0.04, spread=0.50, shade=0.90, dark=0.30, drop=0.12, rough=0.002),
+    Surface.LIGHT_PAINT: Reflection(0.26, spread=0.30, shade=0.45, dark=0.08, drop=0.05, rough=0.002),
+    Surface.RUBBER: Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.10),
+    Surface.PLATE: Reflection(0.95, spread=0.10, shade=0.10, dark=0.0),
+    Surface.PLASTIC: Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03),
+    Surface.ROOF_TILE: Reflection(0.33, spread=0.13, shade=0.20, drop=0.01, rough=0.003),
     # A house's window shows curtains and frames behind its pane; a car's mostly does not.
-    Surface.WINDOW: Reflection(0.30, 0.40, 0.15, 0.25),
+    Surface.WINDOW: Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01),
 }
 
 # The surface of each kind of ground, by raw id.
@@ -169,12 +174,13 @@ GROUND_SURFACES: dict[Label, Surface] = {
 }
 
 
+@lru_cache(maxsize=1)
 def reflection_table() -> np.ndarray:
-    """The reflections as rows by surface: reflectivity, spread, dark, drop. (S, 4) float32."""
-    rows = (REFLECTIONS[surface] for surface in Surface)
-    return np.array([(r.reflectivity, r.spread, r.dark, r.drop) for r in rows], dtype=np.float32)
+    """The reflections as rows by surface, columns in the order of the fields of `Reflection`. (S, 6) float32."""
+    return np.array([astuple(REFLECTIONS[surface]) for surface in Surface], dtype=np.float32)
 
 
+@lru_cache(maxsize=1)
 def ground_surface_table() -> np.ndarray:
     """The surface of each ground id, to be indexed by raw id. (256,) uint8."""
     table = np.zeros(256, dtype=np.uint8)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -39,25 +40,32 @@ class Mesh:
         surface: (T,) uint8 rows of the reflection table.
         label: (T,) uint16 raw class ids; 0 is ground, whose class depends on the place.
         instance: (T,) uint16 instance ids; 0 is none.
+        depth: (T,) float32 metres that a pulse goes into what the triangles enclose, on average; 0 is solid. What is
+            not solid must be closed, its corners counter-clockwise seen from outside.
+        tint: (T,) float32 by how many standard deviations a surface is brighter than others of its kind.
     """
 
     triangles: np.ndarray
     surface: np.ndarray
     label: np.ndarray
     instance: np.ndarray
+    depth: np.ndarray
+    tint: np.ndarray
 
     def __len__(self) -> int:
         return len(self.triangles)
 
 
-def part(triangles: np.ndarray, surface: Surface, label: Label | int) -> Mesh:
-    """Triangles that are all of one surface and one class."""
+def part(triangles: np.ndarray, surface: Surface, label: Label | int, depth: float = 0) -> Mesh:
+    """Triangles that are all of one surface and one class; see `Mesh` for the depth."""
     count = len(triangles)
     return Mesh(
         triangles.astype(np.float32),
         np.full(count, surface, dtype=np.uint8),
         np.full(count, label, dtype=np.uint16),
         np.zeros(count, dtype=np.uint16),
+        np.full(count, depth, dtype=np.float32),
+        np.zeros(count, dtype=np.float32),
     )
 
 
@@ -65,12 +73,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     """Several meshes as one; none at all as an empty one."""
     if not meshes:
         return part(np.zeros((0, 3, 3)), Surface.ASPHALT, 0)
-    return Mesh(
-        np.concatenate([m.triangles for m in meshes]),
-        np.concatenate([m.surface for m in meshes]),
-        np.concatenate([m.label for m in meshes]),
-        np.concatenate([m.instance for m in meshes]),
-    )
+    return Mesh(*(np.concatenate([getattr(m, f.name) for m in meshes]) for f in fields(Mesh)))
 
 
 def place(mesh: Mesh, x: float, y: float, z: float, yaw: float) -> Mesh:
@@ -84,6 +87,11 @@ def place(mesh: Mesh, x: float, y: float, z: float, yaw: float) -> Mesh:
 def named(mesh: Mesh, instance: int) -> Mesh:
     """The mesh as one instance."""
     return replace(mesh, instance=np.full(len(mesh), instance, dtype=np.uint16))
+
+
+def tinted(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """The mesh with each of its surfaces a little brighter or darker than usual."""
+    return replace(mesh, tint=rng.standard_normal(len(Surface), dtype=np.float32)[mesh.surface])
 
 
 def relabelled(mesh: Mesh, labels: dict[Label, int]) -> Mesh:
@@ -141,18 +149,31 @@ def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.nda
     return np.concatenate([np.stack(corners, axis=1) for corners in faces]) + np.array(at)
 
 
-def leaf_ball(rng: np.random.Generator, centre: Vector, radii: Vector, count: int, size: float) -> np.ndarray:
-    """Small triangles strewn in an ellipsoid, denser towards its hull: lasers pass between them. (count, 3, 3)."""
-    direction = rng.normal(size=(count, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    middle = direction * rng.random((count, 1)) ** 0.22 * np.array(radii) + np.array(centre)
-    return middle[:, None] + rng.normal(scale=size, size=(count, 3, 3))
+@lru_cache(maxsize=4)
+def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (V, 3) and faces (T, 3) of a unit sphere."""
+    from trimesh.creation import icosphere
+
+    ball = icosphere(subdivisions=subdivisions)
+    return np.asarray(ball.vertices), np.asarray(ball.faces)
 
 
-def leaf_box(rng: np.random.Generator, size: Vector, count: int, leaf: float) -> np.ndarray:
-    """Small triangles strewn near the sides and the top of a standing box, as in a hedge. (count, 3, 3)."""
-    middle = rng.random((count, 3)) - np.array([0.5, 0.5, 0])
-    side = rng.random(count)
-    middle[side < 0.7, 1] = np.sign(middle[side < 0.7, 1]) * 0.45
-    middle[side > 0.8, 2] = 0.95
-    return (middle * np.array(size))[:, None] + rng.normal(scale=leaf, size=(count, 3, 3))
+def hull(
+    rng: np.random.Generator, centre: Vector, radii: Vector, taper: float = 0, square: float = 1, fine: bool = True
+) -> np.ndarray:
+    """The bumpy, closed hull of a clump of leaves; counter-clockwise seen from outside. (T, 3, 3).
+
+    Args:
+        rng: where the bumps come from.
+        centre: its middle in metres.
+        radii: its half axes in metres.
+        taper: by what share it is narrower at its top and wider at its foot.
+        square: below 1 it comes closer to a box.
+        fine: 320 triangles instead of 80.
+    """
+    corners, faces = _sphere(2 if fine else 1)
+    waves = np.sin(corners @ rng.normal(scale=3.0, size=(3, 3)) + rng.uniform(0, 6.3, size=3)).sum(axis=1)
+    swell = 1 + 0.09 * waves + rng.normal(scale=0.11, size=len(corners))
+    shape = np.sign(corners) * np.abs(corners) ** square * swell[:, None]
+    shape[:, :2] *= 1 - taper * shape[:, 2:]
+    return (shape * np.array(radii) + np.array(centre))[faces]

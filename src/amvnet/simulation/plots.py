@@ -44,7 +44,7 @@ def _house(site: Site, side: int, x: float, width: float) -> None:
     for _ in range(rng.poisson(0.6 * style.green)):
         spot = side * (front + rng.uniform(1, setback + 1))
         site.put(any_tree(rng, rng.uniform(3, 8)), x + rng.uniform(0, width), spot)
-    if rng.random() < 0.45 * style.green:
+    if rng.random() < 0.3 * style.green:
         thickets(site, side, x, width * 0.7, front + rng.uniform(1.8, 3.0))
     _fence_between(site, side, x, front + setback)
 
@@ -52,7 +52,7 @@ def _house(site: Site, side: int, x: float, width: float) -> None:
 def _drive(site: Site, side: int, x: float, depth: float) -> None:
     """A paved way to a garage, with a car on it now and then."""
     rng, front = site.rng, site.ground.front(side)
-    label = Label.PARKING if rng.random() < 0.3 else Label.SIDEWALK
+    label = Label.PARKING if rng.random() < 0.2 else Label.SIDEWALK
     near, far = sorted((side * front, side * (front + depth)))
     site.ground.patches.append(Patch((x, x + 3.0), (near, far), label))
     if rng.random() < 0.4:
@@ -111,8 +111,8 @@ def _wood(site: Site, side: int, x: float, width: float) -> None:
     for _ in range(rng.poisson(density * width * deep)):
         site.put(any_tree(rng, rng.uniform(4, 13)), x + rng.uniform(0, width), side * (front + rng.uniform(1.5, deep)))
     _bushes(site, side, x, width, rng.poisson(density * width * 14), deep)
-    if rng.random() < 0.9:
-        thickets(site, side, x, width, front + rng.uniform(1.5, 7))
+    if rng.random() < 0.75:
+        thickets(site, side, x, width, front + rng.uniform(1.5, 10))
     if rng.random() < 0.5:
         for spot in np.arange(x, x + width, 3.0):
             site.put(fixtures.tall_grass(rng, 3.0), spot, side * (front + rng.uniform(0.5, 3)))

@@ -69,13 +69,15 @@ def _background(site: Site, side: int) -> None:
     rng, ground = site.rng, site.ground
     for x in np.arange(rng.uniform(0, 10), ground.length, 14.0):
         t = side * (ground.front(side) + rng.uniform(32, 45))
-        if rng.random() < 0.6:
-            thickets(site, side, x, 14.0, ground.front(side) + rng.uniform(24, 32))
+        if rng.random() < 0.45:
+            thickets(site, side, x, 14.0, ground.front(side) + rng.uniform(24, 34))
         if rng.random() < 0.35 and ground.style.kind in ("residential", "urban"):
             size = rng.uniform(9, 16), rng.uniform(8, 12), rng.uniform(*ground.style.storeys)
             site.put(fixtures.building(rng, *size, rng.random() < 0.2), x, t, rng.normal(scale=0.3), margin=6.0)
         else:
             site.put(any_tree(rng, rng.uniform(6, 14), fine=False), x, t)
+        far = side * (ground.front(side) + rng.uniform(42, 66))
+        site.put(fixtures.copse(rng, 14.0, rng.uniform(5, 12)), x, far)
 
 
 def _side_roads(site: Site) -> None:

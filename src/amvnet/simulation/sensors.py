@@ -26,8 +26,16 @@ class Sensor:
     reach: float
     # Share of the returns at an edge in depth that lie somewhere between the two surfaces.
     mixed: float
-    # Factor of the intensity that the device reports.
+    # The intensity that the device reports is gain * reflectivity ** gamma, with so many decimals.
     gain: float
+    gamma: float
+    decimals: int
+    # Relative standard deviation of the gain between lasers.
+    gain_spread: float
+    # Seconds that a turn takes, at whose middle the sensor looks ahead.
+    turn: float
+    # True where the files hold points as if the sensor had stood still.
+    corrected: bool
     # True where a lost return is written all the same, somewhere within a metre of the sensor.
     keeps_lost: bool
     # The layout that its scans are written in: semantickitti or nuscenes.
@@ -52,42 +60,66 @@ HDL64E = Sensor(
     height=1.73,
     min_range=1.5,
     max_range=80.0,
-    range_noise=0.015,
+    range_noise=0.0085,
     drop=0.01,
     reach=560.0,
     mixed=0.06,
     gain=1.0,
+    gamma=1.0,
+    decimals=2,
+    gain_spread=0.12,
+    turn=0.1,
+    corrected=True,
     keeps_lost=False,
     layout="semantickitti",
     shadow=(
         (-14, 14, -90, -20.9),
-        (14, 20, -90, -21.9),
+        (-22, 22, -90, -21.9),
         (28, 32, -90, -22.9),
         (132, 142, -90, -19.7),
         (159, 167, -90, -13.0),
         (196, 206, -90, -13.0),
         (160, 208, -90, -18.1),
-        (150, 214, -90, -22.4),
+        (140, 224, -90, -22.4),
         (230, 240, -90, -19.7),
         (284, 304, -22.9, -15.8),
         (328, 332, -90, -21.9),
         (336, 340, -90, -21.9),
     ),
 )
-# Evenly spaced; range, noise and intensity as in nuScenes, whose scans have a row for every shot.
+# Evenly spaced; noise, intensity and shadow as in nuScenes, whose scans have a row for every shot.
 HDL32E = Sensor(
     elevations=tuple(10.67 - i * 4 / 3 for i in range(32)),
     azimuth_steps=1084,
     height=1.84,
     min_range=1.0,
     max_range=100.0,
-    range_noise=0.02,
+    range_noise=0.005,
     drop=0.01,
-    reach=330.0,
+    reach=230.0,
     mixed=0.05,
-    gain=0.22,
+    gain=0.85,
+    gamma=2.6,
+    decimals=3,
+    gain_spread=0.05,
+    turn=0.05,
+    corrected=True,
     keeps_lost=True,
     layout="nuscenes",
-    shadow=((-50, 50, -90, -24.5), (130, 230, -90, -28.5)),
+    shadow=(
+        (-50, 50, -90, -23.5),
+        (-52, 55, -90, -26),
+        (-50, 62, -90, -27.5),
+        (-60, 85, -90, -29),
+        (-80, 90, -90, -30),
+        (120, 230, -90, -30),
+        (125, 230, -90, -29),
+        (132, 222, -90, -27.5),
+        (137, 220, -90, -26),
+        (146, 213, -90, -23.5),
+        (150, 205, -90, -22),
+        (160, 195, -90, -21),
+        (170, 190, -90, -18),
+    ),
 )
 SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E, "hdl32e": HDL32E}

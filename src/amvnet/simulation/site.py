@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from amvnet.simulation.materials import MOVING
-from amvnet.simulation.mesh import Mesh, named, place, relabelled
+from amvnet.simulation.mesh import Mesh, named, place, relabelled, tinted
 from amvnet.simulation.streets import Ground
 
 
@@ -53,7 +53,7 @@ class Site:
         if not self.free(x, t, margin):
             return
         px, py, heading = self.ground.at(x, t)
-        body = place(mesh, px, py, float(self.ground.height(px, py)), heading + yaw)
+        body = place(tinted(mesh, self.rng), px, py, float(self.ground.height(px, py)), heading + yaw)
         self.fixed.append(named(body, self.next_instance()) if thing else body)
 
     def next_instance(self) -> int:
@@ -63,5 +63,5 @@ class Site:
 
     def moving(self, mesh: Mesh, x: float, t: float, speed: float) -> None:
         """Adds something that drives or walks."""
-        body = named(relabelled(mesh, dict(MOVING)), self.next_instance())
+        body = named(relabelled(tinted(mesh, self.rng), dict(MOVING)), self.next_instance())
         self.movers.append(Mover(body, x, t, speed))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -93,7 +93,7 @@ def _pillar_top(rear: float, cabin: float, x: float, shape: CarShape, side: int)
 
 
 def _scaled(mesh: Mesh, factor: float) -> Mesh:
-    return Mesh(mesh.triangles * np.float32(factor), mesh.surface, mesh.label, mesh.instance)
+    return replace(mesh, triangles=mesh.triangles * np.float32(factor))
 
 
 def truck(rng: np.random.Generator) -> Mesh:
