@@ -30,8 +30,13 @@ class Disagreement:
     tau: float = 0.85
 
     def __call__(self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
-        both, length = torch.linalg.vecdot(f, g), torch.linalg.vecdot(f, f) * torch.linalg.vecdot(g, g)
-        return both / length.clamp_min(TINY).sqrt() <= self.tau
+        return cosine_similarity(f, g) <= self.tau
+
+
+def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
+    """(P,) of two networks' scores (P, K): from 0, they have no class in common, to 1, they are the same."""
+    both, length = torch.linalg.vecdot(f, g), torch.linalg.vecdot(f, f) * torch.linalg.vecdot(g, g)
+    return both / length.clamp_min(TINY).sqrt()
 
 
 @dataclass(frozen=True)

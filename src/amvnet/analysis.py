@@ -1,0 +1,192 @@
+"""What the paper shows of the method: who agrees where, mIoU by distance, and sweeps of tau and n (section 4)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from amvnet import jobs
+from amvnet.config import Recipe
+from amvnet.data.labels import Taxonomy
+from amvnet.data.records import Dataset, ScanRecord
+from amvnet.errors import InputError
+from amvnet.evaluation import Evaluation, metrics
+from amvnet.models.amvnet import arithmetic_mean, geometric_mean, maximum, merge, refine
+from amvnet.models.assertions import Disagreement, cosine_similarity
+from amvnet.runner import Run
+from amvnet.scan import Scan
+from amvnet.segmenter import Segmenter
+from amvnet.views.points import PointBatch
+from amvnet.weights import Weights
+
+Progress = Callable[[int, int], None]
+BINS = 100  # of the cosine similarity, which is in [0, 1]
+SWEPT = 98  # bins of the lower similarities for which the head is asked: tau is swept up to 0.98
+ENSEMBLES = {"arithmetic mean": arithmetic_mean, "maximum": maximum, "ensemble": geometric_mean}
+
+
+@dataclass(frozen=True)
+class Swept:
+    """AMVNet with one value of a swept parameter: share of uncertain points, mIoU and accuracy as fractions."""
+
+    value: float
+    uncertain: float
+    miou: float
+    accuracy: float
+
+
+@dataclass
+class Analysis:
+    """Counts over some scans.
+
+    Attributes:
+        evaluation: every method that the weights have, the three ensembles among them.
+        tau: of the weights.
+        points: (BINS,) how many points have which similarity, labelled or not.
+        ensemble: (BINS, K + 1, K + 1) confusion of the geometric mean by the points' similarity.
+        head: (SWEPT, K + 1, K + 1) the same of the point head.
+    """
+
+    evaluation: Evaluation
+    tau: float
+    points: np.ndarray
+    ensemble: np.ndarray
+    head: np.ndarray
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        return self.evaluation.taxonomy
+
+    def sweep(self) -> list[Swept]:
+        """AMVNet for each tau from 0 to 0.98, with the head as it is."""
+        found = []
+        for bins in range(SWEPT + 1):
+            matrix = self.head[:bins].sum(axis=0) + self.ensemble[bins:].sum(axis=0)
+            reached = metrics(matrix, self.taxonomy)
+            share = self.points[:bins].sum() / max(self.points.sum(), 1)
+            found.append(Swept(bins / BINS, float(share), reached["miou"] or 0.0, reached["accuracy"] or 0.0))
+        return found
+
+
+def analyze(
+    dataset: Dataset,
+    records: Sequence[ScanRecord],
+    segmenter: Segmenter,
+    progress: Progress = lambda done, total: None,
+) -> Analysis:
+    """Score some labelled scans once by every method, and by the head wherever a swept tau would ask it.
+
+    Raises:
+        InputError: where the weights lack a part, or a scan has no labels.
+    """
+    assertion = segmenter.model.assertion
+    if segmenter.method != "amvnet" or not isinstance(assertion, Disagreement):
+        raise InputError("expected weights with both networks, a head and the disagreement assertion; train these")
+    size = dataset.taxonomy.size + 1
+    found = Analysis(
+        Evaluation(dataset.taxonomy),
+        assertion.tau,
+        np.zeros(BINS, dtype=np.int64),
+        np.zeros((BINS, size, size), dtype=np.int64),
+        np.zeros((SWEPT, size, size), dtype=np.int64),
+    )
+    for done, record in enumerate(records):
+        progress(done, len(records))
+        scan = dataset.read(record)
+        if scan.labels is None:
+            raise InputError(f"{scan.name}: expected labels to compare with, found none; name labelled sequences")
+        _add(found, scan, segmenter)
+    progress(len(records), len(records))
+    return found
+
+
+@torch.inference_mode()
+def _add(found: Analysis, scan: Scan, segmenter: Segmenter) -> None:
+    model, batch = segmenter.model, PointBatch.of([scan]).to(segmenter.device)
+    f, g = model.score_range_view(batch), model.score_polar_view(batch)
+    place = (cosine_similarity(f, g) * BINS).ceil().long().clamp(1, BINS) - 1  # in (place, place + 1] / BINS
+    asked = place < SWEPT
+    assert model.point_head is not None
+    h = refine(model.point_head, batch.points, f, g, asked)
+    uncertain = model.assertion(f, g, batch.points)
+    scores = {"rv": f, "bev": g, **{name: mean(f, g) for name, mean in ENSEMBLES.items()}}
+    scores["amvnet"] = merge(f, g, uncertain, h[uncertain[asked]])
+    ids = {name: (s.argmax(dim=1) + 1).cpu().numpy() for name, s in scores.items()}
+    valid = scan.valid
+    assert scan.labels is not None
+    truth = scan.labels[valid]
+    found.evaluation.add(scan.points[valid], truth, ids, uncertain.cpu().numpy())
+    bins, size = place.cpu().numpy(), len(found.ensemble[0])
+    found.points += np.bincount(bins, minlength=BINS)
+    found.ensemble += _by_bin(bins, truth, ids["ensemble"], BINS, size)
+    settled = (h.argmax(dim=1) + 1).cpu().numpy()
+    kept = asked.cpu().numpy()
+    found.head += _by_bin(bins[kept], truth[kept], settled, SWEPT, size)
+
+
+def _by_bin(bins: np.ndarray, truth: np.ndarray, ids: np.ndarray, count: int, size: int) -> np.ndarray:
+    """(count, size, size) confusion matrices of points by their bin."""
+    place = (bins * size + truth) * size + ids
+    return np.bincount(place, minlength=count * size * size).reshape(count, size, size)
+
+
+def sweep_neighbours(
+    recipe: Recipe,
+    weights: Weights,
+    dataset: Dataset,
+    train: Sequence[ScanRecord],
+    val: Sequence[ScanRecord],
+    values: Sequence[int],
+    out: Path,
+    say: Callable[[str], None] = lambda line: None,
+) -> Iterator[Swept]:
+    """Train a head for each number of neighbours, with the networks of the weights, and score it.
+
+    Each is kept in OUT/neighbours/N; those that are finished are not trained again.
+    """
+    for n in values:
+        model = dataclasses.replace(
+            weights.model, point_head=dataclasses.replace(weights.model.point_head, neighbours=n)
+        )
+        networks = Weights(model, weights.taxonomy, weights.sensor)
+        for part in ("range_net", "polar_net"):
+            networks = networks.replace_part(part, weights)
+        run = Run(dataclasses.replace(recipe, model=model), dataset, train, val, out / "neighbours" / str(n), True, say)
+        segmenter = Segmenter(run.stages("head", networks))
+        found = jobs.evaluate(dataset, val, jobs.by_weights(dataset, segmenter))
+        reached = metrics(found.matrices["amvnet"][0], dataset.taxonomy)
+        share = found.uncertain / max(found.asked, 1)
+        yield Swept(n, share, reached["miou"] or 0.0, reached["accuracy"] or 0.0)
+
+
+def ablate(
+    recipe: Recipe,
+    dataset: Dataset,
+    train: Sequence[ScanRecord],
+    val: Sequence[ScanRecord],
+    out: Path,
+    say: Callable[[str], None] = lambda line: None,
+    bars: bool = False,
+) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
+    """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
+
+    Each is kept in a folder of OUT; a later call goes on where this one stopped.
+
+    Yields:
+        whether with the GRU, whether with class weights, and the figures as `evaluation.metrics` has them.
+    """
+    for gru, weighted in ((False, False), (True, False), (False, True), (True, True)):
+        model = dataclasses.replace(recipe.model, range_net=dataclasses.replace(recipe.model.range_net, gru=gru))
+        rv = dataclasses.replace(recipe.training.rv, class_weights=weighted)
+        changed = dataclasses.replace(recipe, model=model, training=dataclasses.replace(recipe.training, rv=rv))
+        name = "-".join(["rv", *(["gru"] if gru else []), *(["weights"] if weighted else [])])
+        say(f"{name}:")
+        path = Run(changed, dataset, train, val, out / name, True, say, bars).stages("rv")
+        found = jobs.evaluate(dataset, val, jobs.by_weights(dataset, Segmenter(path, method="rv")))
+        yield gru, weighted, metrics(found.matrices["rv"][0], dataset.taxonomy)

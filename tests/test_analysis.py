@@ -1,0 +1,162 @@
+"""The paper's figures: swept without asking the networks again, they equal what asking them gives."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.image import imread
+from worlds import amvnet, files, fresh_weights, make_streets, without, write_recipe
+
+from amvnet.analysis import BINS, SWEPT, analyze
+from amvnet.config import AssertionConfig
+from amvnet.data.catalog import open_dataset
+from amvnet.evaluation import confusion, metrics
+from amvnet.models.amvnet import arithmetic_mean, maximum
+from amvnet.segmenter import Segmenter
+from amvnet.weights import Weights, load, save
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("world")
+    make_streets(root / "data")
+    write_recipe(root / "recipe.yaml")
+    save(fresh_weights(), root / "weights.safetensors")
+    return root
+
+
+def with_tau(weights: Weights, tau: float) -> Weights:
+    return replace(weights, model=replace(weights.model, assertion=AssertionConfig("disagreement", tau)))
+
+
+def figures_of(world: Path, weights: Weights) -> tuple[float, dict[str, Any]]:
+    """The share of uncertain points and AMVNet's figures, scan by scan through the segmenter."""
+    dataset, segmenter = open_dataset(f"semantickitti:{world / 'data'}"), Segmenter(weights)
+    matrix, uncertain = 0, []
+    for record in dataset.records(["08"]):
+        scan = dataset.read(record)
+        result = segmenter(scan)
+        matrix = matrix + confusion(scan.labels, result.labels, 19)
+        uncertain.append(result.uncertain)
+    return float(np.concatenate(uncertain).mean()), metrics(matrix, dataset.taxonomy)
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.31, 0.85, SWEPT / BINS])
+def test_a_swept_tau_gives_what_weights_with_that_tau_give(world: Path, tau: float) -> None:
+    dataset, weights = open_dataset(f"semantickitti:{world / 'data'}"), fresh_weights()
+    found = analyze(dataset, dataset.records(["08"]), Segmenter(weights))
+    swept = found.sweep()[round(tau * BINS)]
+    share, expected = figures_of(world, with_tau(weights, tau))
+    assert swept.value == pytest.approx(tau)
+    # A point whose similarity is tau to the last bit may fall to either side.
+    assert swept.uncertain == pytest.approx(share, abs=0.002)
+    assert swept.miou == pytest.approx(expected["miou"], abs=0.002)
+    assert swept.accuracy == pytest.approx(expected["accuracy"], abs=0.002)
+
+
+def test_every_method_is_scored_as_by_the_segmenter(world: Path) -> None:
+    dataset, weights = open_dataset(f"semantickitti:{world / 'data'}"), fresh_weights()
+    matrices = analyze(dataset, dataset.records(["08"]), Segmenter(weights)).evaluation.matrices
+    expected = dict.fromkeys(matrices, 0)
+    for record in dataset.records(["08"]):
+        scan = dataset.read(record)
+        result = Segmenter(weights)(scan)
+        f, g = torch.from_numpy(result.rv), torch.from_numpy(result.bev)
+        scores = {"rv": f, "bev": g, "ensemble": torch.sqrt(f * g), "amvnet": torch.from_numpy(result.scores)}
+        scores |= {"arithmetic mean": arithmetic_mean(f, g), "maximum": maximum(f, g)}
+        for name, values in scores.items():
+            expected[name] = expected[name] + confusion(scan.labels, values.argmax(dim=1).numpy() + 1, 19)
+    for name, stack in matrices.items():
+        np.testing.assert_array_equal(stack[0], expected[name])
+
+
+def test_analyze_writes_each_figure_as_picture_table_and_text(world: Path) -> None:
+    out = world / "figures"
+    code, error = amvnet("analyze", world / "data", "--weights", world / "weights.safetensors", "--out", out)
+    assert code == 0, error
+    drawn = {"similarity", "distance", "tau"}
+    assert files(out) == {f"{n}.{e}" for n in drawn for e in ("png", "csv", "md")} | {
+        f"{n}.{e}" for n in ("classes", "methods") for e in ("csv", "md")
+    }
+    for name in drawn:
+        picture = imread(out / f"{name}.png")
+        assert picture.shape[1] == 960
+        assert picture[..., :3].std() > 0.05
+    with (out / "similarity.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert sum(int(row["points"]) for row in rows) == 1000
+    with (out / "methods.csv").open() as file:
+        assert [row["method"] for row in csv.DictReader(file)] == [
+            "RV", "BEV", "arithmetic mean", "maximum", "geometric mean", "AMVNet",
+        ]  # fmt: skip
+
+
+def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
+    out, weights = world / "swept", world / "weights.safetensors"
+    arguments = ("analyze", world / "data", "--weights", weights, "--out", out, "--neighbours", "2,5")
+    arguments += ("--recipe", world / "recipe.yaml")
+    code, error = amvnet(*arguments)
+    assert code == 0, error
+    trained = {n: load(out / "neighbours" / str(n) / "weights.safetensors") for n in (2, 5)}
+    given = load(weights)
+    for n, found in trained.items():
+        assert found.model.point_head.neighbours == n
+        assert torch.equal(
+            found.tensors["range_net.scores.weight"], given.tensors["range_net.scores.weight"]
+        )  # the networks are frozen
+    before = (out / "neighbours" / "2" / "weights.safetensors").stat().st_mtime_ns
+    assert before
+    with (out / "neighbours.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["neighbours"]) for row in rows] == [2, 5]
+    name = "point_head.mlp.0.weight"
+    assert not torch.equal(trained[2].tensors[name], trained[5].tensors[name])
+
+
+def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -> None:
+    out = world / "ablation"
+    arguments = ("ablate", world / "recipe.yaml", "--data", world / "data", "--out", out, "--training.rv.epochs", 1)
+    code, error = amvnet(*arguments)
+    assert code == 0, error
+    with (out / "ablation.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["GRU"], row["class weights"]) for row in rows] == [
+        ("no", "no"), ("yes", "no"), ("no", "yes"), ("yes", "yes"),
+    ]  # fmt: skip
+    assert len({row["accuracy %"] for row in rows}) > 1
+    assert not load(out / "rv" / "weights.safetensors").model.range_net.gru
+    assert load(out / "rv-gru-weights" / "weights.safetensors").model.range_net.gru
+    kept = {name: (out / name / "rv" / "last.safetensors").read_bytes() for name in ("rv", "rv-gru")}
+    table = (out / "ablation.md").read_text()
+    (out / "rv-gru" / "rv" / "done").unlink()
+    (out / "ablation.md").unlink()
+    assert amvnet(*arguments) == (0, "")
+    assert (out / "ablation.md").read_text() == table
+    for name, content in kept.items():
+        assert (out / name / "rv" / "last.safetensors").read_bytes()[-1000:] == content[-1000:]
+
+
+def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
+    save(without(fresh_weights(), "point_head"), world / "headless.safetensors")
+    entropy = replace(fresh_weights(), model=replace(fresh_weights().model, assertion=AssertionConfig("entropy", 0.7)))
+    save(entropy, world / "entropy.safetensors")
+    whole = world / "weights.safetensors"
+    cases = [
+        (world / "headless.safetensors", (), "point_head"),
+        (world / "entropy.safetensors", (), "disagreement"),
+        (whole, ("--neighbours", "3"), "--recipe"),
+        (whole, ("--neighbours", "3,x", "--recipe", world / "recipe.yaml"), "3,x"),
+        (whole, ("--sequences", "77"), "77"),
+    ]
+    for weights, options, word in cases:
+        code, error = amvnet("analyze", world / "data", "--weights", weights, "--out", world / "none", *options)
+        assert code == 2
+        assert error.count("\n") == 1
+        assert word in error
+    assert not (world / "none").exists()
