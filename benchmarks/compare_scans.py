@@ -143,9 +143,9 @@ def main(first: str, second: str) -> None:
     both = [np.mean(x.ranges, axis=0) for x in (a, b)]
     console.print(f"total variation distance of the ranges: {np.abs(both[0] - both[1]).sum() / 2:.3f}")
     if a.lasers and b.lasers:
-        means = [np.mean([one / one.sum() for one in x.lasers], axis=0) for x in (a, b)]
-        rows = [(str(i), *percent(p, q), f"{q / p:.2f}") for i, (p, q) in enumerate(zip(*means, strict=True))]
-        console.print(table("share of the points by laser, from the top, %", rows, ("", "A", "B", "B / A")))
+        means = [np.mean(x.lasers, axis=0) for x in (a, b)]
+        rows = [(str(i), f"{p:.0f}", f"{q:.0f}", f"{q / p:.2f}") for i, (p, q) in enumerate(zip(*means, strict=True))]
+        console.print(table("returns a scan by laser, from the top", rows, ("", "A", "B", "B / A")))
     names = ("unlabelled", *a.taxonomy.classes)
     shares = [np.mean(x.shares, axis=0) for x in (a, b)]
     values = [np.concatenate(x.values) for x in (a, b)]

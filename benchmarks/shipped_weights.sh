@@ -19,5 +19,9 @@ train() { # stage, sequences
 }
 amvnet simulate "$out/streets" --sensor "$sensor" --sequences $((streets + 46)) --scans 6 --seed 11
 export OMP_NUM_THREADS=1
-train rv "$networks" & train bev "$networks" & wait %1 && wait %2
+trap 'kill $(jobs -p) 2>/dev/null || true' EXIT
+train rv "$networks" &
+train bev "$networks" &
+wait %1
+wait %2
 OMP_NUM_THREADS=2 train head "$head"

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.image import imread
-from worlds import amvnet, files, fresh_weights, make_streets, without, write_recipe
+from worlds import amvnet, files, fresh_weights, make_streets, street, without, write_recipe, write_scan
 
+from amvnet import analysis, jobs
 from amvnet.analysis import BINS, SWEPT, analyze
 from amvnet.config import AssertionConfig
 from amvnet.data.catalog import open_dataset
@@ -28,7 +29,15 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_streets(root / "data")
     write_recipe(root / "recipe.yaml")
     save(fresh_weights(), root / "weights.safetensors")
+    options = ("--data", root / "data", "--out", root / "run", "--training.head.epochs", 1)
+    assert amvnet("train", root / "recipe.yaml", *options) == (0, "")
     return root
+
+
+@pytest.fixture(scope="module")
+def weights(world: Path) -> Weights:
+    """Networks that have learnt a little, so that there is an mIoU to speak of."""
+    return load(world / "run")
 
 
 def with_tau(weights: Weights, tau: float) -> Weights:
@@ -48,8 +57,8 @@ def figures_of(world: Path, weights: Weights) -> tuple[float, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.31, 0.85, SWEPT / BINS])
-def test_a_swept_tau_gives_what_weights_with_that_tau_give(world: Path, tau: float) -> None:
-    dataset, weights = open_dataset(f"semantickitti:{world / 'data'}"), fresh_weights()
+def test_a_swept_tau_gives_what_weights_with_that_tau_give(world: Path, weights: Weights, tau: float) -> None:
+    dataset = open_dataset(f"semantickitti:{world / 'data'}")
     found = analyze(dataset, dataset.records(["08"]), Segmenter(weights))
     swept = found.sweep()[round(tau * BINS)]
     share, expected = figures_of(world, with_tau(weights, tau))
@@ -58,10 +67,38 @@ def test_a_swept_tau_gives_what_weights_with_that_tau_give(world: Path, tau: flo
     assert swept.uncertain == pytest.approx(share, abs=0.002)
     assert swept.miou == pytest.approx(expected["miou"], abs=0.002)
     assert swept.accuracy == pytest.approx(expected["accuracy"], abs=0.002)
+    assert swept.miou > 0.02
 
 
-def test_every_method_is_scored_as_by_the_segmenter(world: Path) -> None:
-    dataset, weights = open_dataset(f"semantickitti:{world / 'data'}"), fresh_weights()
+def test_points_that_no_network_sees_count_as_evaluate_counts_them(weights: Weights, tmp_path: Path) -> None:
+    points, raw = street(1)
+    points[::3, 0] = np.nan
+    write_scan(tmp_path, "08", "000000", points, raw)
+    dataset = open_dataset(f"semantickitti:{tmp_path}")
+    segmenter, records = Segmenter(weights), dataset.records(["08"])
+    found = analyze(dataset, records, segmenter)
+    expected = jobs.evaluate(dataset, records, jobs.by_weights(dataset, segmenter))
+    for name, stack in expected.matrices.items():
+        np.testing.assert_array_equal(found.evaluation.matrices[name], stack)
+    assert (found.evaluation.points, found.evaluation.uncertain) == (expected.points, expected.uncertain)
+    tau = round(weights.model.assertion.threshold * BINS)
+    assert found.sweep()[tau].uncertain == pytest.approx(expected.uncertain / expected.points, abs=0.005)
+
+
+def test_a_tau_above_those_that_are_swept_is_analyzed(
+    world: Path, weights: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(analysis, "SWEPT", 50)
+    dataset = open_dataset(f"semantickitti:{world / 'data'}")
+    found = analyze(dataset, dataset.records(["08"]), Segmenter(with_tau(weights, 0.8)))
+    share, expected = figures_of(world, with_tau(weights, 0.8))
+    assert found.points[50:80].sum() > 0
+    assert found.evaluation.uncertain / found.evaluation.asked == pytest.approx(share)
+    assert metrics(found.evaluation.matrices["amvnet"][0], dataset.taxonomy) == expected
+
+
+def test_every_method_is_scored_as_by_the_segmenter(world: Path, weights: Weights) -> None:
+    dataset = open_dataset(f"semantickitti:{world / 'data'}")
     matrices = analyze(dataset, dataset.records(["08"]), Segmenter(weights)).evaluation.matrices
     expected = dict.fromkeys(matrices, 0)
     for record in dataset.records(["08"]):
@@ -110,13 +147,19 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
         assert torch.equal(
             found.tensors["range_net.scores.weight"], given.tensors["range_net.scores.weight"]
         )  # the networks are frozen
-    before = (out / "neighbours" / "2" / "weights.safetensors").stat().st_mtime_ns
-    assert before
     with (out / "neighbours.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["neighbours"]) for row in rows] == [2, 5]
     name = "point_head.mlp.0.weight"
     assert not torch.equal(trained[2].tensors[name], trained[5].tensors[name])
+    lasts = [out / "neighbours" / n / "head" / "last.safetensors" for n in "25"]
+    before = [last.stat().st_mtime_ns for last in lasts]
+    assert amvnet(*arguments) == (0, "")
+    assert [last.stat().st_mtime_ns for last in lasts] == before  # not trained again
+    save(fresh_weights(seed=1), world / "other.safetensors")
+    code, error = amvnet(*(world / "other.safetensors" if a == weights else a for a in arguments))
+    assert (code, error.count("\n")) == (2, 1)
+    assert "networks" in error
 
 
 def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -> None:
@@ -138,6 +181,10 @@ def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -
     (out / "ablation.md").unlink()
     assert amvnet(*arguments) == (0, "")
     assert (out / "ablation.md").read_text() == table
+    make_streets(world / "data2", ("02", "03", "08"))
+    code, error = amvnet(*(world / "data2" if a == world / "data" else a for a in arguments))
+    assert (code, error.count("\n")) == (2, 1)
+    assert "scans" in error
     for name, content in kept.items():
         assert (out / name / "rv" / "last.safetensors").read_bytes()[-1000:] == content[-1000:]
 
@@ -152,6 +199,9 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
         (world / "entropy.safetensors", (), "disagreement"),
         (whole, ("--neighbours", "3"), "--recipe"),
         (whole, ("--neighbours", "3,x", "--recipe", world / "recipe.yaml"), "3,x"),
+        (whole, ("--neighbours", "²", "--recipe", world / "recipe.yaml"), "²"),
+        (whole, ("--neighbours", "3", "--recipe", "nonsense"), "nonsense"),
+        (whole, ("--neighbours", "3", "--recipe", world / "recipe.yaml", "--split", "all"), "both"),
         (whole, ("--sequences", "77"), "77"),
     ]
     for weights, options, word in cases:
@@ -159,4 +209,4 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
         assert code == 2
         assert error.count("\n") == 1
         assert word in error
-    assert not (world / "none").exists()
+    assert not files(world / "none")

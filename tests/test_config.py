@@ -41,7 +41,7 @@ def test_a_recipe_survives_the_way_to_json_and_yaml_and_back(name: str) -> None:
 
 def test_every_builtin_recipe_is_there() -> None:
     names = {"semantickitti", "nuscenes", "simulated"}
-    assert set(recipe_names()) == names | {f"{name}-compact" for name in names}
+    assert set(recipe_names()) == names | {f"{name}-compact" for name in names} | {"simulated-hdl32e-compact"}
 
 
 def test_the_recipes_hold_the_papers_numbers() -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import shlex
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -304,6 +306,52 @@ def test_where_the_networks_agree_everywhere_the_head_learns_from_all_points(wor
     weights = train(world, tmp_path / "run", "--model.assertion.threshold=-1")
     assert weights.parts == PARTS
     assert max(column(tmp_path / "run", "head", "val/acc")) > 0.5
+
+
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(world: Path, tmp_path: Path, stage: str) -> None:
+    options = ("--stage", stage, f"--training.{stage}.lr", "1e38", f"--training.{stage}.clip", "1e38")
+    code, error = amvnet("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run", *options)
+    assert code == 2
+    assert error.count("\n") == 1
+    assert "finite" in error
+    assert "00/0" in error or "01/0" in error
+    assert not (tmp_path / "run" / "weights.safetensors").exists()
+
+
+def test_a_run_says_how_to_repeat_it(world: Path, run: Path, tmp_path: Path) -> None:
+    """The command in the run's folder gives the same weights to the last bit."""
+    said = yaml.safe_load((run / "run.yaml").read_text())
+    assert said["versions"]["torch"] == torch.__version__
+    assert said["train"] == ["00", "01"]
+    assert said["val"] == ["08"]
+    command = shlex.split(said["repeat"])
+    assert command[0] == "amvnet"
+    command[command.index("--out") + 1] = str(tmp_path / "again")
+    assert amvnet(*command[1:]) == (0, "")
+    assert not differing(load(tmp_path / "again"), load(run))
+
+
+@pytest.mark.parametrize("stage", FOLDERS)
+def test_a_killed_run_resumes_to_the_same_weights(world: Path, run: Path, tmp_path: Path, stage: str) -> None:
+    """SIGKILL in the middle of an epoch, after one that was finished."""
+    out = tmp_path / "run"
+    if stage == "head":
+        for earlier in ("rv", "bev"):
+            shutil.copytree(run / earlier, out / earlier)
+    arguments = [world / "recipe.yaml", "--data", world / "data", "--out", out, "--stage", stage]
+    command = [sys.executable, "-m", "amvnet.cli", "train", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (out / stage / "last.ckpt").exists() and process.poll() is None:
+        time.sleep(0.002)
+    process.kill()
+    process.wait()
+    done = (out / stage / "done").exists()
+    again = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert not done, "the run was over before it was killed"
+    found, expected = load(out / stage / "last.safetensors"), load(run / stage / "last.safetensors")
+    assert not differing(found, expected)
 
 
 def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_path: Path) -> None:

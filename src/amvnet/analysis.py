@@ -21,7 +21,7 @@ from amvnet.models.amvnet import arithmetic_mean, geometric_mean, maximum, merge
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.runner import Run
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter
+from amvnet.segmenter import Segmenter, checked_scan, in_place, labels_in_place
 from amvnet.views.points import PointBatch
 from amvnet.weights import Weights
 
@@ -101,7 +101,7 @@ def analyze(
         scan = dataset.read(record)
         if scan.labels is None:
             raise InputError(f"{scan.name}: expected labels to compare with, found none; name labelled sequences")
-        _add(found, scan, segmenter)
+        _add(found, checked_scan(scan), segmenter)
     progress(len(records), len(records))
     return found
 
@@ -110,24 +110,25 @@ def analyze(
 def _add(found: Analysis, scan: Scan, segmenter: Segmenter) -> None:
     model, batch = segmenter.model, PointBatch.of([scan]).to(segmenter.device)
     f, g = model.score_range_view(batch), model.score_polar_view(batch)
+    uncertain = model.assertion(f, g, batch.points)
     place = (cosine_similarity(f, g) * BINS).ceil().long().clamp(1, BINS) - 1  # in (place, place + 1] / BINS
-    asked = place < SWEPT
+    asked = (place < SWEPT) | uncertain
     assert model.point_head is not None
     h = refine(model.point_head, batch.points, f, g, asked)
-    uncertain = model.assertion(f, g, batch.points)
     scores = {"rv": f, "bev": g, **{name: mean(f, g) for name, mean in ENSEMBLES.items()}}
     scores["amvnet"] = merge(f, g, uncertain, h[uncertain[asked]])
-    ids = {name: (s.argmax(dim=1) + 1).cpu().numpy() for name, s in scores.items()}
-    valid = scan.valid
+    scores["head"] = merge(f, g, asked, h)
+    ids = {name: labels_in_place(values, scan.valid) for name, values in scores.items()}
+    head = ids.pop("head")
     assert scan.labels is not None
-    truth = scan.labels[valid]
-    found.evaluation.add(scan.points[valid], truth, ids, uncertain.cpu().numpy())
-    bins, size = place.cpu().numpy(), len(found.ensemble[0])
+    truth, size = scan.labels, len(found.ensemble[0])
+    found.evaluation.add(scan.points, truth, ids, in_place(uncertain, scan.valid))
+    # Points that no network has seen count as agreed on, with id 0, whatever tau is.
+    bins = np.where(scan.valid, in_place(place, scan.valid), BINS - 1)
     found.points += np.bincount(bins, minlength=BINS)
     found.ensemble += _by_bin(bins, truth, ids["ensemble"], BINS, size)
-    settled = (h.argmax(dim=1) + 1).cpu().numpy()
-    kept = asked.cpu().numpy()
-    found.head += _by_bin(bins[kept], truth[kept], settled, SWEPT, size)
+    swept = bins < SWEPT
+    found.head += _by_bin(bins[swept], truth[swept], head[swept], SWEPT, size)
 
 
 def _by_bin(bins: np.ndarray, truth: np.ndarray, ids: np.ndarray, count: int, size: int) -> np.ndarray:
@@ -145,20 +146,26 @@ def sweep_neighbours(
     values: Sequence[int],
     out: Path,
     say: Callable[[str], None] = lambda line: None,
+    device: str = "cpu",
 ) -> Iterator[Swept]:
     """Train a head for each number of neighbours, with the networks of the weights, and score it.
 
     Each is kept in OUT/neighbours/N; those that are finished are not trained again.
+
+    Raises:
+        InputError: where OUT holds heads for other networks, other scans or another recipe.
     """
+    # Folds would train networks of their own.
+    training = dataclasses.replace(recipe.training, head=dataclasses.replace(recipe.training.head, folds=1))
     for n in values:
-        model = dataclasses.replace(
-            weights.model, point_head=dataclasses.replace(weights.model.point_head, neighbours=n)
-        )
+        head = dataclasses.replace(weights.model.point_head, neighbours=n)
+        model = dataclasses.replace(weights.model, point_head=head)
         networks = Weights(model, weights.taxonomy, weights.sensor)
         for part in ("range_net", "polar_net"):
             networks = networks.replace_part(part, weights)
-        run = Run(dataclasses.replace(recipe, model=model), dataset, train, val, out / "neighbours" / str(n), True, say)
-        segmenter = Segmenter(run.stages("head", networks))
+        changed = dataclasses.replace(recipe, model=model, training=training)
+        run = Run(changed, dataset, train, val, out / "neighbours" / str(n), True, say)
+        segmenter = Segmenter(run.stages("head", networks), device)
         found = jobs.evaluate(dataset, val, jobs.by_weights(dataset, segmenter))
         reached = metrics(found.matrices["amvnet"][0], dataset.taxonomy)
         share = found.uncertain / max(found.asked, 1)
@@ -173,6 +180,7 @@ def ablate(
     out: Path,
     say: Callable[[str], None] = lambda line: None,
     bars: bool = False,
+    device: str = "cpu",
 ) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
     """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
 
@@ -180,6 +188,9 @@ def ablate(
 
     Yields:
         whether with the GRU, whether with class weights, and the figures as `evaluation.metrics` has them.
+
+    Raises:
+        InputError: where OUT holds runs on other scans or of another recipe.
     """
     for gru, weighted in ((False, False), (True, False), (False, True), (True, True)):
         model = dataclasses.replace(recipe.model, range_net=dataclasses.replace(recipe.model.range_net, gru=gru))
@@ -188,5 +199,5 @@ def ablate(
         name = "-".join(["rv", *(["gru"] if gru else []), *(["weights"] if weighted else [])])
         say(f"{name}:")
         path = Run(changed, dataset, train, val, out / name, True, say, bars).stages("rv")
-        found = jobs.evaluate(dataset, val, jobs.by_weights(dataset, Segmenter(path, method="rv")))
-        yield gru, weighted, metrics(found.matrices["rv"][0], dataset.taxonomy)
+        scored = jobs.evaluate(dataset, val, jobs.by_weights(dataset, Segmenter(path, device, "rv")))
+        yield gru, weighted, metrics(scored.matrices["rv"][0], dataset.taxonomy)

@@ -34,7 +34,7 @@ HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
 class HeadStage(Stage):
     """Stage `head`: the networks are frozen, in that only their scores are here."""
 
-    part = "point_head"
+    name = "head"
     config: HeadTraining
 
     def __init__(self, head: PointHead, certain: np.ndarray, *args: Any) -> None:

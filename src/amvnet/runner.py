@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import platform
+import shlex
 import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,8 +81,9 @@ class Run:
                 folder holds a run and `resume` is not said.
         """
         names = ("rv", "bev", "head") if stage == "all" else (stage,)
-        for name in names:
-            self._check_earlier(name)
+        if not self.resume:
+            for name in names:  # before hours are spent on the first
+                self._check_earlier(name, Weights(self.recipe.model, self.dataset.taxonomy))
         current, path = self._start(init), self.out / "weights.safetensors"
         for name in names:
             current = self._stage(name, current)
@@ -95,20 +100,48 @@ class Run:
             kept = self._folder(name) / f"{self.recipe.training.keep}.safetensors"
             if kept.is_file() and (self._folder(name) / "done").is_file():
                 current = current.replace_part(part, weights_file.load(kept))
-        with whole_file(self.out / "recipe.yaml") as path:
-            path.write_text(yaml.safe_dump(to_dict(self.recipe), sort_keys=False))
+        for name, tree in (("recipe.yaml", to_dict(self.recipe)), ("run.yaml", self._described())):
+            with whole_file(self.out / name) as path:
+                path.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
         return current
+
+    def _described(self) -> dict[str, Any]:
+        """With what the run is made, on what, and how to make it again."""
+        train, val = names_of(self.train), names_of(self.val)
+        command = [
+            "amvnet",
+            "train",
+            self.out / "recipe.yaml",
+            "--data",
+            self.dataset.root,
+            "--out",
+            f"{self.out}-again",
+        ]
+        command += ["--train-sequences", ",".join(train), "--val-sequences", ",".join(val)]
+        return {
+            "repeat": shlex.join(map(str, command)),
+            "versions": {name: metadata.version(name) for name in ("amvnet", "torch", "lightning", "numpy")},
+            "python": platform.python_version(),
+            "data": str(self.dataset.root),
+            "classes": self.dataset.taxonomy.name,
+            "train": train,
+            "val": val,
+        }
 
     def _folder(self, name: str) -> Path:
         return self.out / name
 
-    def _settings(self, name: str) -> dict[str, Any]:
-        """What the weights of a stage depend on, apart from the data."""
+    def _settings(self, name: str, current: Weights) -> dict[str, Any]:
+        """What the weights of a stage depend on; the data may move to another folder meanwhile."""
         tree = to_dict(self.recipe)
         training = {key: tree["training"][key] for key in (name, "augment", "seed", "precision", "accumulate")}
-        return {"model": {key: tree["model"][key] for key in SIZES[PART[name]]}, "training": training}
+        found = {"model": {key: tree["model"][key] for key in SIZES[PART[name]]}, "training": training}
+        found["scans"] = {split: _digest_of_scans(getattr(self, split)) for split in ("train", "val")}
+        if name == "head":
+            found["networks"] = {part: current.digest(part) for part in ("range_net", "polar_net")}
+        return found
 
-    def _check_earlier(self, name: str) -> None:
+    def _check_earlier(self, name: str, current: Weights) -> None:
         """Raises InputError where the folder holds this stage of a run that is not to be resumed, or of another."""
         folder = self._folder(name)
         if not (folder / LAST).is_file():
@@ -116,11 +149,14 @@ class Run:
         if not self.resume:
             raise InputError(f"{folder}: expected no earlier run, found one; add --resume or give another")
         begun = yaml.safe_load((folder / SETTINGS).read_text()) if (folder / SETTINGS).is_file() else {}
-        if begun != self._settings(name):
-            raise InputError(f"{folder}: expected the values that it was begun with ({SETTINGS}), found others; "
-                             "resume it with those, or give another folder")  # fmt: skip
+        now = self._settings(name, current)
+        if begun != now:
+            other = ", ".join(key for key in now if begun.get(key) != now[key])
+            raise InputError(f"{folder}: expected what it was begun with ({SETTINGS}), found another {other}; "
+                             "resume it with that, or give another folder")  # fmt: skip
 
     def _stage(self, name: str, current: Weights) -> Weights:
+        self._check_earlier(name, current)
         done = self._folder(name) / "done"
         if done.is_file() and self.resume:
             return current
@@ -225,7 +261,8 @@ class Run:
     def _keep(self, name: str, current: Weights) -> KeepWeights:
         """How the part of a stage is written: with the description of what made it."""
         part, started = PART[name], time.time()
-        made = {**self._settings(name)["training"], "sequences": names_of(self.train),
+        settings = self._settings(name, current)
+        made = {**settings["training"], "sequences": names_of(self.train),
                 "validated_on": names_of(self.val), "scans": len(self.train)}  # fmt: skip
 
         def write(module: nn.Module, path: Path, reached: dict[str, float]) -> None:
@@ -238,6 +275,13 @@ class Run:
             )
             weights_file.save(kept, path)
             with whole_file(path.parent / SETTINGS) as file:
-                file.write_text(yaml.safe_dump(self._settings(name), sort_keys=False))
+                file.write_text(yaml.safe_dump(settings, sort_keys=False))
 
         return KeepWeights(write, self._folder(name))
+
+
+def _digest_of_scans(records: Sequence[ScanRecord]) -> str:
+    """Tells scans from other ones by their names and sizes."""
+    paths = [(record.name, record.points_path) for record in records]
+    known = [(name, path.stat().st_size if path.is_file() else None) for name, path in paths]
+    return hashlib.sha256(repr(known).encode()).hexdigest()[:16]

@@ -90,7 +90,7 @@ class Segmenter:
         """
         scan = checked_scan(points)
         scores = self._scores(PointBatch.of([scan]).to(self.device))
-        return _in_place(scan.valid, scores)
+        return _segmentation(scan.valid, scores)
 
     @torch.inference_mode()
     def by_method(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
@@ -108,8 +108,8 @@ class Segmenter:
             found["ensemble"] = geometric_mean(f, g)
             if "point_head" in parts:
                 found["amvnet"] = merge(f, g, uncertain, model.refine(batch, f, g, uncertain))
-        labels = {name: _labels(_full(scores, scan.valid), scan.valid) for name, scores in found.items()}
-        return labels, None if uncertain is None else _full(uncertain, scan.valid)
+        labels = {name: labels_in_place(scores, scan.valid) for name, scores in found.items()}
+        return labels, None if uncertain is None else in_place(uncertain, scan.valid)
 
     @torch.inference_mode()
     def _scores(self, batch: PointBatch) -> Scores:
@@ -166,7 +166,7 @@ def fuse(
         a, b = a.clamp_min(SURE), b.clamp_min(SURE)
         uncertain = assertion(a, b, x)
         h = None if module is None else refine(module, x, a, b, uncertain)
-        return _in_place(scan.valid, Scores(merge(a, b, uncertain, h), uncertain, None, None)).labels
+        return _segmentation(scan.valid, Scores(merge(a, b, uncertain, h), uncertain, None, None)).labels
 
 
 def checked_scan(points: np.ndarray | Scan) -> Scan:
@@ -222,14 +222,14 @@ def widest_method(weights: Weights) -> Method:
     return found[-1] if found else METHODS[-1]
 
 
-def _in_place(valid: np.ndarray, scores: Scores) -> Segmentation:
+def _segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
     """Put what was found for the valid points back among all points."""
-    merged = _full(scores.merged, valid)
-    rv, bev = (None if values is None else _full(values, valid) for values in (scores.rv, scores.bev))
-    return Segmentation(_labels(merged, valid), _full(scores.uncertain, valid), merged, rv, bev)
+    merged = in_place(scores.merged, valid)
+    rv, bev = (None if values is None else in_place(values, valid) for values in (scores.rv, scores.bev))
+    return Segmentation(_labels(merged, valid), in_place(scores.uncertain, valid), merged, rv, bev)
 
 
-def _full(values: Tensor, valid: np.ndarray) -> np.ndarray:
+def in_place(values: Tensor, valid: np.ndarray) -> np.ndarray:
     """(P, ...) of the valid points -> (N, ...) of all, zeros for the others."""
     found = values.cpu().numpy()
     if valid.all():
@@ -237,6 +237,11 @@ def _full(values: Tensor, valid: np.ndarray) -> np.ndarray:
     out = np.zeros((len(valid), *found.shape[1:]), dtype=found.dtype)
     out[valid] = found
     return out
+
+
+def labels_in_place(scores: Tensor, valid: np.ndarray) -> np.ndarray:
+    """(P, K) scores of the valid points -> (N,) uint8 train ids of all, 0 where a point is not valid."""
+    return _labels(in_place(scores, valid), valid)
 
 
 def _labels(scores: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -34,7 +34,7 @@ LAST = "last.ckpt"  # what --resume goes on from
 class Stage(L.LightningModule):
     """What the stages share: class weights, the validation's confusion matrix, the one-cycle schedule."""
 
-    part: str  # the name of the trained part in a weights file
+    name: str  # as --stage says it
     trained: nn.Module
 
     def __init__(self, config: NetworkTraining | HeadTraining, taxonomy: Taxonomy, weights: np.ndarray | None) -> None:
@@ -90,6 +90,11 @@ class NetworkStage(Stage):
     def training_step(self, batch: Batch, index: int) -> Tensor:
         logits, labels, _ = self.logits(*batch)
         loss = self.loss(logits, labels)
+        if not torch.isfinite(loss):
+            names, rate = ", ".join(batch[0].names), f"--training.{self.name}.lr"
+            raise InputError(
+                f"expected a finite loss, found {loss:g} at the scans {names}; lower {rate}, or leave them out"
+            )
         self.log("train/loss", loss, prog_bar=True, batch_size=batch[0].count)
         return loss
 
@@ -105,7 +110,7 @@ class NetworkStage(Stage):
 class RangeStage(NetworkStage):
     """Stage `rv`: the loss is over the pixels, each labelled as the point that represents it."""
 
-    part = "range_net"
+    name = "rv"
 
     def __init__(self, view: RangeView, net: nn.Module, *args: Any) -> None:
         super().__init__(*args)
@@ -125,7 +130,7 @@ class RangeStage(NetworkStage):
 class PolarStage(NetworkStage):
     """Stage `bev`: the loss is over the points, each scored as its voxel."""
 
-    part = "polar_net"
+    name = "bev"
 
     def __init__(self, view: PolarView, net: nn.Module, *args: Any) -> None:
         super().__init__(*args)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,6 +15,7 @@ from amvnet.errors import InputError
 from amvnet.terminal import console, on_terminal, progress, say
 
 if TYPE_CHECKING:
+    from amvnet.analysis import Swept
     from amvnet.data.labels import Taxonomy
     from amvnet.data.records import ScanRecord
     from amvnet.evaluation import Evaluation
@@ -242,7 +243,9 @@ def analyze(
     from amvnet import charts, jobs
     from amvnet.analysis import analyze as score
     from amvnet.analysis import sweep_neighbours
+    from amvnet.data.files import make_folder
     from amvnet.recipes import load_recipe
+    from amvnet.runner import Run
     from amvnet.segmenter import Segmenter
     from amvnet.weights import load
 
@@ -251,16 +254,20 @@ def analyze(
     given = load(weights)
     dataset = _open(data, None, jobs.own_classes(given.taxonomy))
     segmenter = Segmenter(given, device)
-    records = jobs.choose_records(dataset, _names(sequences), split)
     jobs.by_weights(dataset, segmenter)
-    counts = [] if neighbours is None else _counts(neighbours)
+    records = jobs.choose_records(dataset, _names(sequences), split)
+    heads: Iterable[Swept] = ()
+    if recipe is not None:
+        _calm_lightning()
+        learnt = dataset.records(_names(train_sequences) or dataset.sequences("train"))
+        chosen, counts = load_recipe(recipe), _counts(str(neighbours))
+        Run(chosen, dataset, learnt, records, out)  # so that nothing is scored in vain
+        heads = sweep_neighbours(chosen, given, dataset, learnt, records, counts, out, say, device)
+    make_folder(out)
     with progress("scoring") as step:
         found = score(dataset, records, segmenter, step)
     written = charts.write_all(found, data, out)
-    if recipe is not None:
-        chosen = load_recipe(recipe)
-        learnt = dataset.records(_names(train_sequences) or dataset.sequences("train"))
-        swept = list(sweep_neighbours(chosen, given, dataset, learnt, records, counts, out, say))
+    if swept := list(heads):
         used = given.model.point_head.neighbours
         written += charts.write_sweep(swept, "neighbours", used, data, out / "neighbours")
     say(f"{len(written)} files in {out}")
@@ -272,6 +279,7 @@ def ablate(
     out: Path,
     train_sequences: str | None = None,
     val_sequences: str | None = None,
+    device: str = "cpu",
 ) -> None:
     """Train the range-view network with and without GRU and class weights, and write the paper's Table 5.
 
@@ -281,6 +289,7 @@ def ablate(
         out: folder for the four runs and the table; started again, it goes on.
         train_sequences: sequences or scenes to train on, with commas; default: the official split.
         val_sequences: sequences or scenes to score, with commas; default: the official split.
+        device: where the trained networks are scored: cpu, cuda, cuda:1, ...
     """
     from amvnet import charts, jobs
     from amvnet.analysis import ablate as compare
@@ -289,7 +298,7 @@ def ablate(
     dataset = _open(data, None)
     learnt, val = jobs.split_records(dataset, _names(train_sequences), _names(val_sequences))
     say(f"training on {_listed(learnt)}; scoring on {_listed(val)}")
-    rows = list(compare(recipe, dataset, learnt, val, out, say, on_terminal()))
+    rows = list(compare(recipe, dataset, learnt, val, out, say, on_terminal(), device))
     files = charts.write_ablation(rows, out / "ablation")
     say(files[-1].read_text().rstrip())
 
@@ -351,9 +360,9 @@ def _names(text: str | None) -> list[str] | None:
 
 def _counts(text: str) -> list[int]:
     names = _names(text) or []
-    if not all(name.isdigit() and int(name) for name in names):
+    if not all(name.isdecimal() and int(name) for name in names):
         raise InputError(f"expected numbers of neighbours with commas, found {text!r}; say 5,10,15")
-    return [int(name) for name in names]
+    return sorted({int(name) for name in names})
 
 
 def _calm_lightning() -> None:

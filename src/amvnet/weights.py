@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -61,6 +62,13 @@ class Weights:
     def part(self, name: str) -> dict[str, Tensor]:
         """The parameters of one part, named as the part's own module names them."""
         return {k.removeprefix(f"{name}."): v for k, v in self.tensors.items() if k.startswith(f"{name}.")}
+
+    def digest(self, name: str) -> str:
+        """Tells the parameters of one part from other ones."""
+        found = hashlib.sha256()
+        for key, value in sorted(self.part(name).items()):
+            found.update(key.encode() + value.cpu().contiguous().numpy().tobytes())
+        return found.hexdigest()[:16]
 
     def replace_part(self, name: str, other: Weights) -> Weights:
         """The same with one part taken from other weights.

@@ -92,7 +92,8 @@ class SemanticKitti:
 
     def _records(self, sequence: str) -> list[ScanRecord]:
         folder = self._folder / sequence
-        scans = sorted((folder / "velodyne").glob("*.bin"))
+        # What a killed program had begun to write has a name that begins with a dot.
+        scans = sorted(path for path in (folder / "velodyne").glob("*.bin") if not path.name.startswith("."))
         if not scans:
             raise InputError(
                 f"{folder / 'velodyne'}: expected the scans *.bin of sequence {sequence}, found none; "

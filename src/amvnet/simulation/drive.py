@@ -38,9 +38,11 @@ def drive_street(
     drive = drive or Drive()
     blocks = -(-scans // drive.scans_per_street)
     start, clock = np.eye(4), 0.0
-    for block, block_seed in enumerate(seed.spawn(blocks)):
+    *streets, device = seed.spawn(blocks + 1)
+    gains = laser_gains(sensor, np.random.default_rng(device))
+    for block, block_seed in enumerate(streets):
         count = min(drive.scans_per_street, scans - block * drive.scans_per_street)
-        for scan in _drive_block(sensor, count, np.random.default_rng(block_seed), drive):
+        for scan in _drive_block(sensor, gains, count, np.random.default_rng(block_seed), drive):
             pose = start @ scan.pose
             yield replace(scan, pose=pose, time=clock + scan.time)
         # The next street begins one step ahead of this one's last scan.
@@ -49,14 +51,16 @@ def drive_street(
         start, clock = pose @ step, clock + scan.time + 1.0
 
 
-def _drive_block(sensor: Sensor, scans: int, rng: np.random.Generator, drive: Drive) -> Iterator[SimulatedScan]:
+def _drive_block(
+    sensor: Sensor, gains: np.ndarray, scans: int, rng: np.random.Generator, drive: Drive
+) -> Iterator[SimulatedScan]:
     """Scans of one street, with poses relative to its first scan."""
     style = draw_style(rng)
     ground = Ground(style, 2 * drive.margin + scans * drive.spacing, rng)
     speed = float(rng.uniform(*drive.speed))
     site = populate(ground, rng, speed, drive.margin)
     standing = RayScene(join([ground.mesh(), *site.fixed]))
-    sway, gains = rng.uniform(-0.4, 0.4), laser_gains(sensor, rng)
+    sway = rng.uniform(-0.4, 0.4)
     first: np.ndarray | None = None
     for index in range(scans):
         x, time = drive.margin + index * drive.spacing, index * drive.spacing / speed

@@ -16,7 +16,7 @@ from amvnet.simulation.mesh import Mesh
 from amvnet.simulation.sensors import Sensor
 
 SHADOW_EDGE = 6.0  # degrees by which the edges of the car's shadow differ between lasers
-CROWNS = 6  # clumps of leaves that a pulse may pass
+SKINS = 16  # of clumps of leaves that a pulse may pass on its way in and out
 BEYOND = 0.002  # metres behind a surface where a ray goes on
 LEAF_COSINE = 0.5  # leaves look every way
 
@@ -28,6 +28,7 @@ def require_embree() -> tuple[ModuleType, ModuleType]:
         InputError: where the extra `simulate` is not installed.
     """
     try:
+        import trimesh  # noqa: F401  whose spheres the bodies are made from
         from embreex import mesh_construction, rtcore_scene
     except ImportError as error:
         raise InputError(
@@ -215,18 +216,20 @@ def _enter_foliage(
     front: _Front, scenes: Sequence[RayScene], origin: np.ndarray, direction: np.ndarray, rng: np.random.Generator
 ) -> None:
     """Move rays that hit foliage on to the leaf that they end at, or through to what is behind it."""
-    inside = np.flatnonzero(front.depth > 0)
-    for _ in range(CROWNS):
-        if not len(inside):
+    index = np.flatnonzero(front.depth > 0)
+    clumps = np.zeros(len(index), dtype=np.int32)  # that a ray is in: they overlap
+    for _ in range(SKINS):
+        if not len(index):
             return
-        start = front.distance[inside]
-        on = start + BEYOND
-        beyond = _Front(scenes, origin[inside] + direction[inside] * on[:, None], direction[inside])
-        free = rng.standard_exponential(len(inside), dtype=np.float32) * front.depth[inside]
-        free[front.facing[inside] > 0] = np.inf  # on the way out
+        clumps += np.where(front.facing[index] < 0, 1, -1)
+        on = front.distance[index] + BEYOND
+        beyond = _Front(scenes, origin[index] + direction[index] * on[:, None], direction[index])
+        free = rng.standard_exponential(len(index), dtype=np.float32) * front.depth[index]
+        free[clumps <= 0] = np.inf
         stopped = free < beyond.distance
-        front.distance[inside[stopped]] += free[stopped]
+        front.distance[index[stopped]] += free[stopped]
         through = np.flatnonzero(~stopped)
-        inside = inside[through]
-        front.move(inside, beyond, through, on[through])
-        inside = inside[front.depth[inside] > 0]
+        index, clumps = index[through], clumps[through]
+        front.move(index, beyond, through, on[through])
+        leafy = front.depth[index] > 0
+        index, clumps = index[leafy], clumps[leafy]

@@ -123,11 +123,11 @@ class Surface(IntEnum):
 class Reflection:
     """How one surface answers a pulse; figures as in KITTI's scans."""
 
-    # Intensity of a near, head-on return, 0 to 1.
+    # Intensity that an HDL-64E reports of a near, head-on return, 0 to 1.
     reflectivity: float
     # Relative standard deviation of the intensity between returns.
     spread: float
-    # Standard deviation of the intensity's logarithm between things.
+    # Standard deviation of the reflectivity's logarithm between things.
     shade: float
     # Share of the returns that come with intensity 0, as glossy surfaces send most light elsewhere.
     dark: float = 0.02

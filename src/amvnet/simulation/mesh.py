@@ -175,5 +175,5 @@ def hull(
     waves = np.sin(corners @ rng.normal(scale=3.0, size=(3, 3)) + rng.uniform(0, 6.3, size=3)).sum(axis=1)
     swell = 1 + 0.09 * waves + rng.normal(scale=0.11, size=len(corners))
     shape = np.sign(corners) * np.abs(corners) ** square * swell[:, None]
-    shape[:, :2] *= 1 - taper * shape[:, 2:]
+    shape[:, :2] *= np.maximum(1 - taper * shape[:, 2:], 0.05)  # a tip stays a tip
     return (shape * np.array(radii) + np.array(centre))[faces]

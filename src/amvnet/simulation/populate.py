@@ -77,7 +77,7 @@ def _background(site: Site, side: int) -> None:
         else:
             site.put(any_tree(rng, rng.uniform(6, 14), fine=False), x, t)
         far = side * (ground.front(side) + rng.uniform(42, 66))
-        site.put(fixtures.copse(rng, 14.0, rng.uniform(5, 12)), x, far)
+        site.put(fixtures.copse(rng, 14.0, rng.uniform(5, 12)), x, far, margin=10.0)
 
 
 def _side_roads(site: Site) -> None:

@@ -62,7 +62,7 @@ def receive(
 
 
 def _lost(sensor: Sensor, back: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """The rows that nuScenes has for shots without a return: near the sensor, most of them behind its right side."""
+    """The rows that nuScenes has for shots without a return: near the sensor, most of them behind its left side."""
     missing = sensor.azimuth_steps - np.bincount(back, minlength=len(sensor.elevations))
     ring = np.repeat(np.arange(len(missing), dtype=np.uint8), missing)
     one_side = rng.random(len(ring)) < 0.65

@@ -26,11 +26,11 @@ class Sensor:
     reach: float
     # Share of the returns at an edge in depth that lie somewhere between the two surfaces.
     mixed: float
-    # The intensity that the device reports is gain * reflectivity ** gamma, with so many decimals.
+    # Near and head-on, the device reports an intensity of gain * reflectivity ** gamma, with so many decimals.
     gain: float
     gamma: float
     decimals: int
-    # Relative standard deviation of the gain between lasers.
+    # How much the lasers' gains differ, of reflectivity: scale of Student's t with three degrees of freedom.
     gain_spread: float
     # Seconds that a turn takes, at whose middle the sensor looks ahead.
     turn: float

@@ -21,16 +21,18 @@ class PointBatch:
         scan: (P,) int64: which of the B scans a point belongs to; ascending.
         count: B.
         ring: (P,) int64: index of the laser, or None.
+        names: of the scans.
     """
 
     points: Tensor
     scan: Tensor
     count: int
     ring: Tensor | None = None
+    names: tuple[str, ...] = ()
 
     def to(self, device: torch.device | str) -> PointBatch:
         ring = None if self.ring is None else self.ring.to(device)
-        return PointBatch(self.points.to(device), self.scan.to(device), self.count, ring)
+        return PointBatch(self.points.to(device), self.scan.to(device), self.count, ring, self.names)
 
     def slices(self) -> list[slice]:
         """Where each scan's points stand."""
@@ -45,4 +47,5 @@ class PointBatch:
         index = np.repeat(np.arange(len(scans)), [k.sum() for k in kept])
         rings = [s.ring[k] for s, k in zip(scans, kept, strict=True) if s.ring is not None]
         ring = torch.from_numpy(np.concatenate(rings).astype(np.int64)) if len(rings) == len(scans) else None
-        return cls(torch.from_numpy(points), torch.from_numpy(index), len(scans), ring)
+        names = tuple(scan.name for scan in scans)
+        return cls(torch.from_numpy(points), torch.from_numpy(index), len(scans), ring, names)
