@@ -354,6 +354,31 @@ def test_a_killed_run_resumes_to_the_same_weights(world: Path, run: Path, tmp_pa
     assert not differing(found, expected)
 
 
+@pytest.mark.parametrize("room", [1_000, 40_000])
+def test_a_full_disk_stops_with_a_line_and_the_last_good_state(world: Path, tmp_path: Path, room: int) -> None:
+    """No file may grow beyond some bytes, which is what a full disk looks like to a program."""
+    out = tmp_path / "run"
+    arguments = [world / "recipe.yaml", "--data", world / "data", "--out", out, "--stage", "rv"]
+    command = [sys.executable, "-m", "amvnet.cli", "train", *map(str, arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (out / "rv" / "last.ckpt").exists() and process.poll() is None:
+        time.sleep(0.002)
+    process.kill()
+    process.wait()
+    before = load(out / "rv" / "last.safetensors")
+    full = subprocess.run(
+        ["bash", "-c", f'ulimit -f {room // 1024 + 1}; exec "$@"', "-", *command, "--resume"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert full.returncode in (1, 2), full.stderr
+    assert len(full.stderr.splitlines()) == 1, full.stderr
+    assert not differing(load(out / "rv" / "last.safetensors"), before)
+    assert not [name for name in files(out) if ".part" in name]
+    assert subprocess.run([*command, "--resume"], capture_output=True, check=False).returncode == 0
+
+
 def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_path: Path) -> None:
     """The libraries' own notes stay out of stderr, and what is trained is not lost."""
     shutil.copytree(world / "data", tmp_path / "data")

@@ -67,6 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"amvnet: {error}", file=sys.stderr)
         return WRONG_INPUT
+    except OSError as error:  # a full disk, say; what was there before is still whole
+        print(f"amvnet: {error.filename or 'the disk'}: {error.strerror}; mend this and go on", file=sys.stderr)
+        return FAILED
     except KeyboardInterrupt:
         print("amvnet: interrupted", file=sys.stderr)
         return FAILED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import hashlib
 import json
 from collections.abc import Mapping
@@ -127,6 +128,9 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
 
     Args:
         half: keep matrices and kernels as float16: half the size, for weights that are only used.
+
+    Raises:
+        OSError: where there is no room for it.
     """
     description = {
         "format": FORMAT,
@@ -138,7 +142,10 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
     }
     tensors = {k: v.half() if half and v.ndim > 1 else v for k, v in weights.tensors.items()}
     with whole_file(path) as part:
-        save_file(tensors, part, metadata={KEY: json.dumps(description)})
+        try:
+            save_file(tensors, part, metadata={KEY: json.dumps(description)})
+        except SafetensorError as error:  # a full disk
+            raise OSError(errno.EIO, str(error).splitlines()[0], str(path)) from None
     return Path(path)
 
 
