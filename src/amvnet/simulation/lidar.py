@@ -44,8 +44,7 @@ class RayScene:
         scenes, meshes = require_embree()
         self.mesh = mesh
         self._scene = scenes.EmbreeScene()
-        corners = np.ascontiguousarray(mesh.triangles.reshape(-1, 3))
-        self._kept = meshes.TriangleMesh(self._scene, corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+        self._kept = meshes.TriangleMesh(self._scene, mesh.triangles)
         edges = mesh.triangles[:, 1:] - mesh.triangles[:, :1]
         normals = np.cross(edges[:, 0], edges[:, 1])
         length = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
