@@ -125,7 +125,11 @@ def test_a_mistake_is_one_line_and_leaves_nothing(mistake: str, world: Path, tmp
     assert (code, error.count("\n")) == (2, 1), error
     assert error.startswith("amvnet: ")
     assert files(world) == before
-    left = files(tmp_path) - {"out/recipe.yaml", "out/class_counts.npz"}  # a run says at once what it is
+    left = files(tmp_path) - {
+        "out/recipe.yaml",
+        "out/run.yaml",
+        "out/class_counts.npz",
+    }  # a run says at once what it is
     assert not left
 
 

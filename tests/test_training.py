@@ -182,10 +182,12 @@ def test_a_refused_run_leaves_the_recipe_of_the_run_that_is_there(world: Path, r
     "other", [("--training.rv.epochs", 5), ("--model.range_net.decoder", 24), ("--training.seed", 4)]
 )
 def test_a_run_is_not_resumed_with_other_values(world: Path, run: Path, other: tuple[str, object]) -> None:
+    before = {name: (run / name).read_bytes() for name in ("recipe.yaml", "run.yaml", "weights.safetensors")}
     arguments = ("--data", world / "data", "--out", run, "--resume", *other)
     code, error = amvnet("train", world / "recipe.yaml", *arguments)
     assert (code, error.count("\n")) == (2, 1)
     assert "stage.yaml" in error
+    assert {name: (run / name).read_bytes() for name in before} == before
 
 
 def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
@@ -321,7 +323,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(world: Path
 
 def test_a_run_says_how_to_repeat_it(world: Path, run: Path, tmp_path: Path) -> None:
     """The command in the run's folder gives the same weights to the last bit."""
-    said = yaml.safe_load((run / "run.yaml").read_text())
+    said = yaml.safe_load((run / "run.yaml").read_text())["all"]
     assert said["versions"]["torch"] == torch.__version__
     assert said["train"] == ["00", "01"]
     assert said["val"] == ["08"]

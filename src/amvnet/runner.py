@@ -81,10 +81,10 @@ class Run:
                 folder holds a run and `resume` is not said.
         """
         names = ("rv", "bev", "head") if stage == "all" else (stage,)
-        if not self.resume:
-            for name in names:  # before hours are spent on the first
-                self._check_earlier(name, Weights(self.recipe.model, self.dataset.taxonomy))
         current, path = self._start(init), self.out / "weights.safetensors"
+        for name in names:
+            self._check_earlier(name, current)  # before anything is written, and hours are spent on the first
+        self._describe(stage)
         for name in names:
             current = self._stage(name, current)
             weights_file.save(current, path)  # after each stage, so that one that fails takes nothing with it
@@ -100,13 +100,18 @@ class Run:
             kept = self._folder(name) / f"{self.recipe.training.keep}.safetensors"
             if kept.is_file() and (self._folder(name) / "done").is_file():
                 current = current.replace_part(part, weights_file.load(kept))
-        for name, tree in (("recipe.yaml", to_dict(self.recipe)), ("run.yaml", self._described())):
-            with whole_file(self.out / name) as path:
-                path.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
         return current
 
-    def _described(self) -> dict[str, Any]:
-        """With what the run is made, on what, and how to make it again."""
+    def _describe(self, stage: str) -> None:
+        """Write the recipe, and in run.yaml with what a stage (or all) is made, on what, and how to make it again."""
+        path = self.out / "run.yaml"
+        earlier = yaml.safe_load(path.read_text()) if path.is_file() else {}
+        trees = {"recipe.yaml": to_dict(self.recipe), path.name: {**earlier, stage: self._described(stage)}}
+        for name, tree in trees.items():
+            with whole_file(self.out / name) as part:
+                part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
+
+    def _described(self, stage: str) -> dict[str, Any]:
         train, val = names_of(self.train), names_of(self.val)
         command = [
             "amvnet",
@@ -156,7 +161,6 @@ class Run:
                              "resume it with that, or give another folder")  # fmt: skip
 
     def _stage(self, name: str, current: Weights) -> Weights:
-        self._check_earlier(name, current)
         done = self._folder(name) / "done"
         if done.is_file() and self.resume:
             return current
