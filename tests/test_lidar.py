@@ -158,16 +158,17 @@ def test_a_hull_is_closed_and_looks_outwards() -> None:
         assert (outward > 0).mean() > 0.99  # a bump of a thin tip may hang over
 
 
+@pytest.mark.parametrize("counter_clockwise", [True, False])
 @pytest.mark.parametrize("corrected", [True, False])
-def test_a_moving_sensor_smears_a_wall_unless_it_is_corrected(corrected: bool) -> None:
-    """Ahead at the middle of the turn; what is on the left, a quarter turn earlier, is seen from farther back."""
-    sensor = replace(EXACT, turn=0.1, corrected=corrected)
+def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(corrected: bool, counter_clockwise: bool) -> None:
+    """Ahead at the middle of the turn: what is on the left is seen a quarter of a turn later, or earlier."""
+    sensor = replace(EXACT, turn=0.1, corrected=corrected, counter_clockwise=counter_clockwise)
     left = part(wall(10).triangles[..., [1, 0, 2]], Surface.PLASTER, Label.BUILDING)
     pole = part(box((0.2, 0.2, 20), (0, 10, -10)), Surface.METAL, Label.POLE)
     points, labels, _ = scanned(join([place(left, 0, 5, 0, 0), wall(20), pole]), sensor, speed=20.0)
     middle = points[labels == Label.POLE, 0].mean()
-    # The sensor turns clockwise: it looks to the left a quarter of a turn, 0.025 s or 0.5 m, before it looks ahead.
-    assert middle == pytest.approx(0.0 if corrected else 0.5, abs=0.05)
+    moved = 20 * 0.025 * (1 if counter_clockwise else -1)  # metres, when it looks to the left
+    assert middle == pytest.approx(0.0 if corrected else -moved, abs=0.05)
     ahead = points[(labels == Label.BUILDING) & (np.abs(points[:, 1]) < 0.2)]
     np.testing.assert_allclose(ahead[:, 0], 20, atol=0.02)
 

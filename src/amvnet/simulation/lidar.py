@@ -119,8 +119,7 @@ def fired(sensor: Sensor) -> Rays:
     azimuth, level = 2 * np.pi * turned, np.cos(elevation)
     rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1)
     ring = np.repeat(np.arange(len(sensor.elevations), dtype=np.uint8)[::-1], sensor.azimuth_steps)
-    # The sensor turns clockwise.
-    time = sensor.turn * (0.5 - (turned + 0.5) % 1)
+    time = sensor.turn * ((turned + 0.5) % 1 - 0.5) * (1 if sensor.counter_clockwise else -1)
     free = ~_hidden(sensor)
     columns = rays.reshape(-1, 3)[free].astype(np.float32), ring[free], time.ravel()[free].astype(np.float32)
     for array in columns:

@@ -32,8 +32,9 @@ class Sensor:
     decimals: int
     # How much the lasers' gains differ, of reflectivity: scale of Student's t with three degrees of freedom.
     gain_spread: float
-    # Seconds that a turn takes, at whose middle the sensor looks ahead.
+    # Seconds that a turn takes, at whose middle the sensor looks ahead; counter-clockwise seen from above, or not.
     turn: float
+    counter_clockwise: bool
     # True where the files hold points as if the sensor had stood still.
     corrected: bool
     # True where a lost return is written all the same, somewhere within a metre of the sensor.
@@ -69,6 +70,7 @@ HDL64E = Sensor(
     decimals=2,
     gain_spread=0.12,
     turn=0.1,
+    counter_clockwise=True,
     corrected=True,
     keeps_lost=False,
     layout="semantickitti",
@@ -103,6 +105,7 @@ HDL32E = Sensor(
     decimals=3,
     gain_spread=0.05,
     turn=0.05,
+    counter_clockwise=False,
     corrected=True,
     keeps_lost=True,
     layout="nuscenes",
