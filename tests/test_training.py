@@ -334,6 +334,21 @@ def test_a_run_says_how_to_repeat_it(world: Path, run: Path, tmp_path: Path) -> 
     assert not differing(load(tmp_path / "again"), load(run))
 
 
+def test_a_run_of_several_calls_says_how_to_repeat_each(world: Path, tmp_path: Path) -> None:
+    """The stages may be trained on different sequences; their commands in order give the same weights."""
+    out = tmp_path / "run"
+    train(world, out, "--stage", "rv", "--train-sequences", "00", "--val-sequences", "08")
+    train(world, out, "--stage", "bev", "--train-sequences", "01", "--val-sequences", "08")
+    expected = train(world, out, "--stage", "head", "--train-sequences", "00,01", "--val-sequences", "08")
+    calls = yaml.safe_load((out / "run.yaml").read_text())
+    assert list(calls) == ["rv", "bev", "head"]
+    for call in calls.values():
+        command = shlex.split(call["repeat"])
+        assert command[-1] == f"{out}-again"
+        assert amvnet(*command[1:]) == (0, "")
+    assert not differing(load(f"{out}-again"), expected)
+
+
 @pytest.mark.parametrize("stage", FOLDERS)
 def test_a_killed_run_resumes_to_the_same_weights(world: Path, run: Path, tmp_path: Path, stage: str) -> None:
     """SIGKILL in the middle of an epoch, after one that was finished."""

@@ -84,7 +84,7 @@ class Run:
         current, path = self._start(init), self.out / "weights.safetensors"
         for name in names:
             self._check_earlier(name, current)  # before anything is written, and hours are spent on the first
-        self._describe(stage)
+        self._describe(stage, init)
         for name in names:
             current = self._stage(name, current)
             weights_file.save(current, path)  # after each stage, so that one that fails takes nothing with it
@@ -102,27 +102,32 @@ class Run:
                 current = current.replace_part(part, weights_file.load(kept))
         return current
 
-    def _describe(self, stage: str) -> None:
+    def _describe(self, stage: str, init: Weights | None) -> None:
         """Write the recipe, and in run.yaml with what a stage (or all) is made, on what, and how to make it again."""
         path = self.out / "run.yaml"
-        earlier = yaml.safe_load(path.read_text()) if path.is_file() else {}
-        trees = {"recipe.yaml": to_dict(self.recipe), path.name: {**earlier, stage: self._described(stage)}}
+        # Another call of this folder may have trained another stage on other scans: its entry stays, before this one.
+        earlier = {key: value for key, value in self._calls(path).items() if key != stage}
+        trees = {"recipe.yaml": to_dict(self.recipe), path.name: {**earlier, stage: self._described(stage, init)}}
         for name, tree in trees.items():
             with whole_file(self.out / name) as part:
                 part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
 
-    def _described(self, stage: str) -> dict[str, Any]:
+    @staticmethod
+    def _calls(path: Path) -> dict[str, Any]:
+        """What run.yaml holds so far, by stage; nothing where it cannot be read."""
+        try:
+            found = yaml.safe_load(path.read_text())
+        except (OSError, ValueError, yaml.YAMLError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def _described(self, stage: str, init: Weights | None) -> dict[str, Any]:
         train, val = names_of(self.train), names_of(self.val)
-        command = [
-            "amvnet",
-            "train",
-            self.out / "recipe.yaml",
-            "--data",
-            self.dataset.root,
-            "--out",
-            f"{self.out}-again",
-        ]
+        command = ["amvnet", "train", self.out / "recipe.yaml", "--data", self.dataset.root, "--stage", stage]
         command += ["--train-sequences", ",".join(train), "--val-sequences", ",".join(val)]
+        # Weights that were given have no name here; their digests below tell whether it is they.
+        command += ["--init", "WEIGHTS"] if init is not None else []
+        command += ["--out", f"{self.out}-again"]
         return {
             "repeat": shlex.join(map(str, command)),
             "versions": {name: metadata.version(name) for name in ("amvnet", "torch", "lightning", "numpy")},
@@ -131,6 +136,7 @@ class Run:
             "classes": self.dataset.taxonomy.name,
             "train": train,
             "val": val,
+            "init": None if init is None else {part: init.digest(part) for part in init.parts},
         }
 
     def _folder(self, name: str) -> Path:
