@@ -25,7 +25,6 @@ from amvnet.segmenter import Segmenter, checked_scan, in_place, labels_in_place
 from amvnet.views.points import PointBatch
 from amvnet.weights import Weights
 
-Progress = Callable[[int, int], None]
 BINS = 100  # of the cosine similarity, which is in [0, 1]
 SWEPT = 98  # bins of the lower similarities for which the head is asked: tau is swept up to 0.98
 ENSEMBLES = {"arithmetic mean": arithmetic_mean, "maximum": maximum, "ensemble": geometric_mean}
@@ -39,6 +38,12 @@ class Swept:
     uncertain: float
     miou: float
     accuracy: float
+
+    @classmethod
+    def of(cls, value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxonomy) -> Swept:
+        """From a (K + 1, K + 1) confusion matrix."""
+        reached = metrics(matrix, taxonomy)
+        return cls(value, uncertain, reached["miou"] or 0.0, reached["accuracy"] or 0.0)
 
 
 @dataclass
@@ -68,9 +73,8 @@ class Analysis:
         found = []
         for bins in range(SWEPT + 1):
             matrix = self.head[:bins].sum(axis=0) + self.ensemble[bins:].sum(axis=0)
-            reached = metrics(matrix, self.taxonomy)
-            share = self.points[:bins].sum() / max(self.points.sum(), 1)
-            found.append(Swept(bins / BINS, float(share), reached["miou"] or 0.0, reached["accuracy"] or 0.0))
+            share = float(self.points[:bins].sum() / max(self.points.sum(), 1))
+            found.append(Swept.of(bins / BINS, share, matrix, self.taxonomy))
         return found
 
 
@@ -78,7 +82,7 @@ def analyze(
     dataset: Dataset,
     records: Sequence[ScanRecord],
     segmenter: Segmenter,
-    progress: Progress = lambda done, total: None,
+    progress: jobs.Progress = lambda done, total: None,
 ) -> Analysis:
     """Score some labelled scans once by every method, and by the head wherever a swept tau would ask it.
 
@@ -96,13 +100,8 @@ def analyze(
         np.zeros((BINS, size, size), dtype=np.int64),
         np.zeros((SWEPT, size, size), dtype=np.int64),
     )
-    for done, record in enumerate(records):
-        progress(done, len(records))
-        scan = dataset.read(record)
-        if scan.labels is None:
-            raise InputError(f"{scan.name}: expected labels to compare with, found none; name labelled sequences")
+    for _, scan in jobs.labelled(dataset, records, progress):
         _add(found, checked_scan(scan), segmenter)
-    progress(len(records), len(records))
     return found
 
 
@@ -167,9 +166,7 @@ def sweep_neighbours(
         run = Run(changed, dataset, train, val, out / "neighbours" / str(n), True, say)
         segmenter = Segmenter(run.stages("head", networks), device)
         found = jobs.evaluate(dataset, val, jobs.by_weights(dataset, segmenter))
-        reached = metrics(found.matrices["amvnet"][0], dataset.taxonomy)
-        share = found.uncertain / max(found.asked, 1)
-        yield Swept(n, share, reached["miou"] or 0.0, reached["accuracy"] or 0.0)
+        yield Swept.of(n, found.uncertain / max(found.asked, 1), found.matrices["amvnet"][0], dataset.taxonomy)
 
 
 def ablate(

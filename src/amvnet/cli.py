@@ -5,19 +5,31 @@ from __future__ import annotations
 import dataclasses
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amvnet import __version__
-from amvnet.arguments import Parser, parser_of
+from amvnet import __version__, training_verbs, verbs
+from amvnet.arguments import Parser, Positional, parser_of
 from amvnet.errors import InputError
 from amvnet.terminal import say
-from amvnet.verbs import VERBS
 
 if TYPE_CHECKING:
     from amvnet.config import Recipe
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
+
+VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
+    "demo": (verbs.demo, {}),
+    "simulate": (verbs.simulate, {"out": {"metavar": "OUT", "type": Path}}),
+    "train": (training_verbs.train, {"recipe": {"metavar": "RECIPE"}}),
+    "predict": (verbs.predict, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
+    "evaluate": (verbs.evaluate, {"data": {"metavar": "DATA"}}),
+    "analyze": (training_verbs.analyze, {"data": {"metavar": "DATA"}}),
+    "ablate": (training_verbs.ablate, {"recipe": {"metavar": "RECIPE"}}),
+    "bench": (verbs.bench, {}),
+    "info": (verbs.info, {"weights": {"metavar": "W", "nargs": "?"}}),
+}
 
 
 def _parser(verb: str, recipe: Recipe | None = None) -> Parser:

@@ -89,18 +89,29 @@ def evaluate(
     """
     evaluation = Evaluation(dataset.taxonomy)
     drawn = set(np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int).tolist())
-    for done, record in enumerate(records):
-        progress(done, len(records))
-        scan = dataset.read(record)
-        if scan.labels is None:
-            raise InputError(f"{scan.name}: expected labels to compare with, found none; name labelled sequences")
+    for done, (record, scan) in enumerate(labelled(dataset, records, progress)):
+        assert scan.labels is not None
         found, uncertain = label(record, scan)
         evaluation.add(scan.points, scan.labels, found, uncertain)
         if pictures is not None and done in drawn:
             path = pictures / f"{record.name.replace('/', '_')}.png"
             draw_scan(path, scan.points, dataset.taxonomy, found, scan.labels, uncertain, record.name)
-    progress(len(records), len(records))
     return evaluation
+
+
+def labelled(dataset: Dataset, records: Sequence[ScanRecord], progress: Progress) -> Iterator[tuple[ScanRecord, Scan]]:
+    """Read scans that must have labels.
+
+    Raises:
+        InputError: at the first that has none.
+    """
+    for done, record in enumerate(records):
+        progress(done, len(records))
+        scan = dataset.read(record)
+        if scan.labels is None:
+            raise InputError(f"{scan.name}: expected labels to compare with, found none; name labelled sequences")
+        yield record, scan
+    progress(len(records), len(records))
 
 
 def by_weights(
@@ -111,7 +122,7 @@ def by_weights(
     Raises:
         InputError: where the weights know other classes than the data set.
     """
-    _check_classes(dataset, segmenter.taxonomy)
+    check_classes(dataset, segmenter.taxonomy)
     return lambda record, scan: segmenter.by_method(checked_scan(scan))
 
 
@@ -133,7 +144,8 @@ def own_classes(taxonomy: Taxonomy) -> Taxonomy | None:
     return taxonomy if taxonomy.name not in TAXONOMIES else None
 
 
-def _check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
+def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
+    """Raises InputError where weights know other classes than the data set."""
     if taxonomy.classes != dataset.taxonomy.classes:
         raise InputError(
             f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those of "
@@ -186,7 +198,7 @@ def _tasks(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | 
 
 
 def _dataset_tasks(dataset: Dataset, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None) -> Iterator[Task]:
-    _check_classes(dataset, taxonomy)
+    check_classes(dataset, taxonomy)
     for record in choose_records(dataset, sequences, "all"):
         yield _record_task(dataset, record, out)
 

@@ -1,0 +1,46 @@
+"""What verbs are given in words: data sets, names of sequences, numbers; and scans in words again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from amvnet.errors import InputError
+
+if TYPE_CHECKING:
+    from amvnet.data.labels import Taxonomy
+    from amvnet.data.records import ScanRecord
+
+SHOWN = 20  # names of sequences in a line
+
+
+def open_data(data: str, taxonomy: Path | None, otherwise: Taxonomy | None = None) -> Any:
+    """The data set that a verb is given, with a user's YAML file of classes, or other classes, if any."""
+    from amvnet.data.catalog import open_dataset
+    from amvnet.data.labels import taxonomy_from_yaml
+
+    return open_dataset(data, otherwise if taxonomy is None else taxonomy_from_yaml(taxonomy))
+
+
+def listed(records: Sequence[ScanRecord]) -> str:
+    """How many scans there are, of which sequences."""
+    names = sorted({record.sequence for record in records})
+    shown = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
+    return f"{len(records)} scans of {shown}"
+
+
+def names_in(text: str | None) -> list[str] | None:
+    """Names with commas; None where the option was left out. Raises InputError where there is none in it."""
+    names = None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+    if names == []:
+        raise InputError(f"expected names of sequences with commas, found {text!r}; name some, or leave the option out")
+    return names
+
+
+def numbers_in(text: str) -> list[int]:
+    """Numbers from 1 with commas, ascending, each once. Raises InputError where one is none."""
+    names = names_in(text) or []
+    if not all(name.isdecimal() and int(name) for name in names):
+        raise InputError(f"expected numbers of neighbours with commas, found {text!r}; say 5,10,15")
+    return sorted({int(name) for name in names})
