@@ -102,7 +102,7 @@ MISTAKES = {
     "empty batches": TRAIN + " --stage rv --training.rv.batch 0",
     "negative learning rate": TRAIN + " --stage rv --training.rv.lr=-1",
     "no warm-up": TRAIN + " --stage rv --training.rv.warmup 0",
-    "no accumulation": TRAIN + " --stage rv --training.accumulate 0",
+    "no accumulation": TRAIN + " --stage rv --training.rv.accumulate 0",
     "negative workers": TRAIN + " --stage rv --training.workers=-1",
     "unknown accelerator": TRAIN + " --stage rv --training.accelerator abacus",
     "image without columns": TRAIN + " --stage rv --model.range_view.width 0",

@@ -178,7 +178,7 @@ def test_merging_trees_leaves_both_as_they_were() -> None:
         "training: {rv: {epochs: 0}}",
         "training: {bev: {lr: 0}}",
         "training: {head: {warmup: 1}}",
-        "training: {accumulate: 3}",
+        "training: {rv: {accumulate: 3}}",
         "training: {seed: -1}",
         "training: {augment: {flip: 1.5}}",
     ],

@@ -128,8 +128,8 @@ def test_another_seed_gives_other_weights(world: Path, run: Path, tmp_path: Path
 
 
 def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: object) -> None:
-    """A run that stops in the validation of an epoch of a stage, before its weights are kept."""
-    keep = KeepWeights.on_validation_end
+    """A run that stops after the validation of an epoch of a stage, before its weights are kept."""
+    keep = KeepWeights.on_train_epoch_end
 
     def stop(self: KeepWeights, trainer: Any, module: Any) -> None:
         if self.kept.last.parent.name == stage and trainer.current_epoch == epoch:
@@ -137,7 +137,7 @@ def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: 
         keep(self, trainer, module)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(KeepWeights, "on_validation_end", stop)
+        patch.setattr(KeepWeights, "on_train_epoch_end", stop)
         with pytest.raises(RuntimeError, match="power"):
             train(world, out, *options)
 
@@ -261,9 +261,9 @@ def test_folds_score_no_sequence_that_they_learnt_from(
     gathered = []
     gather = runner.gather_points
 
-    def spy(sources: Any, *rest: Any) -> Any:
+    def spy(sources: Any, **rest: Any) -> Any:
         gathered.append(sources)
-        return gather(sources, *rest)
+        return gather(sources, **rest)
 
     monkeypatch.setattr(runner, "gather_points", spy)
     weights = train(world, tmp_path / "run", "--training.head.folds", 2, "--training.rv.epochs", 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from amvnet.config import Recipe
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
+SHARED = ("train", "predict", "evaluate")  # the verbs that several processes can share
 
 VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "demo": (verbs.demo, {}),
@@ -97,9 +99,20 @@ def run(verb: str, arguments: Sequence[str]) -> None:
     if verb not in VERBS:
         raise InputError(f"expected a verb of {', '.join(VERBS)}, found {verb!r}; see amvnet --help")
     _quiet()
+    if verb not in SHARED and _several():
+        raise InputError(f"expected {', '.join(SHARED)} for several processes, found {verb}; run it in one")
     takes_recipe = "recipe" in VERBS[verb][1]
     call = _with_recipe(verb, arguments) if takes_recipe else vars(_parser(verb).parse_args(list(arguments)))
     VERBS[verb][0](**call)
+
+
+def _several() -> bool:
+    """Whether torchrun or SLURM has started several processes."""
+    if not {"WORLD_SIZE", "SLURM_STEP_ID"} & set(os.environ):
+        return False
+    from amvnet.processes import started
+
+    return started() > 1
 
 
 def _quiet() -> None:

@@ -199,6 +199,12 @@ class NetworkTraining(Checked):
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
     clip: Positive = 5.0
     """Largest norm of the gradient (open)."""
+    accumulate: Count = 1
+    """Parts a batch is split into where it does not fit into memory; over several processes, that of each."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check(self.batch % self.accumulate == 0, f"a batch of a multiple of {self.accumulate}", str(self.batch))
 
 
 @dataclass(frozen=True)
@@ -246,17 +252,12 @@ class TrainingConfig(Checked):
     """Seed of the weights, of the order of the scans and of the augmentation."""
     workers: Annotated[int, Range(0)] = 0
     """Processes that read and augment beside the training; 0: none."""
-    precision: Literal["32-true", "bf16-mixed", "16-mixed"] = "32-true"
-    """Arithmetic of the forward and backward passes, in Lightning's words."""
+    precision: Literal["32-true", "bf16-mixed", "16-mixed", "64-true"] = "32-true"
+    """Arithmetic of the forward and backward passes, in Lightning's words; 64 to compare trainings."""
     accelerator: str = "auto"
     """Lightning's accelerator: auto, cpu, gpu."""
-    accumulate: Count = 1
-    """Parts a batch is split into where it does not fit into memory."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for batch in (self.rv.batch, self.bev.batch):
-            self.check(batch % self.accumulate == 0, f"batches of a multiple of {self.accumulate}", str(batch))
+    compile: bool = False
+    """Compile the network by torch.compile: a slow start, then faster steps."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What verbs are given in words: data sets, names of sequences, numbers; and scans in words again."""
+"""What verbs are given: in words, data sets, names of sequences, numbers; and the processes that share them."""
 
 from __future__ import annotations
 
@@ -7,12 +7,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amvnet.errors import InputError
+from amvnet.terminal import silence
 
 if TYPE_CHECKING:
     from amvnet.data.labels import Taxonomy
     from amvnet.data.records import ScanRecord
+    from amvnet.processes import Processes
 
 SHOWN = 20  # names of sequences in a line
+
+
+def meet(cuda: bool = False) -> Processes:
+    """The processes of this job, where torchrun or SLURM has started several; only the first one prints."""
+    from amvnet.processes import join
+
+    found = join(cuda)
+    if not found.first:
+        silence()
+    return found
 
 
 def open_data(data: str, taxonomy: Path | None, otherwise: Taxonomy | None = None) -> Any:

@@ -15,6 +15,7 @@ from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation
 from amvnet.pictures import draw_scan
+from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmentation, Segmenter, checked_scan
 
@@ -43,27 +44,31 @@ def predict(
     sequences: Sequence[str] | None = None,
     scores: bool = False,
     progress: Progress = lambda done, total: None,
+    split: str = "all",
+    processes: Processes = ALONE,
 ) -> list[Path]:
-    """Segment data sets, scan files and folders of them; returns the files of labels.
+    """Segment data sets, scan files and folders of them; returns the files of labels that this process has written.
 
     Args:
         inputs: each a data set as `open_dataset` takes it, a scan file, or a folder of scan files.
-        sequences: of data sets, which to segment; None means all.
+        sequences: of data sets, which to segment; None means those of `split`.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` of an `.npz`.
+        split: the official split of data sets.
+        processes: those that share the scans.
 
     Raises:
         InputError: before anything is written where an input is not there; else at the scan that is broken.
     """
-    tasks = [task for text in inputs for task in _tasks(text, segmenter.taxonomy, Path(out), sequences)]
+    tasks = [task for text in inputs for task in _tasks(text, segmenter.taxonomy, Path(out), sequences, split)]
     _check_names(tasks)
-    written = []
-    for done, task in enumerate(tasks):
-        progress(done, len(tasks))
+    mine, written = processes.share(tasks), []
+    for done, task in enumerate(mine):
+        progress(done, len(mine))
         result = segmenter(task.read())
         if scores:
             write_scores(task.scores, result)
         written.append(task.write(result.labels))
-    progress(len(tasks), len(tasks))
+    progress(len(mine), len(mine))
     return written
 
 
@@ -80,23 +85,26 @@ def evaluate(
     label: Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]],
     pictures: Path | None = None,
     progress: Progress = lambda done, total: None,
+    processes: Processes = ALONE,
 ) -> Evaluation:
     """Score the labels of some scans by the benchmark's formulas.
 
     Args:
         label: what a scan's points are taken for: ids by method, and which points are uncertain.
         pictures: a folder for drawings of some of the scans from above.
+        processes: those that share the scans; each gets the evaluation of all.
     """
-    evaluation = Evaluation(dataset.taxonomy)
-    drawn = set(np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int).tolist())
-    for done, (record, scan) in enumerate(labelled(dataset, records, progress)):
+    mine = Evaluation(dataset.taxonomy)
+    places = np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int)
+    drawn = {records[place].name for place in places}
+    for record, scan in labelled(dataset, processes.share(records), progress):
         assert scan.labels is not None
         found, uncertain = label(record, scan)
-        evaluation.add(scan.points, scan.labels, found, uncertain)
-        if pictures is not None and done in drawn:
+        mine.add(scan.points, scan.labels, found, uncertain)
+        if pictures is not None and record.name in drawn:
             path = pictures / f"{record.name.replace('/', '_')}.png"
             draw_scan(path, scan.points, dataset.taxonomy, found, scan.labels, uncertain, record.name)
-    return evaluation
+    return sum(processes.gather(mine), Evaluation(dataset.taxonomy))
 
 
 def labelled(dataset: Dataset, records: Sequence[ScanRecord], progress: Progress) -> Iterator[tuple[ScanRecord, Scan]]:
@@ -159,11 +167,14 @@ def choose_records(dataset: Dataset, sequences: Sequence[str] | None, split: str
 
 
 def split_records(
-    dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None
+    dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
 ) -> tuple[list[ScanRecord], list[ScanRecord]]:
     """The scans to train on and those to validate with: as named, else by the official split.
 
     Of a data set that has no scan of one of the two official splits, the last sequence validates.
+
+    Args:
+        with_val: train on both, and validate with none.
 
     Raises:
         InputError: where there is just one sequence.
@@ -174,6 +185,8 @@ def split_records(
         official = {"train": present[:-1], "val": present[-1:]}
     val = val or [s for s in official["val"] if s not in (train or ())]
     train = train or [s for s in official["train"] if s not in val]
+    if with_val:
+        return dataset.records([*train, *(s for s in val if s not in train)]), []
     if not train or not val:
         raise InputError(
             f"{dataset.root}: expected two sequences, one to train on and one to validate with, "
@@ -189,18 +202,15 @@ def _present(dataset: Dataset, split: str) -> tuple[str, ...]:
         return ()
 
 
-def _tasks(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None) -> Iterator[Task]:
+def _tasks(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
     if is_dataset(text):
-        yield from _dataset_tasks(open_dataset(text, own_classes(taxonomy)), taxonomy, out, sequences)
+        dataset = open_dataset(text, own_classes(taxonomy))
+        check_classes(dataset, taxonomy)
+        for record in choose_records(dataset, sequences, split):
+            yield _record_task(dataset, record, out)
         return
     for path in find_scans(text):
         yield _file_task(path, taxonomy, out)
-
-
-def _dataset_tasks(dataset: Dataset, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None) -> Iterator[Task]:
-    check_classes(dataset, taxonomy)
-    for record in choose_records(dataset, sequences, "all"):
-        yield _record_task(dataset, record, out)
 
 
 def _record_task(dataset: Dataset, record: ScanRecord, out: Path) -> Task:

@@ -17,6 +17,7 @@ from amvnet.data.augment import augment, mix
 from amvnet.data.files import whole_file
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
+from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
 
@@ -56,20 +57,30 @@ class ScanSet(data.Dataset[Scan]):
 
 
 class EpochSampler(data.Sampler[Key]):
-    """Every scan once an epoch, in an order drawn from (seed, epoch); Lightning tells the epoch."""
+    """Every scan once an epoch, in an order drawn from (seed, epoch); Lightning tells the epoch.
 
-    def __init__(self, size: int, seed: int, shuffle: bool) -> None:
-        self.size, self.seed, self.shuffle, self.epoch = size, seed, shuffle, 0
+    Of several processes each takes its part of every batch. In training all have as many scans: where they cannot be
+    shared out evenly, the first ones of the order come again at its end.
+    """
+
+    def __init__(self, size: int, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
+        self.size, self.seed, self.shuffle, self.processes, self.epoch = size, seed, shuffle, processes, 0
 
     def set_epoch(self, epoch: int) -> None:
         self.epoch = epoch
 
     def __len__(self) -> int:
-        return self.size
+        return len(self._mine())
 
     def __iter__(self) -> Iterator[Key]:
-        order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
-        return iter([(self.epoch, int(place)) for place in (order if self.shuffle else range(self.size))])
+        return iter([(self.epoch, place) for place in self._mine()])
+
+    def _mine(self) -> list[int]:
+        order = np.arange(self.size)
+        if self.shuffle:
+            even = -(-self.size // self.processes.size) * self.processes.size
+            order = np.resize(np.random.default_rng([self.seed, self.epoch]).permutation(self.size), even)
+        return list(self.processes.share(order.tolist()))
 
 
 def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
@@ -78,29 +89,43 @@ def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
     return PointBatch.of(scans), torch.from_numpy(np.concatenate(labels).astype(np.int64))
 
 
-def loader(scans: ScanSet, batch: int, workers: int, shuffle: bool) -> data.DataLoader[tuple[PointBatch, Tensor]]:
-    """Batches of scans; the last one of a training epoch may be smaller."""
+def loader(
+    scans: ScanSet, batch: int, workers: int, shuffle: bool, processes: Processes = ALONE
+) -> data.DataLoader[tuple[PointBatch, Tensor]]:
+    """Batches of scans, of each process its own; the last one of a training epoch may be smaller."""
     return data.DataLoader(
         scans,  # type: ignore[arg-type]  # its keys are pairs, as the sampler gives them
         batch_size=batch,
-        sampler=EpochSampler(len(scans), scans.seed, shuffle),
+        sampler=EpochSampler(len(scans), scans.seed, shuffle, processes),
         num_workers=workers,
         collate_fn=collate,
         persistent_workers=workers > 0,
     )
 
 
-def count_classes(dataset: Dataset, records: Sequence[ScanRecord], kept: Path) -> np.ndarray:
+def count_classes(
+    dataset: Dataset, records: Sequence[ScanRecord], kept: Path, processes: Processes = ALONE
+) -> np.ndarray:
     """(K,) points of each class in some scans; counted once, and kept in a file beside the run."""
     made = {"scans": [record.name for record in records], "classes": list(dataset.taxonomy.classes)}
+    # What the first process found counts for all, who might see the file when it is just being written.
+    if (counted := processes.gather(_counted(kept, made))[0]) is not None:
+        return counted
+    mine = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
+    for record in processes.share(records):
+        labels = dataset.read(record).labels
+        if labels is not None:
+            mine += np.bincount(labels, minlength=len(mine))
+    counts = np.sum(processes.gather(mine), axis=0)[1:]
+    if processes.first:
+        with whole_file(kept) as part:
+            np.savez(part, counts=counts, scans=np.array(made["scans"]), classes=np.array(made["classes"]))
+    return counts
+
+
+def _counted(kept: Path, made: dict[str, list[str]]) -> np.ndarray | None:
+    """The counts in a file, where they are of these scans and classes."""
     with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(kept, allow_pickle=False) as file:
         if all(file[key].tolist() == value for key, value in made.items()):
             return file["counts"]
-    counts = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
-    for record in records:
-        labels = dataset.read(record).labels
-        if labels is not None:
-            counts += np.bincount(labels, minlength=len(counts))
-    with whole_file(kept) as part:
-        np.savez(part, counts=counts[1:], scans=np.array(made["scans"]), classes=np.array(made["classes"]))
-    return counts[1:]
+    return None

@@ -14,6 +14,11 @@ FREQUENCY_FLOOR = 1e-4  # a class rarer than this weighs no more than one at it,
 SMALL = 1e-3  # of the errors that Lovász-softmax leaves out; the loss is exact within it
 
 
+def at_least_float(x: Tensor) -> Tensor:
+    """In float32 where it is in half precision."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
 def class_weights(counts: np.ndarray) -> np.ndarray:
     """Square roots of inverse class frequencies (section 4.1 of the paper), their mean 1.
 
@@ -95,5 +100,5 @@ def _loss(
     kept = labels > 0
     if not kept.any():
         return logits.sum() * 0
-    logits, target = logits[kept].float(), labels[kept].long() - 1
+    logits, target = at_least_float(logits[kept]), labels[kept].long() - 1
     return F.cross_entropy(logits, target, weights) + region * region_loss(logits.softmax(dim=1), target)

@@ -53,12 +53,7 @@ def draw_scan(
 
     Args:
         path: the PNG to write.
-        points: (N, 3 or more) x, y, z in metres.
-        taxonomy: names and colours of the classes.
-        panels: title -> (N,) train ids of a prediction; may be empty where there is a truth.
-        truth: (N,) train ids, or None.
-        uncertain: (N,) bool, or None.
-        title: a line above all panels.
+        others: as of `scan_figure`.
 
     Returns:
         The path that was written.
@@ -67,25 +62,52 @@ def draw_scan(
         InputError: where there is nothing to draw, or an array is not one value per point.
     """
     path = Path(path)
-    _check(path, len(points), panels, truth, uncertain)
-    rows = _rows(taxonomy, panels, truth, uncertain)
-    seen = np.unique(np.concatenate([*panels.values(), *([] if truth is None else [truth])]))
-    errors = truth is not None and bool(panels)
-    figure = _figure(points, rows, _entries(taxonomy, seen, errors, uncertain is not None), title)
+    try:
+        figure = scan_figure(points, taxonomy, panels, truth, uncertain, title)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
     with whole_file(path) as part:
         figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor=GROUND)
     return path
 
 
+def scan_figure(
+    points: np.ndarray,
+    taxonomy: Taxonomy,
+    panels: Mapping[str, np.ndarray],
+    truth: np.ndarray | None = None,
+    uncertain: np.ndarray | None = None,
+    title: str = "",
+) -> Any:
+    """The Matplotlib figure that `draw_scan` writes.
+
+    Args:
+        points: (N, 3 or more) x, y, z in metres.
+        taxonomy: names and colours of the classes.
+        panels: title -> (N,) train ids of a prediction; may be empty where there is a truth.
+        truth: (N,) train ids, or None.
+        uncertain: (N,) bool, or None.
+        title: a line above all panels.
+
+    Raises:
+        InputError: where there is nothing to draw, or an array is not one value per point.
+    """
+    _check(len(points), panels, truth, uncertain)
+    rows = _rows(taxonomy, panels, truth, uncertain)
+    seen = np.unique(np.concatenate([*panels.values(), *([] if truth is None else [truth])]))
+    errors = truth is not None and bool(panels)
+    return _figure(points, rows, _entries(taxonomy, seen, errors, uncertain is not None), title)
+
+
 def _check(
-    path: Path, count: int, panels: Mapping[str, np.ndarray], truth: np.ndarray | None, uncertain: np.ndarray | None
+    count: int, panels: Mapping[str, np.ndarray], truth: np.ndarray | None, uncertain: np.ndarray | None
 ) -> None:
     if not panels and truth is None:
-        raise InputError(f"{path}: expected a prediction or a truth to draw, found neither; give one")
+        raise InputError("expected a prediction or a truth to draw, found neither; give one")
     for name, values in {**panels, "truth": truth, "uncertain": uncertain}.items():
         if values is not None and np.shape(values) != (count,):
             raise InputError(
-                f"{path}: expected {count} values for {name!r}, one per point, found {np.shape(values)}; "
+                f"expected {count} values for {name!r}, one per point, found {np.shape(values)}; "
                 "give those of this scan"
             )
 

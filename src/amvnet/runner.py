@@ -3,39 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import platform
-import shlex
+import functools
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import lightning as L
+import numpy as np
 import yaml
-from torch import nn
+from torch import Tensor, nn
 
 from amvnet import weights as weights_file
-from amvnet.callbacks import KeepWeights
-from amvnet.config import Recipe
+from amvnet.callbacks import KeepWeights, Pictures, Speed
+from amvnet.config import NetworkTraining, Recipe
 from amvnet.data.files import whole_file
 from amvnet.data.labels import NUSCENES, SEMANTICKITTI
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
-from amvnet.head_training import HeadStage, gather_points, head_loader
+from amvnet.head_points import gather_points, head_loader
+from amvnet.head_training import HeadStage
 from amvnet.loading import ScanSet, count_classes, loader
 from amvnet.losses import class_weights
 from amvnet.models.amvnet import AMVNet, build_amvnet
-from amvnet.training import LAST, PolarStage, RangeStage, Stage, fit, names_of
-from amvnet.trees import to_dict
-from amvnet.weights import SIZES, Weights, state_of
+from amvnet.models.point_head import PointHead
+from amvnet.processes import ALONE, Processes
+from amvnet.run_folder import SETTINGS, check_begun, describe, names_of, settings
+from amvnet.training import Course, PolarStage, RangeStage, Stage, fit
+from amvnet.views.points import PointBatch
+from amvnet.weights import Weights, state_of
 
 StageName = Literal["rv", "bev", "head", "all"]
-SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with
 PART = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
+PICTURED_SCANS = 2
+TRIAL_STEPS = 2  # the second of them is timed
 
 
 @dataclass
@@ -45,11 +49,13 @@ class Run:
     Attributes:
         recipe: what to train.
         dataset: where the scans are.
-        train, val: the scans to learn from, and those to validate with; none may be in both.
+        train, val: the scans to learn from, and those to validate with; none may be in both. Without any of the
+            latter nothing is validated, and the last weights are kept.
         out: the folder of the run.
         resume: go on where an earlier run in this folder stopped.
         say: told what happens, in lines.
         bars: show progress bars instead of a line an epoch.
+        processes: those that share the run; all must see its folder.
     """
 
     recipe: Recipe
@@ -60,12 +66,25 @@ class Run:
     resume: bool = False
     say: Callable[[str], None] = lambda line: None
     bars: bool = False
+    processes: Processes = ALONE
 
     def __post_init__(self) -> None:
         self.out = Path(self.out)
         common = {r.name for r in self.train} & {r.name for r in self.val}
         if common:
             raise InputError(f"expected validation scans apart from training, found {min(common)} in both; name others")
+        size = self.processes.size
+        if 0 < len(self.val) < size:  # each must have one, or they would wait for each other
+            raise InputError(
+                f"expected a validation scan for each of {size} processes, found {len(self.val)}; name more"
+            )
+        for name in ("rv", "bev"):
+            config = getattr(self.recipe.training, name)
+            if config.batch % (size * config.accumulate):
+                raise InputError(
+                    f"expected a batch for {size} processes, each in {config.accumulate} parts, found "
+                    f"{config.batch}; set --training.{name}.batch or --training.{name}.accumulate"
+                )
         benchmarks = {SEMANTICKITTI.name, NUSCENES.name}  # a user's own classes fit any recipe
         if self.dataset.taxonomy.name in benchmarks - {self.recipe.taxonomy}:
             raise InputError(
@@ -82,12 +101,16 @@ class Run:
         """
         names = ("rv", "bev", "head") if stage == "all" else (stage,)
         current, path = self._start(init), self.out / "weights.safetensors"
-        for name in names:
-            self._check_earlier(name, current)  # before anything is written, and hours are spent on the first
-        self._describe(stage, init)
+        for name in names:  # before anything is written, and hours are spent on the first
+            check_begun(self._folder(name), self._settings(name, current), self.resume)
+        self.processes.wait()
+        if self.processes.first:
+            describe(self.out, self.recipe, self.dataset, self.train, self.val, stage, init)
         for name in names:
             current = self._stage(name, current)
-            weights_file.save(current, path)  # after each stage, so that one that fails takes nothing with it
+            if self.processes.first:
+                weights_file.save(current, path)  # after each stage, so that one that fails takes nothing with it
+            self.processes.wait()
         return path
 
     def _start(self, init: Weights | None) -> Weights:
@@ -97,74 +120,20 @@ class Run:
             for part in init.parts:
                 current = current.replace_part(part, init)
         for name, part in PART.items():
-            kept = self._folder(name) / f"{self.recipe.training.keep}.safetensors"
+            kept = self._kept(name)
             if kept.is_file() and (self._folder(name) / "done").is_file():
                 current = current.replace_part(part, weights_file.load(kept))
         return current
 
-    def _describe(self, stage: str, init: Weights | None) -> None:
-        """Write the recipe, and in run.yaml with what a stage (or all) is made, on what, and how to make it again."""
-        path = self.out / "run.yaml"
-        # Another call of this folder may have trained another stage on other scans: its entry stays, before this one.
-        earlier = {key: value for key, value in self._calls(path).items() if key != stage}
-        trees = {"recipe.yaml": to_dict(self.recipe), path.name: {**earlier, stage: self._described(stage, init)}}
-        for name, tree in trees.items():
-            with whole_file(self.out / name) as part:
-                part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
-
-    @staticmethod
-    def _calls(path: Path) -> dict[str, Any]:
-        """What run.yaml holds so far, by stage; nothing where it cannot be read."""
-        try:
-            found = yaml.safe_load(path.read_text())
-        except (OSError, ValueError, yaml.YAMLError):
-            return {}
-        return found if isinstance(found, dict) else {}
-
-    def _described(self, stage: str, init: Weights | None) -> dict[str, Any]:
-        train, val = names_of(self.train), names_of(self.val)
-        command = ["amvnet", "train", self.out / "recipe.yaml", "--data", self.dataset.root, "--stage", stage]
-        command += ["--train-sequences", ",".join(train), "--val-sequences", ",".join(val)]
-        # Weights that were given have no name here; their digests below tell whether it is they.
-        command += ["--init", "WEIGHTS"] if init is not None else []
-        command += ["--out", f"{self.out}-again"]
-        return {
-            "repeat": shlex.join(map(str, command)),
-            "versions": {name: metadata.version(name) for name in ("amvnet", "torch", "lightning", "numpy")},
-            "python": platform.python_version(),
-            "data": str(self.dataset.root),
-            "classes": self.dataset.taxonomy.name,
-            "train": train,
-            "val": val,
-            "init": None if init is None else {part: init.digest(part) for part in init.parts},
-        }
-
     def _folder(self, name: str) -> Path:
         return self.out / name
 
-    def _settings(self, name: str, current: Weights) -> dict[str, Any]:
-        """What the weights of a stage depend on; the data may move to another folder meanwhile."""
-        tree = to_dict(self.recipe)
-        training = {key: tree["training"][key] for key in (name, "augment", "seed", "precision", "accumulate")}
-        found = {"model": {key: tree["model"][key] for key in SIZES[PART[name]]}, "training": training}
-        found["scans"] = {split: _digest_of_scans(getattr(self, split)) for split in ("train", "val")}
-        if name == "head":
-            found["networks"] = {part: current.digest(part) for part in ("range_net", "polar_net")}
-        return found
+    def _kept(self, name: str) -> Path:
+        """The weights of a stage that are used in the end."""
+        return self._folder(name) / f"{self.recipe.training.keep}.safetensors"
 
-    def _check_earlier(self, name: str, current: Weights) -> None:
-        """Raises InputError where the folder holds this stage of a run that is not to be resumed, or of another."""
-        folder = self._folder(name)
-        if not (folder / LAST).is_file():
-            return
-        if not self.resume:
-            raise InputError(f"{folder}: expected no earlier run, found one; add --resume or give another")
-        begun = yaml.safe_load((folder / SETTINGS).read_text()) if (folder / SETTINGS).is_file() else {}
-        now = self._settings(name, current)
-        if begun != now:
-            other = ", ".join(key for key in now if begun.get(key) != now[key])
-            raise InputError(f"{folder}: expected what it was begun with ({SETTINGS}), found another {other}; "
-                             "resume it with that, or give another folder")  # fmt: skip
+    def _settings(self, name: str, current: Weights) -> dict[str, Any]:
+        return settings(self.recipe, name, PART[name], self.train, self.val, current)
 
     def _stage(self, name: str, current: Weights) -> Weights:
         done = self._folder(name) / "done"
@@ -172,9 +141,14 @@ class Run:
             return current
         L.seed_everything(self.recipe.training.seed, verbose=False)
         current = current.resized(PART[name], self.recipe.model)
-        kept = self._fit_head(current) if name == "head" else self._fit_network(name, current)
-        current = current.replace_part(PART[name], weights_file.load(kept))
-        done.write_text("")
+        if name == "head":
+            self._fit_head(current)
+        else:
+            self._fit_network(name, current)
+        self.processes.wait()
+        current = current.replace_part(PART[name], weights_file.load(self._kept(name)))
+        if self.processes.first:
+            done.write_text("")
         return current
 
     def _module(self, part: str, current: Weights) -> AMVNet:
@@ -189,63 +163,87 @@ class Run:
                 ) from None
         return model
 
-    def _fit_network(self, name: str, current: Weights) -> Path:
-        training = self.recipe.training
-        config = training.rv if name == "rv" else training.bev
+    def trials(self, stage: StageName) -> Iterator[str]:
+        """Take some steps of each network, and say what they cost; nothing is written."""
+        fresh = self._start(None)
+        for name in [n for n in ("rv", "bev") if stage in (n, "all")]:
+            config = self._config(name)
+            with TemporaryDirectory() as folder:
+                trial = dataclasses.replace(self, out=Path(folder), val=(), resume=False, say=lambda line: None)
+                # The classes' weights cost a look at every scan, and nothing else.
+                speed = trial._fit_network(name, fresh, np.ones(self.dataset.taxonomy.size), TRIAL_STEPS)
+            steps = -(-len(self.train) // config.batch) * config.epochs
+            yield (
+                f"{name}: {speed.seconds[-1]:.1f} s for a step of {config.batch} scans "
+                f"({config.batch / speed.seconds[-1]:.3g} scans/s), memory so far {speed.memory / 2**30:.1f} GiB; "
+                f"{config.epochs} epochs of {len(self.train)} scans would take {steps * speed.seconds[-1] / 3600:.1f} h"
+            )
+
+    def _config(self, name: str) -> NetworkTraining:
+        return self.recipe.training.rv if name == "rv" else self.recipe.training.bev
+
+    def _fit_network(
+        self, name: str, current: Weights, counts: np.ndarray | None = None, steps: int | None = None
+    ) -> Speed:
+        training, config = self.recipe.training, self._config(name)
         model = self._module(PART[name], current)
-        weights = class_weights(self._counts()) if config.class_weights else None
-        shared = (config, self.dataset.taxonomy, weights)
+        weights = class_weights(self._counts() if counts is None else counts) if config.class_weights else None
+        shared = (config, self.dataset.taxonomy, weights, self.processes)
         stage: Stage = (
             RangeStage(model.range_view, model.range_net, *shared)
             if name == "rv"
             else PolarStage(model.polar_view, model.polar_net, *shared)
         )
-        keep = self._keep(name, current)
-        part = config.batch // training.accumulate
-        fit(
+        scored = model.score_range_view if name == "rv" else model.score_polar_view
+        part = config.batch // config.accumulate // self.processes.size
+        load = functools.partial(loader, workers=training.workers, processes=self.processes)
+        course = self._course(name, config.epochs, config.accumulate, config.clip)
+        return fit(
             stage,
-            training,
-            config.epochs,
-            loader(ScanSet(self.dataset, self.train, training.augment, training.seed), part, training.workers, True),
-            loader(ScanSet(self.dataset, self.val), 1, training.workers, False),
-            self._folder(name),
-            keep,
-            self.resume,
-            self.say,
-            self.bars,
-            training.accumulate,
-            config.clip,
+            dataclasses.replace(course, steps=steps),
+            load(ScanSet(self.dataset, self.train, training.augment, training.seed), part, shuffle=True),
+            load(ScanSet(self.dataset, self.val), 1, shuffle=False) if self.val else None,
+            [] if steps else [self._keep(name, current), self._pictures(lambda batch: scored(batch))],
         )
-        return getattr(keep.kept, training.keep)
 
-    def _fit_head(self, current: Weights) -> Path:
+    def _fit_head(self, current: Weights) -> None:
         training, config = self.recipe.training, self.recipe.training.head
         missing = [part for part in ("range_net", "polar_net") if part not in current.parts]
         if missing:
             raise InputError(f"expected trained networks for the head, found no {missing[0]}; train it, or give --init")
-        sources = self._sources(current)
         folder = self._folder("head")
-        train = gather_points(sources, self.dataset, training, config.views, folder / "train", self.say)
-        val = gather_points([(current, self.val)], self.dataset, training, 0, folder / "val")
+        gather = functools.partial(gather_points, dataset=self.dataset, training=training, processes=self.processes)
+        train = gather(self._sources(current), views=config.views, folder=folder / "train", say=self.say)
+        val = gather([(current, self.val)], views=0, folder=folder / "val") if self.val else None
         head = self._module(PART["head"], current).point_head
         assert head is not None
         weights = class_weights(self._counts()) if config.class_weights else None
-        keep = self._keep("head", current)
+        load = functools.partial(head_loader, seed=training.seed, processes=self.processes)
         fit(
-            HeadStage(head, val.certain, config, self.dataset.taxonomy, weights),
-            dataclasses.replace(training, precision="32-true"),
-            config.epochs,
-            head_loader(train, config.batch, training.seed, True),
-            head_loader(val, 64 * config.batch, training.seed, False),
-            folder,
-            keep,
-            self.resume,
-            self.say,
-            self.bars,
+            HeadStage(head, train, val, config, self.dataset.taxonomy, weights, self.processes),
+            self._course("head", config.epochs),
+            load(train, config.batch, shuffle=True),
+            load(val, 64 * config.batch, shuffle=False) if val is not None else None,
+            [self._keep("head", current), self._pictures(_whole(current, head))],
         )
-        for points in (train, val):
-            shutil.rmtree(points.folder)
-        return getattr(keep.kept, training.keep)
+        self.processes.wait()
+        if self.processes.first:
+            for kind in ("train", "val"):
+                shutil.rmtree(folder / kind, ignore_errors=True)
+
+    def _course(self, name: str, epochs: int, parts: int = 1, clip: float | None = None) -> Course:
+        training = self.recipe.training
+        if name == "head":  # of so few multiplications bfloat16 would save nothing
+            training = dataclasses.replace(training, precision="32-true")
+        return Course(
+            training, self._folder(name), epochs, parts, clip, self.resume, self.say, self.bars, self.processes
+        )
+
+    def _pictures(self, score: Callable[[PointBatch], Tensor]) -> Pictures:
+        """Of the first and the last validation scan, say, by the (P, K) scores of a batch of one scan."""
+        places = np.linspace(0, len(self.val) - 1, min(PICTURED_SCANS, len(self.val))).astype(int)
+        scans = [self.dataset.read(self.val[place]) for place in places] if self.processes.first else []
+        return Pictures(scans, self.dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
 
     def _sources(self, current: Weights) -> list[tuple[Weights, Sequence[ScanRecord]]]:
         """Which networks score which training scans for the head: with folds, such as have not seen them."""
@@ -261,12 +259,13 @@ class Run:
         """Networks trained without some sequences, and the scans of these."""
         seen = [r for r in self.train if r.sequence not in left_out]
         unseen = [r for r in self.train if r.sequence in left_out]
-        fold = Run(self.recipe, self.dataset, seen, unseen, self.out / "folds" / str(index), True, self.say, self.bars)
+        out = self.out / "folds" / str(index)
+        fold = Run(self.recipe, self.dataset, seen, unseen, out, True, self.say, self.bars, self.processes)
         fold.stages("rv")
         return weights_file.load(fold.stages("bev")), unseen
 
     def _counts(self) -> Any:
-        return count_classes(self.dataset, self.train, self.out / "class_counts.npz")
+        return count_classes(self.dataset, self.train, self.out / "class_counts.npz", self.processes)
 
     def _keep(self, name: str, current: Weights) -> KeepWeights:
         """How the part of a stage is written: with the description of what made it."""
@@ -290,8 +289,8 @@ class Run:
         return KeepWeights(write, self._folder(name))
 
 
-def _digest_of_scans(records: Sequence[ScanRecord]) -> str:
-    """Tells scans from other ones by their names and sizes."""
-    paths = [(record.name, record.points_path) for record in records]
-    known = [(name, path.stat().st_size if path.is_file() else None) for name, path in paths]
-    return hashlib.sha256(repr(known).encode()).hexdigest()[:16]
+def _whole(current: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
+    """The scores by AMVNet whose head is being trained."""
+    model = current.build()
+    model.point_head = head
+    return lambda batch: model.to(batch.points.device)(batch).merged

@@ -16,6 +16,11 @@ def say(line: str) -> None:
     console.print(line, markup=False, soft_wrap=True)
 
 
+def silence() -> None:
+    """Print nothing from here on: of several processes, one is enough."""
+    console.quiet = True
+
+
 def on_terminal() -> bool:
     return console.is_terminal
 

@@ -5,29 +5,33 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from amvnet.callbacks import Curves, EpochLines, KeepWeights, SeedBatches
+from amvnet.callbacks import Bar, Curves, EpochLines, SeedBatches, Speed
 from amvnet.config import HeadTraining, NetworkTraining, TrainingConfig
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import confusion, metrics
 from amvnet.losses import polar_view_loss, range_view_loss
+from amvnet.processes import ALONE, Processes, device_of, environment, synced
 from amvnet.views.points import PointBatch
 from amvnet.views.polar_view import PolarView
 from amvnet.views.range_view import RangeView
 
 Batch = tuple[PointBatch, Tensor]
 MOMENTUM_CYCLE = 0.1  # by so much the one-cycle schedule lowers the momentum
+DOUBLE = "64-true"
 LAST = "last.ckpt"  # what --resume goes on from
 
 
@@ -36,10 +40,17 @@ class Stage(L.LightningModule):
 
     name: str  # as --stage says it
     trained: nn.Module
+    unit: str  # what a batch is made of
 
-    def __init__(self, config: NetworkTraining | HeadTraining, taxonomy: Taxonomy, weights: np.ndarray | None) -> None:
+    def __init__(
+        self,
+        config: NetworkTraining | HeadTraining,
+        taxonomy: Taxonomy,
+        weights: np.ndarray | None,
+        processes: Processes = ALONE,
+    ) -> None:
         super().__init__()
-        self.config, self.taxonomy = config, taxonomy
+        self.config, self.taxonomy, self.processes = config, taxonomy, processes
         self.class_weights: Tensor | None
         self.register_buffer("class_weights", None if weights is None else torch.from_numpy(weights), persistent=False)
         self.matrix = self._empty_matrix()
@@ -47,17 +58,35 @@ class Stage(L.LightningModule):
     def _empty_matrix(self) -> np.ndarray:
         return np.zeros((self.taxonomy.size + 1,) * 2)
 
+    def size_of(self, batch: Any) -> int:
+        """How many units a batch has."""
+        raise NotImplementedError
+
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        """In the precision of the weights."""
+        return tuple(x.to(self.dtype) if isinstance(x, PointBatch) or x.is_floating_point() else x for x in batch)
+
     def on_validation_epoch_start(self) -> None:
         self.matrix = self._empty_matrix()
+
+    def check_finite(self, loss: Tensor, where: str) -> None:
+        """Raises InputError where a loss is not finite, before it has spoiled the weights."""
+        if not torch.isfinite(loss):
+            rate = f"--training.{self.name}.lr"
+            raise InputError(f"expected a finite loss, found {loss:g} {where}; lower {rate}, or leave them out")
 
     def count(self, labels: Tensor, prediction: Tensor) -> None:
         """Add points to the validation's confusion matrix."""
         self.matrix += confusion(labels.cpu().numpy(), prediction.cpu().numpy(), self.taxonomy.size)
 
+    def whole_matrix(self) -> np.ndarray:
+        """The validation's confusion matrix over the scans of all processes."""
+        return np.sum(self.processes.gather(self.matrix), axis=0)
+
     def on_validation_epoch_end(self) -> None:
-        found = metrics(self.matrix, self.taxonomy)
-        values = {"val/miou": found["miou"], "val/miou_present": found["miou_present"], "val/acc": found["accuracy"]}
-        self.log_dict({k: v or 0.0 for k, v in values.items()})
+        found = metrics(self.whole_matrix(), self.taxonomy)
+        self.log("val/miou", found["miou"] or 0.0, prog_bar=True)
+        self.log_dict({"val/miou_present": found["miou_present"] or 0.0, "val/acc": found["accuracy"] or 0.0})
         self.log_dict({f"iou/{name}": value for name, value in found["iou"].items() if value is not None})
 
     def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
@@ -79,9 +108,13 @@ class NetworkStage(Stage):
     """Training of one of the two networks; which one is said by `logits` and the loss."""
 
     config: NetworkTraining
+    unit = "scans"
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Scores and labels (M, K), (M,) of what the loss is over, and scores (P, K) of the points."""
+    def size_of(self, batch: Batch) -> int:
+        return batch[0].count
+
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
+        """Of each scan the scores and labels (M, K), (M,) that the loss is over, and scores (P, K) of all points."""
         raise NotImplementedError
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
@@ -89,12 +122,9 @@ class NetworkStage(Stage):
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         logits, labels, _ = self.logits(*batch)
-        loss = self.loss(logits, labels)
-        if not torch.isfinite(loss):
-            names, rate = ", ".join(batch[0].names), f"--training.{self.name}.lr"
-            raise InputError(
-                f"expected a finite loss, found {loss:g} at the scans {names}; lower {rate}, or leave them out"
-            )
+        # Scan by scan: the same however a batch is split, over processes or into parts that fit into memory.
+        loss = torch.stack([self.loss(*scan) for scan in zip(logits, labels, strict=True)]).mean()
+        self.check_finite(loss, f"at the scans {', '.join(batch[0].names)}")
         self.log("train/loss", loss, prog_bar=True, batch_size=batch[0].count)
         return loss
 
@@ -116,12 +146,14 @@ class RangeStage(NetworkStage):
         super().__init__(*args)
         self.view, self.trained = view, net
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
         view = self.view.project(batch)
         scores = self.trained(view.image)  # (B, K, H, W)
         seen = view.nearest >= 0
+        sizes = seen.view(batch.count, -1).sum(dim=1).tolist()
         pixels = scores.permute(0, 2, 3, 1).flatten(0, 2)
-        return pixels[seen], labels[view.nearest[seen]], pixels[view.pixel]
+        kept, truth = pixels[seen].split(sizes), labels[view.nearest[seen]].split(sizes)
+        return list(kept), list(truth), pixels[view.pixel]
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         return range_view_loss(logits, labels, self.class_weights, self.config.region)
@@ -136,80 +168,113 @@ class PolarStage(NetworkStage):
         super().__init__(*args)
         self.view, self.trained = view, net
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
         view = self.view.project(batch)
         points = view.to_points(self.trained(view))  # (P, K)
-        return points, labels, points
+        return [points[s] for s in batch.slices()], [labels[s] for s in batch.slices()], points
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         return polar_view_loss(logits, labels, self.class_weights, self.config.region)
 
 
-def fit(
-    stage: Stage,
-    config: TrainingConfig,
-    epochs: int,
-    train: DataLoader[Any],
-    val: DataLoader[Any],
-    folder: Path,
-    keep: KeepWeights,
-    resume: bool,
-    say: Callable[[str], None],
-    bars: bool,
-    batches: int = 1,
-    clip: float | None = None,
-) -> None:
-    """Train a stage in its folder; with `resume`, on from its last epoch.
+@dataclass(frozen=True)
+class Course:
+    """How a stage is trained.
 
-    Args:
+    Attributes:
+        training: the recipe's.
+        folder: where its checkpoint, curves and weights are.
+        epochs: passes over the data.
+        parts: into which a batch is split, and accumulated before a step.
+        clip: largest norm of the gradient.
+        resume: go on from the last epoch in the folder.
         say: told one line an epoch.
         bars: show a progress bar instead.
-        batches: parts of a batch that are accumulated before a step.
-        clip: largest norm of the gradient.
+        processes: those that share the training.
+        steps: end after so many, for a trial; validation is left out then.
     """
-    shown: list[Callback] = [RichProgressBar() if bars else EpochLines(say, folder.name), LearningRateMonitor()]
-    # Weights and curves are kept before the checkpoint is, so that a checkpoint never says more than they hold.
-    kept: list[Callback] = [keep, Curves(folder / "metrics.csv"), SeedBatches(config.seed)]
-    trainer = L.Trainer(
-        accelerator=_accelerator(config.accelerator),
-        devices=1,
-        precision=config.precision,
-        max_epochs=epochs,
-        accumulate_grad_batches=batches,
-        gradient_clip_val=clip,
+
+    training: TrainingConfig
+    folder: Path
+    epochs: int
+    parts: int = 1
+    clip: float | None = None
+    resume: bool = False
+    say: Callable[[str], None] = lambda line: None
+    bars: bool = False
+    processes: Processes = ALONE
+    steps: int | None = None
+
+
+def fit(
+    stage: Stage,
+    course: Course,
+    train: DataLoader[Any],
+    val: DataLoader[Any] | None,
+    kept: Sequence[Callback] = (),
+) -> Speed:
+    """Train a stage in its folder; returns how fast it was.
+
+    Args:
+        val: None where nothing is validated.
+        kept: callbacks that write at the end of each epoch, before the checkpoint is written: it never says more
+            than they have kept.
+    """
+    on_cuda = device_of(course.training.accelerator) == "cuda"
+    if course.processes.size > 1:
+        synced(stage.trained, on_cuda)
+    if course.training.precision == DOUBLE:
+        stage.double()
+    if course.training.compile:
+        stage.trained.compile()
+    speed = Speed()
+    checkpoint = course.folder / LAST
+    begun = checkpoint if course.resume and checkpoint.is_file() else None
+    if begun is not None:
+        # Lightning tells the sampler its epoch only after the reading processes have begun to draw.
+        train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
+    try:
+        trainer = _trainer(course, [speed, *kept], val is not None)
+        trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
+    except InputError as error:  # from a reading process it comes with that process's traceback
+        raise InputError(str(error).splitlines()[-1].removeprefix(f"{InputError.__module__}.InputError: ")) from None
+    return speed
+
+
+def _trainer(course: Course, callbacks: Sequence[Callback], validates: bool) -> L.Trainer:
+    training, processes, folder, trial = course.training, course.processes, course.folder, course.steps is not None
+    kept = [] if trial else [
+        Curves(folder / "metrics.csv"),
+        ModelCheckpoint(folder, filename="last", enable_version_counter=False, save_on_train_epoch_end=True),
+        LearningRateMonitor(),
+    ]  # fmt: skip
+    bars = course.bars and processes.first
+    shown = [Bar() if bars else EpochLines(course.say, folder.name)]
+    # The statistics of synchronised batch norms are the same everywhere, and processes may validate unequal shares.
+    ddp = DDPStrategy(broadcast_buffers=False)
+    return L.Trainer(
+        accelerator=training.accelerator,
+        devices=processes.here,
+        num_nodes=processes.nodes,
+        strategy=ddp if processes.size > 1 else "auto",
+        plugins=[environment()],
+        # Lightning's own way to double precision does not know our batches.
+        precision="32-true" if training.precision == DOUBLE else training.precision,
+        max_epochs=course.epochs,
+        max_steps=-1 if course.steps is None else course.steps,
+        limit_val_batches=None if validates else 0,
+        accumulate_grad_batches=course.parts,
+        gradient_clip_val=course.clip,
         default_root_dir=folder,
-        callbacks=[*kept, ModelCheckpoint(folder, filename="last", enable_version_counter=False), *shown],
-        logger=TensorBoardLogger(folder, name="", version=""),
+        callbacks=[*callbacks, SeedBatches(training.seed, processes.rank), *kept, *shown],
+        logger=False if trial else TensorBoardLogger(folder, name="", version=""),
+        enable_checkpointing=not trial,
         enable_progress_bar=bars,
         enable_model_summary=False,
         num_sanity_val_steps=0,
         log_every_n_steps=10,
         use_distributed_sampler=False,
     )
-    checkpoint = folder / LAST
-    begun = checkpoint if resume and checkpoint.is_file() else None
-    if begun is not None:
-        # Lightning tells the sampler its epoch only after the reading processes have begun to draw.
-        train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
-    try:
-        trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
-    except InputError as error:  # from a reading process it comes with that process's traceback
-        raise InputError(str(error).splitlines()[-1].removeprefix(f"{InputError.__module__}.InputError: ")) from None
-
-
-def _accelerator(name: str) -> str:
-    """Lightning's name of an accelerator of this machine.
-
-    Raises:
-        InputError: where it is none.
-    """
-    there = ["auto", "cpu", *(["gpu", "cuda"] if torch.cuda.is_available() else [])]
-    there += ["mps"] if torch.backends.mps.is_available() else []
-    if name not in there:
-        raise InputError(
-            f"expected an accelerator of this machine ({', '.join(there)}), found {name!r}; use one of them"
-        )
-    return name
 
 
 def _epochs_done(checkpoint: Path) -> int:
@@ -222,8 +287,3 @@ def _epochs_done(checkpoint: Path) -> int:
         return torch.load(checkpoint, map_location="cpu", weights_only=True)["epoch"] + 1
     except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError):
         raise InputError(f"{checkpoint}: expected a checkpoint, found a broken file; delete it to train anew") from None
-
-
-def names_of(records: Sequence[Any]) -> list[str]:
-    """The sequences of some scans, for the description of a run."""
-    return sorted({record.sequence for record in records})

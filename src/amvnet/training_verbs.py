@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from amvnet.errors import InputError
-from amvnet.inputs import listed, names_in, numbers_in, open_data
+from amvnet.inputs import listed, meet, names_in, numbers_in, open_data
 from amvnet.terminal import on_terminal, progress, say
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ def train(
     resume: bool = False,
     train_sequences: str | None = None,
     val_sequences: str | None = None,
+    with_val: bool = False,
+    dry_run: bool = False,
     taxonomy: Path | None = None,
 ) -> None:
     """Train the two networks and the point head.
@@ -37,19 +39,27 @@ def train(
         resume: go on where an earlier run in the folder stopped.
         train_sequences: sequences or scenes to train on, with commas; default: the official split.
         val_sequences: sequences or scenes to validate on, with commas; default: the official split.
+        with_val: learn from these too, as for an entry to a benchmark; then nothing is validated.
+        dry_run: only take two steps of each network, and say what they cost and the whole training would.
         taxonomy: a semantic-kitti.yaml with other classes.
     """
     from amvnet import weights
     from amvnet.jobs import split_records
+    from amvnet.processes import device_of
     from amvnet.runner import Run
 
     _calm_lightning()
+    processes = meet(device_of(recipe.training.accelerator) == "cuda")
     dataset = open_data(data, taxonomy)
-    learnt, val = split_records(dataset, names_in(train_sequences), names_in(val_sequences))
+    learnt, val = split_records(dataset, names_in(train_sequences), names_in(val_sequences), with_val)
     say(f"training on {listed(learnt)}; validating on {listed(val)}")
     given = None if init is None else weights.load(init)
-    path = Run(recipe, dataset, learnt, val, out, resume, say, on_terminal()).stages(stage, given)
-    say(f"weights in {path}")
+    run = Run(recipe, dataset, learnt, val, out, resume, say, on_terminal(), processes)
+    if dry_run:
+        for trial in run.trials(stage):
+            say(trial)
+        return
+    say(f"weights in {run.stages(stage, given)}")
 
 
 def analyze(

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.errors import InputError
-from amvnet.inputs import names_in, open_data
+from amvnet.inputs import meet, names_in, open_data
 from amvnet.terminal import console, progress, say
 
 if TYPE_CHECKING:
@@ -89,6 +89,7 @@ def predict(
     weights: str,
     out: Path,
     method: MethodName = "amvnet",
+    split: Literal["train", "val", "test", "all"] = "all",
     sequences: str | None = None,
     scores: bool = False,
     device: str = "cpu",
@@ -100,17 +101,19 @@ def predict(
         weights: a weights file, or the name of a built-in one.
         out: folder for the labels.
         method: the whole of AMVNet, or a part of it.
-        sequences: of data sets, which sequences or scenes, with commas; default: all.
+        split: of data sets, the official split.
+        sequences: of data sets, which sequences or scenes instead, with commas.
         scores: also write the probabilities of both networks.
         device: cpu, cuda, cuda:1, ...
     """
     from amvnet import jobs
     from amvnet.segmenter import Segmenter
 
-    segmenter = Segmenter(weights, device, method)
+    processes = meet()
+    segmenter = Segmenter(weights, processes.device(device), method)
     with progress("segmenting") as step:
-        written = jobs.predict(inputs, segmenter, out, names_in(sequences), scores, step)
-    say(f"{len(written)} label files in {out}")
+        written = jobs.predict(inputs, segmenter, out, names_in(sequences), scores, step, split, processes)
+    say(f"{sum(processes.gather(len(written)))} label files in {out}")
 
 
 def evaluate(
@@ -144,19 +147,21 @@ def evaluate(
 
     if (weights is None) == (predictions is None):
         raise InputError("expected either --weights or --predictions, found both or neither; give one of them")
+    processes = meet()
     given = None if weights is None else load(weights)
     dataset = open_data(data, taxonomy, None if given is None else jobs.own_classes(given.taxonomy))
     records = jobs.choose_records(dataset, names_in(sequences), split)
     if given is not None:
-        label = jobs.by_weights(dataset, Segmenter(given, device, widest_method(given)))
+        label = jobs.by_weights(dataset, Segmenter(given, processes.device(device), widest_method(given)))
     else:
         label = jobs.by_files(dataset, Path(str(predictions)))
     for path in (json, pictures):  # so that nothing is scored in vain
         if path is not None:
             make_folder(path.parent)
     with progress("scoring") as step:
-        found = jobs.evaluate(dataset, records, label, pictures, step)
-    show_evaluation(found, data, dataset.taxonomy, json)
+        found = jobs.evaluate(dataset, records, label, pictures, step, processes)
+    if processes.first:
+        show_evaluation(found, data, dataset.taxonomy, json)
 
 
 def info(weights: str | None = None) -> None:

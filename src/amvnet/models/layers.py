@@ -101,7 +101,7 @@ class AzimuthGRU(nn.Module):
         padding = round(self.padding * w)
         columns = wrap_width(x, padding, 0).permute(0, 3, 2, 1)  # (B, padding + W, H, C)
         with torch.autocast(x.device.type, enabled=False):  # a recurrence in bfloat16 loses its state
-            outputs, _ = self.gru(columns.reshape(b, -1, c).float())
+            outputs, _ = self.gru(columns.reshape(b, -1, c).to(next(self.gru.parameters()).dtype))
         return outputs.view(b, -1, h, c)[:, padding:].permute(0, 3, 2, 1)  # (B, C, H, W)
 
 

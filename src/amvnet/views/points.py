@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -30,9 +30,12 @@ class PointBatch:
     ring: Tensor | None = None
     names: tuple[str, ...] = ()
 
-    def to(self, device: torch.device | str) -> PointBatch:
-        ring = None if self.ring is None else self.ring.to(device)
-        return PointBatch(self.points.to(device), self.scan.to(device), self.count, ring, self.names)
+    def to(self, where: torch.device | torch.dtype | str) -> PointBatch:
+        """On a device, or with points of a floating-point type."""
+        if isinstance(where, torch.dtype):
+            return replace(self, points=self.points.to(where))
+        ring = None if self.ring is None else self.ring.to(where)
+        return PointBatch(self.points.to(where), self.scan.to(where), self.count, ring, self.names)
 
     def slices(self) -> list[slice]:
         """Where each scan's points stand."""

@@ -71,7 +71,7 @@ class PolarView:
         # In double precision, so that a point at a cell's border falls the same way on every device.
         cell = ((polar - low) / (high - low) * cells).floor().clamp_min(0).minimum(cells - 1)
         centre = low + (cell + 0.5) * (high - low) / cells
-        features = torch.cat([polar - centre, polar], dim=1).float()
+        features = torch.cat([polar - centre, polar], dim=1).to(batch.points.dtype)
         radius, angle, voxel = cell.long().unbind(1)
         c = self.config
         pillar = (batch.scan * c.radial + radius) * c.angular + angle

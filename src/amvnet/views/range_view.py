@@ -96,7 +96,7 @@ def _nearest(distance: Tensor, pixel: Tensor, pixels: int) -> Tensor:
     """(pixels,) index of the point with the least distance in each pixel, -1 where there is none."""
     # The bits of floats >= 0 are ordered as the floats: one integer minimum finds distance and point at once.
     index = torch.arange(len(distance), device=distance.device)
-    key = (distance.view(torch.int32).long() << _INDEX_BITS) | index
+    key = (distance.float().view(torch.int32).long() << _INDEX_BITS) | index
     empty = torch.iinfo(torch.int64).max
     least = torch.full((pixels,), empty, device=key.device).scatter_reduce_(0, pixel, key, "amin")
     return torch.where(least == empty, -1, least & ((1 << _INDEX_BITS) - 1))

@@ -1,0 +1,7 @@
+"""`python -m amvnet` is the command line, and what torchrun starts."""
+
+import sys
+
+from amvnet.cli import main
+
+sys.exit(main())
