@@ -106,7 +106,7 @@ def test_every_method_is_scored_as_by_the_segmenter(world: Path, weights: Weight
         result = Segmenter(weights)(scan)
         f, g = torch.from_numpy(result.rv), torch.from_numpy(result.bev)
         scores = {"rv": f, "bev": g, "ensemble": torch.sqrt(f * g), "amvnet": torch.from_numpy(result.scores)}
-        scores |= {"arithmetic mean": arithmetic_mean(f, g), "maximum": maximum(f, g)}
+        scores |= {"arithmetic": arithmetic_mean(f, g), "maximum": maximum(f, g)}
         for name, values in scores.items():
             expected[name] = expected[name] + confusion(scan.labels, values.argmax(dim=1).numpy() + 1, 19)
     for name, stack in matrices.items():

@@ -41,6 +41,7 @@ def test_a_recipe_survives_the_way_to_json_and_yaml_and_back(name: str) -> None:
 
 def test_every_builtin_recipe_is_there() -> None:
     names = {"semantickitti", "nuscenes", "simulated"}
+    names |= {f"{name}-{part}" for name in names - {"simulated"} for part in ("polarnet", "no-rnn")}
     assert set(recipe_names()) == names | {f"{name}-compact" for name in names} | {"simulated-hdl32e-compact"}
 
 

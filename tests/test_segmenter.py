@@ -181,7 +181,7 @@ def test_each_method_has_its_own_scores(result: Segmentation) -> None:
 
 def test_by_method_equals_each_method(segmenter: Segmenter) -> None:
     points, _ = lost(POINTS)
-    found, uncertain = segmenter.by_method(Scan(points))
+    found, uncertain = segmenter.by_method(Scan(points), METHODS)
     assert list(found) == list(METHODS)
     for method, labels in found.items():
         assert np.array_equal(labels, Segmenter(WEIGHTS, method=method)(points).labels)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import shlex
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from worlds import GOLDEN, amvnet, files, label_map, make_streets, write_recipe
 
 from amvnet import runner
@@ -22,6 +24,7 @@ from amvnet.callbacks import KeepWeights
 from amvnet.weights import PARTS, Weights, load
 
 STILL = ("--training.augment.yaw", 0, "--training.augment.scale", 0, "--training.augment.flip", 0)
+SURE = ("--model.polar_net.dropblock", 0)  # a compiled network draws other numbers
 FOLDERS = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 
 
@@ -408,6 +411,80 @@ def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_p
     assert "000001.label" in done.stderr
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert load(tmp_path / "run").parts == ("range_net",)
+
+
+@pytest.mark.parametrize(("baseline", "stage"), [("polarnet", "bev"), ("no-rnn", "rv")])
+def test_a_baseline_is_trained_and_scored_by_its_name(world: Path, tmp_path: Path, baseline: str, stage: str) -> None:
+    recipe = write_recipe(tmp_path / "recipe.yaml", f"semantickitti-{baseline}-compact")
+    data, run = world / "data", tmp_path / "run"
+    assert amvnet("train", recipe, "--data", data, "--out", run) == (0, "")
+    weights = load(run)
+    assert weights.parts == (FOLDERS[stage],)
+    assert not [name for name in weights.tensors if "gru" in name]
+    assert amvnet("evaluate", data, "--weights", run, "--json", tmp_path / "m.json") == (0, "")
+    assert list(json.loads((tmp_path / "m.json").read_text())["methods"]) == [stage]
+
+
+def test_the_scans_of_validation_can_be_learnt_too(world: Path, tmp_path: Path) -> None:
+    """For an entry to a benchmark: nothing is validated, the last weights are kept, and the run can be repeated."""
+    weights = train(world, tmp_path / "run", "--with-val")
+    for part, stage in zip(PARTS, FOLDERS, strict=True):
+        assert weights.training[part]["sequences"] == ["00", "01", "08"]
+        assert weights.training[part]["validated_on"] == []
+        best, last = (load(tmp_path / "run" / stage / f"{kept}.safetensors") for kept in ("best", "last"))
+        assert not differing(best, last)
+        assert len(column(tmp_path / "run", stage, "epoch")) == (2 if stage == "head" else 3)
+        assert not column(tmp_path / "run", stage, "val/miou")
+    command = shlex.split(yaml.safe_load((tmp_path / "run" / "run.yaml").read_text())["all"]["repeat"])
+    assert amvnet(*command[1:]) == (0, "")
+    assert not differing(load(f"{tmp_path}/run-again"), weights)
+
+
+def test_a_dry_run_says_what_a_training_would_cost_and_leaves_nothing(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train_arguments = ("--data", world / "data", "--out", tmp_path / "run", "--training.bev.accumulate", 2)
+    assert amvnet("train", world / "recipe.yaml", *train_arguments, "--dry-run") == (0, "")
+    said = [line for line in capsys.readouterr().out.splitlines() if "would take" in line]
+    assert [line.split(":")[0] for line in said] == ["rv", "bev"]
+    assert all("step of 2 scans" in line and "3 epochs of 4 scans" in line and "GiB" in line for line in said)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("stage", FOLDERS)
+def test_a_stage_can_be_followed_in_tensorboard(run: Path, stage: str) -> None:
+    events = EventAccumulator(str(run / stage), size_guidance={"images": 0})
+    events.Reload()
+    scalars = set(events.Tags()["scalars"])
+    assert {"train/loss", "val/miou", "iou/road"} <= scalars
+    assert any(name.startswith("lr-") for name in scalars)
+    assert {"points/s" if stage == "head" else "scans/s"} <= scalars
+    pictures = events.Tags()["images"]
+    assert sorted(pictures) == ["08/000000", "08/000001"]
+    drawn = [events.Images(name) for name in pictures]
+    assert [len(images) for images in drawn] == [2 if stage == "head" else 3] * 2
+    assert drawn[0][0].encoded_image_string.startswith(b"\x89PNG")
+    assert drawn[0][0].encoded_image_string != drawn[1][0].encoded_image_string
+
+
+def test_the_share_of_uncertain_points_is_that_of_the_networks(world: Path, run: Path, tmp_path: Path) -> None:
+    assert amvnet("evaluate", world / "data", "--weights", run, "--json", tmp_path / "m.json") == (0, "")
+    scored = json.loads((tmp_path / "m.json").read_text())["uncertain_fraction"]
+    labelled = column(run, "head", "val/uncertain")[0]  # the other counts unlabelled points, too: two in a hundred
+    assert labelled == pytest.approx(scored, abs=0.02)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler on a CPU")
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+@pytest.mark.slow
+def test_a_compiled_training_is_the_same_within_rounding(world: Path, run: Path, tmp_path: Path, stage: str) -> None:
+    """Of one step, as later ones amplify what rounding there is."""
+    one = ("--stage", stage, f"--training.{stage}.epochs", 1, f"--training.{stage}.batch", 4, *SURE)
+    plain = train(world, tmp_path / "plain", *one)
+    train(world, tmp_path / "compiled", *one, "--training.compile", "true")
+    losses = [column(tmp_path / name, stage, "train/loss")[0] for name in ("plain", "compiled")]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-3)
+    assert plain.parts == load(tmp_path / "compiled").parts
 
 
 def test_networks_of_few_channels_train_without_a_crash() -> None:

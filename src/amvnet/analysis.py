@@ -17,8 +17,9 @@ from amvnet.data.labels import Taxonomy
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation, metrics
-from amvnet.models.amvnet import arithmetic_mean, geometric_mean, maximum, merge, refine
+from amvnet.models.amvnet import ENSEMBLES, merge, refine
 from amvnet.models.assertions import Disagreement, cosine_similarity
+from amvnet.processes import ALONE, Processes
 from amvnet.runner import Run
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter, checked_scan, in_place, labels_in_place
@@ -27,7 +28,6 @@ from amvnet.weights import Weights
 
 BINS = 100  # of the cosine similarity, which is in [0, 1]
 SWEPT = 98  # bins of the lower similarities for which the head is asked: tau is swept up to 0.98
-ENSEMBLES = {"arithmetic mean": arithmetic_mean, "maximum": maximum, "ensemble": geometric_mean}
 
 
 @dataclass(frozen=True)
@@ -178,6 +178,7 @@ def ablate(
     say: Callable[[str], None] = lambda line: None,
     bars: bool = False,
     device: str = "cpu",
+    processes: Processes = ALONE,
 ) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
     """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
 
@@ -195,6 +196,7 @@ def ablate(
         changed = dataclasses.replace(recipe, model=model, training=dataclasses.replace(recipe.training, rv=rv))
         name = "-".join(["rv", *(["gru"] if gru else []), *(["weights"] if weighted else [])])
         say(f"{name}:")
-        path = Run(changed, dataset, train, val, out / name, True, say, bars).stages("rv")
-        scored = jobs.evaluate(dataset, val, jobs.by_weights(dataset, Segmenter(path, device, "rv")))
+        path = Run(changed, dataset, train, val, out / name, True, say, bars, processes).stages("rv")
+        segmenter = Segmenter(path, processes.device(device), "rv")
+        scored = jobs.evaluate(dataset, val, jobs.by_weights(dataset, segmenter), processes=processes)
         yield gru, weighted, metrics(scored.matrices["rv"][0], dataset.taxonomy)

@@ -109,7 +109,10 @@ def _classes(found: Analysis, path: Path) -> list[Path]:
 
 def _methods(found: Analysis, path: Path) -> list[Path]:
     """Table 4 of the paper: the networks, the ensembles and AMVNet."""
-    titles = {name: title for name, (title, _, _) in STYLES.items()} | {"ensemble": "geometric mean"}
+    titles = {name: title for name, (title, _, _) in STYLES.items()} | {
+        "arithmetic": "arithmetic mean",
+        "ensemble": "geometric mean",
+    }
     rows = []
     for name, matrices in found.evaluation.matrices.items():
         reached = metrics(matrices[0], found.taxonomy)

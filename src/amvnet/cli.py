@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from amvnet.config import Recipe
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
-SHARED = ("train", "predict", "evaluate")  # the verbs that several processes can share
+SHARED = ("train", "predict", "evaluate", "ablate")  # the verbs that several processes can share
 
 VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "demo": (verbs.demo, {}),

@@ -11,6 +11,8 @@ from typing import Annotated, Literal
 
 from amvnet.ranges import Checked, Count, NotNegative, Positive, Range, Share
 
+StageName = Literal["rv", "bev", "head"]
+
 
 @dataclass(frozen=True)
 class RangeViewConfig(Checked):
@@ -268,6 +270,8 @@ class Recipe:
     """The benchmark whose classes are learnt."""
     sensor: str = "hdl64e"
     """Name of the sensor of the scans, for the weights file."""
+    stages: tuple[StageName, ...] = ("rv", "bev", "head")
+    """What is trained where no stage is named; a baseline is a part of the method."""
     model: ModelConfig = ModelConfig()
     """The networks and their sizes."""
     training: TrainingConfig = field(default_factory=TrainingConfig)

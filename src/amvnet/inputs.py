@@ -50,6 +50,16 @@ def names_in(text: str | None) -> list[str] | None:
     return names
 
 
+def methods_in(text: str) -> list[str]:
+    """Methods with commas. Raises InputError where one is none."""
+    from amvnet.segmenter import METHODS
+
+    names = names_in(text) or []
+    if wrong := [name for name in names if name not in METHODS]:
+        raise InputError(f"expected methods of {', '.join(METHODS)}, found {wrong[0]!r}; use some of them")
+    return names
+
+
 def numbers_in(text: str) -> list[int]:
     """Numbers from 1 with commas, ascending, each once. Raises InputError where one is none."""
     names = names_in(text) or []

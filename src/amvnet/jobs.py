@@ -17,7 +17,7 @@ from amvnet.evaluation import Evaluation
 from amvnet.pictures import draw_scan
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmentation, Segmenter, checked_scan
+from amvnet.segmenter import COMPARED, Segmentation, Segmenter, checked_scan
 
 Progress = Callable[[int, int], None]  # done, in all
 PICTURES = 4  # scans that are drawn, evenly spaced
@@ -123,15 +123,15 @@ def labelled(dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
 
 
 def by_weights(
-    dataset: Dataset, segmenter: Segmenter
+    dataset: Dataset, segmenter: Segmenter, methods: Sequence[str] = COMPARED
 ) -> Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]]:
-    """Labels by every method that the weights have the parts for.
+    """Labels by every one of some methods that the weights have the parts for.
 
     Raises:
         InputError: where the weights know other classes than the data set.
     """
     check_classes(dataset, segmenter.taxonomy)
-    return lambda record, scan: segmenter.by_method(checked_scan(scan))
+    return lambda record, scan: segmenter.by_method(checked_scan(scan), methods)
 
 
 def by_files(

@@ -15,7 +15,7 @@ from amvnet.data.labels import Taxonomy
 from amvnet.recipes import recipe_names
 from amvnet.weights import Weights, built_in
 
-TITLES = {"rv": "RV", "bev": "BEV", "ensemble": "ensemble", "amvnet": "AMVNet"}
+TITLES = {"rv": "RV", "bev": "BEV", "arithmetic": "arithmetic mean", "amvnet": "AMVNet"}
 OVERALL = {"miou": "mIoU", "miou_present": "mIoU, classes present", "accuracy": "accuracy", "fwiou": "fwIoU"}
 
 

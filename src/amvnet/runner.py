@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from amvnet import weights as weights_file
 from amvnet.callbacks import KeepWeights, Pictures, Speed
-from amvnet.config import NetworkTraining, Recipe
+from amvnet.config import NetworkTraining, Recipe, StageName
 from amvnet.data.files import whole_file
 from amvnet.data.labels import NUSCENES, SEMANTICKITTI
 from amvnet.data.records import Dataset, ScanRecord
@@ -36,7 +36,6 @@ from amvnet.training import Course, PolarStage, RangeStage, Stage, fit
 from amvnet.views.points import PointBatch
 from amvnet.weights import Weights, state_of
 
-StageName = Literal["rv", "bev", "head", "all"]
 PART = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 PICTURED_SCANS = 2
 TRIAL_STEPS = 2  # the second of them is timed
@@ -92,14 +91,14 @@ class Run:
                 "use the recipe of that benchmark"
             )
 
-    def stages(self, stage: StageName, init: Weights | None = None) -> Path:
+    def stages(self, stage: StageName | Literal["all"] = "all", init: Weights | None = None) -> Path:
         """Train one stage, or all three; returns the weights file with what is trained so far.
 
         Raises:
             InputError: where the head is to be trained and there are no networks to train it for, or the
                 folder holds a run and `resume` is not said.
         """
-        names = ("rv", "bev", "head") if stage == "all" else (stage,)
+        names = self.recipe.stages if stage == "all" else (stage,)
         current, path = self._start(init), self.out / "weights.safetensors"
         for name in names:  # before anything is written, and hours are spent on the first
             check_begun(self._folder(name), self._settings(name, current), self.resume)
@@ -163,7 +162,7 @@ class Run:
                 ) from None
         return model
 
-    def trials(self, stage: StageName) -> Iterator[str]:
+    def trials(self, stage: StageName | Literal["all"]) -> Iterator[str]:
         """Take some steps of each network, and say what they cost; nothing is written."""
         fresh = self._start(None)
         for name in [n for n in ("rv", "bev") if stage in (n, "all")]:

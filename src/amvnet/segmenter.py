@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -14,7 +15,7 @@ from torch import Tensor
 from amvnet.config import AssertionConfig
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
-from amvnet.models.amvnet import Scores, geometric_mean, merge, refine
+from amvnet.models.amvnet import ENSEMBLES, Scores, merge, refine
 from amvnet.models.assertions import Assertion, Disagreement, build_assertion
 from amvnet.models.layers import fold_batch_norms
 from amvnet.models.point_head import PointHead
@@ -22,15 +23,15 @@ from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
 from amvnet.weights import Weights, load
 
-Method = Literal["rv", "bev", "ensemble", "amvnet"]
+Method = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 METHODS: tuple[Method, ...] = get_args(Method)
+COMPARED: tuple[Method, ...] = ("rv", "bev", "ensemble", "amvnet")  # in the paper's tables by class
 NEEDED: dict[str, tuple[str, ...]] = {
     "rv": ("range_net",),
     "bev": ("polar_net",),
-    "ensemble": ("range_net", "polar_net"),
+    **dict.fromkeys(ENSEMBLES, ("range_net", "polar_net")),
     "amvnet": ("range_net", "polar_net", "point_head"),
 }
-
 
 SURE = 1e-7  # two models that are wholly sure of different classes have a product of 0 for every class
 
@@ -62,7 +63,7 @@ class Segmenter:
     Args:
         weights: trained weights, or the name or path of a weights file.
         device: where to compute: "cpu", "cuda", ...
-        method: "amvnet", or to compare "ensemble" (geometric mean), "rv" or "bev" alone.
+        method: "amvnet", or to compare "rv" or "bev" alone, and "ensemble" (geometric mean), "arithmetic" or "maximum".
 
     Raises:
         InputError: where the weights lack a part that the method needs, or there is no such device.
@@ -93,7 +94,9 @@ class Segmenter:
         return _segmentation(scan.valid, scores)
 
     @torch.inference_mode()
-    def by_method(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+    def by_method(
+        self, scan: Scan, methods: Sequence[str] = COMPARED
+    ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """The (N,) train ids by each method that the weights have the parts for, and which points are uncertain."""
         model, parts, batch = self.model, self.weights.parts, PointBatch.of([scan]).to(self.device)
         found: dict[str, Tensor] = {}
@@ -105,10 +108,10 @@ class Segmenter:
         if len(found) == 2:
             f, g = found["rv"], found["bev"]
             uncertain = model.assertion(f, g, batch.points)
-            found["ensemble"] = geometric_mean(f, g)
-            if "point_head" in parts:
+            found |= {name: mean(f, g) for name, mean in ENSEMBLES.items() if name in methods}
+            if "point_head" in parts and "amvnet" in methods:
                 found["amvnet"] = merge(f, g, uncertain, model.refine(batch, f, g, uncertain))
-        labels = {name: labels_in_place(scores, scan.valid) for name, scores in found.items()}
+        labels = {name: labels_in_place(found[name], scan.valid) for name in methods if name in found}
         return labels, None if uncertain is None else in_place(uncertain, scan.valid)
 
     @torch.inference_mode()
@@ -124,7 +127,7 @@ class Segmenter:
         if self.method == "bev":
             return Scores(g, none, None, g)
         f = model.score_range_view(batch)
-        return Scores(geometric_mean(f, g), model.assertion(f, g, batch.points), f, g)
+        return Scores(ENSEMBLES[self.method](f, g), model.assertion(f, g, batch.points), f, g)
 
 
 def fuse(

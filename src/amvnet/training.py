@@ -31,6 +31,7 @@ from amvnet.views.range_view import RangeView
 
 Batch = tuple[PointBatch, Tensor]
 MOMENTUM_CYCLE = 0.1  # by so much the one-cycle schedule lowers the momentum
+LOGGED_EVERY = 10  # batches, of the loss
 DOUBLE = "64-true"
 LAST = "last.ckpt"  # what --resume goes on from
 
@@ -234,14 +235,14 @@ def fit(
         # Lightning tells the sampler its epoch only after the reading processes have begun to draw.
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
     try:
-        trainer = _trainer(course, [speed, *kept], val is not None)
+        trainer = _trainer(course, len(train), [speed, *kept], val is not None)
         trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
     except InputError as error:  # from a reading process it comes with that process's traceback
         raise InputError(str(error).splitlines()[-1].removeprefix(f"{InputError.__module__}.InputError: ")) from None
     return speed
 
 
-def _trainer(course: Course, callbacks: Sequence[Callback], validates: bool) -> L.Trainer:
+def _trainer(course: Course, batches: int, callbacks: Sequence[Callback], validates: bool) -> L.Trainer:
     training, processes, folder, trial = course.training, course.processes, course.folder, course.steps is not None
     kept = [] if trial else [
         Curves(folder / "metrics.csv"),
@@ -272,7 +273,7 @@ def _trainer(course: Course, callbacks: Sequence[Callback], validates: bool) -> 
         enable_progress_bar=bars,
         enable_model_summary=False,
         num_sanity_val_steps=0,
-        log_every_n_steps=10,
+        log_every_n_steps=min(LOGGED_EVERY, batches),
         use_distributed_sampler=False,
     )
 

@@ -139,14 +139,17 @@ def ablate(
     """
     from amvnet import charts, jobs
     from amvnet.analysis import ablate as compare
+    from amvnet.processes import device_of
 
     _calm_lightning()
+    processes = meet(device_of(recipe.training.accelerator) == "cuda")
     dataset = open_data(data, None)
     learnt, val = jobs.split_records(dataset, names_in(train_sequences), names_in(val_sequences))
     say(f"training on {listed(learnt)}; scoring on {listed(val)}")
-    rows = list(compare(recipe, dataset, learnt, val, out, say, on_terminal(), device))
-    files = charts.write_ablation(rows, out / "ablation")
-    say(files[-1].read_text().rstrip())
+    rows = list(compare(recipe, dataset, learnt, val, out, say, on_terminal(), device, processes))
+    if processes.first:
+        files = charts.write_ablation(rows, out / "ablation")
+        say(files[-1].read_text().rstrip())
 
 
 def _calm_lightning() -> None:

@@ -57,8 +57,8 @@ def _value(default: Any, value: Any, kind: Any, where: str) -> Any:
         if isinstance(value, Mapping):
             return _replace(default, value, where)
     elif isinstance(default, tuple):
-        if isinstance(value, list | tuple) and all(type(v) is int for v in value):
-            return tuple(value)
+        if isinstance(value, list | tuple):
+            return tuple(_value(default[0], one, get_args(kind)[0], where) for one in value)
     elif allowed := get_args(kind):  # of a Literal
         if value in allowed:
             return value

@@ -9,14 +9,14 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.errors import InputError
-from amvnet.inputs import meet, names_in, open_data
+from amvnet.inputs import meet, methods_in, names_in, open_data
 from amvnet.terminal import console, progress, say
 
 if TYPE_CHECKING:
     from amvnet.data.labels import Taxonomy
     from amvnet.evaluation import Evaluation
 
-MethodName = Literal["rv", "bev", "ensemble", "amvnet"]
+MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 WEIGHTS = "sim-hdl64e"
 
 
@@ -122,6 +122,7 @@ def evaluate(
     predictions: Path | None = None,
     split: Literal["train", "val", "test", "all"] = "val",
     sequences: str | None = None,
+    methods: str = "rv,bev,ensemble,amvnet",
     json: Path | None = None,
     pictures: Path | None = None,
     taxonomy: Path | None = None,
@@ -135,6 +136,7 @@ def evaluate(
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
         split: the official split to score.
         sequences: sequences or scenes to score instead, with commas.
+        methods: what to score of weights, with commas; arithmetic and maximum are the other ensembles.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
         taxonomy: a semantic-kitti.yaml with other classes.
@@ -152,7 +154,8 @@ def evaluate(
     dataset = open_data(data, taxonomy, None if given is None else jobs.own_classes(given.taxonomy))
     records = jobs.choose_records(dataset, names_in(sequences), split)
     if given is not None:
-        label = jobs.by_weights(dataset, Segmenter(given, processes.device(device), widest_method(given)))
+        segmenter = Segmenter(given, processes.device(device), widest_method(given))
+        label = jobs.by_weights(dataset, segmenter, methods_in(methods))
     else:
         label = jobs.by_files(dataset, Path(str(predictions)))
     for path in (json, pictures):  # so that nothing is scored in vain

@@ -107,6 +107,9 @@ def maximum(f: Tensor, g: Tensor) -> Tensor:
     return torch.maximum(f, g)
 
 
+ENSEMBLES = {"arithmetic": arithmetic_mean, "maximum": maximum, "ensemble": geometric_mean}
+
+
 def build_amvnet(config: ModelConfig, classes: int) -> AMVNet:
     """AMVNet with fresh weights, for K classes."""
     return AMVNet(
