@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from submissions import MAKERS, Case
 
 from amvnet.scan import Scan
 
@@ -23,3 +24,14 @@ def _random_scan(count: int, seed: int = 0) -> Scan:
 @pytest.fixture
 def random_scan() -> Callable[..., Scan]:
     return _random_scan
+
+
+@pytest.fixture(scope="session")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
+    """Submissions to both benchmarks; nothing may change them."""
+    return {name: make(tmp_path_factory.mktemp(name)) for name, make in MAKERS.items()}
+
+
+@pytest.fixture(params=MAKERS)
+def case(request: pytest.FixtureRequest, cases: dict[str, Case]) -> Case:
+    return cases[request.param]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from argparse import BooleanOptionalAction
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NoReturn, get_type_hints
 
@@ -52,7 +53,8 @@ def _add_option(parser: Parser, name: str, kind: Any, default: Any, text: str | 
     """One parameter of a verb's function as an option, with dashes as the shell has them."""
     flag = "--" + name.replace("_", "-")
     if kind is bool:
-        parser.add_argument(flag, action="store_true", help=text)
+        action = BooleanOptionalAction if default else "store_true"
+        parser.add_argument(flag, action=action, default=default, help=text)
     elif default is inspect.Parameter.empty:
         parser.add_argument(flag, type=kind, required=True, help=text)
     else:

@@ -27,6 +27,7 @@ VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "train": (training_verbs.train, {"recipe": {"metavar": "RECIPE"}}),
     "predict": (verbs.predict, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
     "evaluate": (verbs.evaluate, {"data": {"metavar": "DATA"}}),
+    "submit": (verbs.submit, {"data": {"metavar": "DATA"}}),
     "analyze": (training_verbs.analyze, {"data": {"metavar": "DATA"}}),
     "ablate": (training_verbs.ablate, {"recipe": {"metavar": "RECIPE"}}),
     "bench": (verbs.bench, {}),
@@ -59,6 +60,7 @@ USAGE = f"""usage: amvnet VERB ...
   train      train the networks and the point head
   predict    segment scans
   evaluate   score weights or predictions by the official formulas
+  submit     pack or check predictions for a benchmark's server
   analyze    the paper's figures, sweeps and tables
   ablate     the paper's ablation of the range-view network
   bench      time per stage on this machine

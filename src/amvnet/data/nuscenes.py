@@ -11,6 +11,7 @@ import numpy as np
 
 from amvnet.data import files
 from amvnet.data.labels import NUSCENES, UNKNOWN, Taxonomy
+from amvnet.data.predictions import read_prediction
 from amvnet.data.records import ScanRecord
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -71,17 +72,25 @@ class NuScenes:
 
     def sequences(self, split: str) -> tuple[str, ...]:
         """The scenes of "train", "val", "test" or "all" that are on disk; raises as `records.Dataset`."""
-        if split not in SPLITS:
-            raise InputError(f"{self.root}: expected a split of {', '.join(SPLITS)}, found {split!r}; give one of them")
+        scenes = self.scenes(split)
         folder = self.root / "samples" / CHANNEL
         present = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        scenes = [s for s in sorted(self._by_scene) if split in ("all", self._split(s).removeprefix("mini_"))]
         if found := tuple(s for s in scenes if any(r.points_path.name in present for r in self._by_scene[s])):
             return found
         raise InputError(
             f"{folder}: expected scans of {split} scenes ({len(scenes)} in the tables of {self.version}), "
             f"found none; name the scenes to use, such as {', '.join(sorted(self._by_scene)[:3])}"
         )
+
+    def scenes(self, split: str) -> tuple[str, ...]:
+        """The scenes of a split that the tables list, on disk or not.
+
+        Raises:
+            InputError: where the split is unknown.
+        """
+        if split not in SPLITS:
+            raise InputError(f"{self.root}: expected a split of {', '.join(SPLITS)}, found {split!r}; give one of them")
+        return tuple(s for s in sorted(self._by_scene) if split in ("all", self._split(s).removeprefix("mini_")))
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """The scans of these scenes in order; raises as `records.Dataset`."""
@@ -104,9 +113,7 @@ class NuScenes:
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
         """Read (N,) uint8 train ids; raises as `records.Dataset`."""
-        return files.read_labels(
-            Path(folder) / record.prediction, np.uint8, self._count(record), self.taxonomy.to_train
-        )
+        return read_prediction(Path(folder) / record.prediction, np.uint8, self._count(record), self.taxonomy)
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) train ids (uint8); raises as `records.Dataset`."""

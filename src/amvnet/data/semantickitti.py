@@ -10,6 +10,7 @@ import numpy as np
 
 from amvnet.data import files
 from amvnet.data.labels import SEMANTICKITTI, Taxonomy
+from amvnet.data.predictions import read_prediction
 from amvnet.data.records import ScanRecord
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -70,9 +71,7 @@ class SemanticKitti:
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
         """Read (N,) uint8 train ids; raises as `records.Dataset`."""
-        return files.read_labels(
-            Path(folder) / record.prediction, np.uint32, self._count(record), self.taxonomy.to_train
-        )
+        return read_prediction(Path(folder) / record.prediction, np.uint32, self._count(record), self.taxonomy)
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) train ids as raw ids (uint32); raises as `records.Dataset`."""
