@@ -95,9 +95,10 @@ class Browser:
         return np.asarray(image[:, 300:740])
 
 
-def pixels(image: np.ndarray, color: tuple[int, ...]) -> int:
-    """How many pixels have a colour."""
-    return int((np.abs(image - np.asarray(color)).max(axis=-1) <= 3).sum())
+def places(image: np.ndarray, color: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of the pixels that have a colour."""
+    rows, columns = np.nonzero(np.abs(image - np.asarray(color)).max(axis=-1) <= 3)
+    return rows, columns
 
 
 @pytest.fixture(scope="session")

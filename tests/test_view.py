@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pages import Browser, Page, browser, pixels, read_page
+from pages import Browser, Page, browser, places, read_page
 from worlds import GOLDEN, amvnet, files, fresh_weights, make_streets, street, without
 
 from amvnet import page as pages
@@ -322,22 +322,24 @@ def test_a_click_on_a_class_hides_it(world: Path, tmp_path: Path, browser: Brows
     assert browser.state(tmp_path / "p.html", "labels=truth")["drawn"] == drawn(planes, "truth", hide=(road,))
 
 
-def test_the_picture_has_the_colours_of_what_is_shown(tmp_path: Path, browser: Browser) -> None:
+def test_the_picture_shows_what_is_asked_for_where_it_is(tmp_path: Path, browser: Browser) -> None:
+    """From above, x up and y to the left: cars left, green right, and wrong labels at the bottom."""
     rng = np.random.default_rng(0)
     points = rng.uniform((-15, -15, -0.1, 0), (15, 15, 0.1, 1), (20_000, 4))
     truth = np.where(points[:, 1] > 0, 1, 15)
     labels = np.where(points[:, 0] > 0, truth, 13)
-    save_as = tmp_path / "p.html"
-    pages.write_page(save_as, [frame(points, truth=truth, labels=labels)], SEMANTICKITTI, "")
+    path, look = tmp_path / "p.html", "size=2&camera=3.1416,1.5708,40,0,0,0"
+    pages.write_page(path, [frame(points, truth=truth, labels=labels)], SEMANTICKITTI, "")
     car, building, green = (SEMANTICKITTI.colors[c] for c in (1, 13, 15))
-    whole = browser.picture(save_as, "size=2")
-    assert min(pixels(whole, color) for color in (car, building, green)) > 1000
-    less = browser.picture(save_as, "size=2&hide=13,15")
-    assert pixels(less, car) > 1000
-    assert pixels(less, building) == pixels(less, green) == 0
-    errors = browser.picture(save_as, "size=2&color=error")
-    assert pixels(errors, view.WRONG) > 1000
-    assert pixels(errors, car) == pixels(errors, building) == 0
+    whole = browser.picture(path, look)
+    assert places(whole, car)[1].max() < places(whole, green)[1].min() + 3
+    assert places(whole, car)[0].max() < places(whole, building)[0].min() + 3
+    less = browser.picture(path, f"{look}&hide=13,15")
+    assert len(places(less, car)[0]) > 1000
+    assert len(places(less, building)[0]) == len(places(less, green)[0]) == 0
+    errors = browser.picture(path, f"{look}&color=error")
+    assert places(errors, view.PLAIN)[0].max() < places(errors, view.WRONG)[0].min() + 3
+    assert len(places(errors, car)[0]) == len(places(errors, building)[0]) == 0
 
 
 def test_a_hostile_name_is_shown_and_not_run(tmp_path: Path, browser: Browser) -> None:

@@ -24,8 +24,8 @@ function swatch(color) {
 
 /** A row: swatch, name, value. */
 function row(kind, color, text, value) {
-  const children = [element("span", { name: "name", text, title: text }), element("span", { name: "value", text: value })];
-  return element(kind, { children: color ? [swatch(color), ...children] : children });
+  const texts = [element("span", { name: "name", text, title: text }), element("span", { name: "value", text: value })];
+  return element(kind, { children: color ? [swatch(color), ...texts] : texts });
 }
 
 /** Fill a group of buttons of which one is chosen; arrow keys move the choice. */
@@ -149,7 +149,7 @@ class Panel {
       const button = row("button", about.colors[id], about.classes[id], counted(all[id]));
       button.setAttribute("aria-pressed", String(!look.hidden.has(id)));
       button.dataset.id = id;
-      button.onclick = (event) => this.change({ hidden: event.altKey ? this.others(look, id) : this.toggled(look, id) });
+      button.onclick = ({ altKey }) => this.change({ hidden: altKey ? this.others(look, id) : this.toggled(look, id) });
       return button;
     });
     list.replaceChildren(...rows);
