@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,11 @@ from amvnet.jobs import Progress, check_classes, choose_records, own_classes, st
 from amvnet.models.assertions import cosine_similarity
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter, checked_scan, in_place, labels_in_place
+
+# Colours on a dark ground, RGB in 0..255. The official one of points without a class is black, as the ground nearly is.
+UNLABELLED = (128, 136, 148)
+RIGHT, WRONG, UNSCORED = (78, 92, 112), (255, 64, 54), (40, 47, 58)
+UNCERTAIN = (238, 128, 0)
 
 
 @dataclass(frozen=True)
@@ -76,9 +81,8 @@ class Frames:
 
     def _frame(self, source: Source) -> Frame:
         scan = checked_scan(source.read())
-        frame = Frame(source.name, scan.points, scan.valid, scan.labels)
-        if self.labels is not None:
-            frame.labels["labels"] = source.read_labels(self.labels, len(scan))
+        given = {} if self.labels is None else {"labels": source.read_labels(self.labels, len(scan))}
+        frame = Frame(source.name, scan.points, scan.valid, scan.labels, given)
         return frame if self.segmenter is None else _segmented(frame, scan, self.segmenter)
 
 
@@ -122,10 +126,9 @@ def _segmented(frame: Frame, scan: Scan, segmenter: Segmenter) -> Frame:
     scores, uncertain = segmenter.scores_by_method(scan)
     labels = {name: labels_in_place(values, scan.valid) for name, values in scores.items()}
     if uncertain is None:
-        return Frame(frame.name, frame.points, frame.valid, frame.truth, labels)
-    disagreement = 1 - cosine_similarity(scores["rv"], scores["bev"])
-    doubts = in_place(uncertain, scan.valid), in_place(disagreement.clamp(0, 1), scan.valid)
-    return Frame(frame.name, frame.points, frame.valid, frame.truth, labels, *doubts)
+        return replace(frame, labels=labels)
+    disagreement = in_place((1 - cosine_similarity(scores["rv"], scores["bev"])).clamp(0, 1), scan.valid)
+    return replace(frame, labels=labels, uncertain=in_place(uncertain, scan.valid), disagreement=disagreement)
 
 
 def _given_taxonomy(text: str | None, segmenter: Segmenter | None) -> Taxonomy | None:

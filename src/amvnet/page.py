@@ -18,16 +18,15 @@ import numpy as np
 
 from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
-from amvnet.frames import Frame
+from amvnet.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 from amvnet.report import TITLES
 
 MOST_POINTS = 400_000  # of one scan; of more, every second or third is drawn, so that a telephone can
 REACH = 500.0  # metres along each axis; farther points are left out, so that positions stay within 1.6 cm of the truth
 LEVELS = 32_767  # int16
-UNLABELLED = (128, 136, 148)  # its official colour is black, as the page is
 STOPS = 17  # colours from which the page makes a ramp
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}  # colour map, and the part that is used
-DOUBT = ((78, 92, 112), (128, 104, 92), (190, 110, 50), (238, 128, 0), (255, 190, 60))
+DOUBT = (RIGHT, (128, 104, 92), (190, 110, 50), UNCERTAIN, (255, 190, 60))
 SCRIPTS = ("scans", "camera", "shaders", "draw", "look", "panel", "point", "hands", "page")
 
 
@@ -121,6 +120,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
         "colors": [UNLABELLED, *taxonomy.colors[1:]],
+        "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
         "present": sorted(set().union(*(scan.present for scan in packed))),
         "sources": [{"key": name, "title": _capital(TITLES.get(name, name))} for name in sources],
         "scans": [scan.about for scan in packed],

@@ -14,14 +14,12 @@ import numpy as np
 from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
-from amvnet.frames import Frame
+from amvnet.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 from amvnet.report import TITLES
 
 TIMELINE = "scan"
 DOT, LARGE_DOT = 1.2, 1.8  # radius of points on the screen
 GROUND = (13, 17, 24)
-PLAIN, WRONG, UNCERTAIN = (78, 92, 112), (255, 64, 54), (238, 128, 0)
-UNLABELLED = (128, 136, 148)  # its official colour is black, as the ground nearly is
 
 
 def check_rerun() -> Any:
@@ -144,7 +142,7 @@ def _log_points(stream: Any, rerun: Any, frame: Frame) -> None:
         places = xyz if chosen is None else frame.points[frame.valid & chosen, :3]
         return rerun.Points3D(places, radii=rerun.Radius.ui_points(dot), **looks)
 
-    stream.log("points", points(colors=PLAIN if frame.labels else _by_height(xyz)))
+    stream.log("points", points(colors=RIGHT if frame.labels else _by_height(xyz)))
     if frame.truth is not None:
         stream.log("truth", points(class_ids=frame.truth[frame.valid]))
     for method, ids in frame.labels.items():

@@ -4,7 +4,6 @@
 const ATTRIBUTES = { position: 0, intensity: 1, disagreement: 2, label: 3, truth: 4, uncertain: 5 };
 const RINGS = [10, 20, 30, 40, 50], SIDES = 180;
 const MOST_PIXELS = 6e6;  // up to these, two are drawn for each of the window along both axes: edges get smooth
-const RIGHT = [78, 92, 112], WRONG = [255, 64, 54], UNSCORED = [40, 47, 58];
 
 class Drawing {
   constructor(canvas) {
@@ -155,7 +154,6 @@ class Drawing {
 
   drawPoints(scan, look, matrix) {
     const gl = this.gl, { program, places } = this.points;
-    const floats = (color) => color.map((part) => part / 255);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -168,9 +166,7 @@ class Drawing {
     gl.uniform3fv(places.center, scan.center);
     gl.uniform3fv(places.unit, scan.step);
     gl.uniform2fv(places.range, look.range());
-    gl.uniform3fv(places.right, floats(RIGHT));
-    gl.uniform3fv(places.wrong, floats(WRONG));
-    gl.uniform3fv(places.unscored, floats(UNSCORED));
+    for (const [name, color] of Object.entries(about.marks)) gl.uniform3fv(places[name], color.map((part) => part / 255));
     gl.uniform1f(places.size, (look.size * this.height) / (2 * FIELD));
     gl.uniform1f(places.smallest, 1.4 * this.ratio * Math.max(1, look.size));
     gl.uniform1i(places.mode, MODES.indexOf(look.color));

@@ -116,9 +116,9 @@ class Panel {
   errorKey(look, scan) {
     const { scored, wrong } = errorsOf(scan, look.labels);
     const rows = [
-      row("div", WRONG, "wrong", share(wrong, scored)),
-      row("div", RIGHT, "right", share(scored - wrong, scored)),
-      row("div", UNSCORED, "no class in truth", counted(scan.count - scored)),
+      row("div", about.marks.wrong, "wrong", share(wrong, scored)),
+      row("div", about.marks.right, "right", share(scored - wrong, scored)),
+      row("div", about.marks.unscored, "no class in truth", counted(scan.count - scored)),
     ];
     return element("div", { name: "rows", children: rows });
   }
