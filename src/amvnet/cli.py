@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amvnet import __version__, training_verbs, verbs
+from amvnet import __version__, training_verbs, verbs, viewing_verbs
 from amvnet.arguments import Parser, Positional, parser_of
 from amvnet.errors import InputError
 from amvnet.terminal import say
@@ -30,6 +30,7 @@ VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "submit": (verbs.submit, {"data": {"metavar": "DATA"}}),
     "analyze": (training_verbs.analyze, {"data": {"metavar": "DATA"}}),
     "ablate": (training_verbs.ablate, {"recipe": {"metavar": "RECIPE"}}),
+    "view": (viewing_verbs.view, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
     "bench": (verbs.bench, {}),
     "info": (verbs.info, {"weights": {"metavar": "W", "nargs": "?"}}),
 }
@@ -63,6 +64,7 @@ USAGE = f"""usage: amvnet VERB ...
   submit     pack or check predictions for a benchmark's server
   analyze    the paper's figures, sweeps and tables
   ablate     the paper's ablation of the range-view network
+  view       look at scans, labels and errors in 3D
   bench      time per stage on this machine
   info       what a weights file is, or what is installed
 

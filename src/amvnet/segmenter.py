@@ -93,26 +93,33 @@ class Segmenter:
         scores = self._scores(PointBatch.of([scan]).to(self.device))
         return _segmentation(scan.valid, scores)
 
-    @torch.inference_mode()
     def by_method(
         self, scan: Scan, methods: Sequence[str] = COMPARED
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """The (N,) train ids by each method that the weights have the parts for, and which points are uncertain."""
+        found, uncertain = self.scores_by_method(scan, methods)
+        labels = {name: labels_in_place(found[name], scan.valid) for name in methods if name in found}
+        return labels, None if uncertain is None else in_place(uncertain, scan.valid)
+
+    @torch.inference_mode()
+    def scores_by_method(
+        self, scan: Scan, methods: Sequence[str] = COMPARED
+    ) -> tuple[dict[str, Tensor], Tensor | None]:
+        """The same for the P valid points of a scan alone: (P, K) scores by each method, and (P,) bool."""
         model, parts, batch = self.model, self.weights.parts, PointBatch.of([scan]).to(self.device)
         found: dict[str, Tensor] = {}
         if "range_net" in parts:
             found["rv"] = model.score_range_view(batch)
         if "polar_net" in parts:
             found["bev"] = model.score_polar_view(batch)
-        uncertain = None
-        if len(found) == 2:
-            f, g = found["rv"], found["bev"]
-            uncertain = model.assertion(f, g, batch.points)
-            found |= {name: mean(f, g) for name, mean in ENSEMBLES.items() if name in methods}
-            if "point_head" in parts and "amvnet" in methods:
-                found["amvnet"] = merge(f, g, uncertain, model.refine(batch, f, g, uncertain))
-        labels = {name: labels_in_place(found[name], scan.valid) for name in methods if name in found}
-        return labels, None if uncertain is None else in_place(uncertain, scan.valid)
+        if len(found) < 2:
+            return found, None
+        f, g = found["rv"], found["bev"]
+        uncertain = model.assertion(f, g, batch.points)
+        found |= {name: mean(f, g) for name, mean in ENSEMBLES.items() if name in methods}
+        if "point_head" in parts and "amvnet" in methods:
+            found["amvnet"] = merge(f, g, uncertain, model.refine(batch, f, g, uncertain))
+        return found, uncertain
 
     @torch.inference_mode()
     def _scores(self, batch: PointBatch) -> Scores:

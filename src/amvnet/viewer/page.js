@@ -1,0 +1,166 @@
+// Puts the parts together: one look, one camera, one scan at a time; draws when something has changed.
+"use strict";
+
+const look = new Look(), camera = new Camera();
+const PAUSE = 800;  // milliseconds between the scans when they are played
+const GLIDE = 0.04;  // of the window's height, by one press of a key
+let drawing, panel, scan = null, chosen = -1, asked = 0, playing = 0, remembering = 0;
+
+function redraw() {
+  if (!asked) asked = requestAnimationFrame(draw);
+}
+
+function draw() {
+  asked = 0;
+  if (!scan) return;
+  camera.middle = panel.free();
+  drawing.draw(scan, look, camera);
+  mark();
+}
+
+/** The ring about the point that was clicked. */
+function mark() {
+  const marker = byId("marker"), canvas = byId("canvas");
+  marker.hidden = byId("point").hidden = chosen < 0;
+  if (chosen < 0) return;
+  const [u, v, , w] = projected(placeOf(scan, chosen), camera.matrix(canvas.clientWidth / canvas.clientHeight));
+  marker.hidden = w <= 0;
+  marker.style.left = `${((u / w + 1) / 2) * canvas.clientWidth}px`;
+  marker.style.top = `${((1 - v / w) / 2) * canvas.clientHeight}px`;
+}
+
+/** Change the look, and show it. */
+async function change(changes) {
+  look.set(changes);
+  await show();
+  remember();
+}
+
+async function show() {
+  const wanted = look.scan, found = await scanAt(wanted);
+  if (look.scan !== wanted) return;  // another one was asked for meanwhile
+  if (found !== scan) chosen = -1;
+  scan = found;
+  const drawn = panel.show(look, scan);
+  byId("scan").value = wanted;
+  byId("place").textContent = `${wanted + 1} of ${about.scans.length} · ${scan.name}`;
+  byId("place").title = scan.name;
+  redraw();
+  // For whoever looks at the page by a program.
+  Object.assign(document.documentElement.dataset, { drawn: JSON.stringify(drawn), scan: wanted, color: look.color });
+}
+
+/** Keep the look in the address, though not at every step of a movement. */
+function remember() {
+  clearTimeout(remembering);
+  const place = [camera.azimuth, camera.elevation, camera.distance, ...camera.target];
+  remembering = setTimeout(() => history.replaceState(null, "", look.hash(place)), 250);
+}
+
+/** Do as the address says. */
+function recall() {
+  const [azimuth, elevation, distance, ...target] = look.read(location.hash);
+  const whole = target.length === 3 && [azimuth, elevation, distance, ...target].every(Number.isFinite);
+  if (whole) camera.set({ azimuth, elevation, distance, target });
+  else stand(FIRST);
+  return show();
+}
+
+function moved() {
+  redraw();
+  remember();
+}
+
+/** Go to a place; in a window that is higher than wide, farther away. */
+function stand(place) {
+  camera.set({ ...place, distance: place.distance * Math.sqrt(Math.max(1, innerHeight / innerWidth)) });
+  moved();
+}
+
+function step(by) {
+  return change({ scan: (look.scan + by + about.scans.length) % about.scans.length });
+}
+
+function play() {
+  document.body.classList.toggle("playing", !playing);
+  clearInterval(playing);
+  playing = playing ? 0 : setInterval(() => step(1), PAUSE);
+}
+
+function click(x, y, again) {
+  const { clientWidth: width, clientHeight: height } = byId("canvas");
+  chosen = scan ? pointAt(x, y, scan, look, camera.matrix(width / height), width, height) : -1;
+  if (chosen >= 0) describe(chosen, scan);
+  if (chosen >= 0 && again) camera.set({ ...camera, target: placeOf(scan, chosen) });
+  moved();
+}
+
+/** The next one of a list, in a circle. */
+function next(list, now) {
+  return list[(list.indexOf(now) + 1) % list.length];
+}
+
+/** [keys, what they do in words, the function]; what one scan has no use for is left out. */
+const KEYS = [
+  [["1", "2", "3", "4", "5"].slice(0, possible.labels.length), "labels, from the first on",
+    (key) => change({ labels: possible.labels[Number(key) - 1] })],
+  [["C"], "next colouring", () => change({ color: next(possible.color, look.color) })],
+  [["X"], "all points, wrong ones, uncertain ones", () => change({ only: next(possible.only, look.only) })],
+  [["0"], "show all classes", () => change({ hidden: new Set() })],
+  [["←", "→"], "scan before, after", (key) => step(key === "→" ? 1 : -1)],
+  [[" "], "play the scans", play],
+  [["T"], "from above", () => stand(ABOVE)],
+  [["F"], "close to the ground", () => stand(STREET)],
+  [["R"], "first view", () => stand(FIRST)],
+  [["W", "A", "S", "D"], "move", (key) => {
+    camera.move({ A: GLIDE, D: -GLIDE }[key] ?? 0, { W: GLIDE, S: -GLIDE }[key] ?? 0);
+    moved();
+  }],
+  [["Q", "E"], "turn", (key) => {
+    camera.turn(key === "Q" ? 12 : -12, 0);
+    moved();
+  }],
+  [["↑", "↓"], "zoom in, out", (key) => {
+    camera.zoom(key === "↑" ? 0.9 : 1 / 0.9);
+    moved();
+  }],
+  [["+", "-"], "larger, smaller points", (key) => change({
+    size: Math.min(Math.max(look.size * (key === "+" ? 1.2 : 1 / 1.2), SIZES[0]), SIZES[1]),
+  })],
+  [["L"], "shading on, off", () => change({ shading: !look.shading })],
+  [["G"], "rings every 10 m on, off", () => change({ rings: !look.rings })],
+  [["P"], "fold the panel", () => panel.fold()],
+  [["escape"], "let go of the point", () => click(-100, -100)],
+  [["?"], "this list", () => byId("keys").showModal()],
+].filter(([names]) => names.length && (about.scans.length > 1 || !(names.includes("→") || names.includes(" "))));
+
+function start() {
+  if (!("DecompressionStream" in window)) throw new Error("This page needs a browser of 2023 or later.");
+  // A telephone may take the graphics processor away from a page that lies in the background.
+  byId("canvas").addEventListener("webglcontextlost", (event) => event.preventDefault());
+  byId("canvas").addEventListener("webglcontextrestored", () => location.reload());
+  drawing = new Drawing(byId("canvas"));
+  panel = new Panel(change);
+  new Hands(byId("canvas"), camera, { camera: moved, click });
+  listen(KEYS);
+  byId("above").onclick = () => stand(ABOVE);
+  byId("street").onclick = () => stand(STREET);
+  byId("reset").onclick = () => stand(FIRST);
+  byId("help").onclick = () => byId("keys").showModal();
+  byId("play").onclick = play;
+  byId("point").querySelector("button").onclick = () => click(-100, -100);
+  byId("timeline").hidden = about.scans.length < 2;
+  byId("scan").max = about.scans.length - 1;
+  byId("scan").oninput = (event) => change({ scan: Number(event.target.value) });
+  addEventListener("resize", redraw);
+  new ResizeObserver(redraw).observe(byId("panel"));
+  addEventListener("hashchange", () => recall().catch(fail));
+  return recall();
+}
+
+function fail(error) {
+  byId("problem").textContent = error.message;
+  byId("problem").hidden = false;
+}
+
+(async () => start())().catch(fail);

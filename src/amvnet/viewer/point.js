@@ -1,0 +1,46 @@
+// The point that was clicked: which it is, and all that is known of it.
+"use strict";
+
+const CLOSE = 9;  // pixels from the pointer, within which a point is taken
+
+/** The nearest point to the eye among those drawn close to (x, y) in the window, or -1. */
+function pointAt(x, y, scan, look, matrix, width, height) {
+  const shown = shownBy(look, scan), { center, step, positions } = scan;
+  let best = -1, least = Infinity;
+  for (let i = 0; i < scan.count; i++) {
+    const p = [0, 1, 2].map((axis) => center[axis] + step[axis] * positions[3 * i + axis]);
+    const [u, v, , w] = projected(p, matrix);
+    if (w <= 0) continue;
+    const off = Math.hypot(((u / w + 1) / 2) * width - x, ((1 - v / w) / 2) * height - y);
+    const cost = w * (1 + off);  // a point in front, or else one that was hit better
+    if (off < CLOSE && cost < least && shown(i)) [best, least] = [i, cost];
+  }
+  return best;
+}
+
+function projected([x, y, z], m) {
+  return [0, 1, 2, 3].map((r) => m[r] * x + m[4 + r] * y + m[8 + r] * z + m[12 + r]);
+}
+
+/** Fill the card with a point's classes and values. */
+function describe(i, scan) {
+  const { planes } = scan, [x, y, z] = placeOf(scan, i), lines = [];
+  const truth = planes.truth ? planes.truth[i] : 0;
+  for (const { key, title } of about.sources) {
+    if (!planes[key]) continue;
+    const id = planes[key][i];
+    const wrong = truth > 0 && key !== "truth" && id !== truth;
+    const text = element("span", { name: wrong ? "wrong" : "", text: about.classes[id] + (wrong ? " ✗" : "") });
+    lines.push([title, swatch(about.colors[id]), text]);
+  }
+  if (planes.disagreement) {
+    const doubt = planes.uncertain[i] ? ", uncertain" : "";
+    lines.push(["disagreement", `${(planes.disagreement[i] / 255).toFixed(2)}${doubt}`]);
+  }
+  lines.push(["x, y, z", [x, y, z].map((value) => value.toFixed(2)).join(", ") + " m"]);
+  lines.push(["distance", `${Math.hypot(x, y, z).toFixed(1)} m`]);
+  lines.push(["intensity", (planes.intensity[i] / 255).toFixed(2)]);
+  const rows = lines.map(([name, ...found]) =>
+    element("tr", { children: [element("th", { text: name }), element("td", { children: found })] }));
+  byId("point").querySelector("table").replaceChildren(...rows);
+}

@@ -1,0 +1,50 @@
+// Reads the scans that the page carries: base64 of deflated planes of bytes.
+"use strict";
+
+const about = JSON.parse(document.getElementById("about").textContent);
+const loaded = new Map();  // index of a scan -> promise of it
+
+function bytesOf(text) {
+  const characters = atob(text), bytes = new Uint8Array(characters.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = characters.charCodeAt(i);
+  return bytes;
+}
+
+async function inflated(bytes) {
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+/** (3 n) int16 x, y, z, x, ...: each axis lies there as low bytes and high bytes of what it changes by. */
+function positionsOf(bytes, count) {
+  const positions = new Int16Array(3 * count);
+  for (let axis = 0; axis < 3; axis++) {
+    const low = 2 * axis * count, high = low + count;
+    for (let i = 0, value = 0; i < count; i++) {
+      value = (value + bytes[low + i] + (bytes[high + i] << 8)) & 0xffff;
+      positions[3 * i + axis] = value;  // wraps to -32768..32767
+    }
+  }
+  return positions;
+}
+
+async function read(index) {
+  const said = about.scans[index];
+  const bytes = await inflated(bytesOf(document.getElementById(`scan-${index}`).textContent));
+  const planes = {};
+  said.planes.forEach((name, place) => {
+    planes[name] = bytes.subarray((6 + place) * said.count, (7 + place) * said.count);
+  });
+  return { ...said, index, planes, positions: positionsOf(bytes, said.count) };
+}
+
+/** The scan of an index: {name, count, center, step, positions, planes: {intensity, truth, rv, ...}}. */
+function scanAt(index) {
+  if (!loaded.has(index)) loaded.set(index, read(index));
+  return loaded.get(index);
+}
+
+/** Metres in the sensor's frame. */
+function placeOf(scan, i) {
+  return [0, 1, 2].map((axis) => scan.center[axis] + scan.step[axis] * scan.positions[3 * i + axis]);
+}

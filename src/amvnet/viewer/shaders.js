@@ -1,0 +1,94 @@
+// What runs on the graphics processor: points and their colours, rings on the ground, depth made visible.
+"use strict";
+
+const MODES = ["class", "error", "uncertainty", "height", "intensity"];
+const ONLY = ["all", "wrong", "uncertain"];
+
+const POINT_SHADER = `#version 300 es
+layout(location = 0) in vec3 position;
+layout(location = 1) in float intensity;
+layout(location = 2) in float disagreement;
+layout(location = 3) in uint label;
+layout(location = 4) in uint truth;
+layout(location = 5) in uint uncertain;
+uniform mat4 matrix;
+uniform vec3 center, unit;
+uniform vec2 range;
+uniform vec3 right, wrong, unscored;
+uniform float size, smallest;
+uniform int mode, only;
+uniform sampler2D classes;  // colour of each class; alpha 0 where it is hidden
+uniform sampler2D ramp;
+flat out vec3 color;
+
+vec3 ramped(float value) {
+  float place = clamp((value - range.x) / max(range.y - range.x, 1e-6), 0.0, 1.0);
+  return texture(ramp, vec2((place * 255.0 + 0.5) / 256.0, 0.5)).rgb;
+}
+
+void main() {
+  vec3 at = center + unit * position;
+  vec4 own = texelFetch(classes, ivec2(int(label), 0), 0);
+  bool scored = truth > 0u, missed = scored && label != truth, doubted = uncertain > 0u;
+  color = own.rgb;
+  if (mode == 1) color = missed ? wrong : scored ? right : unscored;
+  if (mode == 2) color = ramped(disagreement);
+  if (mode == 3) color = ramped(at.z);
+  if (mode == 4) color = ramped(intensity);
+  bool shown = own.a > 0.5 && (only == 0 || (only == 1 && missed) || (only == 2 && doubted));
+  gl_Position = shown ? matrix * vec4(at, 1.0) : vec4(0.0, 0.0, 2.0, 1.0);
+  // Lasers spread: what is far from the sensor is drawn larger, so that surfaces stay whole.
+  float metres = 0.055 + 0.002 * length(at);
+  bool stressed = (mode == 1 && missed) || (mode == 2 && doubted);
+  gl_PointSize = clamp(size * metres / gl_Position.w, smallest, 40.0) * (stressed ? 1.4 : 1.0);
+}`;
+
+const POINT_COLOR = `#version 300 es
+precision mediump float;
+flat in vec3 color;
+out vec4 painted;
+void main() {
+  vec2 off = gl_PointCoord - 0.5;
+  if (dot(off, off) > 0.25) discard;
+  painted = vec4(color, 1.0);
+}`;
+
+const RING_SHADER = `#version 300 es
+layout(location = 0) in vec3 position;
+uniform mat4 matrix;
+void main() { gl_Position = matrix * vec4(position, 1.0); }`;
+
+const RING_COLOR = `#version 300 es
+precision mediump float;
+uniform float strength;
+out vec4 painted;
+void main() { painted = vec4(strength); }`;
+
+const SCREEN_SHADER = `#version 300 es
+void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }`;
+
+// Points behind others get darker beside them (eye-dome lighting): edges and depth show without normals.
+const SCREEN_COLOR = `#version 300 es
+precision highp float;
+uniform sampler2D colors;
+uniform highp sampler2D depths;
+uniform float near, far, strength, reach;
+out vec4 painted;
+
+float distance_at(ivec2 pixel) {
+  float depth = texelFetch(depths, clamp(pixel, ivec2(0), textureSize(depths, 0) - 1), 0).r;
+  return log2(2.0 * near * far / (far + near - (2.0 * depth - 1.0) * (far - near)));
+}
+
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  vec4 color = texelFetch(colors, pixel, 0);
+  if (color.a == 0.0) discard;
+  float own = distance_at(pixel), hidden = 0.0;
+  for (int place = 0; place < 8; place++) {
+    float angle = 0.7853982 * float(place);
+    ivec2 beside = pixel + ivec2(round(reach * vec2(cos(angle), sin(angle))));
+    hidden += clamp(own - distance_at(beside) - 0.01, 0.0, 0.6);
+  }
+  painted = vec4(color.rgb * max(exp(-strength * hidden), 0.25), 1.0);
+}`;
