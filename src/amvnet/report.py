@@ -15,7 +15,14 @@ from amvnet.data.labels import Taxonomy
 from amvnet.recipes import recipe_names
 from amvnet.weights import Weights, built_in
 
-TITLES = {"rv": "RV", "bev": "BEV", "arithmetic": "arithmetic mean", "amvnet": "AMVNet"}
+TITLES = {
+    "rv": "RV",
+    "bev": "BEV",
+    "arithmetic": "arithmetic mean",
+    "maximum": "maximum",
+    "ensemble": "ensemble",
+    "amvnet": "AMVNet",
+}
 OVERALL = {"miou": "mIoU", "miou_present": "mIoU, classes present", "accuracy": "accuracy", "fwiou": "fwIoU"}
 
 

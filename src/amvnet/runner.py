@@ -171,11 +171,12 @@ class Run:
                 trial = dataclasses.replace(self, out=Path(folder), val=(), resume=False, say=lambda line: None)
                 # The classes' weights cost a look at every scan, and nothing else.
                 speed = trial._fit_network(name, fresh, np.ones(self.dataset.taxonomy.size), TRIAL_STEPS)
-            steps = -(-len(self.train) // config.batch) * config.epochs
+            step, batch = speed.seconds[-1], min(config.batch, len(self.train))
+            hours = -(-len(self.train) // config.batch) * config.epochs * step / 3600
             yield (
-                f"{name}: {speed.seconds[-1]:.1f} s for a step of {config.batch} scans "
-                f"({config.batch / speed.seconds[-1]:.3g} scans/s), memory so far {speed.memory / 2**30:.1f} GiB; "
-                f"{config.epochs} epochs of {len(self.train)} scans would take {steps * speed.seconds[-1] / 3600:.1f} h"
+                f"{name}: {step:.3g} s for a step of {batch} scans ({batch / step:.3g} scans/s), "
+                f"memory so far {speed.memory / 2**30:.1f} GiB; "
+                f"{config.epochs} epochs of {len(self.train)} scans would take {hours:.3g} h"
             )
 
     def _config(self, name: str) -> NetworkTraining:
