@@ -313,6 +313,13 @@ def test_where_the_networks_agree_everywhere_the_head_learns_from_all_points(wor
     assert max(column(tmp_path / "run", "head", "val/acc")) > 0.5
 
 
+def test_the_head_learns_where_the_loss_is_high(world: Path, run: Path, tmp_path: Path) -> None:
+    options = ("--stage", "head", "--init", run, "--model.assertion.name", "loss", "--model.assertion.threshold", 0.5)
+    weights = train(world, tmp_path / "run", *options)
+    assert weights.model.assertion.name == "loss"
+    assert differing(load(run), weights) == {"point_head"}
+
+
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(world: Path, tmp_path: Path, stage: str) -> None:
     options = ("--stage", stage, f"--training.{stage}.lr", "1e38", f"--training.{stage}.clip", "1e38")

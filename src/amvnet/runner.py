@@ -29,6 +29,7 @@ from amvnet.head_training import HeadStage
 from amvnet.loading import ScanSet, count_classes, loader
 from amvnet.losses import class_weights
 from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.models.assertions import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.processes import ALONE, Processes
 from amvnet.run_folder import SETTINGS, check_begun, describe, names_of, settings
@@ -293,4 +294,6 @@ def _whole(current: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
     """The scores by AMVNet whose head is being trained."""
     model = current.build()
     model.point_head = head
+    if current.model.assertion.name == "loss":  # which needs labels, that a picture of a prediction must not know
+        model.assertion = Disagreement()
     return lambda batch: model.to(batch.points.device)(batch).merged
