@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -20,6 +20,7 @@ from amvnet.models.layers import fold_batch_norms
 from amvnet.models.point_head import PointHead
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
+from amvnet.views.range_view import RangeView
 from amvnet.weights import Weights, load
 
 Method = Literal["rv", "bev", "ensemble", "amvnet"]
@@ -91,6 +92,13 @@ class Segmenter:
         scan = checked_scan(points)
         scores = self._scores(PointBatch.of([scan]).to(self.device))
         return _segmentation(scan.valid, scores)
+
+    def by_ring(self) -> Segmenter:
+        """The same for scans whose `ring` is the row of each point, 0 the lowest, whatever rows the weights have."""
+        other = copy.copy(self)
+        other.model = copy.copy(self.model)
+        other.model.range_view = RangeView(replace(self.model.range_view.config, rows="ring"))
+        return other
 
     @torch.inference_mode()
     def by_method(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
