@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-NEAREST = 2.0  # metres: nearer returns are of what carries the sensor
+NEAREST = 1.0  # metres: nearer returns are of what carries the sensor
 ENDS = (0.5, 99.5)  # percentiles of the elevation that are the ends of the field of view
 FEWEST = 100  # points that say something
 
-JUMP = 0.7  # of the width of the scan: where the azimuth goes back by so much, the next laser begins
-STEP = 0.05  # of the width: most steps are smaller where a file is in order of lasers
+FULL_TURN = 350  # degrees
+JUMP = 0.7  # of the width of a scan that is no full turn: where the azimuth goes back by so much, another laser begins
+STEP = 0.05  # of the width: most steps of the azimuth are smaller where a file is in an order
+MOSTLY = 0.9
 FEWEST_BEAMS, MOST_BEAMS = 4, 256
 BIN = 0.02  # degrees, of the histogram of elevations
 AROUND = 1.5  # degrees: a laser's peak is compared with the highest so near
@@ -28,6 +30,7 @@ FADE = 8.0  # metres: a cell so far away counts half
 TRIES = 400  # planes through three low points
 THICKNESS = 0.1  # metres that the ground's points are off its plane
 STEEPEST = 10.0  # degrees
+DEEPEST = -0.5  # metres: what is higher over the origin is a ceiling
 LARGE = 1.0  # square metres, twice the area of the triangle that a plane is laid through
 FEWEST_CELLS = 30
 AGREEING = 0.25  # weighted share of the cells that must be of the plane
@@ -71,10 +74,13 @@ def beams_by_order(xyz: np.ndarray) -> int | None:
     azimuth = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))
     low, high = np.percentile(azimuth, (0.1, 99.9))
     steps, width = np.diff(azimuth), high - low
-    # Near the ends it may tremble to and fro: what counts is how often it went back more than forth.
-    back = abs(int((steps > JUMP * width).sum()) - int((steps < -JUMP * width).sum()))
-    beams = back + int(width < 350)  # of a full turn, each laser passes the end of the azimuth once
-    in_order = np.mean(np.abs(steps) < STEP * width) > 1 - 2 * beams / len(azimuth) - 0.1
+    turned = (steps + 180) % 360 - 180
+    if width > FULL_TURN:
+        beams = round(abs(float(turned.sum())) / 360)
+    else:  # near the ends it may tremble to and fro: what counts is how often it went back more than forth
+        beams = 1 + abs(int((steps > JUMP * width).sum()) - int((steps < -JUMP * width).sum()))
+        turned = steps
+    in_order = np.mean(np.abs(turned) < STEP * width) > MOSTLY
     return beams if in_order and FEWEST_BEAMS <= beams <= MOST_BEAMS else None
 
 
@@ -96,8 +102,7 @@ def _peaks(elevation: np.ndarray) -> tuple[int, float]:
     """How many peaks hold nearly all of some elevations, and the share of the field of view that they cover."""
     low, high = np.percentile(elevation, (0.05, 99.95))
     counts, _ = np.histogram(elevation, np.arange(low - AROUND, high + AROUND, BIN))
-    smooth = np.convolve(counts, (0.25, 0.5, 0.25), "same")
-    peak = smooth > np.maximum(PEAK * maximum_filter1d(smooth, int(2 * AROUND / BIN)), 1)
+    peak = counts > np.maximum(PEAK * maximum_filter1d(counts, int(2 * AROUND / BIN)), 1)
     if counts[peak].sum() < INSIDE * len(elevation):
         return 0, 1.0
     return int((np.diff(peak.astype(int), prepend=0) == 1).sum()), peak.sum() * BIN / max(high - low, BIN)
@@ -120,7 +125,8 @@ def ground_height(xyz: np.ndarray) -> float | None:
     for _ in range(3):
         near = np.abs(low[:, 2] - across @ plane) < THICKNESS
         plane = np.linalg.lstsq(across[near], low[near, 2], rcond=None)[0]
-    return float(-plane[2]) if weight[near].sum() > AGREEING * weight.sum() else None
+    agreed = weight[near].sum() > AGREEING * weight.sum()
+    return float(-plane[2]) if agreed and -plane[2] > DEEPEST else None
 
 
 def _lowest(xyz: np.ndarray) -> np.ndarray:

@@ -77,7 +77,7 @@ def _opened(path: Path, ending: str) -> Iterator[Any]:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
     except ImportError:
-        raise InputError(f"{path}: expected rosbags to read it, found it not installed; pip install rosbags") from None
+        raise InputError(f'{path}: expected rosbags to read it, found none; do pip install "amvnet[formats]"') from None
     with ExitStack() as stack:
         if ending in (".mcap", ".db3") and path.suffix != ending:
             folder = Path(stack.enter_context(TemporaryDirectory()))

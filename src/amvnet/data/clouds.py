@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -115,9 +116,10 @@ def check_number(count: int, path: Path | str, least: int = 0) -> int:
 
 @contextmanager
 def refusing(path: Path | str, expected: str, advice: str) -> Iterator[None]:
-    """Turn whatever a reader raises on broken bytes into an InputError of one line."""
+    """Turn whatever a reader raises on broken bytes into an InputError of one line; its warnings are for nobody."""
     try:
-        yield
+        with warnings.catch_warnings(action="ignore"):
+            yield
     except InputError:
         raise
     except BaseException as error:
@@ -151,6 +153,7 @@ def cloud_of(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     return Cloud(xyz, columns.get("intensity"), rings(columns.get("ring")), name)
 
 
+@np.errstate(invalid="ignore")
 def rings(values: np.ndarray | None) -> np.ndarray | None:
     """(N,) int64 ring indices, or None where the values are no such thing; what is not finite counts as 0."""
     if values is None or not len(values):

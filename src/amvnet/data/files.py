@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from amvnet.data.formats import ENDINGS, is_bag_folder, is_scan, read_cloud
-from amvnet.data.raw import FULL_INTENSITY, KITTI_COLUMNS, NUSCENES_COLUMNS, ring_column
+from amvnet.data.raw import FULL_INTENSITY, KITTI_COLUMNS, NUSCENES_COLUMNS, read_table, ring_column
+from amvnet.data.raw import count_rows as count_rows
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -54,7 +55,7 @@ def read_scan(path: Path | str) -> Scan:
     Raises:
         InputError: where the file is missing, of another format, truncated, empty or all NaN.
     """
-    return read_cloud(Path(path)).to_scan()
+    return read_cloud(path).to_scan()
 
 
 def find_scans(path: Path | str) -> list[Path]:
@@ -71,29 +72,6 @@ def find_scans(path: Path | str) -> list[Path]:
     if found := sorted(entry for entry in path.iterdir() if is_scan(entry)):
         return found
     raise InputError(f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; give the folder of scans")
-
-
-def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
-    """Read a file that is nothing but rows of `columns` values; (N, columns) of `dtype`.
-
-    Raises:
-        InputError: where the file is missing or its size is not a whole number of rows.
-    """
-    count = count_rows(path, dtype, columns)
-    return np.fromfile(path, dtype=dtype, count=count * columns).reshape(count, columns)
-
-
-def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
-    """The number of rows in such a file, by its size alone; raises as `read_table` does."""
-    if not path.is_file():
-        raise InputError(f"{path}: expected a file, found none; check the path or complete the data set")
-    size, row = path.stat().st_size, np.dtype(dtype).itemsize * columns
-    if size % row:
-        raise InputError(
-            f"{path}: expected a whole number of rows of {row} bytes, found {size} bytes; "
-            "the file is truncated or of another format, copy it again"
-        )
-    return size // row
 
 
 def check_points(points: np.ndarray, path: Path) -> np.ndarray:

@@ -65,8 +65,8 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def is_scan(path: Path) -> bool:
-    """Whether the name of a file in a folder says that it is a scan or a bag."""
-    if path.name.startswith("."):
+    """Whether the name of a file in a folder says that it is a scan or a bag, and not the scores of one."""
+    if path.name.startswith(".") or (path.suffix == ".npz" and path.with_suffix(".label").exists()):
         return False
     return is_bag_folder(path) if path.is_dir() else path.name.lower().endswith(ENDINGS)
 
@@ -96,12 +96,13 @@ def ending_of(path: Path) -> str:
     return named
 
 
-def read_cloud(path: Path) -> Cloud:
+def read_cloud(path: Path | str) -> Cloud:
     """Read the one scan of a file.
 
     Raises:
         InputError: where the file is missing, of another format, broken, or a bag of several scans.
     """
+    path = Path(path)
     ending = ending_of(path)
     if ending in READERS:
         return READERS[ending](path)

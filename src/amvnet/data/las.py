@@ -63,7 +63,7 @@ def _require_laspy(path: Path) -> None:
         import lazrs  # noqa: F401
     except ImportError:
         raise InputError(
-            f"{path}: expected laspy[lazrs] to read it, found it not installed; pip install 'laspy[lazrs]'"
+            f'{path}: expected laspy and lazrs to read it, found none; do pip install "amvnet[formats]"'
         ) from None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from amvnet.data.clouds import MAX_POINTS, MOST_RINGS, Cloud, check_number
 from amvnet.errors import InputError
@@ -24,19 +25,37 @@ def read_raw(path: Path) -> Cloud:
         InputError: where the file is no whole number of rows, or has five columns and the last is no ring.
     """
     columns = columns_of(path) or (NUSCENES_COLUMNS if _named_nuscenes(path) else KITTI_COLUMNS)
-    size, row = path.stat().st_size, 4 * columns
-    if size % row:
-        raise InputError(
-            f"{path}: expected a whole number of rows of {row} bytes, found {size} bytes; "
-            "the file is truncated or of another format, copy it again"
-        )
-    check_number(size // row, path)
-    table = np.fromfile(path, dtype=np.float32).reshape(-1, columns)
+    check_number(count_rows(path, np.float32, columns), path)
+    table = read_table(path, np.float32, columns)
     ring = None if columns == KITTI_COLUMNS else ring_column(table[:, 4], path)
     full = FULL_INTENSITY if ring is not None and _named_nuscenes(path) else None
     return Cloud(table[:, :3], table[:, 3], ring, str(path), full)
 
 
+def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
+    """Read a file that is nothing but rows of `columns` values; (N, columns) of `dtype`.
+
+    Raises:
+        InputError: where the file is missing or its size is not a whole number of rows.
+    """
+    count = count_rows(path, dtype, columns)
+    return np.fromfile(path, dtype=dtype, count=count * columns).reshape(count, columns)
+
+
+def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
+    """The number of rows in such a file, by its size alone; raises as `read_table` does."""
+    if not path.is_file():
+        raise InputError(f"{path}: expected a file, found none; check the path or complete the data set")
+    size, row = path.stat().st_size, np.dtype(dtype).itemsize * columns
+    if size % row:
+        raise InputError(
+            f"{path}: expected a whole number of rows of {row} bytes, found {size} bytes; "
+            "the file is truncated or of another format, copy it again"
+        )
+    return size // row
+
+
+@np.errstate(invalid="ignore", over="ignore")
 def columns_of(path: Path) -> int | None:
     """How many columns the values of a file can only have, whatever its name says; None where they do not tell."""
     size = path.stat().st_size
@@ -66,6 +85,7 @@ def _is_kitti(table: np.ndarray) -> bool:
     return bool(near.all() and negative and (table[:, 3] >= 0).all() and (table[:, 3] <= 65535).all())
 
 
+@np.errstate(invalid="ignore")
 def ring_column(values: np.ndarray, path: Path) -> np.ndarray:
     """(N,) int64 ring indices of a fifth column.
 
