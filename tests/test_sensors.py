@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -9,12 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scan_files import pcd_bytes, write_bag1
 from worlds import amvnet, fails, files, fresh_weights, make_streets
 
 from amvnet.cli import main
 from amvnet.data.clouds import Cloud
 from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.errors import InputError
 from amvnet.fitting import MEASURED, Fitting
 from amvnet.measuring import ground_height, measure
 from amvnet.scan import Scan
@@ -58,8 +62,8 @@ def place(
 def test_lasers_field_of_view_and_height_are_measured(name: str, height: float) -> None:
     points, laser = place(LASERS[name], height)
     by_laser = np.argsort(laser, kind="stable")
-    for given, ring in ((points, None), (points[by_laser], None), (points, laser)):
-        found = measure(given, ring)
+    for table, ring in ((points, None), (points[by_laser], None), (points, laser)):
+        found = measure(table, ring)
         assert found.beams == len(LASERS[name])
         assert found.height == pytest.approx(height, abs=0.05)
         assert found.fov_up == pytest.approx(max(LASERS[name]), abs=0.5)
@@ -87,8 +91,8 @@ def test_what_a_scan_does_not_tell_is_left_open() -> None:
 def test_a_firing_order_and_chance_are_no_order_of_lasers() -> None:
     points, _ = place(HDL64E.elevations, 1.73)
     shuffled = points[np.random.default_rng(0).permutation(len(points))]
-    for given in (points, shuffled):
-        assert measure(given).beams == 64  # by the peaks
+    for table in (points, shuffled):
+        assert measure(table).beams == 64  # by the peaks
 
 
 @pytest.mark.skipif(not REAL, reason="AMVNET_REAL_DATA does not name a folder")
@@ -154,8 +158,8 @@ def test_any_frame_that_is_described_gives_the_same_scan(axes: str, turn: tuple[
     matrix, offset = rotation(*turn) @ np.array(AXES[axes], float), np.array([0.1, -0.2, 0.4])
     there = (points[:, :3] - offset) @ matrix  # the inverse of matrix @ there + offset
     there[5] = 0
-    given = Sensor(axes=axes, rotate=turn, offset=(0.1, -0.2, 0.4))
-    found = _fitting(given)[0](Cloud(there, points[:, 3], None, "a.pcd"), "a")
+    sensor = Sensor(axes=axes, rotate=turn, offset=(0.1, -0.2, 0.4))
+    found = _fitting(sensor)[0](Cloud(there, points[:, 3], None, "a.pcd"), "a")
     _equal(found, expected)
     assert np.flatnonzero(~found.valid).tolist() == [5]
 
@@ -249,10 +253,37 @@ def test_scans_of_one_source_keep_one_height_unless_they_disagree() -> None:
         assert rise == pytest.approx(height - 1.73, abs=0.05) or height == 1.0
 
 
-def test_a_scan_whose_origin_is_on_the_ground_is_lifted() -> None:
+@pytest.mark.parametrize("up", [1.5, 1.73, 2.0])
+def test_a_scan_whose_origin_is_on_the_ground_or_below_is_moved(up: float) -> None:
     points, _ = place(HDL64E.elevations, 1.73)
-    on_ground = points + np.array([0, 0, 1.73, 0], np.float32)
+    on_ground = points + np.array([0, 0, up, 0], np.float32)
     _equal(_fitting()[0](_cloud(on_ground), "a"), _fitting()[0](_cloud(points), "a"), atol=0.05)
+
+
+coordinate = st.floats(width=32) | st.floats(-50, 50, width=32) | st.sampled_from([0.0, 1.0, -1.7, 1e4, 3e38])
+
+
+@settings(max_examples=200, deadline=None, derandomize=True, database=None)
+@given(
+    rows=st.lists(st.tuples(*[coordinate] * 4), max_size=8),
+    repeated=st.sampled_from([1, 3, 60]),
+    ring=st.booleans(),
+    sensor=st.sampled_from(["hdl64e", "hdl32e", "homemade"]),
+    nuscenes=st.booleans(),
+    given_sensor=st.sampled_from([None, Sensor(fov_up=-40), SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]),
+)
+def test_any_numbers_end_in_a_scan_or_one_line(
+    rows: list[Any], repeated: int, ring: bool, sensor: str, nuscenes: bool, given_sensor: Sensor | None
+) -> None:
+    points = np.array(rows * repeated, np.float32).reshape(-1, 4)
+    cloud = _cloud(points, np.arange(len(points)) % 40 if ring else None)
+    fit, _ = _fitting(given_sensor, sensor, nuscenes)
+    with contextlib.suppress(InputError):
+        for _ in range(2):
+            scan = fit(cloud, "a")
+            assert len(scan) == len(points)
+            assert not scan.valid[(points[:, :3] == 0).all(axis=1)].any()
+            assert ((scan.points[scan.valid, 3] >= 0) & (scan.points[scan.valid, 3] <= 1)).all()
 
 
 # --- descriptions

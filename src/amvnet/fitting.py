@@ -21,9 +21,10 @@ MEASURED = 5  # scans of a source that are measured; then their median stays
 STEADY = 0.4  # metres: where heights of a source differ by more, each of its scans counts for itself
 SAME_HEIGHT = 0.15  # metres that do not matter: training moves the sensor by as much
 LOWEST = 0.3  # metres: a lower origin is a place on the ground, not the sensor
-OUTSIDE = 0.2  # share of the points out of the weights' field of view from which on it is widened to the scan's
+OUTSIDE = 0.16  # share of the points out of the weights' field of view from which on it is widened to the scan's
 SAME_ANGLE = 6.0  # degrees: fields of view that differ by less at both ends are alike
 SAME_BEAMS = 1.4  # factor: numbers of lasers that differ by less are alike
+KEYS = ("beams", "fov_up", "fov_down", "height")  # what can be measured, or given
 
 
 @dataclass
@@ -90,23 +91,23 @@ class Fitting:
         known.steady &= not heights or max(heights) - min(heights) < STEADY
         return _median(known.found) if known.steady else found
 
-    def _rise(self, sensor: Sensor) -> float:
+    def _rise(self, sensor: Measured) -> float:
         """Metres to move a scan up."""
         if self.height is None or sensor.height is None or abs(sensor.height - self.height) < SAME_HEIGHT:
             return 0.0
         return sensor.height - self.height
 
-    def _widened(self, points: np.ndarray, sensor: Sensor) -> RangeViewConfig | None:
+    def _widened(self, points: np.ndarray, sensor: Measured) -> RangeViewConfig | None:
         """The range view with rows by elevation: as trained, or wider where the scan is; None where that is unknown."""
         view = self._view
         if view.rows == "ring":
             known = self.trained or (sensor if sensor.beams == view.height else None)
-            if known is None or known.fov_up is None or known.fov_down is None:
+            if known is None or known.fov_up is None or known.fov_down is None or known.fov_up <= known.fov_down:
                 return None
             view = _by_elevation(view, known.fov_up, known.fov_down, view.height - 1)
         elevation = elevations(points[:, :3].astype(np.float64))
         outside = ((elevation > view.fov_up) | (elevation < view.fov_down)).mean()
-        if outside < OUTSIDE or sensor.fov_up is None or sensor.fov_down is None:
+        if outside < OUTSIDE or sensor.fov_up is None or sensor.fov_down is None or sensor.fov_up <= sensor.fov_down:
             return view
         return _by_elevation(view, sensor.fov_up, sensor.fov_down, view.height)
 
@@ -122,7 +123,7 @@ class Fitting:
         out[valid] = rows
         return out
 
-    def _words(self, cloud: Cloud, scale: float | None, sensor: Sensor) -> str:
+    def _words(self, cloud: Cloud, scale: float | None, sensor: Measured) -> str:
         """What was assumed, and what it means for the weights."""
         taken = [_intensity_words(cloud, scale), self._height_words(sensor), _lasers_words(sensor)]
         line = f"{cloud.name}: assumed {', '.join(filter(None, [cloud.note, *taken]))}"
@@ -131,16 +132,16 @@ class Fitting:
         known = _lasers_words(self.trained)
         return f"{line}; the weights were trained for {self.trained.name} ({known}) and have seen no such sensor"
 
-    def _height_words(self, sensor: Sensor) -> str:
+    def _height_words(self, sensor: Measured) -> str:
         if sensor.height is None:
             return "no ground to measure the height by (give --height)"
         rise = self._rise(sensor)
         moved = f" (moved by {rise:+.2f} m to {self.height:.2f} m)" if rise else ""
         return f"sensor {sensor.height:.2f} m over the ground{moved}"
 
-    def _unseen(self, sensor: Sensor) -> bool:
+    def _unseen(self, sensor: Measured) -> bool:
         known = self.trained
-        if known is None or sensor.name == known.name:
+        if known is None or self.given.name == known.name:
             return False
         ratio = 1.0 if not (sensor.beams and known.beams) else sensor.beams / known.beams
         ends = ((sensor.fov_up, known.fov_up), (sensor.fov_down, known.fov_down))
@@ -170,17 +171,17 @@ def _raised(scan: Scan, rise: float) -> Scan:
 def _median(found: list[Measured]) -> Measured:
     """The median of each thing that was measured."""
     values: dict[str, float | None] = {}
-    for key in ("beams", "fov_up", "fov_down", "height"):
+    for key in KEYS:
         known = [getattr(m, key) for m in found if getattr(m, key) is not None]
         values[key] = float(np.median(known)) if known else None
     beams = values.pop("beams")
     return Measured(None if beams is None else round(beams), **values)
 
 
-def _known(given: Sensor, found: Measured) -> Sensor:
+def _known(given: Sensor, found: Measured) -> Measured:
     """What is given, and where it is not, what was measured."""
-    keys = ("beams", "fov_up", "fov_down", "height")
-    return dataclasses.replace(given, **{k: getattr(found, k) for k in keys if getattr(given, k) is None})
+    stated = {key: getattr(given, key) for key in KEYS}
+    return dataclasses.replace(found, **{key: value for key, value in stated.items() if value is not None})
 
 
 def _agree(ring: np.ndarray, rows: np.ndarray) -> bool:
@@ -192,7 +193,7 @@ def _intensity_words(cloud: Cloud, scale: float | None) -> str:
     return "no intensity" if cloud.intensity is None or scale is None else f"intensity 0 to {scale:g}"
 
 
-def _lasers_words(sensor: Sensor) -> str:
+def _lasers_words(sensor: Sensor | Measured) -> str:
     lasers = "lasers" if sensor.beams is None else f"{sensor.beams} lasers"
     if sensor.fov_up is None or sensor.fov_down is None:
         return lasers if sensor.beams else "field of view not found"

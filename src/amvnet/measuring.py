@@ -124,6 +124,8 @@ def ground_height(xyz: np.ndarray) -> float | None:
     across = np.column_stack([low[:, :2], np.ones(len(low))])
     for _ in range(3):
         near = np.abs(low[:, 2] - across @ plane) < THICKNESS
+        if near.sum() < FEWEST_CELLS / 2:
+            return None
         plane = np.linalg.lstsq(across[near], low[near, 2], rcond=None)[0]
     agreed = weight[near].sum() > AGREEING * weight.sum()
     return float(-plane[2]) if agreed and -plane[2] > DEEPEST else None

@@ -78,9 +78,7 @@ def _cloud(array: np.ndarray, path: Path) -> Cloud:
 
 def _others(table: np.ndarray, image: bool, path: Path) -> tuple[list[str], np.ndarray | None]:
     """What the columns after the intensity are taken for, and the ring where it is among them."""
-    if table.shape[1] == 4 or not len(table):
-        return [], None
-    if table.shape[1] == 3:
+    if table.shape[1] <= len(COLUMNS) or not len(table):
         return [], None
     fifth = table[:, 4]
     if _is_distance(table):

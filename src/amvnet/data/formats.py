@@ -61,7 +61,7 @@ class NamedScan:
 
 def is_bag_folder(path: Path) -> bool:
     """Whether a folder is a ROS 2 bag."""
-    return (path / METADATA).is_file()
+    return (path / METADATA).is_file() and any(any(path.glob(f"*{ending}*")) for ending in (".db3", ".mcap"))
 
 
 def is_scan(path: Path) -> bool:
