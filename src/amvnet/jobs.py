@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.catalog import is_dataset, open_dataset
-from amvnet.data.files import find_scans, read_scan, whole_file, write_labels
+from amvnet.data.files import find_scans, whole_file, write_labels
+from amvnet.data.formats import NamedScan, named_scans
 from amvnet.data.labels import TAXONOMIES, Taxonomy
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation
+from amvnet.fitting import Fitting
 from amvnet.pictures import draw_scan
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
@@ -29,10 +31,11 @@ DEMO_SEQUENCES = 3
 
 @dataclass(frozen=True)
 class Task:
-    """One scan to segment: how it is read, and where its labels go."""
+    """One scan to segment: how it is read, by what it is segmented, and where its labels go."""
 
     name: str
     read: Callable[[], Scan]
+    segmenter: Segmenter
     write: Callable[[np.ndarray], Path]
     scores: Path
 
@@ -45,26 +48,31 @@ def predict(
     scores: bool = False,
     progress: Progress = lambda done, total: None,
     split: str = "all",
+    topic: str | None = None,
+    fitting: Fitting | None = None,
     processes: Processes = ALONE,
 ) -> list[Path]:
-    """Segment data sets, scan files and folders of them; returns the files of labels that this process has written.
+    """Segment data sets, scan files, bags and folders of them; returns the files that this process has written.
 
     Args:
-        inputs: each a data set as `open_dataset` takes it, a scan file, or a folder of scan files.
+        inputs: each a data set as `open_dataset` takes it, a scan file, a bag, or a folder of these.
         sequences: of data sets, which to segment; None means those of `split`.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` of an `.npz`.
         split: the official split of data sets.
+        topic: of bags; None is the only one with PointCloud2.
+        fitting: makes lone scans such as the weights know them; None measures all, and says nothing.
         processes: those that share the scans.
 
     Raises:
         InputError: before anything is written where an input is not there; else at the scan that is broken.
     """
-    tasks = [task for text in inputs for task in _tasks(text, segmenter.taxonomy, Path(out), sequences, split)]
+    lone = Lone(segmenter.by_ring(), fitting or Fitting(segmenter.weights), Path(out), topic)
+    tasks = [task for text in inputs for task in _tasks(text, segmenter, lone, sequences, split)]
     _check_names(tasks)
     mine, written = processes.share(tasks), []
     for done, task in enumerate(mine):
         progress(done, len(mine))
-        result = segmenter(task.read())
+        result = task.segmenter(task.read())
         if scores:
             write_scores(task.scores, result)
         written.append(task.write(result.labels))
@@ -202,38 +210,45 @@ def _present(dataset: Dataset, split: str) -> tuple[str, ...]:
         return ()
 
 
-def _tasks(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
+@dataclass(frozen=True)
+class Lone:
+    """What lone scans have in common."""
+
+    segmenter: Segmenter
+    fitting: Fitting
+    out: Path
+    topic: str | None
+
+    def task(self, scan: NamedScan) -> Task:
+        to_raw, fit = self.segmenter.taxonomy.to_raw, self.fitting
+        return Task(
+            scan.name,
+            lambda: fit(scan.read(), scan.source),
+            self.segmenter,
+            lambda ids: write_labels(self.out / f"{scan.name}.label", to_raw(ids)),
+            self.out / f"{scan.name}.npz",
+        )
+
+
+def _tasks(text: str, segmenter: Segmenter, lone: Lone, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
     if is_dataset(text):
-        dataset = open_dataset(text, own_classes(taxonomy))
-        check_classes(dataset, taxonomy)
+        dataset = open_dataset(text, own_classes(segmenter.taxonomy))
+        check_classes(dataset, segmenter.taxonomy)
         for record in choose_records(dataset, sequences, split):
-            yield _record_task(dataset, record, out)
+            yield _record_task(dataset, record, segmenter, lone.out)
         return
     for path in find_scans(text):
-        yield _file_task(path, taxonomy, out)
+        yield from map(lone.task, named_scans(path, lone.topic))
 
 
-def _record_task(dataset: Dataset, record: ScanRecord, out: Path) -> Task:
+def _record_task(dataset: Dataset, record: ScanRecord, segmenter: Segmenter, out: Path) -> Task:
     return Task(
         record.name,
         lambda: dataset.read(record, labels=False),
+        segmenter,
         lambda ids: dataset.write_prediction(record, out, ids),
         (out / record.prediction).with_suffix(".npz"),
     )
-
-
-def _file_task(path: Path, taxonomy: Taxonomy, out: Path) -> Task:
-    return Task(
-        path.name,
-        lambda: read_scan(path),
-        lambda ids: write_labels(out / f"{stem(path)}.label", taxonomy.to_raw(ids)),
-        out / f"{stem(path)}.npz",
-    )
-
-
-def stem(path: Path) -> str:
-    """A scan file's name without its ending, `.pcd.bin` included."""
-    return path.name.removesuffix(".pcd.bin") if path.name.endswith(".pcd.bin") else path.stem
 
 
 def _check_names(tasks: Sequence[Task]) -> None:
