@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from amvnet.config import RangeViewConfig
 from amvnet.data.clouds import Cloud
+from amvnet.errors import InputError
 from amvnet.measuring import Measured, elevations, measure
 from amvnet.scan import Scan
 from amvnet.sensors import HEIGHTS, SENSORS, Sensor
@@ -33,6 +35,8 @@ class _Source:
 
     found: list[Measured] = field(default_factory=list)
     steady: bool = True
+    learnt: bool = False
+    said: bool = False
 
 
 class Fitting:
@@ -54,7 +58,7 @@ class Fitting:
         self.given, self._say = given or Sensor(), say
         self.trained, self.height = SENSORS.get(weights.sensor), HEIGHTS.get(weights.sensor)
         self._view = weights.model.range_view
-        self._sources: dict[object, _Source] = {}
+        self._sources: dict[tuple[str, float | None], _Source] = {}
 
     def __call__(self, cloud: Cloud, source: str) -> Scan:
         """The scan for the weights; its points keep their order and number.
@@ -70,22 +74,39 @@ class Fitting:
         scan = _level(cloud, self.given).to_scan(scale)
         valid = scan.valid
         known = self._sources.setdefault((source, scale), _Source())
-        first = not known.found
         found = self._settled(known, scan, valid)
         sensor = _known(self.given, found)
         moved = _raised(scan, self._rise(sensor))
         seen = moved if sensor.height is not None and sensor.height < LOWEST else scan  # from where the sensor is
         wide = self._widened(seen.points[valid], sensor)
-        if first:
+        if not known.said:
+            known.said = True
             self._say(self._words(cloud, scale, sensor))
         return dataclasses.replace(moved, ring=self._rows(seen, valid, wide))
 
+    def learn(self, source: str, first: Sequence[Callable[[], Cloud]]) -> None:
+        """Measure the first scans of a source: all of it then have their median, or, where they differ, each its own.
+
+        Args:
+            first: how they are read; those that are broken are left out.
+        """
+        for read in first:
+            with suppress(InputError):
+                cloud = read()
+                scale = self.given.intensity_scale or cloud.intensity_scale()
+                scan = _level(cloud, self.given).to_scan(scale)
+                self._settled(self._sources.setdefault((source, scale), _Source()), scan, scan.valid)
+        for (name, _), known in self._sources.items():
+            known.learnt |= name == source
+
     def _settled(self, known: _Source, scan: Scan, valid: np.ndarray) -> Measured:
         """What counts as measured for a scan: the median of the first ones of its source, where these agree."""
-        if known.steady and len(known.found) == MEASURED:
+        if known.steady and (known.learnt or len(known.found) == MEASURED):
             return _median(known.found)
         ring = None if scan.ring is None else scan.ring[valid]
         found = measure(scan.points[valid], ring)
+        if known.learnt:
+            return found
         known.found = [*known.found, found][-MEASURED:]
         heights = [m.height for m in known.found if m.height is not None]
         known.steady &= not heights or max(heights) - min(heights) < STEADY

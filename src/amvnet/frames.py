@@ -55,7 +55,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Source:
-    """One scan to look at: how it is read, its labels from a folder that the user gave, what segments it if anything."""
+    """One scan to look at: how it is read, its labels from a folder that the user gave, what segments it."""
 
     name: str
     read: Callable[[], Scan]

@@ -30,6 +30,7 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
     """
     from amvnet import jobs
     from amvnet.data.semantickitti import SemanticKitti
+    from amvnet.prediction import predict as segment
     from amvnet.segmenter import Segmenter
     from amvnet.simulation import simulate as write
 
@@ -40,7 +41,7 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
     dataset = SemanticKitti(out / "data")
     records = jobs.choose_records(dataset, None, "all")
     with progress("segmenting") as step:
-        jobs.predict([str(out / "data")], segmenter, out / "predictions", progress=step)
+        segment([str(out / "data")], segmenter, out / "predictions", progress=step)
     with progress("scoring") as step:
         label = jobs.by_weights(dataset, segmenter)
         found = jobs.evaluate(dataset, records, label, out / "pictures", step)
@@ -92,6 +93,7 @@ def predict(
     split: Literal["train", "val", "test", "all"] = "all",
     sequences: str | None = None,
     scores: bool = False,
+    resume: bool = False,
     device: str = "cpu",
     topic: str | None = None,
     sensor: str | None = None,
@@ -111,6 +113,7 @@ def predict(
         split: of data sets, the official split.
         sequences: of data sets, which sequences or scenes instead, with commas.
         scores: also write the probabilities of both networks.
+        resume: go on where an interrupted run into the folder stopped.
         device: cpu, cuda, cuda:1, ...
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
         sensor: of lone scans, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
@@ -120,8 +123,8 @@ def predict(
         rotate: of lone scans, yaw,pitch,roll in degrees that turn them level.
         offset: of lone scans, metres to add to x,y,z after that.
     """
-    from amvnet import jobs
     from amvnet.fitting import Fitting
+    from amvnet.prediction import predict as segment
     from amvnet.segmenter import Segmenter
     from amvnet.sensors import describe
 
@@ -131,10 +134,10 @@ def predict(
     segmenter = Segmenter(weights, processes.device(device), method)
     fitting = Fitting(segmenter.weights, given, say)
     with progress("segmenting") as step:
-        written = jobs.predict(
-            inputs, segmenter, out, names_in(sequences), scores, step, split, topic, fitting, processes
+        written = segment(
+            inputs, segmenter, out, names_in(sequences), scores, step, split, topic, fitting, resume, processes
         )
-    say(f"{sum(processes.gather(len(written)))} label files in {out}")
+    say(f"{written} label files in {out}")
 
 
 def evaluate(
