@@ -176,11 +176,12 @@ class Run:
                 )
                 # The classes' weights cost a look at every scan, and nothing else.
                 speed = trial._fit_network(name, fresh, np.ones(self.dataset.taxonomy.size), TRIAL_STEPS)
-            step, steps = speed.seconds[-1], -(-len(self.train) // config.batch)
+            step = speed.seconds[-1]
+            hours = -(-len(self.train) // config.batch) * config.epochs * step / 3600
             yield (
                 f"{name}: {step:.3g} s for a step of {config.batch} scans ({config.batch / step:.3g} scans/s), "
                 f"memory so far {speed.memory / 2**30:.1f} GiB; "
-                f"{config.epochs} epochs of {len(self.train)} scans would take {steps * config.epochs * step / 3600:.3g} h"
+                f"{config.epochs} epochs of {len(self.train)} scans would take {hours:.3g} h"
             )
 
     def _config(self, name: str) -> NetworkTraining:
