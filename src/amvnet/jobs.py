@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.catalog import is_dataset, open_dataset
-from amvnet.data.files import find_scans, whole_file, write_labels
-from amvnet.data.formats import NamedScan, named_scans
+from amvnet.data.files import find_scans, whole_file
+from amvnet.data.formats import READERS, NamedScan, named_scans
 from amvnet.data.labels import TAXONOMIES, Taxonomy
+from amvnet.data.outputs import check_kind, write_scan_labels, write_uncertain
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation
@@ -36,8 +37,13 @@ class Task:
     name: str
     read: Callable[[], Scan]
     segmenter: Segmenter
-    write: Callable[[np.ndarray], Path]
+    write: Callable[[Segmentation], Path]
     scores: Path
+
+    @property
+    def uncertain(self) -> Path:
+        """Where it is written which points are uncertain."""
+        return self.scores.with_suffix(".uncertain.npy")
 
 
 def predict(
@@ -51,6 +57,8 @@ def predict(
     topic: str | None = None,
     fitting: Fitting | None = None,
     processes: Processes = ALONE,
+    kind: str = "label",
+    uncertain: bool = False,
 ) -> list[Path]:
     """Segment data sets, scan files, bags and folders of them; returns the files that this process has written.
 
@@ -62,11 +70,17 @@ def predict(
         topic: of bags; None is the only one with PointCloud2.
         fitting: makes lone scans such as the weights know them; None measures all, and says nothing.
         processes: those that share the scans.
+        kind: the format that the labels of lone scans are written in, of `data.outputs.KINDS`.
+        uncertain: also write which points are uncertain, (N,) bool, as `.uncertain.npy`.
 
     Raises:
-        InputError: before anything is written where an input is not there; else at the scan that is broken.
+        InputError: before anything is written where an input is not there or its folder is `out`, or the method has
+            no uncertain points; else at the scan that is broken.
     """
-    lone = Lone(segmenter.by_ring(), fitting or Fitting(segmenter.weights), Path(out), topic)
+    check_kind(kind)
+    if uncertain and segmenter.method in ("rv", "bev"):
+        raise InputError(f"expected a method of two networks for --uncertain, found {segmenter.method}; use amvnet")
+    lone = Lone(segmenter.by_ring(), fitting or Fitting(segmenter.weights), Path(out), topic, kind, scores)
     tasks = [task for text in inputs for task in _tasks(text, segmenter, lone, sequences, split)]
     _check_names(tasks)
     mine, written = processes.share(tasks), []
@@ -75,7 +89,9 @@ def predict(
         result = task.segmenter(task.read())
         if scores:
             write_scores(task.scores, result)
-        written.append(task.write(result.labels))
+        if uncertain:
+            write_uncertain(task.uncertain, result.uncertain)
+        written.append(task.write(result))
     progress(len(mine), len(mine))
     return written
 
@@ -218,16 +234,34 @@ class Lone:
     fitting: Fitting
     out: Path
     topic: str | None
+    kind: str
+    scores: bool
 
     def task(self, scan: NamedScan) -> Task:
-        to_raw, fit = self.segmenter.taxonomy.to_raw, self.fitting
-        return Task(
-            scan.name,
-            lambda: fit(scan.read(), scan.source),
-            self.segmenter,
-            lambda ids: write_labels(self.out / f"{scan.name}.label", to_raw(ids)),
-            self.out / f"{scan.name}.npz",
-        )
+        kept: list[np.ndarray] = []  # the file's own coordinates, from the reading to the writing
+
+        def read() -> Scan:
+            cloud = scan.read()
+            kept[:] = [cloud.xyz]
+            return self.fitting(cloud, scan.source)
+
+        def write(result: Segmentation) -> Path:
+            known = None if result.rv is None or result.bev is None else result.uncertain
+            taxonomy = self.segmenter.taxonomy
+            return write_scan_labels(self.out / scan.name, self.kind, kept.pop(), result.labels, taxonomy, known)
+
+        return Task(scan.name, read, self.segmenter, write, self.out / f"{scan.name}.npz")
+
+    def check(self, path: Path, task: Task) -> Task:
+        """Hand back a task of a scan file.
+
+        Raises:
+            InputError: where what is written would lie beside the scans, and be taken for one or replace one.
+        """
+        mistaken = f".{self.kind}" in READERS or (self.scores and path.suffix.lower() == ".npz")
+        if mistaken and task.scores.parent.resolve() == path.parent.resolve():
+            raise InputError(f"{path}: expected another folder for the labels, found the scan's own; change --out")
+        return task
 
 
 def _tasks(text: str, segmenter: Segmenter, lone: Lone, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
@@ -238,7 +272,7 @@ def _tasks(text: str, segmenter: Segmenter, lone: Lone, sequences: Sequence[str]
             yield _record_task(dataset, record, segmenter, lone.out)
         return
     for path in find_scans(text):
-        yield from map(lone.task, named_scans(path, lone.topic))
+        yield from (lone.check(path, lone.task(scan)) for scan in named_scans(path, lone.topic))
 
 
 def _record_task(dataset: Dataset, record: ScanRecord, segmenter: Segmenter, out: Path) -> Task:
@@ -246,7 +280,7 @@ def _record_task(dataset: Dataset, record: ScanRecord, segmenter: Segmenter, out
         record.name,
         lambda: dataset.read(record, labels=False),
         segmenter,
-        lambda ids: dataset.write_prediction(record, out, ids),
+        lambda result: dataset.write_prediction(record, out, result.labels),
         (out / record.prediction).with_suffix(".npz"),
     )
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from amvnet.evaluation import Evaluation
 
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
+FormatName = Literal["label", "npy", "ply", "pcd", "las"]
 WEIGHTS = "sim-hdl64e"
 
 
@@ -92,6 +93,8 @@ def predict(
     split: Literal["train", "val", "test", "all"] = "all",
     sequences: str | None = None,
     scores: bool = False,
+    format: FormatName = "label",
+    uncertain: bool = False,
     device: str = "cpu",
     topic: str | None = None,
     sensor: str | None = None,
@@ -111,6 +114,8 @@ def predict(
         split: of data sets, the official split.
         sequences: of data sets, which sequences or scenes instead, with commas.
         scores: also write the probabilities of both networks.
+        format: of lone scans' labels: raw ids alone (label, npy), or coloured points (ply, pcd, las).
+        uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         device: cpu, cuda, cuda:1, ...
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
         sensor: of lone scans, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
@@ -129,10 +134,10 @@ def predict(
     options = {"height": height, "intensity_scale": intensity_scale, "axes": axes, "rotate": rotate, "offset": offset}
     given = describe(sensor, **options)
     segmenter = Segmenter(weights, processes.device(device), method)
-    fitting = Fitting(segmenter.weights, given, say)
+    fitting, chosen = Fitting(segmenter.weights, given, say), names_in(sequences)
     with progress("segmenting") as step:
         written = jobs.predict(
-            inputs, segmenter, out, names_in(sequences), scores, step, split, topic, fitting, processes
+            inputs, segmenter, out, chosen, scores, step, split, topic, fitting, processes, format, uncertain
         )
     say(f"{sum(processes.gather(len(written)))} label files in {out}")
 
