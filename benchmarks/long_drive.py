@@ -42,10 +42,11 @@ def main(folder: Path, scans: int = 1000, method: str = "amvnet") -> None:
     if not any(samples.glob("*.pcd.bin")):  # a folder of lone scans
         for path in sorted(samples.rglob("*.pcd.bin")):
             path.rename(samples / path.name)
-    started = time.perf_counter()
-    memory = run(folder, folder / "whole", method, scans + 1)
-    seconds = time.perf_counter() - started
-    print(f"{scans} scans in {seconds:.0f} s; memory at each tenth, MiB:", [kb // 1024 for kb in memory])
+    if not (folder / "whole").exists():
+        started = time.perf_counter()
+        memory = run(folder, folder / "whole", method, scans + 1)
+        seconds = time.perf_counter() - started
+        print(f"{scans} scans in {seconds:.0f} s; memory at each tenth, MiB:", [kb // 1024 for kb in memory])
     for share in (*KILLED_AT, 2):
         run(folder, folder / "killed", method, int(share * scans))
     names = sorted(path.name for path in (folder / "whole").iterdir())

@@ -8,7 +8,6 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from worlds import amvnet, files, fresh_weights, make_streets, street
 
@@ -98,9 +97,7 @@ def test_a_killed_run_goes_on_where_it_stopped(world: Path, whole: Path, tmp_pat
 
 def test_an_interrupted_run_is_not_gone_on_with_by_others(world: Path, tmp_path: Path) -> None:
     arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--resume")
-    weights = Segmenter(str(world / WEIGHTS)).weights
-    settings = {"weights": {p: weights.digest(p) for p in weights.parts}, "method": "rv", "scores": False, "sensor": ""}
-    Journal(tmp_path, settings)
+    Journal(tmp_path, {**settings_of(world), "method": "rv"})
     code, error = amvnet(*arguments)
     assert (code, error.count("\n")) == (2, 1)
     assert "method" in error
@@ -142,7 +139,9 @@ def test_a_part_of_a_folder_is_labelled_as_in_the_whole(world: Path, whole: Path
 def settings_of(world: Path) -> dict[str, object]:
     weights = Segmenter(str(world / WEIGHTS)).weights
     parts = {part: weights.digest(part) for part in weights.parts}
-    return {"weights": parts, "method": "amvnet", "scores": False, "sensor": repr(prediction.Fitting(weights).given)}
+    sensor = repr(prediction.Fitting(weights).given)
+    kept = {"scores": False, "uncertain": False, "format": "label"}
+    return {"weights": parts, "method": "amvnet", "sensor": sensor, **kept}
 
 
 def test_few_scans_are_in_memory_however_many_there_are(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,14 +155,16 @@ def test_few_scans_are_in_memory_however_many_there_are(world: Path, monkeypatch
             most.append(len(held))
             return prediction.Scan(street(place)[0])
 
-        def write(ids: np.ndarray) -> Path:
+        def write(result: object) -> Path:
             time.sleep(0.02)  # slower than the reading
             held.remove(place)
             return Path()
 
         return prediction.Task(str(place), read, segmenter, write, Path())  # type: ignore[arg-type]
 
-    done = [one.name for one, fault in prediction._stream([task(place) for place in range(30)], False) if not fault]
+    done = [
+        one.name for one, fault in prediction._stream([task(place) for place in range(30)], False, False) if not fault
+    ]
     assert done == [str(place) for place in range(30)]
     assert max(most) <= 2 * prediction.AHEAD + 2
     assert not held

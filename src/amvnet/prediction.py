@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.catalog import is_dataset, open_dataset
-from amvnet.data.files import find_scans, whole_file, write_labels
-from amvnet.data.formats import NamedScan, named_scans
+from amvnet.data.files import find_scans, whole_file
+from amvnet.data.formats import READERS, NamedScan, named_scans
+from amvnet.data.outputs import check_kind, write_scan_labels, write_uncertain
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError, SomeBroken
 from amvnet.fitting import MEASURED, Fitting
@@ -33,8 +34,13 @@ class Task:
     name: str
     read: Callable[[], Scan]
     segmenter: Segmenter
-    write: Callable[[np.ndarray], Path]
+    write: Callable[[Segmentation], Path]
     scores: Path
+
+    @property
+    def uncertain(self) -> Path:
+        """Where it is written which points are uncertain."""
+        return self.scores.with_suffix(".uncertain.npy")
 
 
 @dataclass
@@ -45,6 +51,8 @@ class Lone:
     fitting: Fitting
     out: Path
     topic: str | None
+    kind: str
+    scores: bool
     first: dict[str, list[NamedScan]] = field(default_factory=dict)
 
     def tasks(self, path: Path) -> Iterator[Task]:
@@ -52,22 +60,35 @@ class Lone:
             first = self.first.setdefault(scan.source, [])
             if len(first) < MEASURED:
                 first.append(scan)
-            yield self._task(scan)
+            yield self._checked(path, self._task(scan))
 
     def _task(self, scan: NamedScan) -> Task:
-        to_raw = self.segmenter.taxonomy.to_raw
-        return Task(
-            scan.name,
-            lambda: self._read(scan),
-            self.segmenter,
-            lambda ids: write_labels(self.out / f"{scan.name}.label", to_raw(ids)),
-            self.out / f"{scan.name}.npz",
-        )
+        kept: list[np.ndarray] = []  # the file's own coordinates, from the reading to the writing
 
-    def _read(self, scan: NamedScan) -> Scan:
-        # Whichever of its scans comes first here, after an interruption or in another process: all have the same.
-        self.fitting.learn(scan.source, [one.read for one in self.first.pop(scan.source, [])])
-        return self.fitting(scan.read(), scan.source)
+        def read() -> Scan:
+            # Whichever of its scans comes first here, after an interruption or in another process: all have the same.
+            self.fitting.learn(scan.source, [one.read for one in self.first.pop(scan.source, [])])
+            cloud = scan.read()
+            kept[:] = [cloud.xyz]
+            return self.fitting(cloud, scan.source)
+
+        def write(result: Segmentation) -> Path:
+            known = None if result.rv is None or result.bev is None else result.uncertain
+            taxonomy = self.segmenter.taxonomy
+            return write_scan_labels(self.out / scan.name, self.kind, kept.pop(), result.labels, taxonomy, known)
+
+        return Task(scan.name, read, self.segmenter, write, self.out / f"{scan.name}.npz")
+
+    def _checked(self, path: Path, task: Task) -> Task:
+        """Hand back a task of a scan file.
+
+        Raises:
+            InputError: where what is written would lie beside the scans, and be taken for one or replace one.
+        """
+        mistaken = f".{self.kind}" in READERS or (self.scores and path.suffix.lower() == ".npz")
+        if mistaken and task.scores.parent.resolve() == path.parent.resolve():
+            raise InputError(f"{path}: expected another folder for the labels, found the scan's own; change --out")
+        return task
 
 
 def predict(
@@ -82,6 +103,8 @@ def predict(
     fitting: Fitting | None = None,
     resume: bool = False,
     processes: Processes = ALONE,
+    kind: str = "label",
+    uncertain: bool = False,
 ) -> int:
     """Segment data sets, scan files, bags and folders of them; returns how many label files there are now.
 
@@ -94,21 +117,28 @@ def predict(
         fitting: makes lone scans such as the weights know them; None measures all, and says nothing.
         resume: leave out what an interrupted run into `out` has done.
         processes: those that share the scans.
+        kind: the format that the labels of lone scans are written in, of `data.outputs.KINDS`.
+        uncertain: also write which points are uncertain, (N,) bool, as `.uncertain.npy`.
 
     Raises:
-        InputError: before anything is written where an input is not there; later where every scan is broken.
+        InputError: before anything is written where an input is not there or its folder is `out`, or the method has
+            no uncertain points; later where every scan is broken.
         SomeBroken: at the end, where some of several scans are.
     """
+    check_kind(kind)
+    if uncertain and segmenter.method in ("rv", "bev"):
+        raise InputError(f"expected a method of two networks for --uncertain, found {segmenter.method}; use amvnet")
     out, fitting = Path(out), fitting or Fitting(segmenter.weights)
-    lone = Lone(segmenter.by_ring(), fitting, out, topic)
+    lone = Lone(segmenter.by_ring(), fitting, out, topic, kind, scores)
     tasks = [task for text in inputs for task in _tasks(text, segmenter, lone, sequences, split)]
     _check_names(tasks)
     parts = {part: segmenter.weights.digest(part) for part in segmenter.weights.parts}
-    settings = {"weights": parts, "method": segmenter.method, "scores": scores, "sensor": repr(fitting.given)}
+    model = {"weights": parts, "method": segmenter.method, "sensor": repr(fitting.given)}
+    settings = {**model, "scores": scores, "uncertain": uncertain, "format": kind}
     journal = Journal(out, settings, resume, processes)
     mine = [task for task in processes.share(tasks) if str(task.scores.relative_to(out)) not in journal.done]
     broken: list[str] = []
-    for done, (task, fault) in enumerate(_stream(mine, scores)):
+    for done, (task, fault) in enumerate(_stream(mine, scores, uncertain)):
         progress(done, len(mine))
         if fault is None:
             journal.add(str(task.scores.relative_to(out)))
@@ -126,7 +156,7 @@ def predict(
     return len(tasks)
 
 
-def _stream(tasks: Sequence[Task], scores: bool) -> Iterator[tuple[Task, str | None]]:
+def _stream(tasks: Sequence[Task], scores: bool, uncertain: bool) -> Iterator[tuple[Task, str | None]]:
     """Each task when it is done, with what is wrong with its scan; only a few scans are in memory."""
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
         source, writing = iter(tasks), deque[tuple[Task, Future[None]]]()
@@ -140,7 +170,7 @@ def _stream(tasks: Sequence[Task], scores: bool) -> Iterator[tuple[Task, str | N
                 except InputError as error:
                     yield task, str(error)
                     continue
-                writing.append((task, writer.submit(_write, task, result, scores)))
+                writing.append((task, writer.submit(_write, task, result, scores, uncertain)))
                 while len(writing) > AHEAD:
                     yield _written(*writing.popleft())
             while writing:
@@ -149,10 +179,12 @@ def _stream(tasks: Sequence[Task], scores: bool) -> Iterator[tuple[Task, str | N
             reader.shutdown(wait=False, cancel_futures=True)
 
 
-def _write(task: Task, result: Segmentation, scores: bool) -> None:
+def _write(task: Task, result: Segmentation, scores: bool, uncertain: bool) -> None:
     if scores:
         write_scores(task.scores, result)
-    task.write(result.labels)
+    if uncertain:
+        write_uncertain(task.uncertain, result.uncertain)
+    task.write(result)
 
 
 def _written(task: Task, writing: Future[None]) -> tuple[Task, None]:
@@ -183,7 +215,7 @@ def _record_task(dataset: Dataset, record: ScanRecord, segmenter: Segmenter, out
         record.name,
         lambda: dataset.read(record, labels=False),
         segmenter,
-        lambda ids: dataset.write_prediction(record, out, ids),
+        lambda result: dataset.write_prediction(record, out, result.labels),
         (out / record.prediction).with_suffix(".npz"),
     )
 

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from amvnet.evaluation import Evaluation
 
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
+FormatName = Literal["label", "npy", "ply", "pcd", "las"]
 WEIGHTS = "sim-hdl64e"
 
 
@@ -94,6 +95,8 @@ def predict(
     sequences: str | None = None,
     scores: bool = False,
     resume: bool = False,
+    format: FormatName = "label",
+    uncertain: bool = False,
     device: str = "cpu",
     topic: str | None = None,
     sensor: str | None = None,
@@ -114,6 +117,8 @@ def predict(
         sequences: of data sets, which sequences or scenes instead, with commas.
         scores: also write the probabilities of both networks.
         resume: go on where an interrupted run into the folder stopped.
+        format: of lone scans' labels: raw ids alone (label, npy), or coloured points (ply, pcd, las).
+        uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         device: cpu, cuda, cuda:1, ...
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
         sensor: of lone scans, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
@@ -132,10 +137,10 @@ def predict(
     options = {"height": height, "intensity_scale": intensity_scale, "axes": axes, "rotate": rotate, "offset": offset}
     given = describe(sensor, **options)
     segmenter = Segmenter(weights, processes.device(device), method)
-    fitting = Fitting(segmenter.weights, given, say)
+    fitting, chosen = Fitting(segmenter.weights, given, say), names_in(sequences)
     with progress("segmenting") as step:
         written = segment(
-            inputs, segmenter, out, names_in(sequences), scores, step, split, topic, fitting, resume, processes
+            inputs, segmenter, out, chosen, scores, step, split, topic, fitting, resume, processes, format, uncertain
         )
     say(f"{written} label files in {out}")
 

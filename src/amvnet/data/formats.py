@@ -65,8 +65,10 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def is_scan(path: Path) -> bool:
-    """Whether the name of a file in a folder says that it is a scan or a bag, and not the scores of one."""
-    if path.name.startswith(".") or (path.suffix == ".npz" and path.with_suffix(".label").exists()):
+    """Whether the name of a file in a folder says that it is a scan or a bag, and not what was found of one."""
+    if path.name.startswith(".") or path.name.endswith(".uncertain.npy"):
+        return False
+    if path.suffix == ".npz" and path.with_suffix(".label").exists():
         return False
     return is_bag_folder(path) if path.is_dir() else path.name.lower().endswith(ENDINGS)
 
