@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from amvnet.errors import InputError
+    from amvnet.fusion import fuse
     from amvnet.scan import Scan
-    from amvnet.segmenter import Segmentation, Segmenter, fuse
+    from amvnet.segmenter import Segmentation, Segmenter
     from amvnet.simulation import simulate
 
 __all__ = ["InputError", "Scan", "Segmentation", "Segmenter", "fuse", "load", "simulate"]
@@ -26,7 +27,7 @@ _HOMES = {
     "Scan": "amvnet.scan",
     "Segmentation": "amvnet.segmenter",
     "Segmenter": "amvnet.segmenter",
-    "fuse": "amvnet.segmenter",
+    "fuse": "amvnet.fusion",
     "simulate": "amvnet.simulation",
 }
 

@@ -59,9 +59,7 @@ def predict(
     Raises:
         InputError: before anything is written where an input is not there; else at the scan that is broken.
     """
-    tasks = [task for text in inputs for task in _tasks(text, segmenter.taxonomy, Path(out), sequences, split)]
-    _check_names(tasks)
-    mine, written = processes.share(tasks), []
+    mine, written = processes.share(tasks_in(inputs, segmenter.taxonomy, Path(out), sequences, split)), []
     for done, task in enumerate(mine):
         progress(done, len(mine))
         result = segmenter(task.read())
@@ -202,7 +200,16 @@ def _present(dataset: Dataset, split: str) -> tuple[str, ...]:
         return ()
 
 
-def _tasks(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
+def tasks_in(
+    inputs: Sequence[str], taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None, split: str
+) -> list[Task]:
+    """The scans of all inputs; raises InputError where the files of two would have the same name."""
+    tasks = [task for text in inputs for task in _tasks_of(text, taxonomy, out, sequences, split)]
+    _check_names(tasks)
+    return tasks
+
+
+def _tasks_of(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
     if is_dataset(text):
         dataset = open_dataset(text, own_classes(taxonomy))
         check_classes(dataset, taxonomy)

@@ -22,6 +22,7 @@ from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.models.point_head import PointHead
 from amvnet.trees import from_dict, to_dict
 
 SIZES = {
@@ -105,13 +106,28 @@ class Weights:
         """
         model = build_amvnet(self.model, self.taxonomy.size)
         for part in self.parts:
-            try:
-                getattr(model, part).load_state_dict({k: v.float() for k, v in self.part(part).items()})
-            except RuntimeError:
-                raise InputError(f"the parameters of {part} do not fit its description; train it anew") from None
+            self._fill(part, getattr(model, part))
         if "point_head" not in self.parts:
             model.point_head = None
         return model.eval()
+
+    def build_head(self) -> PointHead:
+        """The point head alone, in evaluation mode.
+
+        Raises:
+            InputError: where there is none, or its parameters do not fit its sizes.
+        """
+        if "point_head" not in self.parts:
+            raise InputError("expected weights with a point head, found none; train one with --stage head")
+        head = PointHead(self.model.point_head, self.taxonomy.size)
+        self._fill("point_head", head)
+        return head.eval()
+
+    def _fill(self, part: str, module: torch.nn.Module) -> None:
+        try:
+            module.load_state_dict({k: v.float() for k, v in self.part(part).items()})
+        except RuntimeError:
+            raise InputError(f"the parameters of {part} do not fit its description; train it anew") from None
 
 
 def _only(values: Mapping[str, Any], name: str) -> dict[str, Any]:
