@@ -29,6 +29,7 @@ VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "evaluate": (verbs.evaluate, {"data": {"metavar": "DATA"}}),
     "submit": (verbs.submit, {"data": {"metavar": "DATA"}}),
     "fuse": (fusion_verbs.fuse, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
+    "rank": (fusion_verbs.rank, {"data": {"metavar": "DATA"}}),
     "analyze": (training_verbs.analyze, {"data": {"metavar": "DATA"}}),
     "ablate": (training_verbs.ablate, {"recipe": {"metavar": "RECIPE"}}),
     "view": (viewing_verbs.view, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
@@ -64,6 +65,7 @@ USAGE = f"""usage: amvnet VERB ...
   evaluate   score weights or predictions by the official formulas
   submit     pack or check predictions for a benchmark's server
   fuse       fuse the scores of any two models
+  rank       what to label next, and which labels look wrong
   analyze    the paper's figures, sweeps and tables
   ablate     the paper's ablation of the range-view network
   view       look at scans, labels and errors in 3D

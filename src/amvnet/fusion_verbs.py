@@ -1,4 +1,4 @@
-"""The verbs that build on the fusion of two models: fuse."""
+"""The verbs that build on how two models agree: fuse, rank."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.errors import InputError
-from amvnet.inputs import names_in, scores_in
+from amvnet.inputs import names_in, open_data, scores_in
 from amvnet.terminal import progress, say
 
 if TYPE_CHECKING:
@@ -56,6 +56,49 @@ def fuse(
     with progress("fusing") as step:
         written, uncertain = run(inputs, pair, fusion, classes, out, names_in(sequences), step, split)
     say(f"{len(written)} label files in {out}; the two models disagree on {uncertain:.1%} of the points")
+
+
+def rank(
+    data: str,
+    weights: str,
+    out: Path,
+    by: Literal["disagreement", "labels"] = "disagreement",
+    split: Literal["train", "val", "test", "all"] = "all",
+    sequences: str | None = None,
+    pictures: Path | None = None,
+    device: str = "cpu",
+) -> None:
+    """Say which clusters of points, and which scans, to look at next: to label them, or to correct their labels.
+
+    Args:
+        data: the data set.
+        weights: a weights file with both networks, or the name of a built-in one.
+        out: the table of the clusters, FILE.csv; that of the scans is written beside it, FILE-scans.csv.
+        by: what is doubted: disagreement of the two views (what to label next), or labels that both contradict.
+        split: the official split.
+        sequences: sequences or scenes instead, with commas.
+        pictures: folder for drawings of the first clusters from above.
+        device: cpu, cuda, cuda:1, ...
+    """
+    from amvnet import ranking
+    from amvnet.data.files import make_folder
+    from amvnet.jobs import choose_records, own_classes
+    from amvnet.ranking_pictures import draw
+    from amvnet.segmenter import Segmenter, widest_method
+    from amvnet.weights import load
+
+    given = load(weights)
+    dataset = open_data(data, None, own_classes(given.taxonomy))
+    records = choose_records(dataset, names_in(sequences), split)
+    segmenter = Segmenter(given, device, widest_method(given))
+    for folder in (out.parent, *([] if pictures is None else [pictures])):  # so that nothing is scored in vain
+        make_folder(folder)
+    with progress("scoring") as step:
+        found = ranking.rank(dataset, records, segmenter, by, step)
+    scans = ranking.write(found, dataset.taxonomy, out)
+    say(f"{len(found.clusters)} clusters in {out}, {len(records)} scans in {scans}")
+    if pictures is not None:
+        say(f"{len(draw(found, dataset, segmenter, by, pictures))} pictures in {pictures}")
 
 
 def _classes(inputs: list[str], text: str | None, head: Weights | None) -> Taxonomy:

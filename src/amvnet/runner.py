@@ -281,7 +281,7 @@ class Run:
         settings = self._settings(name, current)
         made = {**settings["training"], "sequences": names_of(self.train),
                 "validated_on": names_of(self.val), "scans": len(self.train),
-                **({} if self.scores is None else {"scores": self.scores.said()})}  # fmt: skip
+                **{key: settings[key] for key in ("scores",) if key in settings}}  # fmt: skip
 
         def write(module: nn.Module, path: Path, reached: dict[str, float]) -> None:
             seconds = round(time.time() - started)
