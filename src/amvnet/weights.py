@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from amvnet import hub
 from amvnet.config import ModelConfig
 from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
@@ -166,7 +167,9 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
 
 
 def load(name_or_path: str | Path) -> Weights:
-    """Read a weights file, or a built-in one by name (`sim-hdl64e`). Nothing in it is ever run.
+    """Read a weights file, a built-in one by name (`sim-hdl64e`), or one of the hub (`hf-hub:OWNER/NAME`).
+
+    Nothing in it is ever run.
 
     Raises:
         InputError: where there is no such file or name, or it is not a weights file of this project.
@@ -200,6 +203,8 @@ def built_in() -> dict[str, Path]:
 
 
 def _find(name_or_path: str) -> Path:
+    if name_or_path.startswith(hub.PREFIX):
+        return hub.fetch(name_or_path)
     path = built_in().get(name_or_path, Path(name_or_path))
     if path.is_dir() and (path / "weights.safetensors").is_file():
         return path / "weights.safetensors"  # the folder of a training run
