@@ -90,7 +90,16 @@ def things() -> tuple[np.ndarray, np.ndarray]:
     thing = np.repeat([0, 1, 2, 3], [100, 100, 100, 1])
     points = rng.uniform(-0.5, 0.5, (301, 4)).astype(np.float32) + thing[:, None] * [10, 0, 0, 0]
     points[-1, 0] = np.nan
+    points[:, 1] += 5
     return points.astype(np.float32), thing
+
+
+def test_the_vehicle_that_carries_the_sensor_is_not_doubted() -> None:
+    points, thing = things()
+    points[thing == 0, :3] *= (1, 0.1, 1)  # to half a metre from the sensor
+    f, g = (sure(np.full(301, kind)) for kind in (CAR, PERSON))
+    _, of = clusters_of(doubts_of(Scan(points), Said(f, g), "disagreement"))
+    assert np.array_equal(of >= 0, (thing == 1) | (thing == 2))
 
 
 def test_a_disagreement_is_one_cluster_where_it_is() -> None:

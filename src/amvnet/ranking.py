@@ -23,6 +23,7 @@ from amvnet.segmenter import Segmenter, checked_scan, in_place
 
 By = Literal["disagreement", "labels"]
 
+NEAR = 1.5  # metres: what is nearer to the sensor is the vehicle that carries it
 FEW = 20.0  # points: a cluster counts as if so many more of it were beyond doubt, so that stray points do not lead
 COMMON = 0.5  # power of how often the views contradict labels so: a mistake that they make often says less
 COLUMNS = ("rank", "scan", "score", "x", "y", "z", "points", "point", "rv", "bev", "label")
@@ -118,7 +119,6 @@ def rank(
     return Ranking(records, rows[order], scans, means[scans], sizes[scans])
 
 
-@torch.inference_mode()
 def doubts_of(scan: Scan, segmenter: Segmenter, by: By) -> Doubts:
     """What is doubted of one scan's points.
 
@@ -130,17 +130,23 @@ def doubts_of(scan: Scan, segmenter: Segmenter, by: By) -> Doubts:
     scores, uncertain = segmenter.scores_by_method(scan, ("rv", "bev"))
     assert uncertain is not None
     f, g = scores["rv"], scores["bev"]
-    rv, bev = (in_place((one.argmax(dim=1) + 1).to(torch.uint8), scan.valid) for one in (f, g))
+    xyz, valid = scan.points[:, :3], scan.valid
+    seen = torch.from_numpy(np.hypot(*scan.points[valid, :2].T) >= NEAR).to(f.device)
+    rv, bev = (in_place((one.argmax(dim=1) + 1).to(torch.uint8), valid) for one in (f, g))
     label = np.zeros(len(scan), dtype=np.uint8) if scan.labels is None else scan.labels
     if by == "disagreement":
-        doubt = in_place((1 - cosine_similarity(f, g)).clamp(0, 1) * uncertain, scan.valid)
-        return Doubts(scan.points[:, :3], doubt, rv, bev, label, _pair(rv, bev))
-    found = _contradicted(f, g, torch.from_numpy(label[scan.valid]).to(f.device))
-    doubt, said = (in_place(one, scan.valid) for one in found)
-    whole = np.ones(len(scan))
-    thing = cluster(scan.points[scan.valid, :3], label[scan.valid])
-    whole[scan.valid] = np.bincount(thing)[thing]
-    return Doubts(scan.points[:, :3], doubt, rv, bev, label, _pair(label, said), whole)
+        doubt = in_place((1 - cosine_similarity(f, g)).clamp(0, 1) * (uncertain & seen), valid)
+        return Doubts(xyz, doubt, rv, bev, label, _pair(rv, bev))
+    against, said = _contradicted(f, g, torch.from_numpy(label[valid]).to(f.device))
+    doubt, kind = in_place(against * seen, valid), _pair(label, in_place(said, valid))
+    return Doubts(xyz, doubt, rv, bev, label, kind, _sizes_of_things(xyz, label, valid))
+
+
+def _sizes_of_things(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """(N,) how many points the connected thing of one label has that a point is part of."""
+    sizes, thing = np.ones(len(xyz)), cluster(xyz[valid], label[valid])
+    sizes[valid] = np.bincount(thing)[thing]
+    return sizes
 
 
 def _contradicted(f: torch.Tensor, g: torch.Tensor, label: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
