@@ -156,7 +156,7 @@ def test_broken_scores_are_one_line_that_says_what_to_do(world: Path, tmp_path: 
         code, error = amvnet("fuse", tmp_path / "one", *scores, "--out", tmp_path / "out")
         assert (code, error.count("\n")) == (2, 1), kind
         assert all(word in error for word in words), (kind, error)
-        assert not (tmp_path / "out").exists(), kind
+        assert not files(tmp_path / "out"), kind
 
 
 def test_wrong_options_are_one_line(world: Path, tmp_path: Path) -> None:

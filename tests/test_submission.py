@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import shlex
 import shutil
 import zipfile
 from pathlib import Path
@@ -13,7 +11,7 @@ import numpy as np
 import pytest
 from submissions import TEST, Case, measured, write_files
 from test_data import make_nuscenes
-from worlds import GOLDEN, amvnet, fails, files, fresh_weights, street, write_scan
+from worlds import GOLDEN, amvnet, commands_of, fails, files, fresh_weights, street, write_scan
 
 from amvnet import submission
 from amvnet.data.catalog import open_dataset
@@ -222,11 +220,10 @@ def test_every_command_of_the_page_runs(
         write_scan(tmp_path / "data/semantickitti", sequence, "000000", *street(int(sequence)))
     save(fresh_weights(), tmp_path / "runs/kitti/weights.safetensors")
     save(fresh_weights(NUSCENES), tmp_path / "runs/nuscenes/weights.safetensors")
-    page = (Path(__file__).parents[1] / "docs/submission.md").read_text()
-    commands = [line for block in re.findall(r"```bash\n(.*?)```", page, re.S) for line in block.splitlines()]
+    commands = commands_of("docs/submission.md")
     assert len(commands) >= 8
     for command in commands:
-        words = shlex.split(command.replace("/data/", f"{tmp_path}/data/"))
+        words = [word.replace("/data/", f"{tmp_path}/data/") for word in command]
         if "val" in words:
             amvnet("predict", words[2], "--sequences", "08", "--weights", "runs/kitti", "--out", "predictions")
         assert words[0] == "amvnet"

@@ -313,6 +313,13 @@ def test_where_the_networks_agree_everywhere_the_head_learns_from_all_points(wor
     assert max(column(tmp_path / "run", "head", "val/acc")) > 0.5
 
 
+def test_the_head_learns_where_the_loss_is_high(world: Path, run: Path, tmp_path: Path) -> None:
+    options = ("--stage", "head", "--init", run, "--model.assertion.name", "loss", "--model.assertion.threshold", 0.5)
+    weights = train(world, tmp_path / "run", *options)
+    assert weights.model.assertion.name == "loss"
+    assert differing(load(run), weights) == {"point_head"}
+
+
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(world: Path, tmp_path: Path, stage: str) -> None:
     options = ("--stage", stage, f"--training.{stage}.lr", "1e38", f"--training.{stage}.clip", "1e38")
@@ -443,11 +450,13 @@ def test_the_scans_of_validation_can_be_learnt_too(world: Path, tmp_path: Path) 
 def test_a_dry_run_says_what_a_training_would_cost_and_leaves_nothing(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    train_arguments = ("--data", world / "data", "--out", tmp_path / "run", "--training.bev.accumulate", 2)
+    batches = ("--training.rv.batch", 6, "--training.bev.accumulate", 2)  # of four scans
+    train_arguments = ("--data", world / "data", "--out", tmp_path / "run", *batches)
     assert amvnet("train", world / "recipe.yaml", *train_arguments, "--dry-run") == (0, "")
     said = [line for line in capsys.readouterr().out.splitlines() if "would take" in line]
     assert [line.split(":")[0] for line in said] == ["rv", "bev"]
-    assert all("step of 2 scans" in line and "3 epochs of 4 scans" in line and "GiB" in line for line in said)
+    assert ["step of 6 scans" in said[0], "step of 2 scans" in said[1]] == [True, True]
+    assert all("3 epochs of 4 scans" in line and "GiB" in line for line in said)
     assert not (tmp_path / "run").exists()
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pages import Browser, Page, browser, places, read_page
-from worlds import GOLDEN, amvnet, files, fresh_weights, make_streets, street, without
+from worlds import GOLDEN, amvnet, commands_of, files, fresh_weights, make_streets, street, without
 
 from amvnet import page as pages
 from amvnet import view
@@ -406,9 +406,7 @@ def test_the_commands_of_the_documentation_run(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(view, "check_window", lambda: None)
     monkeypatch.setattr(view, "open_window", lambda frames, taxonomy: opened.append(1))
     monkeypatch.chdir(tmp_path)
-    text = (Path(__file__).parent.parent / "docs/viewing.md").read_text()
-    lines = [line for block in re.findall(r"```bash\n(.*?)```", text, re.S) for line in block.splitlines()]
-    commands = [line.split("#")[0].split()[1:] for line in lines if line.startswith("amvnet ")]
+    commands = [words[1:] for words in commands_of("docs/viewing.md") if words[0] == "amvnet"]
     assert commands
     for command in commands:
         if "--save" in command and find_spec("rerun") is None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -119,6 +121,14 @@ def amvnet(*arguments: object) -> tuple[int, str]:
     with contextlib.redirect_stderr(stderr):
         code = main([str(a) for a in arguments])
     return code, stderr.getvalue()
+
+
+def commands_of(page: str) -> list[list[str]]:
+    """The words of every command in the bash blocks of a page of the documentation, named from the project's root."""
+    text = (Path(__file__).parents[1] / page).read_text()
+    blocks = re.findall(r"```bash\n(.*?)```", text, re.S)
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return [words for words in (shlex.split(line, comments=True) for line in lines) if words]
 
 
 def files(folder: Path) -> set[str]:

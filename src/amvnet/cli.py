@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from amvnet import __version__, fusion_verbs, training_verbs, verbs, viewing_verbs
 from amvnet.arguments import Parser, Positional, parser_of
-from amvnet.errors import InputError
+from amvnet.errors import InputError, SomeBroken
 from amvnet.terminal import say
 
 if TYPE_CHECKING:
     from amvnet.config import Recipe
 
-DONE, FAILED, WRONG_INPUT = 0, 1, 2
+DONE, FAILED, WRONG_INPUT, SOME_BROKEN = 0, 1, 2, 3
 SHARED = ("train", "predict", "evaluate", "ablate")  # the verbs that several processes can share
 
 VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
@@ -76,7 +76,7 @@ USAGE = f"""usage: amvnet VERB ...
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; returns the exit code: 0 done, 2 the input is wrong, 1 anything else."""
+    """Run one verb; returns the exit code: 0 done, 2 the input is wrong, 3 some of many inputs are, 1 anything else."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
         say(USAGE)
@@ -89,6 +89,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"amvnet: {error}", file=sys.stderr)
         return WRONG_INPUT
+    except SomeBroken as error:
+        for fault in error.faults:
+            print(f"amvnet: {fault}", file=sys.stderr)
+        print(f"amvnet: {error}", file=sys.stderr)
+        return SOME_BROKEN
     except OSError as error:  # a full disk, say; what was there before is still whole
         print(f"amvnet: {error.filename or 'the disk'}: {error.strerror}; mend this and go on", file=sys.stderr)
         return FAILED

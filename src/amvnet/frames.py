@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.catalog import is_dataset, open_dataset
-from amvnet.data.files import find_scans, read_labels, read_scan
+from amvnet.data.files import find_scans, read_labels
+from amvnet.data.formats import NamedScan, ending_of, named_scans, stem
 from amvnet.data.labels import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
-from amvnet.jobs import Progress, check_classes, choose_records, own_classes, stem
+from amvnet.fitting import Fitting
+from amvnet.jobs import Progress, check_classes, choose_records, own_classes
 from amvnet.models.assertions import cosine_similarity
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter, checked_scan, in_place, labels_in_place
@@ -53,11 +55,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class Source:
-    """One scan to look at: how it is read, and the labels of its N points from a folder that the user gave."""
+    """One scan to look at: how it is read, its labels from a folder that the user gave, what segments it."""
 
     name: str
     read: Callable[[], Scan]
     read_labels: Callable[[Path, int], np.ndarray]
+    segmenter: Segmenter | None = None
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,6 @@ class Frames:
     taxonomy: Taxonomy
     sources: Sequence[Source]
     labels: Path | None = None
-    segmenter: Segmenter | None = None
 
     def __len__(self) -> int:
         return len(self.sources)
@@ -83,7 +85,7 @@ class Frames:
         scan = checked_scan(source.read())
         given = {} if self.labels is None else {"labels": source.read_labels(self.labels, len(scan))}
         frame = Frame(source.name, scan.points, scan.valid, scan.labels, given)
-        return frame if self.segmenter is None else _segmented(frame, scan, self.segmenter)
+        return frame if source.segmenter is None else _segmented(frame, scan, source.segmenter)
 
 
 def choose_frames(
@@ -119,7 +121,7 @@ def choose_frames(
     if labels is not None and labels.is_file() and len(sources) > 1:
         raise InputError(f"{labels}: expected a folder of labels for {len(sources)} scans, found a file; give a folder")
     places = np.linspace(0, len(sources) - 1, min(count, len(sources))).round().astype(int)
-    return Frames(found[0][0], [sources[place] for place in places], labels, segmenter)
+    return Frames(found[0][0], [sources[place] for place in places], labels)
 
 
 def _segmented(frame: Frame, scan: Scan, segmenter: Segmenter) -> Frame:
@@ -148,22 +150,31 @@ def _sources(
         if segmenter is not None:
             check_classes(dataset, segmenter.taxonomy)
         records = choose_records(dataset, sequences, "all")
-        return dataset.taxonomy, [_record_source(dataset, record) for record in records]
+        return dataset.taxonomy, [_record_source(dataset, record, segmenter) for record in records]
     paths = find_scans(text)
-    ours = NUSCENES if paths[0].name.lower().endswith(".pcd.bin") else SEMANTICKITTI
+    ours = NUSCENES if ending_of(paths[0]) == ".pcd.bin" else SEMANTICKITTI
     taxonomy = given or (ours if segmenter is None else segmenter.taxonomy)
-    return taxonomy, [_file_source(path, taxonomy) for path in paths]
+    fit = None if segmenter is None else Fitting(segmenter.weights)
+    by_ring = None if segmenter is None else segmenter.by_ring()
+    return taxonomy, [_lone_source(scan, taxonomy, by_ring, fit) for path in paths for scan in named_scans(path)]
 
 
-def _record_source(dataset: Dataset, record: ScanRecord) -> Source:
+def _record_source(dataset: Dataset, record: ScanRecord, segmenter: Segmenter | None) -> Source:
     # A token says nothing to people; the last part of nuScenes' names of files is the time.
     name = record.name if "/" in record.name else f"{record.sequence}/{stem(record.points_path).split('__')[-1]}"
-    return Source(name, lambda: dataset.read(record), lambda folder, count: dataset.read_prediction(record, folder))
+
+    def labels(folder: Path, count: int) -> np.ndarray:
+        return dataset.read_prediction(record, folder)
+
+    return Source(name, lambda: dataset.read(record), labels, segmenter)
 
 
-def _file_source(path: Path, taxonomy: Taxonomy) -> Source:
+def _lone_source(scan: NamedScan, taxonomy: Taxonomy, segmenter: Segmenter | None, fit: Fitting | None) -> Source:
+    def read() -> Scan:
+        return scan.read().to_scan() if fit is None else fit(scan.read(), scan.source)
+
     def labels(place: Path, count: int) -> np.ndarray:
-        file = place / f"{stem(path)}.label" if place.is_dir() else place
+        file = place / f"{scan.name}.label" if place.is_dir() else place
         return read_labels(file, np.uint32, count, taxonomy.to_train)
 
-    return Source(path.name, lambda: read_scan(path), labels)
+    return Source(scan.name, read, labels, segmenter)

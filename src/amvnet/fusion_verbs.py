@@ -27,6 +27,7 @@ def fuse(
     split: Literal["train", "val", "test", "all"] = "all",
     sequences: str | None = None,
     taxonomy: str | None = None,
+    topic: str | None = None,
 ) -> None:
     """Fuse the scores of any two models: labels by the point head, or by the ensemble.
 
@@ -44,18 +45,18 @@ def fuse(
         split: of data sets, the official split.
         sequences: of data sets, which sequences or scenes instead, with commas.
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the head's or data's.
+        topic: of bags, the topic of the scans; default: the only one with PointCloud2.
     """
     from amvnet.fusing import fuse as run
-    from amvnet.fusion import Fusion
     from amvnet.weights import load
 
     pair = scores_in(scores_a, scores_b, key_a, key_b, logits)
     assert pair is not None
     given = None if head is None else load(head)
-    classes, fusion = _classes(inputs, taxonomy, given), Fusion(given, tau)
+    classes = _classes(inputs, taxonomy, given)
     with progress("fusing") as step:
-        written, uncertain = run(inputs, pair, fusion, classes, out, names_in(sequences), step, split)
-    say(f"{len(written)} label files in {out}; the two models disagree on {uncertain:.1%} of the points")
+        written, uncertain = run(inputs, pair, given, classes, out, names_in(sequences), step, split, tau, topic)
+    say(f"{written} label files in {out}; the two models disagree on {uncertain:.1%} of the points")
 
 
 def rank(

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from amvnet.data.records import ScanRecord
+from amvnet.errors import InputError
+from amvnet.models.assertions import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.scan import Scan
 from amvnet.score_files import SURE, ScorePair
@@ -70,12 +72,22 @@ class Files:
 
 
 def source_of(networks: Weights, scores: ScorePair | None, records: Sequence[ScanRecord]) -> Source:
-    """The networks, or files of scores where there are any."""
-    return Networks(networks, records) if scores is None else Files(scores, records, networks.taxonomy.size)
+    """The networks, or files of scores where there are any.
+
+    Raises:
+        InputError: where there are no files, and a network is missing.
+    """
+    if scores is not None:
+        return Files(scores, records, networks.taxonomy.size)
+    if missing := [part for part in ("range_net", "polar_net") if part not in networks.parts]:
+        raise InputError(f"expected trained networks for the head, found no {missing[0]}; train it, or give --init")
+    return Networks(networks, records)
 
 
 def scored_with(networks: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
     """The (P, K) scores of a batch by AMVNet whose head is being trained."""
     model = networks.build()
     model.point_head = head
+    if networks.model.assertion.name == "loss":  # which needs labels, that a picture of a prediction must not know
+        model.assertion = Disagreement()
     return lambda batch: model.to(batch.points.device)(batch).merged

@@ -40,7 +40,7 @@ def listed(records: Sequence[ScanRecord]) -> str:
     """How many scans there are, of which sequences."""
     names = sorted({record.sequence for record in records})
     shown = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
-    return f"{len(records)} scans of {shown}"
+    return f"{len(records)} scans of {shown}" if records else "none"
 
 
 def names_in(text: str | None) -> list[str] | None:

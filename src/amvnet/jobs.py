@@ -1,15 +1,12 @@
-"""The jobs behind the verbs: predict, evaluate, demo. They print nothing; `progress` is told how far they are."""
+"""Jobs behind the verbs: which scans there are, and scoring them; they print nothing."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.catalog import is_dataset, open_dataset
-from amvnet.data.files import find_scans, read_scan, whole_file, write_labels
 from amvnet.data.labels import TAXONOMIES, Taxonomy
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
@@ -17,7 +14,7 @@ from amvnet.evaluation import Evaluation
 from amvnet.pictures import draw_scan
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
-from amvnet.segmenter import COMPARED, Segmentation, Segmenter, checked_scan
+from amvnet.segmenter import COMPARED, Segmenter, checked_scan
 
 Progress = Callable[[int, int], None]  # done, in all
 PICTURES = 4  # scans that are drawn, evenly spaced
@@ -25,56 +22,6 @@ PICTURES = 4  # scans that are drawn, evenly spaced
 DEMO_SEED = 20_201_209  # far from the seeds of the streets that the shipped weights were trained on
 DEMO_SCANS = 6
 DEMO_SEQUENCES = 3
-
-
-@dataclass(frozen=True)
-class Task:
-    """One scan to segment: how it is read, and where its labels go."""
-
-    name: str
-    read: Callable[[], Scan]
-    write: Callable[[np.ndarray], Path]
-    scores: Path
-
-
-def predict(
-    inputs: Sequence[str],
-    segmenter: Segmenter,
-    out: Path,
-    sequences: Sequence[str] | None = None,
-    scores: bool = False,
-    progress: Progress = lambda done, total: None,
-    split: str = "all",
-    processes: Processes = ALONE,
-) -> list[Path]:
-    """Segment data sets, scan files and folders of them; returns the files of labels that this process has written.
-
-    Args:
-        inputs: each a data set as `open_dataset` takes it, a scan file, or a folder of scan files.
-        sequences: of data sets, which to segment; None means those of `split`.
-        scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` of an `.npz`.
-        split: the official split of data sets.
-        processes: those that share the scans.
-
-    Raises:
-        InputError: before anything is written where an input is not there; else at the scan that is broken.
-    """
-    mine, written = processes.share(tasks_in(inputs, segmenter.taxonomy, Path(out), sequences, split)), []
-    for done, task in enumerate(mine):
-        progress(done, len(mine))
-        result = segmenter(task.read())
-        if scores:
-            write_scores(task.scores, result)
-        written.append(task.write(result.labels))
-    progress(len(mine), len(mine))
-    return written
-
-
-def write_scores(path: Path, result: Segmentation) -> None:
-    """Both networks' probabilities, (N, K) float16, as `rv` and `bev` of an `.npz`."""
-    found = {name: v.astype(np.float16) for name, v in (("rv", result.rv), ("bev", result.bev)) if v is not None}
-    with whole_file(path) as part:
-        np.savez_compressed(part, **found)  # type: ignore[arg-type]  # of the arrays, none is an option
 
 
 def evaluate(
@@ -198,57 +145,3 @@ def _present(dataset: Dataset, split: str) -> tuple[str, ...]:
         return dataset.sequences(split)
     except InputError:
         return ()
-
-
-def tasks_in(
-    inputs: Sequence[str], taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None, split: str
-) -> list[Task]:
-    """The scans of all inputs; raises InputError where the files of two would have the same name."""
-    tasks = [task for text in inputs for task in _tasks_of(text, taxonomy, out, sequences, split)]
-    _check_names(tasks)
-    return tasks
-
-
-def _tasks_of(text: str, taxonomy: Taxonomy, out: Path, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
-    if is_dataset(text):
-        dataset = open_dataset(text, own_classes(taxonomy))
-        check_classes(dataset, taxonomy)
-        for record in choose_records(dataset, sequences, split):
-            yield _record_task(dataset, record, out)
-        return
-    for path in find_scans(text):
-        yield _file_task(path, taxonomy, out)
-
-
-def _record_task(dataset: Dataset, record: ScanRecord, out: Path) -> Task:
-    return Task(
-        record.name,
-        lambda: dataset.read(record, labels=False),
-        lambda ids: dataset.write_prediction(record, out, ids),
-        (out / record.prediction).with_suffix(".npz"),
-    )
-
-
-def _file_task(path: Path, taxonomy: Taxonomy, out: Path) -> Task:
-    return Task(
-        path.name,
-        lambda: read_scan(path),
-        lambda ids: write_labels(out / f"{stem(path)}.label", taxonomy.to_raw(ids)),
-        out / f"{stem(path)}.npz",
-    )
-
-
-def stem(path: Path) -> str:
-    """A scan file's name without its ending, `.pcd.bin` included."""
-    return path.name.removesuffix(".pcd.bin") if path.name.endswith(".pcd.bin") else path.stem
-
-
-def _check_names(tasks: Sequence[Task]) -> None:
-    seen: dict[Path, str] = {}
-    for task in tasks:
-        if task.scores in seen:
-            raise InputError(
-                f"expected scans of different names, found {task.name} twice ({task.scores.stem}); "
-                "segment them in two runs with two folders"
-            )
-        seen[task.scores] = task.name

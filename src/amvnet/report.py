@@ -15,7 +15,27 @@ from amvnet.data.labels import Taxonomy
 from amvnet.recipes import recipe_names
 from amvnet.weights import built_in
 
-TITLES = {"rv": "RV", "bev": "BEV", "arithmetic": "arithmetic mean", "amvnet": "AMVNet"}
+TITLES = {
+    "rv": "RV",
+    "bev": "BEV",
+    "arithmetic": "arithmetic mean",
+    "maximum": "maximum",
+    "ensemble": "ensemble",
+    "amvnet": "AMVNet",
+}
+PACKAGES = (
+    "amvnet",
+    "torch",
+    "lightning",
+    "numpy",
+    "scipy",
+    "safetensors",
+    "trimesh",
+    "embreex",
+    "laspy",
+    "rosbags",
+    "huggingface_hub",
+)
 OVERALL = {"miou": "mIoU", "miou_present": "mIoU, classes present", "accuracy": "accuracy", "fwiou": "fwIoU"}
 
 
@@ -67,17 +87,7 @@ def timing_table(timing: Timing) -> Table:
 def installation_table() -> Table:
     """What is installed: versions, devices, built-in weights and recipes."""
     table = Table(title="AMVNet", show_header=False, show_edge=False)
-    for name in (
-        "amvnet",
-        "torch",
-        "lightning",
-        "numpy",
-        "scipy",
-        "safetensors",
-        "trimesh",
-        "embreex",
-        "huggingface_hub",
-    ):
+    for name in PACKAGES:
         table.add_row(name, _version(name))
     table.add_row("python", platform.python_version())
     gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]

@@ -175,14 +175,18 @@ class Run:
         for name in [n for n in ("rv", "bev") if stage in (n, "all")]:
             config = self._config(name)
             with TemporaryDirectory() as folder:
-                trial = dataclasses.replace(self, out=Path(folder), val=(), resume=False, say=lambda line: None)
+                # Whole steps, where there are fewer scans, too.
+                scans = [self.train[place % len(self.train)] for place in range(TRIAL_STEPS * config.batch)]
+                trial = dataclasses.replace(self, train=scans, val=(), out=Path(folder), resume=False)
+                trial.say = lambda line: None
                 # The classes' weights cost a look at every scan, and nothing else.
                 speed = trial._fit_network(name, fresh, np.ones(self.dataset.taxonomy.size), TRIAL_STEPS)
-            steps = -(-len(self.train) // config.batch) * config.epochs
+            step = speed.seconds[-1]
+            hours = -(-len(self.train) // config.batch) * config.epochs * step / 3600
             yield (
-                f"{name}: {speed.seconds[-1]:.1f} s for a step of {config.batch} scans "
-                f"({config.batch / speed.seconds[-1]:.3g} scans/s), memory so far {speed.memory / 2**30:.1f} GiB; "
-                f"{config.epochs} epochs of {len(self.train)} scans would take {steps * speed.seconds[-1] / 3600:.1f} h"
+                f"{name}: {step:.3g} s for a step of {config.batch} scans ({config.batch / step:.3g} scans/s), "
+                f"memory so far {speed.memory / 2**30:.1f} GiB; "
+                f"{config.epochs} epochs of {len(self.train)} scans would take {hours:.3g} h"
             )
 
     def _config(self, name: str) -> NetworkTraining:
@@ -214,14 +218,11 @@ class Run:
 
     def _fit_head(self, current: Weights) -> None:
         training, config = self.recipe.training, self.recipe.training.head
-        missing = [part for part in ("range_net", "polar_net") if part not in current.parts]
-        if missing and self.scores is None:
-            raise InputError(f"expected trained networks for the head, found no {missing[0]}; train it, or give --init")
-        folder = self._folder("head")
+        folder, validated = self._folder("head"), source_of(current, self.scores, self.val)
         gather = functools.partial(gather_points, dataset=self.dataset, model=current.model, training=training,
                                    processes=self.processes)  # fmt: skip
         train = gather(self._sources(current), views=config.views, folder=folder / "train", say=self.say)
-        val = gather([source_of(current, self.scores, self.val)], views=0, folder=folder / "val") if self.val else None
+        val = gather([validated], views=0, folder=folder / "val") if self.val else None
         head = self._module(PART["head"], current).point_head
         assert head is not None
         weights = class_weights(self._counts()) if config.class_weights else None

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -17,6 +18,7 @@ from amvnet.models.amvnet import ENSEMBLES, Scores, merge
 from amvnet.models.layers import fold_batch_norms
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
+from amvnet.views.range_view import RangeView
 from amvnet.weights import Weights, load
 
 Method = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
@@ -86,6 +88,13 @@ class Segmenter:
         scan = checked_scan(points)
         scores = self._scores(PointBatch.of([scan]).to(self.device))
         return segmentation(scan.valid, scores)
+
+    def by_ring(self) -> Segmenter:
+        """The same for scans whose `ring` is the row of each point, 0 the lowest, whatever rows the weights have."""
+        other = copy.copy(self)
+        other.model = copy.copy(self.model)
+        other.model.range_view = RangeView(replace(self.model.range_view.config, rows="ring"))
+        return other
 
     def by_method(
         self, scan: Scan, methods: Sequence[str] = COMPARED

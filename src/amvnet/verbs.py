@@ -30,6 +30,7 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
     """
     from amvnet import jobs
     from amvnet.data.semantickitti import SemanticKitti
+    from amvnet.prediction import predict as segment
     from amvnet.segmenter import Segmenter
     from amvnet.simulation import simulate as write
 
@@ -40,7 +41,7 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
     dataset = SemanticKitti(out / "data")
     records = jobs.choose_records(dataset, None, "all")
     with progress("segmenting") as step:
-        jobs.predict([str(out / "data")], segmenter, out / "predictions", progress=step)
+        segment([str(out / "data")], segmenter, out / "predictions", progress=step)
     with progress("scoring") as step:
         label = jobs.by_weights(dataset, segmenter)
         found = jobs.evaluate(dataset, records, label, out / "pictures", step)
@@ -92,28 +93,51 @@ def predict(
     split: Literal["train", "val", "test", "all"] = "all",
     sequences: str | None = None,
     scores: bool = False,
+    resume: bool = False,
     device: str = "cpu",
+    topic: str | None = None,
+    sensor: str | None = None,
+    height: float | None = None,
+    intensity_scale: float | None = None,
+    axes: str | None = None,
+    rotate: str | None = None,
+    offset: str | None = None,
 ) -> None:
-    """Segment data sets, scans, or folders of scans.
+    """Segment data sets, scans, bags, or folders of scans.
 
     Args:
-        inputs: data sets, scan files, or folders of scans.
+        inputs: data sets, scan files, bags, or folders of these.
         weights: a weights file, or the name of a built-in one.
         out: folder for the labels.
         method: the whole of AMVNet, or a part of it.
         split: of data sets, the official split.
         sequences: of data sets, which sequences or scenes instead, with commas.
         scores: also write the probabilities of both networks.
+        resume: go on where an interrupted run into the folder stopped.
         device: cpu, cuda, cuda:1, ...
+        topic: of bags, the topic of the scans; default: the only one with PointCloud2.
+        sensor: of lone scans, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
+        height: of lone scans, the sensor's metres over the ground; default: measured.
+        intensity_scale: of lone scans, the largest intensity there can be; default: 1, 255 or 65535 by the values.
+        axes: of lone scans, x-forward (y left), y-forward (x right), z-forward (y down) or z-down (y right).
+        rotate: of lone scans, yaw,pitch,roll in degrees that turn them level.
+        offset: of lone scans, metres to add to x,y,z after that.
     """
-    from amvnet import jobs
+    from amvnet.fitting import Fitting
+    from amvnet.prediction import predict as segment
     from amvnet.segmenter import Segmenter
+    from amvnet.sensors import describe
 
     processes = meet()
+    options = {"height": height, "intensity_scale": intensity_scale, "axes": axes, "rotate": rotate, "offset": offset}
+    given = describe(sensor, **options)
     segmenter = Segmenter(weights, processes.device(device), method)
+    fitting = Fitting(segmenter.weights, given, say)
     with progress("segmenting") as step:
-        written = jobs.predict(inputs, segmenter, out, names_in(sequences), scores, step, split, processes)
-    say(f"{sum(processes.gather(len(written)))} label files in {out}")
+        written = segment(
+            inputs, segmenter, out, names_in(sequences), scores, step, split, topic, fitting, resume, processes
+        )
+    say(f"{written} label files in {out}")
 
 
 def evaluate(

@@ -65,7 +65,7 @@ def _show(chosen: Frames, title: str, html: Path | None, save: Path | None) -> N
     from amvnet.page import write_page
     from amvnet.view import open_window, save_recording
 
-    with progress("reading" if chosen.segmenter is None else "segmenting") as step:
+    with progress("looking") as step:
         made = chosen.each(step)
         frames = list(made) if html is not None and save is not None else made
         if save is not None:

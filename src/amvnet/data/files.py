@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
+from amvnet.data.formats import ENDINGS, is_bag_folder, is_scan, read_cloud
+from amvnet.data.raw import FULL_INTENSITY, KITTI_COLUMNS, NUSCENES_COLUMNS, read_table, ring_column
+from amvnet.data.raw import count_rows as count_rows
 from amvnet.errors import InputError
 from amvnet.scan import Scan
-
-KITTI_COLUMNS = 4  # x, y, z, intensity
-NUSCENES_COLUMNS = 5  # x, y, z, intensity 0..255, ring
-FULL_INTENSITY = 255.0
 
 
 @contextmanager
@@ -42,13 +41,13 @@ def whole_file(path: Path | str) -> Iterator[Path]:
 
 
 def read_scan(path: Path | str) -> Scan:
-    """Read a lone scan; the ending of its name says the format.
+    """Read a lone scan; what is in the file says the format, its name only where that does not.
 
-    `.pcd.bin`: float32 rows x, y, z, intensity (0..255), ring, as nuScenes has them.
-    `.bin`: float32 rows x, y, z, intensity, as KITTI has them.
-    `.npy`: (N, 3..5) numbers, in that order; without a fourth column the intensity is 0.
+    Rows of float32 (x, y, z, intensity as KITTI has them, or x, y, z, intensity 0..255, ring as nuScenes), `.npy` and
+    `.npz` ((N, 3..), or (H, W, C) row by row), `.pcd`, `.ply`, `.las`, `.laz`, and bags of one scan.
 
-    In `.bin` and `.npy` the intensity is taken as 0..255 where any value is above 1, and scaled.
+    The intensity is taken as 0..255 where a value is above 1, as 0..65535 where one is above 255, and scaled. A
+    point at 0, 0, 0 is a lost return: its place is kept, its coordinates become NaN.
 
     Returns:
         Scan with points (N, 4), metres and intensity in [0, 1], `ring` where the file has it.
@@ -56,52 +55,23 @@ def read_scan(path: Path | str) -> Scan:
     Raises:
         InputError: where the file is missing, of another format, truncated, empty or all NaN.
     """
-    path = Path(path)
-    for ending, read in READERS.items():
-        if path.name.lower().endswith(ending):
-            return read(path)
-    raise InputError(f"{path}: expected a scan file ({', '.join(READERS)}), found another ending; convert it to one")
+    return read_cloud(path).to_scan()
 
 
 def find_scans(path: Path | str) -> list[Path]:
-    """List the scan files of a folder, sorted by name (hidden ones left out); a file is its own list.
+    """List the scan files and bags of a folder, sorted by name (hidden ones left out); a file is its own list.
 
     Raises:
         InputError: where the path is not there or the folder has no scan.
     """
     path = Path(path)
-    if path.is_file():
+    if path.is_file() or is_bag_folder(path):
         return [path]
     if not path.is_dir():
         raise InputError(f"{path}: expected a scan file or a folder of scans, found nothing; check the path")
-    endings = tuple(READERS)
-    names = [entry for entry in path.iterdir() if entry.is_file() and not entry.name.startswith(".")]
-    if found := sorted(entry for entry in names if entry.name.lower().endswith(endings)):
+    if found := sorted(entry for entry in path.iterdir() if is_scan(entry)):
         return found
-    raise InputError(f"{path}: expected scan files ({', '.join(endings)}), found none in it; give the folder of scans")
-
-
-def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
-    """Read a file that is nothing but rows of `columns` values; (N, columns) of `dtype`.
-
-    Raises:
-        InputError: where the file is missing or its size is not a whole number of rows.
-    """
-    count = count_rows(path, dtype, columns)
-    return np.fromfile(path, dtype=dtype, count=count * columns).reshape(count, columns)
-
-
-def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
-    """The number of rows in such a file, by its size alone; raises as `read_table` does."""
-    if not path.is_file():
-        raise InputError(f"{path}: expected a file, found none; check the path or complete the data set")
-    size, row = path.stat().st_size, np.dtype(dtype).itemsize * columns
-    if size % row:
-        raise InputError(
-            f"{path}: expected a whole number of rows of {row} bytes, found {size} bytes; "
-            "the file is truncated or of another format, copy it again"
-        )
-    return size // row
+    raise InputError(f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; give the folder of scans")
 
 
 def check_points(points: np.ndarray, path: Path) -> np.ndarray:
@@ -127,7 +97,7 @@ def read_nuscenes(path: Path) -> tuple[np.ndarray, np.ndarray]:
     table = read_table(path, np.float32, NUSCENES_COLUMNS)
     points = check_points(table[:, :4], path)
     points[:, 3] /= FULL_INTENSITY
-    return points, _ring(table[:, 4], path)
+    return points, ring_column(table[:, 4], path)
 
 
 def read_labels(path: Path, dtype: DTypeLike, count: int, to_train: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
@@ -178,59 +148,3 @@ def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
             f"{path}: expected {count} ids, one per point, found shape {ids.shape}; segment the whole scan"
         )
     return ids
-
-
-def _ring(values: np.ndarray, path: Path) -> np.ndarray:
-    if not np.isfinite(values).all() or values.min() < 0 or not np.array_equal(values, np.round(values)):
-        raise InputError(f"{path}: expected ring indices 0, 1, ... in column 5, found other values; correct the column")
-    return values.astype(np.int64)
-
-
-def _scaled(points: np.ndarray) -> np.ndarray:
-    """Bring intensities of 0..255 to [0, 1]; one value above 1 says that they are."""
-    intensity = points[:, 3]
-    if (intensity[np.isfinite(intensity)] > 1).any():
-        intensity /= FULL_INTENSITY
-    return points
-
-
-def _read_bin(path: Path) -> Scan:
-    return Scan(_scaled(read_kitti(path)), name=str(path))
-
-
-def _read_pcd_bin(path: Path) -> Scan:
-    points, ring = read_nuscenes(path)
-    return Scan(points, ring=ring, name=str(path))
-
-
-def _read_npy(path: Path) -> Scan:
-    table = _load_array(path)
-    columns = table.shape[1]
-    points = np.zeros((len(table), 4), dtype=np.float32)
-    points[:, : min(columns, 4)] = table[:, :4]
-    ring = _ring(table[:, 4], path) if columns == 5 and len(table) else None
-    return Scan(_scaled(check_points(points, path)), ring=ring, name=str(path))
-
-
-def _load_array(path: Path) -> np.ndarray:
-    """Load (N, 3..5) numbers; nothing is ever unpickled."""
-    if not path.is_file():
-        raise InputError(f"{path}: expected a file, found none; check the path")
-    try:
-        table = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        reason = str(error).splitlines()[0] if str(error) else "an unreadable one"
-        raise InputError(f"{path}: expected a plain NumPy array, found {reason}; save it again with np.save") from None
-    if not isinstance(table, np.ndarray) or table.dtype.kind not in "fiu" or table.ndim != 2:
-        found = f"{table.dtype} of shape {table.shape}" if isinstance(table, np.ndarray) else "an archive"
-        raise InputError(
-            f"{path}: expected numbers of shape (N, 3), (N, 4) or (N, 5), found {found}; save such an array"
-        )
-    if not 3 <= table.shape[1] <= 5:
-        raise InputError(
-            f"{path}: expected 3 to 5 columns (x, y, z, intensity, ring), found {table.shape[1]}; drop the others"
-        )
-    return table
-
-
-READERS: dict[str, Callable[[Path], Scan]] = {".pcd.bin": _read_pcd_bin, ".bin": _read_bin, ".npy": _read_npy}

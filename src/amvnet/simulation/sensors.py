@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from amvnet.sensors import HEIGHTS
+
 
 @dataclass(frozen=True)
 class Sensor:
@@ -58,7 +60,7 @@ _HDL64E_ELEVATIONS = (
 HDL64E = Sensor(
     elevations=_HDL64E_ELEVATIONS,
     azimuth_steps=2180,
-    height=1.73,
+    height=HEIGHTS["hdl64e"],
     min_range=1.5,
     max_range=80.0,
     range_noise=0.0085,
@@ -93,7 +95,7 @@ HDL64E = Sensor(
 HDL32E = Sensor(
     elevations=tuple(10.67 - i * 4 / 3 for i in range(32)),
     azimuth_steps=1084,
-    height=1.84,
+    height=HEIGHTS["hdl32e"],
     min_range=1.0,
     max_range=100.0,
     range_noise=0.005,

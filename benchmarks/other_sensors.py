@@ -1,0 +1,74 @@
+"""What measuring is worth: simulated scans of other sensors, labelled as they are and as `amvnet predict` fits them.
+
+    python benchmarks/other_sensors.py [FOLDER]
+
+FOLDER (other_sensors) keeps the scans: six each, of three streets that no training has seen.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from amvnet.data.clouds import Cloud
+from amvnet.data.semantickitti import SemanticKitti
+from amvnet.evaluation import Evaluation
+from amvnet.fitting import Fitting
+from amvnet.segmenter import Segmenter
+from amvnet.simulation import simulate
+from amvnet.simulation.sensors import HDL64E, SENSORS, Sensor
+
+SEED = 78
+VLP32C = (
+    15, 10.333, 7, 4.667, 3.333, 2.333, 1.667, 1.333, 1, 0.667, 0.333, 0, -0.333, -0.667, -1, -1.333, -1.667, -2,
+    -2.333, -2.667, -3, -3.333, -3.667, -4, -4.667, -5.333, -6.148, -7.254, -8.843, -11.31, -15.639, -25,
+)  # fmt: skip
+
+
+def sensor(elevations: tuple[float, ...], height: float, steps: int) -> Sensor:
+    """An HDL-64E with other lasers at another height, on no car."""
+    return replace(HDL64E, elevations=elevations, height=height, azimuth_steps=steps, shadow=())
+
+
+def evenly(end: float, beams: int) -> tuple[float, ...]:
+    return tuple(np.linspace(end, -end, beams).tolist())
+
+
+OTHERS = {
+    "hdl64e-1.0m": sensor(HDL64E.elevations, 1.0, 2180),
+    "hdl64e-2.5m": sensor(HDL64E.elevations, 2.5, 2180),
+    "vlp32c-1.07m": sensor(VLP32C, 1.07, 1800),
+    "64-22.5-1.0m": sensor(evenly(22.5, 64), 1.0, 1024),
+    "64-22.5-1.73m": sensor(evenly(22.5, 64), 1.73, 1024),
+    "64-22.5-2.5m": sensor(evenly(22.5, 64), 2.5, 1024),
+    "128-45-1.73m": sensor(evenly(45, 128), 1.73, 1024),
+    "vlp16-0.6m": sensor(evenly(15, 16), 0.6, 1800),
+    "vlp16-1.73m": sensor(evenly(15, 16), 1.73, 1800),
+}
+
+
+def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
+    """Print mIoU over the classes present and accuracy of AMVNet, both ways."""
+    dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
+    fit, by_row = Fitting(segmenter.weights), segmenter.by_ring()
+    found = {way: Evaluation(dataset.taxonomy) for way in ("as it is", "measured")}
+    for record in dataset.records(dataset.sequences("all")):
+        scan = dataset.read(record)
+        fitted = fit(Cloud(scan.points[:, :3], scan.points[:, 3], name=name), name)
+        for evaluation, labels in zip(found.values(), (segmenter(scan).labels, by_row(fitted).labels), strict=True):
+            assert scan.labels is not None
+            evaluation.add(scan.points, scan.labels, {"amvnet": labels}, None)
+    for way, evaluation in found.items():
+        figures = evaluation.report(name)["methods"]["amvnet"]
+        print(f"{name:14} {way:9} {100 * figures['miou_present']:.1f} ({100 * figures['accuracy']:.1f})", flush=True)
+
+
+if __name__ == "__main__":
+    SENSORS.update(OTHERS)
+    root = Path(sys.argv[1] if len(sys.argv) > 1 else "other_sensors")
+    segmenter = Segmenter("sim-hdl64e")
+    for other in OTHERS:
+        compare(other, root / other, segmenter)

@@ -1,0 +1,228 @@
+"""Segments any number of scans: read, computed and written side by side, and gone on with after an interruption."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.catalog import is_dataset, open_dataset
+from amvnet.data.files import find_scans, whole_file, write_labels
+from amvnet.data.formats import NamedScan, named_scans
+from amvnet.data.labels import Taxonomy
+from amvnet.data.records import Dataset, ScanRecord
+from amvnet.errors import InputError, SomeBroken
+from amvnet.fitting import MEASURED, Fitting
+from amvnet.jobs import Progress, check_classes, choose_records, own_classes
+from amvnet.journal import Journal
+from amvnet.processes import ALONE, Processes
+from amvnet.scan import Scan
+from amvnet.segmenter import Segmentation, Segmenter
+
+AHEAD = 3  # scans that are read before they are asked for, and that may wait to be written
+
+
+Segment = Callable[[Scan], Segmentation]
+By = Callable[
+    [Path, bool], Segment
+]  # by what to segment the scan whose scores lie at a place; whether it is a lone one
+
+
+@dataclass(frozen=True)
+class Task:
+    """One scan to segment: how it is read, by what it is segmented, and where its labels go."""
+
+    name: str
+    read: Callable[[], Scan]
+    segment: Segment
+    write: Callable[[np.ndarray], Path]
+    scores: Path
+
+
+@dataclass
+class Lone:
+    """What lone scans have in common."""
+
+    taxonomy: Taxonomy
+    by: By
+    fitting: Fitting
+    out: Path
+    topic: str | None
+    first: dict[str, list[NamedScan]] = field(default_factory=dict)
+
+    def tasks(self, path: Path) -> Iterator[Task]:
+        for scan in named_scans(path, self.topic):
+            first = self.first.setdefault(scan.source, [])
+            if len(first) < MEASURED:
+                first.append(scan)
+            yield self._task(scan)
+
+    def _task(self, scan: NamedScan) -> Task:
+        to_raw, scores = self.taxonomy.to_raw, self.out / f"{scan.name}.npz"
+        return Task(
+            scan.name,
+            lambda: self._read(scan),
+            self.by(scores, True),
+            lambda ids: write_labels(self.out / f"{scan.name}.label", to_raw(ids)),
+            scores,
+        )
+
+    def _read(self, scan: NamedScan) -> Scan:
+        # Whichever of its scans comes first here, after an interruption or in another process: all have the same.
+        self.fitting.learn(scan.source, [one.read for one in self.first.pop(scan.source, [])])
+        return self.fitting(scan.read(), scan.source)
+
+
+def predict(
+    inputs: Sequence[str],
+    segmenter: Segmenter,
+    out: Path,
+    sequences: Sequence[str] | None = None,
+    scores: bool = False,
+    progress: Progress = lambda done, total: None,
+    split: str = "all",
+    topic: str | None = None,
+    fitting: Fitting | None = None,
+    resume: bool = False,
+    processes: Processes = ALONE,
+) -> int:
+    """Segment data sets, scan files, bags and folders of them; returns how many label files there are now.
+
+    Args:
+        inputs: each a data set as `open_dataset` takes it, a scan file, a bag, or a folder of these.
+        sequences: of data sets, which to segment; None means those of `split`.
+        scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` of an `.npz`.
+        split: the official split of data sets.
+        topic: of bags; None is the only one with PointCloud2.
+        fitting: makes lone scans such as the weights know them; None measures all, and says nothing.
+        resume: leave out what an interrupted run into `out` has done.
+        processes: those that share the scans.
+
+    Raises:
+        InputError: before anything is written where an input is not there; later where every scan is broken.
+        SomeBroken: at the end, where some of several scans are.
+    """
+    fitting, by_ring = fitting or Fitting(segmenter.weights), segmenter.by_ring()
+    lone = Lone(segmenter.taxonomy, lambda scores, lone: by_ring if lone else segmenter, fitting, Path(out), topic)
+    tasks = tasks_in(inputs, lone, sequences, split)
+    parts = {part: segmenter.weights.digest(part) for part in segmenter.weights.parts}
+    settings = {"weights": parts, "method": segmenter.method, "scores": scores, "sensor": repr(fitting.given)}
+    return run_tasks(tasks, Path(out), settings, scores, progress, resume, processes)
+
+
+def tasks_in(inputs: Sequence[str], lone: Lone, sequences: Sequence[str] | None, split: str) -> list[Task]:
+    """The scans of all inputs, data sets as lone ones; raises InputError where two would have the same files."""
+    tasks = [task for text in inputs for task in _tasks(text, lone, sequences, split)]
+    _check_names(tasks)
+    return tasks
+
+
+def run_tasks(
+    tasks: Sequence[Task],
+    out: Path,
+    settings: Mapping[str, Any],
+    scores: bool = False,
+    progress: Progress = lambda done, total: None,
+    resume: bool = False,
+    processes: Processes = ALONE,
+) -> int:
+    """Segment scans into `out`; `settings` is what their labels depend on. The rest is as of `predict`."""
+    journal = Journal(out, settings, resume, processes)
+    mine = [task for task in processes.share(tasks) if str(task.scores.relative_to(out)) not in journal.done]
+    broken: list[str] = []
+    for done, (task, fault) in enumerate(_stream(mine, scores)):
+        progress(done, len(mine))
+        if fault is None:
+            journal.add(str(task.scores.relative_to(out)))
+        else:
+            broken.append(fault)
+    progress(len(mine), len(mine))
+    journal.close()
+    broken = [fault for some in processes.gather(broken) for fault in some]
+    if broken and len(broken) == len(tasks):
+        more = f" (and {len(broken) - 1} more scans, each broken)" if len(broken) > 1 else ""
+        raise InputError(broken[0] + more)
+    if broken:
+        kept = len(tasks) - len(broken)
+        raise SomeBroken(f"{kept} of {len(tasks)} scans are segmented, {len(broken)} are broken", broken)
+    return len(tasks)
+
+
+def _stream(tasks: Sequence[Task], scores: bool) -> Iterator[tuple[Task, str | None]]:
+    """Each task when it is done, with what is wrong with its scan; only a few scans are in memory."""
+    with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
+        source, writing = iter(tasks), deque[tuple[Task, Future[None]]]()
+        reading = deque((task, reader.submit(task.read)) for task in islice(source, AHEAD))
+        try:
+            while reading:
+                task, coming = reading.popleft()
+                reading.extend((task, reader.submit(task.read)) for task in islice(source, 1))
+                try:
+                    result = task.segment(coming.result())
+                except InputError as error:
+                    yield task, str(error)
+                    continue
+                writing.append((task, writer.submit(_write, task, result, scores)))
+                while len(writing) > AHEAD:
+                    yield _written(*writing.popleft())
+            while writing:
+                yield _written(*writing.popleft())
+        finally:
+            reader.shutdown(wait=False, cancel_futures=True)
+
+
+def _write(task: Task, result: Segmentation, scores: bool) -> None:
+    if scores:
+        write_scores(task.scores, result)
+    task.write(result.labels)
+
+
+def _written(task: Task, writing: Future[None]) -> tuple[Task, None]:
+    writing.result()  # raises what went wrong
+    return task, None
+
+
+def write_scores(path: Path, result: Segmentation) -> None:
+    """Both networks' probabilities, (N, K) float16, as `rv` and `bev` of an `.npz`."""
+    found = {name: v.astype(np.float16) for name, v in (("rv", result.rv), ("bev", result.bev)) if v is not None}
+    with whole_file(path) as part:
+        np.savez_compressed(part, **found)  # type: ignore[arg-type]  # of the arrays, none is an option
+
+
+def _tasks(text: str, lone: Lone, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
+    if is_dataset(text):
+        dataset = open_dataset(text, own_classes(lone.taxonomy))
+        check_classes(dataset, lone.taxonomy)
+        for record in choose_records(dataset, sequences, split):
+            yield _record_task(dataset, record, lone.by, lone.out)
+        return
+    for path in find_scans(text):
+        yield from lone.tasks(path)
+
+
+def _record_task(dataset: Dataset, record: ScanRecord, by: By, out: Path) -> Task:
+    scores = (out / record.prediction).with_suffix(".npz")
+    return Task(
+        record.name,
+        lambda: dataset.read(record, labels=False),
+        by(scores, False),
+        lambda ids: dataset.write_prediction(record, out, ids),
+        scores,
+    )
+
+
+def _check_names(tasks: Sequence[Task]) -> None:
+    seen: dict[Path, str] = {}
+    for task in tasks:
+        if task.scores in seen:
+            raise InputError(
+                f"expected scans of different names, found {task.name} twice ({task.scores.stem}); "
+                "segment them in two runs with two folders"
+            )
+        seen[task.scores] = task.name

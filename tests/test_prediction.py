@@ -1,0 +1,169 @@
+"""Many scans: some broken, interrupted and gone on with, in little memory."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from worlds import amvnet, files, fresh_weights, make_streets, street
+
+from amvnet import prediction
+from amvnet.journal import Journal
+from amvnet.segmenter import Segmenter
+from amvnet.weights import save
+
+WEIGHTS = "w.safetensors"
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights, and a folder of twelve lone scans from sensors at different heights."""
+    root = tmp_path_factory.mktemp("world")
+    save(fresh_weights(), root / WEIGHTS)
+    (root / "scans").mkdir()
+    for place in range(12):
+        points, _ = street(place)
+        points[:, 2] += 0.1 * place
+        points.tofile(root / f"scans/{place:06d}.bin")
+    make_streets(root / "data")
+    return root
+
+
+@pytest.fixture(scope="module")
+def whole(world: Path) -> Path:
+    """What an undisturbed run writes."""
+    assert amvnet("predict", world / "scans", "--weights", world / WEIGHTS, "--out", world / "whole") == (0, "")
+    return world / "whole"
+
+
+def same(a: Path, b: Path) -> None:
+    assert files(a) == files(b)
+    for name in files(a):
+        assert (a / name).read_bytes() == (b / name).read_bytes(), name
+
+
+def test_broken_scans_are_listed_and_the_others_are_segmented(world: Path, whole: Path, tmp_path: Path) -> None:
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for path in (world / "scans").iterdir():
+        (scans / path.name).write_bytes(path.read_bytes())
+    (scans / "000003.bin").write_bytes(b"123")
+    (scans / "000007.bin").write_bytes(b"")
+    code, error = amvnet("predict", scans, "--weights", world / WEIGHTS, "--out", tmp_path / "out")
+    assert code == 3
+    *faults, last = error.splitlines()
+    assert [name in line for name, line in zip(("000003.bin", "000007.bin"), faults, strict=True)] == [True, True]
+    assert "10 of 12" in last
+    assert files(tmp_path / "out") == files(whole) - {"000003.label", "000007.label"}
+
+
+def test_only_broken_scans_are_one_line(world: Path, tmp_path: Path) -> None:
+    for name in ("a.bin", "b.bin"):
+        (tmp_path / name).write_bytes(b"123")
+    inputs = (tmp_path / "a.bin", tmp_path / "b.bin")
+    code, error = amvnet("predict", *inputs, "--weights", world / WEIGHTS, "--out", tmp_path / "out")
+    assert (code, error.count("\n")) == (2, 1)
+    assert "a.bin" in error
+    assert not files(tmp_path / "out")
+
+
+@pytest.mark.parametrize("kills", [1, 2])
+def test_a_killed_run_goes_on_where_it_stopped(world: Path, whole: Path, tmp_path: Path, kills: int) -> None:
+    """SIGKILL in the midst of it, once or twice; what is done is not done again, and the end is the same."""
+    out = tmp_path / "out"
+    slow = "import time; from amvnet import prediction, cli; write = prediction._write\n"
+    slow += "prediction._write = lambda *a: (time.sleep(0.1), write(*a))\nimport sys; sys.exit(cli.main())"
+    arguments = ["predict", str(world / "scans"), "--weights", str(world / WEIGHTS), "--out", str(out), "--resume"]
+    times: dict[str, int] = {}
+    for kill in range(1, kills + 1):
+        process = subprocess.Popen([sys.executable, "-c", slow, *arguments], stdout=subprocess.DEVNULL)
+        while len(list(out.glob("*.label"))) < 3 * kill and process.poll() is None:
+            time.sleep(0.005)
+        process.kill()
+        process.wait()
+        assert list(out.glob(".unfinished-*")), "the run was over before it was killed"
+        written = {path.name: path.stat().st_mtime_ns for path in out.glob("*.label")}
+        kept = {name for name in times if written.get(name) == times[name]}
+        assert len(kept) >= len(times) - 1  # the last one may have been written, and not yet written down
+        times = written
+    assert amvnet(*arguments) == (0, "")
+    same(out, whole)
+    assert sum((out / name).stat().st_mtime_ns == at for name, at in times.items()) >= len(times) - 1
+
+
+def test_an_interrupted_run_is_not_gone_on_with_by_others(world: Path, tmp_path: Path) -> None:
+    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--resume")
+    weights = Segmenter(str(world / WEIGHTS)).weights
+    settings = {"weights": {p: weights.digest(p) for p in weights.parts}, "method": "rv", "scores": False, "sensor": ""}
+    Journal(tmp_path, settings)
+    code, error = amvnet(*arguments)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "method" in error
+    assert amvnet(*arguments[:-1]) == (0, "")  # without --resume it begins anew
+    assert len(files(tmp_path)) == 12
+
+
+def test_a_finished_run_is_not_taken_for_an_interrupted_one(world: Path, whole: Path, tmp_path: Path) -> None:
+    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--resume")
+    assert amvnet(*arguments) == (0, "")
+    (tmp_path / "000005.label").write_bytes(b"other")
+    assert amvnet(*arguments) == (0, "")
+    same(tmp_path, whole)
+
+
+@pytest.mark.parametrize("end", ['"a"\n"b"\n', '"a"\n"b"', '"a"\n"b', '"a"\n\x00\n"b"\n{}\n'])
+def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, end: str) -> None:
+    """A name that was not finished is not done."""
+    journal = Journal(tmp_path, {"x": 1})
+    with journal.path.open("a") as file:
+        file.write(end)
+    assert Journal(tmp_path, {"x": 1}, resume=True).done == ({"a", "b"} if end.count('"b"\n') else {"a"})
+    kept = [json.loads(line) for line in (tmp_path / ".unfinished-0.jsonl").read_text().splitlines()]
+    assert kept[0] == {"x": 1}
+
+
+def test_a_part_of_a_folder_is_labelled_as_in_the_whole(world: Path, whole: Path, tmp_path: Path) -> None:
+    """What is measured of a sensor comes of a folder's first scans, whichever are left to segment."""
+    journal = Journal(tmp_path, settings_of(world))
+    for place in range(9):
+        journal.add(f"{place:06d}.npz")
+    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--resume")
+    assert amvnet(*arguments) == (0, "")
+    assert files(tmp_path) == {f"{place:06d}.label" for place in (9, 10, 11)}
+    for name in files(tmp_path):
+        assert (tmp_path / name).read_bytes() == (whole / name).read_bytes()
+
+
+def settings_of(world: Path) -> dict[str, object]:
+    weights = Segmenter(str(world / WEIGHTS)).weights
+    parts = {part: weights.digest(part) for part in weights.parts}
+    return {"weights": parts, "method": "amvnet", "scores": False, "sensor": repr(prediction.Fitting(weights).given)}
+
+
+def test_few_scans_are_in_memory_however_many_there_are(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Counted: those that are read and not yet written."""
+    held, most = set(), []
+    segmenter = Segmenter(str(world / WEIGHTS))
+
+    def task(place: int) -> prediction.Task:
+        def read() -> object:
+            held.add(place)
+            most.append(len(held))
+            return prediction.Scan(street(place)[0])
+
+        def write(ids: np.ndarray) -> Path:
+            time.sleep(0.02)  # slower than the reading
+            held.remove(place)
+            return Path()
+
+        return prediction.Task(str(place), read, segmenter, write, Path())  # type: ignore[arg-type]
+
+    done = [one.name for one, fault in prediction._stream([task(place) for place in range(30)], False) if not fault]
+    assert done == [str(place) for place in range(30)]
+    assert max(most) <= 2 * prediction.AHEAD + 2
+    assert not held
