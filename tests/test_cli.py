@@ -291,7 +291,8 @@ def test_the_golden_sets_score_as_the_official_tools_say(name: str, predictions:
 def test_info_says_what_the_weights_are(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(world / "w.safetensors")]) == 0
     shown = capsys.readouterr().out
-    assert all(word in shown for word in ("19 of semantickitti", "16 x 64", "range_net", "polar_net", "point_head"))
+    words = ("19 of semantickitti", "16 x 64", "range_net", "polar_net", "point_head", "| 50.0 |", "amvnet.load")
+    assert all(word in shown for word in words)
 
 
 def test_info_says_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None:

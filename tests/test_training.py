@@ -271,10 +271,10 @@ def test_folds_score_no_sequence_that_they_learnt_from(
     monkeypatch.setattr(runner, "gather_points", spy)
     weights = train(world, tmp_path / "run", "--training.head.folds", 2, "--training.rv.epochs", 1)
     scored = []
-    for networks, records in gathered[0]:
+    for source in gathered[0]:
         for part in ("range_net", "polar_net"):
-            assert not set(networks.training[part]["sequences"]) & {record.sequence for record in records}
-        scored += [record.name for record in records]
+            assert not set(source.weights.training[part]["sequences"]) & {one.sequence for one in source.records}
+        scored += [record.name for record in source.records]
     assert sorted(scored) == ["00/000000", "00/000001", "01/000000", "01/000001"]
     assert weights.training["point_head"]["head"]["folds"] == 2
     assert weights.training["range_net"]["sequences"] == ["00", "01"]

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from amvnet.errors import InputError
+    from amvnet.fusion import fuse
     from amvnet.scan import Scan
-    from amvnet.segmenter import Segmentation, Segmenter, fuse
+    from amvnet.segmenter import Segmentation, Segmenter
+    from amvnet.sharing import push
     from amvnet.simulation import simulate
 
-__all__ = ["InputError", "Scan", "Segmentation", "Segmenter", "fuse", "load", "simulate"]
+__all__ = ["InputError", "Scan", "Segmentation", "Segmenter", "fuse", "load", "push", "simulate"]
 __version__ = version("amvnet")
 
 _HOMES = {
@@ -26,13 +28,14 @@ _HOMES = {
     "Scan": "amvnet.scan",
     "Segmentation": "amvnet.segmenter",
     "Segmenter": "amvnet.segmenter",
-    "fuse": "amvnet.segmenter",
+    "fuse": "amvnet.fusion",
+    "push": "amvnet.sharing",
     "simulate": "amvnet.simulation",
 }
 
 
 def load(weights: str, device: str = "cpu", method: str = "amvnet") -> Segmenter:
-    """A segmenter from a weights file, or from built-in weights by name (`sim-hdl64e`).
+    """A segmenter from a weights file, the name of built-in weights (`sim-hdl64e`), or the hub (`hf-hub:OWNER/NAME`).
 
     Raises:
         InputError: where there are no such weights, or they lack a part that the method needs.

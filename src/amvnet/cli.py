@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amvnet import __version__, training_verbs, verbs, viewing_verbs
+from amvnet import __version__, fusion_verbs, training_verbs, verbs, viewing_verbs
 from amvnet.arguments import Parser, Positional, parser_of
 from amvnet.errors import InputError, SomeBroken
 from amvnet.terminal import say
@@ -28,6 +28,8 @@ VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "predict": (verbs.predict, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
     "evaluate": (verbs.evaluate, {"data": {"metavar": "DATA"}}),
     "submit": (verbs.submit, {"data": {"metavar": "DATA"}}),
+    "fuse": (fusion_verbs.fuse, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
+    "rank": (fusion_verbs.rank, {"data": {"metavar": "DATA"}}),
     "analyze": (training_verbs.analyze, {"data": {"metavar": "DATA"}}),
     "ablate": (training_verbs.ablate, {"recipe": {"metavar": "RECIPE"}}),
     "view": (viewing_verbs.view, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
@@ -62,6 +64,8 @@ USAGE = f"""usage: amvnet VERB ...
   predict    segment scans
   evaluate   score weights or predictions by the official formulas
   submit     pack or check predictions for a benchmark's server
+  fuse       fuse the scores of any two models
+  rank       what to label next, and which labels look wrong
   analyze    the paper's figures, sweeps and tables
   ablate     the paper's ablation of the range-view network
   view       look at scans, labels and errors in 3D

@@ -14,21 +14,21 @@ import torch
 from torch import Tensor
 from torch.utils import data
 
-from amvnet.config import PointHeadConfig, TrainingConfig
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.config import ModelConfig, PointHeadConfig, TrainingConfig
+from amvnet.data.records import Dataset
 from amvnet.errors import InputError
 from amvnet.evaluation import confusion
+from amvnet.head_sources import Source
 from amvnet.loading import ScanSet, collate
-from amvnet.models.amvnet import AMVNet, geometric_mean
-from amvnet.models.assertions import Assertion
+from amvnet.models.amvnet import geometric_mean
+from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
 from amvnet.processes import ALONE, Processes, device_of
 from amvnet.scan import Scan
-from amvnet.weights import Weights
+from amvnet.views.points import PointBatch
 
 # p_i (U, 2 K + 4), S_i (U, n, 2 K + 4), train ids (U,), and for how many points of its scan each stands (U,)
 HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
-Source = tuple[Weights, Sequence[ScanRecord]]  # networks, and the scans that they score
 
 
 def row_of(classes: int, neighbours: int) -> np.dtype:
@@ -107,17 +107,20 @@ def head_loader(
 def gather_points(
     sources: Sequence[Source],
     dataset: Dataset,
+    model: ModelConfig,
     training: TrainingConfig,
     views: int,
     folder: Path,
     say: Callable[[str], None] = lambda line: None,
     processes: Processes = ALONE,
 ) -> HeadPoints:
-    """Score scans by frozen networks, and keep on disk what the head needs of their uncertain points.
+    """Score scans by two models, and keep on disk what the head needs of their uncertain points.
 
     Args:
-        sources: networks, and the scans that they score.
-        views: how often each scan is scored, each time augmented anew; 0: once, as it is.
+        sources: what scores which scans.
+        model: says which points are uncertain, and what the head sees of them.
+        views: how often each scan is scored, each time augmented anew; 0: once, as it is. Of sources that only
+            know the scans as they are: once.
         folder: is made anew; all processes must see it.
         say: told how far it is.
 
@@ -126,11 +129,12 @@ def gather_points(
     Raises:
         InputError: where the scans have no labelled points.
     """
-    gather = functools.partial(_gather, sources, dataset, training, views, folder, say, processes)
-    found, least = gather(lambda model: model.assertion), max(2, processes.size)  # batch norm needs two
+    views = views if all(source.augmented for source in sources) else 0
+    gather = functools.partial(_gather, sources, dataset, model.point_head, training, views, folder, say, processes)
+    found, least = gather(build_assertion(model.assertion)), max(2, processes.size)  # batch norm needs two
     if len(found) < least:
         say("head: the networks agree everywhere; it learns from points drawn from all")
-        found = gather(lambda model: _everywhere)
+        found = gather(_everywhere)
     if len(found) < least:
         raise InputError(f"{folder}: expected labelled points to train the head with, found none; name other scans")
     return found
@@ -144,26 +148,27 @@ def _everywhere(f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = No
 def _gather(
     sources: Sequence[Source],
     dataset: Dataset,
+    config: PointHeadConfig,
     training: TrainingConfig,
     views: int,
     folder: Path,
     say: Callable[[str], None],
     processes: Processes,
-    assertion_of: Callable[[AMVNet], Assertion],
+    assertion: Assertion,
 ) -> HeadPoints:
     """As `gather_points`, of the points that an assertion doubts."""
     _empty(folder, processes)
-    config, classes = sources[0][0].model.point_head, dataset.taxonomy.size
+    classes, device = dataset.taxonomy.size, device_of(training.accelerator)
     row, matrices = row_of(classes, config.neighbours), np.zeros((2, classes + 1, classes + 1), dtype=np.int64)
-    jobs = [(s, *job) for s, (_, scans) in enumerate(sources) for job in np.ndindex(max(views, 1), len(scans))]
-    sets = [ScanSet(dataset, scans, training.augment if views else None, training.seed) for _, scans in sources]
-    model_of = functools.lru_cache(1)(lambda s: sources[s][0].build().to(device_of(training.accelerator)))
+    jobs = [(s, *job) for s, one in enumerate(sources) for job in np.ndindex(max(views, 1), len(one.records))]
+    sets = [ScanSet(dataset, one.records, training.augment if views else None, training.seed) for one in sources]
+    scorer_of = functools.lru_cache(1)(lambda s: sources[s].scorer(device))
     most, counts, mine = -(-training.head.points // len(jobs)), [], processes.share(jobs)
     with (folder / str(processes.rank)).open("wb") as file:
         for done, (source, epoch, place) in enumerate(mine, start=1):
-            rng, model = np.random.default_rng([training.seed, epoch, place]), model_of(source)
-            scan = sets[source][epoch, place]
-            rows, matrix = _gather_scan(model, config, assertion_of(model), scan, most, row, rng)
+            rng, scan = np.random.default_rng([training.seed, epoch, place]), sets[source][epoch, place]
+            score = functools.partial(scorer_of(source), sources[source].records[place], scan)
+            rows, matrix = _gather_scan(score, config, assertion, scan, most, row, rng, device)
             rows.tofile(file)
             counts.append(len(rows))
             matrices += matrix
@@ -200,19 +205,19 @@ def _join(folder: Path, counts: Sequence[Sequence[int]], row: np.dtype, processe
 
 @torch.inference_mode()
 def _gather_scan(
-    model: AMVNet,
+    score: Callable[[PointBatch], tuple[Tensor, Tensor]],
     config: PointHeadConfig,
     assertion: Assertion,
     scan: Scan,
     most: int,
     row: np.dtype,
     rng: np.random.Generator,
+    device: str,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The rows of one scan's kept points, and (2, K + 1, K + 1) of the ensemble: its certain points, and the others."""
-    device = next(model.parameters()).device
     batch, labels = collate([scan])
     batch, labels = batch.to(device), labels.to(device)
-    f, g = model.score_range_view(batch), model.score_polar_view(batch)
+    f, g = score(batch)
     uncertain = assertion(f, g, batch.points, labels) & (labels > 0)
     agreed = (geometric_mean(f, g).argmax(dim=1) + 1).cpu().numpy()
     truth, doubted = labels.cpu().numpy(), uncertain.cpu().numpy()

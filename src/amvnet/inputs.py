@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from amvnet.data.labels import Taxonomy
     from amvnet.data.records import ScanRecord
     from amvnet.processes import Processes
+    from amvnet.score_files import ScorePair, Which
 
 SHOWN = 20  # names of sequences in a line
 
@@ -66,3 +67,16 @@ def numbers_in(text: str) -> list[int]:
     if not all(name.isdecimal() and int(name) for name in names):
         raise InputError(f"expected numbers of neighbours with commas, found {text!r}; say 5,10,15")
     return sorted({int(name) for name in names})
+
+
+def scores_in(
+    a: Path | None, b: Path | None, key_a: str | None, key_b: str | None, logits: Which | None
+) -> ScorePair | None:
+    """Two models' scores; None where no option names any. Raises InputError where a folder is missing."""
+    from amvnet.score_files import ScorePair
+
+    if a is not None and b is not None:
+        return ScorePair.of(a, b, key_a, key_b, logits)
+    if (a, b, key_a, key_b, logits) == (None,) * 5:
+        return None
+    raise InputError("expected --scores-a and --scores-b, found not both; give two models' scores")

@@ -44,8 +44,10 @@ def draw_scan(
     truth: np.ndarray | None = None,
     uncertain: np.ndarray | None = None,
     title: str = "",
+    reach: float = REACH,
+    marked: str = "uncertain",
 ) -> Path:
-    """Draw one scan from above, x to the right and y up, 50 m to each side.
+    """Draw one scan from above, x to the right and y up, 50 m (`reach`) to each side.
 
     The first row has the truth and each prediction. Below a prediction are its errors (correct
     grey, wrong red; ignored points count as neither), below the truth the uncertain points.
@@ -63,7 +65,7 @@ def draw_scan(
     """
     path = Path(path)
     try:
-        figure = scan_figure(points, taxonomy, panels, truth, uncertain, title)
+        figure = scan_figure(points, taxonomy, panels, truth, uncertain, title, reach, marked)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     with whole_file(path) as part:
@@ -78,6 +80,8 @@ def scan_figure(
     truth: np.ndarray | None = None,
     uncertain: np.ndarray | None = None,
     title: str = "",
+    reach: float = REACH,
+    marked: str = "uncertain",
 ) -> Any:
     """The Matplotlib figure that `draw_scan` writes.
 
@@ -88,15 +92,19 @@ def scan_figure(
         truth: (N,) train ids, or None.
         uncertain: (N,) bool, or None.
         title: a line above all panels.
+        reach: metres that are shown to each side.
+        marked: what the points of `uncertain` are.
 
     Raises:
         InputError: where there is nothing to draw, or an array is not one value per point.
     """
     _check(len(points), panels, truth, uncertain)
-    rows = _rows(taxonomy, panels, truth, uncertain)
+    rows = _rows(taxonomy, panels, truth, uncertain, marked)
     seen = np.unique(np.concatenate([*panels.values(), *([] if truth is None else [truth])]))
     errors = truth is not None and bool(panels)
-    return _figure(points, rows, _entries(taxonomy, seen, errors, uncertain is not None), title)
+    return _figure(
+        points, rows, _entries(taxonomy, seen, errors, marked if uncertain is not None else ""), title, reach
+    )
 
 
 def _check(
@@ -113,13 +121,17 @@ def _check(
 
 
 def _rows(
-    taxonomy: Taxonomy, panels: Mapping[str, np.ndarray], truth: np.ndarray | None, uncertain: np.ndarray | None
+    taxonomy: Taxonomy,
+    panels: Mapping[str, np.ndarray],
+    truth: np.ndarray | None,
+    uncertain: np.ndarray | None,
+    marked: str,
 ) -> list[list[_Panel | None]]:
     """The grid: one column per prediction, after one for the truth; None leaves a place free."""
     palette = np.asarray(taxonomy.colors) / 255.0
     palette[0] = IGNORED
     shown = [_Panel(name, palette[ids], ids > 0) for name, ids in panels.items()]
-    doubts = [] if uncertain is None else [_chosen("uncertain", uncertain, len(uncertain), UNCERTAIN)]
+    doubts = [] if uncertain is None else [_chosen(marked, uncertain, len(uncertain), UNCERTAIN)]
     if truth is None:
         return [[*shown, *doubts]]
     known = truth > 0
@@ -135,15 +147,17 @@ def _chosen(title: str, chosen: np.ndarray, count: int, color: Color) -> _Panel:
     return _Panel(f"{title} ({share:.1%})", np.where(chosen[:, None], color, PLAIN), chosen)
 
 
-def _entries(taxonomy: Taxonomy, seen: np.ndarray, errors: bool, doubts: bool) -> list[tuple[str, Color]]:
+def _entries(taxonomy: Taxonomy, seen: np.ndarray, errors: bool, marked: str) -> list[tuple[str, Color]]:
     """(name, colour) of the legend: the classes that appear, then what the other panels show."""
     palette = [(r / 255, g / 255, b / 255) for r, g, b in taxonomy.colors]
     entries = [(taxonomy.classes[c - 1], palette[c]) for c in seen.tolist() if c]
-    extras = {"ignored": (0 in seen, IGNORED), "wrong": (errors, WRONG), "uncertain": (doubts, UNCERTAIN)}
+    extras = {"ignored": (0 in seen, IGNORED), "wrong": (errors, WRONG), marked: (bool(marked), UNCERTAIN)}
     return entries + [(name, color) for name, (appears, color) in extras.items() if appears]
 
 
-def _figure(points: np.ndarray, rows: list[list[_Panel | None]], entries: list[tuple[str, Color]], title: str) -> Any:
+def _figure(
+    points: np.ndarray, rows: list[list[_Panel | None]], entries: list[tuple[str, Color]], title: str, reach: float
+) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -154,21 +168,21 @@ def _figure(points: np.ndarray, rows: list[list[_Panel | None]], entries: list[t
     FigureCanvasAgg(figure)
     for place, panel in enumerate((panel for row in rows for panel in row), start=1):
         if panel is not None:
-            _draw(figure.add_subplot(len(rows), columns, place), points, panel)
+            _draw(figure.add_subplot(len(rows), columns, place), points, panel, reach)
     if title:
         figure.suptitle(title, color=INK, fontsize=13)
     _legend(figure, entries, columns)
     return figure
 
 
-def _draw(axes: Any, points: np.ndarray, panel: _Panel) -> None:
-    inside = (np.abs(points[:, :2]) <= REACH).all(axis=1)
+def _draw(axes: Any, points: np.ndarray, panel: _Panel, reach: float) -> None:
+    inside = (np.abs(points[:, :2]) <= reach).all(axis=1)
     order = np.argsort(points[inside, 2], kind="stable")  # what is higher hides what is below
     order = order[np.argsort(panel.on_top[inside][order], kind="stable")]
     xy, colors = points[inside, :2][order], panel.colors[inside][order]
-    axes.scatter(xy[:, 0], xy[:, 1], c=colors, s=DOT, marker="o", linewidths=0, rasterized=True)
+    axes.scatter(xy[:, 0], xy[:, 1], c=colors, s=DOT * REACH / reach, marker="o", linewidths=0, rasterized=True)
     axes.plot(0, 0, marker="+", color=INK, markersize=7)
-    axes.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal", facecolor=GROUND)
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", facecolor=GROUND)
     axes.set_title(panel.title, color=INK, fontsize=11)
     axes.set_xlabel("x (m)", color=INK, fontsize=8)
     axes.set_ylabel("y (m)", color=INK, fontsize=8)

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from amvnet.data.catalog import is_dataset, open_dataset
 from amvnet.data.files import find_scans, whole_file
 from amvnet.data.formats import READERS, NamedScan, named_scans
+from amvnet.data.labels import Taxonomy
 from amvnet.data.outputs import check_kind, write_scan_labels, write_uncertain
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError, SomeBroken
@@ -25,6 +27,8 @@ from amvnet.scan import Scan
 from amvnet.segmenter import Segmentation, Segmenter
 
 AHEAD = 3  # scans that are read before they are asked for, and that may wait to be written
+Segment = Callable[[Scan], Segmentation]
+By = Callable[[Path, bool], Segment]  # for the scan whose scores lie at a place, and whether it is a lone one
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Task:
 
     name: str
     read: Callable[[], Scan]
-    segmenter: Segmenter
+    segment: Segment
     write: Callable[[Segmentation], Path]
     scores: Path
 
@@ -47,12 +51,13 @@ class Task:
 class Lone:
     """What lone scans have in common."""
 
-    segmenter: Segmenter
+    taxonomy: Taxonomy
+    by: By
     fitting: Fitting
     out: Path
     topic: str | None
-    kind: str
-    scores: bool
+    kind: str = "label"
+    scores: bool = False
     first: dict[str, list[NamedScan]] = field(default_factory=dict)
 
     def tasks(self, path: Path) -> Iterator[Task]:
@@ -74,10 +79,11 @@ class Lone:
 
         def write(result: Segmentation) -> Path:
             known = None if result.rv is None or result.bev is None else result.uncertain
-            taxonomy = self.segmenter.taxonomy
-            return write_scan_labels(self.out / scan.name, self.kind, kept.pop(), result.labels, taxonomy, known)
+            stem = self.out / scan.name
+            return write_scan_labels(stem, self.kind, kept.pop(), result.labels, self.taxonomy, known)
 
-        return Task(scan.name, read, self.segmenter, write, self.out / f"{scan.name}.npz")
+        scores = self.out / f"{scan.name}.npz"
+        return Task(scan.name, read, self.by(scores, True), write, scores)
 
     def _checked(self, path: Path, task: Task) -> Task:
         """Hand back a task of a scan file.
@@ -128,13 +134,36 @@ def predict(
     check_kind(kind)
     if uncertain and segmenter.method in ("rv", "bev"):
         raise InputError(f"expected a method of two networks for --uncertain, found {segmenter.method}; use amvnet")
-    out, fitting = Path(out), fitting or Fitting(segmenter.weights)
-    lone = Lone(segmenter.by_ring(), fitting, out, topic, kind, scores)
-    tasks = [task for text in inputs for task in _tasks(text, segmenter, lone, sequences, split)]
-    _check_names(tasks)
+    out, fitting, by_ring = Path(out), fitting or Fitting(segmenter.weights), segmenter.by_ring()
+
+    def by(place: Path, lone: bool) -> Segment:
+        return by_ring if lone else segmenter
+
+    tasks = tasks_in(inputs, Lone(segmenter.taxonomy, by, fitting, out, topic, kind, scores), sequences, split)
     parts = {part: segmenter.weights.digest(part) for part in segmenter.weights.parts}
     model = {"weights": parts, "method": segmenter.method, "sensor": repr(fitting.given)}
     settings = {**model, "scores": scores, "uncertain": uncertain, "format": kind}
+    return run_tasks(tasks, out, settings, scores, uncertain, progress, resume, processes)
+
+
+def tasks_in(inputs: Sequence[str], lone: Lone, sequences: Sequence[str] | None, split: str) -> list[Task]:
+    """The scans of all inputs, data sets as lone ones; raises InputError where two would have the same files."""
+    tasks = [task for text in inputs for task in _tasks(text, lone, sequences, split)]
+    _check_names(tasks)
+    return tasks
+
+
+def run_tasks(
+    tasks: Sequence[Task],
+    out: Path,
+    settings: Mapping[str, Any],
+    scores: bool = False,
+    uncertain: bool = False,
+    progress: Progress = lambda done, total: None,
+    resume: bool = False,
+    processes: Processes = ALONE,
+) -> int:
+    """Segment scans into `out`; `settings` is what their labels depend on. The rest is as of `predict`."""
     journal = Journal(out, settings, resume, processes)
     mine = [task for task in processes.share(tasks) if str(task.scores.relative_to(out)) not in journal.done]
     broken: list[str] = []
@@ -166,7 +195,7 @@ def _stream(tasks: Sequence[Task], scores: bool, uncertain: bool) -> Iterator[tu
                 task, coming = reading.popleft()
                 reading.extend((task, reader.submit(task.read)) for task in islice(source, 1))
                 try:
-                    result = task.segmenter(coming.result())
+                    result = task.segment(coming.result())
                 except InputError as error:
                     yield task, str(error)
                     continue
@@ -199,24 +228,25 @@ def write_scores(path: Path, result: Segmentation) -> None:
         np.savez_compressed(part, **found)  # type: ignore[arg-type]  # of the arrays, none is an option
 
 
-def _tasks(text: str, segmenter: Segmenter, lone: Lone, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
+def _tasks(text: str, lone: Lone, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
     if is_dataset(text):
-        dataset = open_dataset(text, own_classes(segmenter.taxonomy))
-        check_classes(dataset, segmenter.taxonomy)
+        dataset = open_dataset(text, own_classes(lone.taxonomy))
+        check_classes(dataset, lone.taxonomy)
         for record in choose_records(dataset, sequences, split):
-            yield _record_task(dataset, record, segmenter, lone.out)
+            yield _record_task(dataset, record, lone.by, lone.out)
         return
     for path in find_scans(text):
         yield from lone.tasks(path)
 
 
-def _record_task(dataset: Dataset, record: ScanRecord, segmenter: Segmenter, out: Path) -> Task:
+def _record_task(dataset: Dataset, record: ScanRecord, by: By, out: Path) -> Task:
+    scores = (out / record.prediction).with_suffix(".npz")
     return Task(
         record.name,
         lambda: dataset.read(record, labels=False),
-        segmenter,
+        by(scores, False),
         lambda result: dataset.write_prediction(record, out, result.labels),
-        (out / record.prediction).with_suffix(".npz"),
+        scores,
     )
 
 

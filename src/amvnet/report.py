@@ -1,4 +1,4 @@
-"""The tables that a person reads: of an evaluation, and of a weights file."""
+"""The tables that a person reads: of an evaluation, of times, and of what is installed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rich.table import Table
 from amvnet.bench import FUSION, Timing
 from amvnet.data.labels import Taxonomy
 from amvnet.recipes import recipe_names
-from amvnet.weights import Weights, built_in
+from amvnet.weights import built_in
 
 TITLES = {
     "rv": "RV",
@@ -23,7 +23,19 @@ TITLES = {
     "ensemble": "ensemble",
     "amvnet": "AMVNet",
 }
-PACKAGES = ("amvnet", "torch", "lightning", "numpy", "scipy", "safetensors", "trimesh", "embreex", "laspy", "rosbags")
+PACKAGES = (
+    "amvnet",
+    "torch",
+    "lightning",
+    "numpy",
+    "scipy",
+    "safetensors",
+    "trimesh",
+    "embreex",
+    "laspy",
+    "rosbags",
+    "huggingface_hub",
+)
 OVERALL = {"miou": "mIoU", "miou_present": "mIoU, classes present", "accuracy": "accuracy", "fwiou": "fwIoU"}
 
 
@@ -54,32 +66,6 @@ def _rows(methods: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[list[str] 
     bins = [m["by_distance"] for m in methods.values()]
     for same in zip(*bins, strict=True):
         yield [f"mIoU, {same[0]['from_m']:.0f} to {same[0]['to_m']:.0f} m", *(_percent(b["miou"]) for b in same)]
-
-
-def weights_table(weights: Weights, name: str) -> Table:
-    """What a weights file is: classes, views, and each part with how it was trained and what it reached."""
-    table = Table(title=name, show_header=False, show_edge=False)
-    view, grid = weights.model.range_view, weights.model.polar_view
-    table.add_row(
-        "classes", f"{weights.taxonomy.size} of {weights.taxonomy.name}: {', '.join(weights.taxonomy.classes)}"
-    )
-    table.add_row("sensor", weights.sensor or "not said")
-    field = "by ring" if view.rows == "ring" else f"{view.fov_up:+g} to {view.fov_down:+g} degrees"
-    table.add_row("range view", f"{view.height} x {view.width}, {field}")
-    table.add_row(
-        "polar view",
-        f"{grid.radial} x {grid.angular} x {grid.vertical}, {grid.radius_min:g} to {grid.radius_max:g} m, "
-        f"height {grid.z_min:g} to {grid.z_max:g} m",
-    )
-    assertion = weights.model.assertion
-    table.add_row("uncertain points", f"{assertion.name}, threshold {assertion.threshold:g}")
-    for part in weights.parts:
-        table.add_section()
-        count = sum(v.numel() for v in weights.part(part).values())
-        table.add_row(part, f"{count:,} values")
-        for key, value in {**weights.training.get(part, {}), **weights.metrics.get(part, {})}.items():
-            table.add_row(f"  {key}", _plain(value))
-    return table
 
 
 def timing_table(timing: Timing) -> Table:
@@ -117,14 +103,6 @@ def _version(name: str) -> str:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
         return "not installed"
-
-
-def _plain(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return ", ".join(f"{k} {v}" for k, v in value.items())
-    if isinstance(value, list):
-        return ", ".join(map(str, value))
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _percent(value: float | None) -> str:

@@ -16,6 +16,7 @@ from amvnet.config import Recipe
 from amvnet.data.files import whole_file
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
+from amvnet.score_files import ScorePair
 from amvnet.training import LAST
 from amvnet.trees import to_dict
 from amvnet.weights import SIZES, Weights
@@ -31,12 +32,13 @@ def describe(
     val: Sequence[ScanRecord],
     stage: str,
     init: Weights | None,
+    scores: ScorePair | None = None,
 ) -> None:
     """Write the recipe, and in run.yaml with what a stage (or all) is made, on what, and how to make it again."""
     # Another call of this folder may have trained another stage on other scans: its entry stays, before this one.
     earlier = {key: value for key, value in _calls(out / "run.yaml").items() if key != stage}
     said = {
-        "repeat": shlex.join(map(str, _repeat(out, dataset, train, val, stage, init))),
+        "repeat": shlex.join(map(str, _repeat(out, dataset, train, val, stage, init, scores))),
         "versions": {name: metadata.version(name) for name in ("amvnet", "torch", "lightning", "numpy")},
         "python": platform.python_version(),
         "data": str(dataset.root),
@@ -44,6 +46,7 @@ def describe(
         "train": names_of(train),
         "val": names_of(val),
         "init": None if init is None else {part: init.digest(part) for part in init.parts},
+        **({} if scores is None else {"scores": scores.said()}),
     }
     for name, tree in {"recipe.yaml": to_dict(recipe), "run.yaml": {**earlier, stage: said}}.items():
         with whole_file(out / name) as part:
@@ -66,6 +69,7 @@ def _repeat(
     val: Sequence[ScanRecord],
     stage: str,
     init: Weights | None,
+    scores: ScorePair | None,
 ) -> list[Any]:
     """The command that makes a run again."""
     validated = ["--val-sequences", ",".join(names_of(val))] if val else ["--with-val"]
@@ -74,19 +78,28 @@ def _repeat(
         *("--train-sequences", ",".join(names_of(train)), *validated),
         # Weights that were given have no name here; their digests tell whether it is they.
         *([] if init is None else ["--init", "WEIGHTS"]),
+        *([] if scores is None else scores.options()),
         *("--out", f"{out}-again"),
     ]
 
 
 def settings(
-    recipe: Recipe, name: str, part: str, train: Sequence[ScanRecord], val: Sequence[ScanRecord], current: Weights
+    recipe: Recipe,
+    name: str,
+    part: str,
+    train: Sequence[ScanRecord],
+    val: Sequence[ScanRecord],
+    current: Weights,
+    scores: ScorePair | None = None,
 ) -> dict[str, Any]:
     """What the weights of a stage depend on; the data may move to another folder meanwhile."""
     tree = to_dict(recipe)
     training = {key: tree["training"][key] for key in (name, "augment", "seed", "precision")}
     found = {"model": {key: tree["model"][key] for key in SIZES[part]}, "training": training}
     found["scans"] = {"train": _digest_of_scans(train), "val": _digest_of_scans(val)}
-    if name == "head":
+    if scores is not None:
+        found["scores"] = scores.digests([*train, *val])
+    elif name == "head":
         found["networks"] = {network: current.digest(network) for network in ("range_net", "polar_net")}
     return found
 

@@ -25,14 +25,14 @@ from amvnet.data.labels import NUSCENES, SEMANTICKITTI
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.head_points import gather_points, head_loader
+from amvnet.head_sources import Networks, Source, scored_with, source_of
 from amvnet.head_training import HeadStage
 from amvnet.loading import ScanSet, count_classes, loader
 from amvnet.losses import class_weights
 from amvnet.models.amvnet import AMVNet, build_amvnet
-from amvnet.models.assertions import Disagreement
-from amvnet.models.point_head import PointHead
 from amvnet.processes import ALONE, Processes
 from amvnet.run_folder import SETTINGS, check_begun, describe, names_of, settings
+from amvnet.score_files import ScorePair
 from amvnet.training import Course, PolarStage, RangeStage, Stage, fit
 from amvnet.views.points import PointBatch
 from amvnet.weights import Weights, state_of
@@ -56,6 +56,7 @@ class Run:
         say: told what happens, in lines.
         bars: show progress bars instead of a line an epoch.
         processes: those that share the run; all must see its folder.
+        scores: two other models' scores of the scans, for which the head is trained in place of the networks'.
     """
 
     recipe: Recipe
@@ -67,6 +68,7 @@ class Run:
     say: Callable[[str], None] = lambda line: None
     bars: bool = False
     processes: Processes = ALONE
+    scores: ScorePair | None = None
 
     def __post_init__(self) -> None:
         self.out = Path(self.out)
@@ -100,12 +102,14 @@ class Run:
                 folder holds a run and `resume` is not said.
         """
         names = self.recipe.stages if stage == "all" else (stage,)
+        if self.scores is not None and names != ("head",):
+            raise InputError(f"expected --stage head for scores of other models, found {stage}; add it")
         current, path = self._start(init), self.out / "weights.safetensors"
         for name in names:  # before anything is written, and hours are spent on the first
             check_begun(self._folder(name), self._settings(name, current), self.resume)
         self.processes.wait()
         if self.processes.first:
-            describe(self.out, self.recipe, self.dataset, self.train, self.val, stage, init)
+            describe(self.out, self.recipe, self.dataset, self.train, self.val, stage, init, self.scores)
         for name in names:
             current = self._stage(name, current)
             if self.processes.first:
@@ -116,10 +120,12 @@ class Run:
     def _start(self, init: Weights | None) -> Weights:
         """Fresh weights, or those that are given; earlier stages of this folder are taken up."""
         current = Weights(self.recipe.model, self.dataset.taxonomy, self.recipe.sensor)
+        # A head for other models is kept by itself: these networks are not those that it knows.
+        used = PART if self.scores is None else {"head": PART["head"]}
         if init is not None:
-            for part in init.parts:
+            for part in [part for part in init.parts if part in used.values()]:
                 current = current.replace_part(part, init)
-        for name, part in PART.items():
+        for name, part in used.items():
             kept = self._kept(name)
             if kept.is_file() and (self._folder(name) / "done").is_file():
                 current = current.replace_part(part, weights_file.load(kept))
@@ -133,7 +139,7 @@ class Run:
         return self._folder(name) / f"{self.recipe.training.keep}.safetensors"
 
     def _settings(self, name: str, current: Weights) -> dict[str, Any]:
-        return settings(self.recipe, name, PART[name], self.train, self.val, current)
+        return settings(self.recipe, name, PART[name], self.train, self.val, current, self.scores)
 
     def _stage(self, name: str, current: Weights) -> Weights:
         done = self._folder(name) / "done"
@@ -171,9 +177,8 @@ class Run:
             with TemporaryDirectory() as folder:
                 # Whole steps, where there are fewer scans, too.
                 scans = [self.train[place % len(self.train)] for place in range(TRIAL_STEPS * config.batch)]
-                trial = dataclasses.replace(
-                    self, train=scans, val=(), out=Path(folder), resume=False, say=lambda line: None
-                )
+                trial = dataclasses.replace(self, train=scans, val=(), out=Path(folder), resume=False)
+                trial.say = lambda line: None
                 # The classes' weights cost a look at every scan, and nothing else.
                 speed = trial._fit_network(name, fresh, np.ones(self.dataset.taxonomy.size), TRIAL_STEPS)
             step = speed.seconds[-1]
@@ -213,13 +218,11 @@ class Run:
 
     def _fit_head(self, current: Weights) -> None:
         training, config = self.recipe.training, self.recipe.training.head
-        missing = [part for part in ("range_net", "polar_net") if part not in current.parts]
-        if missing:
-            raise InputError(f"expected trained networks for the head, found no {missing[0]}; train it, or give --init")
-        folder = self._folder("head")
-        gather = functools.partial(gather_points, dataset=self.dataset, training=training, processes=self.processes)
+        folder, validated = self._folder("head"), source_of(current, self.scores, self.val)
+        gather = functools.partial(gather_points, dataset=self.dataset, model=current.model, training=training,
+                                   processes=self.processes)  # fmt: skip
         train = gather(self._sources(current), views=config.views, folder=folder / "train", say=self.say)
-        val = gather([(current, self.val)], views=0, folder=folder / "val") if self.val else None
+        val = gather([validated], views=0, folder=folder / "val") if self.val else None
         head = self._module(PART["head"], current).point_head
         assert head is not None
         weights = class_weights(self._counts()) if config.class_weights else None
@@ -229,7 +232,8 @@ class Run:
             self._course("head", config.epochs),
             load(train, config.batch, shuffle=True),
             load(val, 64 * config.batch, shuffle=False) if val is not None else None,
-            [self._keep("head", current), self._pictures(_whole(current, head))],
+            # The pictures' scans are scored as they come, and of files nobody knows which scan that is.
+            [self._keep("head", current), *([] if self.scores else [self._pictures(scored_with(current, head))])],
         )
         self.processes.wait()
         if self.processes.first:
@@ -250,24 +254,24 @@ class Run:
         scans = [self.dataset.read(self.val[place]) for place in places] if self.processes.first else []
         return Pictures(scans, self.dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
 
-    def _sources(self, current: Weights) -> list[tuple[Weights, Sequence[ScanRecord]]]:
-        """Which networks score which training scans for the head: with folds, such as have not seen them."""
+    def _sources(self, current: Weights) -> list[Source]:
+        """What scores which training scans for the head: with folds, networks that have not seen them."""
         folds = self.recipe.training.head.folds
-        if folds < 2:
-            return [(current, self.train)]
+        if folds < 2 or self.scores is not None:
+            return [source_of(current, self.scores, self.train)]
         names = names_of(self.train)
         if len(names) < folds:
             raise InputError(f"expected at least {folds} training sequences for {folds} folds, found {len(names)}")
         return [self._fold(index, set(names[index::folds])) for index in range(folds)]
 
-    def _fold(self, index: int, left_out: set[str]) -> tuple[Weights, list[ScanRecord]]:
+    def _fold(self, index: int, left_out: set[str]) -> Networks:
         """Networks trained without some sequences, and the scans of these."""
         seen = [r for r in self.train if r.sequence not in left_out]
         unseen = [r for r in self.train if r.sequence in left_out]
         out = self.out / "folds" / str(index)
         fold = Run(self.recipe, self.dataset, seen, unseen, out, True, self.say, self.bars, self.processes)
         fold.stages("rv")
-        return weights_file.load(fold.stages("bev")), unseen
+        return Networks(weights_file.load(fold.stages("bev")), unseen)
 
     def _counts(self) -> Any:
         return count_classes(self.dataset, self.train, self.out / "class_counts.npz", self.processes)
@@ -277,7 +281,8 @@ class Run:
         part, started = PART[name], time.time()
         settings = self._settings(name, current)
         made = {**settings["training"], "sequences": names_of(self.train),
-                "validated_on": names_of(self.val), "scans": len(self.train)}  # fmt: skip
+                "validated_on": names_of(self.val), "scans": len(self.train),
+                **{key: settings[key] for key in ("scores",) if key in settings}}  # fmt: skip
 
         def write(module: nn.Module, path: Path, reached: dict[str, float]) -> None:
             seconds = round(time.time() - started)
@@ -292,12 +297,3 @@ class Run:
                 file.write_text(yaml.safe_dump(settings, sort_keys=False))
 
         return KeepWeights(write, self._folder(name))
-
-
-def _whole(current: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
-    """The scores by AMVNet whose head is being trained."""
-    model = current.build()
-    model.point_head = head
-    if current.model.assertion.name == "loss":  # which needs labels, that a picture of a prediction must not know
-        model.assertion = Disagreement()
-    return lambda batch: model.to(batch.points.device)(batch).merged

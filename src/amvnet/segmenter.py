@@ -12,13 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from amvnet.config import AssertionConfig
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
-from amvnet.models.amvnet import ENSEMBLES, Scores, merge, refine
-from amvnet.models.assertions import Assertion, Disagreement, build_assertion
+from amvnet.models.amvnet import ENSEMBLES, Scores, merge
 from amvnet.models.layers import fold_batch_norms
-from amvnet.models.point_head import PointHead
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
 from amvnet.views.range_view import RangeView
@@ -33,8 +30,6 @@ NEEDED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(ENSEMBLES, ("range_net", "polar_net")),
     "amvnet": ("range_net", "polar_net", "point_head"),
 }
-
-SURE = 1e-7  # two models that are wholly sure of different classes have a product of 0 for every class
 
 
 @dataclass(frozen=True)
@@ -92,7 +87,7 @@ class Segmenter:
         """
         scan = checked_scan(points)
         scores = self._scores(PointBatch.of([scan]).to(self.device))
-        return _segmentation(scan.valid, scores)
+        return segmentation(scan.valid, scores)
 
     def by_ring(self) -> Segmenter:
         """The same for scans whose `ring` is the row of each point, 0 the lowest, whatever rows the weights have."""
@@ -145,48 +140,6 @@ class Segmenter:
         return Scores(ENSEMBLES[self.method](f, g), model.assertion(f, g, batch.points), f, g)
 
 
-def fuse(
-    points: np.ndarray,
-    f: np.ndarray,
-    g: np.ndarray,
-    head: PointHead | Weights | Path | str | None = None,
-    tau: float | None = None,
-) -> np.ndarray:
-    """The late fusion alone, for any two models' scores (section 3.2 of the paper).
-
-    Args:
-        points: (N, 4) x, y, z in metres and intensity in [0, 1].
-        f, g: (N, K) class probabilities of the two models.
-        head: a trained point head, or weights that hold one; None gives the ensemble.
-        tau: points whose scores have a cosine similarity of at most this are uncertain; by default the
-            threshold that weights were trained with, or else the paper's.
-
-    Returns:
-        (N,) uint8 train ids, 1..K; 0 where a point is not finite.
-
-    Raises:
-        InputError: where the shapes do not fit.
-    """
-    scan = checked_scan(points)
-    if f.shape != g.shape or f.ndim != 2 or len(f) != len(scan):
-        raise InputError(
-            f"expected two arrays of scores of shape ({len(scan)}, K), found {f.shape} and {g.shape}; "
-            "give both models' scores of this scan"
-        )
-    module, assertion = _head(head, tau)
-    classes = None if module is None else module.fc[-1].out_features
-    if classes not in (None, f.shape[1]):
-        raise InputError(f"expected scores of the head's {classes} classes, found {f.shape[1]}; use a head for them")
-    with torch.inference_mode():
-        x, a, b = (torch.from_numpy(np.asarray(v, dtype=np.float32)[scan.valid]) for v in (scan.points, f, g))
-        if not (a.isfinite().all() and b.isfinite().all()):
-            raise InputError("expected finite scores, found NaN or infinity among them; give probabilities")
-        a, b = a.clamp_min(SURE), b.clamp_min(SURE)
-        uncertain = assertion(a, b, x)
-        h = None if module is None else refine(module, x, a, b, uncertain)
-        return _segmentation(scan.valid, Scores(merge(a, b, uncertain, h), uncertain, None, None)).labels
-
-
 def checked_scan(points: np.ndarray | Scan) -> Scan:
     """A scan that holds something to work on.
 
@@ -198,19 +151,6 @@ def checked_scan(points: np.ndarray | Scan) -> Scan:
         found = "none finite" if len(scan) else "none"
         raise InputError(f"{scan.name or 'scan'}: expected points to segment, found {found}; leave the scan out")
     return scan
-
-
-def _head(head: PointHead | Weights | Path | str | None, tau: float | None) -> tuple[PointHead | None, Assertion]:
-    """The head, and the assertion that chooses its points."""
-    if isinstance(head, str | Path):
-        head = load(head)
-    config = AssertionConfig()
-    if isinstance(head, Weights):
-        if "point_head" not in head.parts:
-            raise InputError("expected weights with a point head, found none; train one with --stage head")
-        config, head = head.model.assertion, head.build().point_head
-    assertion = build_assertion(config) if tau is None else Disagreement(tau)
-    return None if head is None else copy.deepcopy(head).cpu().eval(), assertion
 
 
 def _checked_method(method: Method, weights: Weights) -> Method:
@@ -240,7 +180,7 @@ def widest_method(weights: Weights) -> Method:
     return found[-1] if found else METHODS[-1]
 
 
-def _segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
+def segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
     """Put what was found for the valid points back among all points."""
     merged = in_place(scores.merged, valid)
     rv, bev = (None if values is None else in_place(values, valid) for values in (scores.rv, scores.bev))

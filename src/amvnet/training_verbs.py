@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from amvnet.errors import InputError
-from amvnet.inputs import listed, meet, names_in, numbers_in, open_data
+from amvnet.inputs import listed, meet, names_in, numbers_in, open_data, scores_in
 from amvnet.terminal import on_terminal, progress, say
 
 if TYPE_CHECKING:
@@ -27,6 +27,11 @@ def train(
     with_val: bool = False,
     dry_run: bool = False,
     taxonomy: Path | None = None,
+    scores_a: Path | None = None,
+    scores_b: Path | None = None,
+    key_a: str | None = None,
+    key_b: str | None = None,
+    logits: Literal["a", "b", "both"] | None = None,
 ) -> None:
     """Train the two networks and the point head.
 
@@ -42,6 +47,11 @@ def train(
         with_val: learn from these too, as for an entry to a benchmark; then nothing is validated.
         dry_run: only take two steps of each network, and say what they cost and the whole training would.
         taxonomy: a semantic-kitti.yaml with other classes.
+        scores_a: with --stage head: a folder of another model's scores, to train a head for it and --scores-b.
+        scores_b: a folder of the other model's scores.
+        key_a: which array of each .npz in --scores-a.
+        key_b: which array of each .npz in --scores-b.
+        logits: which of the two are scores before softmax.
     """
     from amvnet import weights
     from amvnet.jobs import split_records
@@ -54,7 +64,8 @@ def train(
     learnt, val = split_records(dataset, names_in(train_sequences), names_in(val_sequences), with_val)
     say(f"training on {listed(learnt)}; validating on {listed(val)}")
     given = None if init is None else weights.load(init)
-    run = Run(recipe, dataset, learnt, val, out, resume, say, on_terminal(), processes)
+    pair = scores_in(scores_a, scores_b, key_a, key_b, logits)
+    run = Run(recipe, dataset, learnt, val, out, resume, say, on_terminal(), processes, pair)
     if dry_run:
         for trial in run.trials(stage):
             say(trial)

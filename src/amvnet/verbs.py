@@ -248,15 +248,16 @@ def info(weights: str | None = None) -> None:
     """Say what a weights file is; without one, what is installed.
 
     Args:
-        weights: a weights file, or the name of a built-in one.
+        weights: a weights file, or the name of a built-in one: its model card, in Markdown.
     """
-    from amvnet import report
-    from amvnet import weights as weights_file
+    from amvnet.model_card import OURS, model_card
+    from amvnet.report import installation_table
+    from amvnet.weights import built_in, load
 
     if weights is not None:
-        console.print(report.weights_table(weights_file.load(weights), weights))
+        say(model_card(load(weights), weights, OURS if weights in built_in() else None).rstrip())
         return
-    console.print(report.installation_table())
+    console.print(installation_table())
 
 
 def bench(weights: str = WEIGHTS, scan: Path | None = None, runs: int = 10, device: str = "cpu") -> None:

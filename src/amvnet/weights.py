@@ -17,11 +17,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from amvnet import hub
 from amvnet.config import ModelConfig
 from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.models.point_head import PointHead
 from amvnet.trees import from_dict, to_dict
 
 SIZES = {
@@ -105,13 +107,28 @@ class Weights:
         """
         model = build_amvnet(self.model, self.taxonomy.size)
         for part in self.parts:
-            try:
-                getattr(model, part).load_state_dict({k: v.float() for k, v in self.part(part).items()})
-            except RuntimeError:
-                raise InputError(f"the parameters of {part} do not fit its description; train it anew") from None
+            self._fill(part, getattr(model, part))
         if "point_head" not in self.parts:
             model.point_head = None
         return model.eval()
+
+    def build_head(self) -> PointHead:
+        """The point head alone, in evaluation mode.
+
+        Raises:
+            InputError: where there is none, or its parameters do not fit its sizes.
+        """
+        if "point_head" not in self.parts:
+            raise InputError("expected weights with a point head, found none; train one with --stage head")
+        head = PointHead(self.model.point_head, self.taxonomy.size)
+        self._fill("point_head", head)
+        return head.eval()
+
+    def _fill(self, part: str, module: torch.nn.Module) -> None:
+        try:
+            module.load_state_dict({k: v.float() for k, v in self.part(part).items()})
+        except RuntimeError:
+            raise InputError(f"the parameters of {part} do not fit its description; train it anew") from None
 
 
 def _only(values: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -150,7 +167,9 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
 
 
 def load(name_or_path: str | Path) -> Weights:
-    """Read a weights file, or a built-in one by name (`sim-hdl64e`). Nothing in it is ever run.
+    """Read a weights file, a built-in one by name (`sim-hdl64e`), or one of the hub (`hf-hub:OWNER/NAME`).
+
+    Nothing in it is ever run.
 
     Raises:
         InputError: where there is no such file or name, or it is not a weights file of this project.
@@ -184,6 +203,8 @@ def built_in() -> dict[str, Path]:
 
 
 def _find(name_or_path: str) -> Path:
+    if name_or_path.startswith(hub.PREFIX):
+        return hub.fetch(name_or_path)
     path = built_in().get(name_or_path, Path(name_or_path))
     if path.is_dir() and (path / "weights.safetensors").is_file():
         return path / "weights.safetensors"  # the folder of a training run

@@ -1,0 +1,45 @@
+"""The first clusters of a ranking from above: where they are, and what each view and the label take them for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from amvnet.data.records import Dataset
+from amvnet.pictures import draw_scan
+from amvnet.ranking import By, Ranking, clusters_of, doubts_of
+from amvnet.segmenter import Segmenter, checked_scan
+
+PICTURES = 12  # clusters that are drawn
+REACH = 8.0  # metres from the cluster to each side
+DEEP = 6.0  # metres above and below it: what is farther would hide it
+
+
+def draw(ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, folder: Path) -> list[Path]:
+    """Draw the first clusters, each with its surroundings; returns the files, RANK.png."""
+    return [
+        _draw(row, ranking, dataset, segmenter, by, folder / f"{place:02d}.png")
+        for place, row in enumerate(ranking.clusters[:PICTURES], start=1)
+    ]
+
+
+def _draw(row: np.void, ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, path: Path) -> Path:
+    record = ranking.records[row["scan"]]
+    scan = checked_scan(dataset.read(record))
+    doubts = doubts_of(scan, segmenter, by)
+    _, of = clusters_of(doubts)
+    points = scan.points[:, :3] - row["xyz"]
+    near = (np.abs(points) <= (REACH, REACH, DEEP)).all(axis=1)
+    panels = {"rv": doubts.rv, "bev": doubts.bev, **({} if scan.labels is None else {"label": doubts.label})}
+    x, y, z = row["xyz"]
+    return draw_scan(
+        path,
+        points[near],
+        dataset.taxonomy,
+        {name: ids[near] for name, ids in panels.items()},
+        uncertain=(of == of[row["point"]])[near],
+        title=f"{record.name}, around ({x:.1f}, {y:.1f}, {z:.1f}) m",
+        reach=REACH,
+        marked="cluster",
+    )
