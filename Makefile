@@ -1,6 +1,8 @@
 # Everything runs in a virtual environment of its own, .venv.
 PYTHON ?= python3
 BIN := .venv/bin
+# A process for each processor, and one thread in each.
+SPREAD := OMP_NUM_THREADS=1
 
 .PHONY: demo test test-slow lint format clean
 
@@ -8,10 +10,10 @@ demo: .venv/installed  ## simulate streets, segment, score and draw them
 	$(BIN)/amvnet demo --out demo
 
 test: .venv/installed lint  ## style, types and the tests
-	$(BIN)/python -m pytest
+	$(SPREAD) $(BIN)/python -m pytest -n auto
 
 test-slow: .venv/installed  ## the tests that take minutes, too
-	$(BIN)/python -m pytest -m "slow or not slow"
+	$(SPREAD) $(BIN)/python -m pytest -n auto -m "slow or not slow"
 
 lint: .venv/installed
 	$(BIN)/ruff check src tests benchmarks

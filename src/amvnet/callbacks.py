@@ -24,7 +24,7 @@ from amvnet.pictures import scan_figure
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
 
-PICTURED = 20  # times in a training that the pictures are drawn, at most about
+PICTURED = 10  # times in a training that the pictures are drawn, at most about
 PICTURE_DOTS = 60  # an inch
 
 

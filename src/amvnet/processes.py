@@ -168,7 +168,8 @@ class SyncedBatchNorm(_BatchNorm):
     @classmethod
     def of(cls, norm: _BatchNorm) -> SyncedBatchNorm:
         """One with the parameters of another."""
-        found = cls(norm.num_features, norm.eps, norm.momentum)
+        like = norm.weight
+        found = cls(norm.num_features, norm.eps, norm.momentum, device=like.device, dtype=like.dtype)
         found.load_state_dict(norm.state_dict())
         return found
 
