@@ -227,6 +227,7 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
             external_data=False,
             verbose=False,
         )
+    _strip(path)
     inputs, outputs, found = _run(path, graph)
     difference = _difference(graph, expected, found)
     if not difference <= LARGEST_DIFFERENCE:
@@ -237,6 +238,24 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     said = {"file": path.name, "sha256": digest, "inputs": inputs, "outputs": outputs}
     return {**said, "difference": difference}
+
+
+def _strip(path: Path) -> None:
+    """Take out the exporter's notes, which name places on this machine."""
+    import onnx
+
+    model = onnx.load(path)
+    model.ClearField("metadata_props")
+    for holder in (model.graph, *model.functions):
+        holder.ClearField("metadata_props")
+        for node in holder.node:
+            node.ClearField("metadata_props")
+        for value in (*holder.value_info, *getattr(holder, "input", ()), *getattr(holder, "output", ())):
+            if not isinstance(value, str):
+                value.ClearField("metadata_props")
+    for tensor in model.graph.initializer:
+        tensor.ClearField("metadata_props")
+    onnx.save(model, path)
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:
