@@ -1,4 +1,4 @@
-"""Trained networks as ONNX graphs beside a description of all that is needed to use them, checked before they appear."""
+"""Trained networks as ONNX graphs beside a description of all that one needs to use them, checked before they appear."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from amvnet.scan import FARTHEST, Scan
 from amvnet.segmenter import Segmenter, widest_method
 from amvnet.trees import to_dict
 from amvnet.views.points import PointBatch
-from amvnet.weights import Weights
+from amvnet.weights import Weights, load
 
 EXTRA = ("onnx", "onnxscript", "onnxruntime")
-OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 8.6 and ONNX Runtime 1.14 read it
+OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it
 LARGEST_DIFFERENCE = 1e-4  # of probabilities, and of features as shares of the largest
 POINTS = 5000  # of the made scan that the graphs are traced and checked with
 DYNAMIC = {"polar_points": "points", "polar_pillars": "pillars", "point_head": "uncertain"}  # name of the first axis
@@ -78,7 +78,8 @@ def export(
             written, or differs by more than `LARGEST_DIFFERENCE`; then the folder is as it was.
     """
     check_libraries()
-    segmenter = Segmenter(weights, method=_method(weights))
+    given = weights if isinstance(weights, Weights) else load(weights)
+    segmenter = Segmenter(given, method=widest_method(given))
     out = Path(out)
     make_folder(out)
     part = out / f".{uuid.uuid4().hex}.part"
@@ -137,13 +138,6 @@ def describe(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, Any]:
         "opset": OPSET,
         "graphs": graphs,
     }
-
-
-def _method(weights: Weights | Path | str) -> Any:
-    from amvnet.weights import load
-
-    given = weights if isinstance(weights, Weights) else load(weights)
-    return widest_method(given)
 
 
 def _graphs(segmenter: Segmenter) -> dict[str, Graph]:
@@ -245,16 +239,9 @@ def _strip(path: Path) -> None:
     import onnx
 
     model = onnx.load(path)
-    model.ClearField("metadata_props")
-    for holder in (model.graph, *model.functions):
+    graph = model.graph
+    for holder in (model, graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output):
         holder.ClearField("metadata_props")
-        for node in holder.node:
-            node.ClearField("metadata_props")
-        for value in (*holder.value_info, *getattr(holder, "input", ()), *getattr(holder, "output", ())):
-            if not isinstance(value, str):
-                value.ClearField("metadata_props")
-    for tensor in model.graph.initializer:
-        tensor.ClearField("metadata_props")
     onnx.save(model, path)
 
 
@@ -300,4 +287,6 @@ def _one_line(name: str) -> Iterator[None]:
         raise
     except Exception as error:
         kind = type(error).__name__
-        raise InputError(f"{name}: expected a graph of torch.onnx, found {kind}; upgrade torch and onnxscript") from error
+        raise InputError(
+            f"{name}: expected a graph of torch.onnx, found {kind}; upgrade torch and onnxscript"
+        ) from error

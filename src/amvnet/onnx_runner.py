@@ -65,6 +65,7 @@ class OnnxSegmenter:
         self.assertion = from_dict(AssertionConfig, said.get("assertion", {}), str(folder))
         self.head = from_dict(PointHeadConfig, said.get("point_head", {}), str(folder))
         self._graphs = {name: _session(folder, said["graphs"][name], providers) for name in GRAPHS[self.method]}
+        self._check_sizes(folder, len(said["classes"]) - 1)
 
     def __call__(self, points: np.ndarray, ring: np.ndarray | None = None) -> OnnxSegmentation:
         """Segment one scan.
@@ -83,6 +84,20 @@ class OnnxSegmenter:
         scores, uncertain = self._scores(scan.points[valid], None if scan.ring is None else scan.ring[valid])
         labels = scores.argmax(axis=1).astype(np.uint8) + 1
         return OnnxSegmentation(*(_in_place(values, valid) for values in (labels, uncertain, scores)))
+
+    def _check_sizes(self, folder: Path, k: int) -> None:
+        """Raises InputError where the graphs have other sizes than the description."""
+        a, b = self.range_view, self.polar_view
+        shapes = {
+            "range_net": [1, k, a.height, a.width],
+            "polar_map": [1, b.vertical * k, b.radial, b.angular],
+            "point_head": [self.head.neighbours, 2 * k + 4],
+        }
+        for name in set(shapes) & set(self._graphs):
+            graph = self._graphs[name]
+            found = graph.get_inputs()[1].shape[1:] if name == "point_head" else graph.get_outputs()[0].shape
+            if found != shapes[name]:
+                raise InputError(f"{folder}: expected {name} of size {shapes[name]}, found {found}; export anew")
 
     def _scores(self, points: np.ndarray, ring: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """(P, K) scores and (P,) uncertain of the valid points."""
@@ -111,8 +126,8 @@ class OnnxSegmenter:
         pillars = self._run("polar_pillars", pooled)  # (M, pillar)
         plane = np.zeros((c.radial * c.angular, pillars.shape[1]), dtype=np.float32)
         plane[occupied] = pillars
-        plane = plane.T.reshape(1, -1, c.radial, c.angular)
-        scores = self._run("polar_map", np.ascontiguousarray(plane))  # (1, Z * K, R, A)
+        image = np.ascontiguousarray(plane.T).reshape(1, -1, c.radial, c.angular)
+        scores = self._run("polar_map", image)  # (1, Z * K, R, A)
         return softmax(scores.reshape(c.vertical, -1, c.radial * c.angular)[voxel, :, pillar])
 
     def _settle(self, points: np.ndarray, f: np.ndarray, g: np.ndarray, uncertain: np.ndarray) -> np.ndarray:
@@ -221,21 +236,23 @@ def _description(folder: Path) -> dict[str, Any]:
         said = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         raise InputError(f"{folder}: expected {DESCRIPTION} of amvnet export, found none; export anew") from None
-    if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("method") not in GRAPHS:
+    if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("method") not in list(GRAPHS):
         raise InputError(f"{folder / DESCRIPTION}: expected format {FORMAT} and a method, found others; export anew")
     graphs = said.get("graphs")
     for name in GRAPHS[said["method"]]:
         if not isinstance(graphs, dict) or not _complete(graphs.get(name)):
             raise InputError(f"{folder / DESCRIPTION}: expected the graph {name}, found no such; export anew")
+    if not isinstance(said.get("classes"), list):
+        raise InputError(f"{folder / DESCRIPTION}: expected classes, found none; export anew")
     return said
 
 
 def _complete(graph: Any) -> bool:
-    """Whether a graph's description has its file, and names and shapes of its inputs."""
+    """Whether a graph's description has its file and its inputs."""
     if not isinstance(graph, dict) or not isinstance(graph.get("file"), str):
         return False
     inputs = graph.get("inputs")
-    return isinstance(inputs, list) and all(isinstance(one, dict) and {"name", "shape"} <= set(one) for one in inputs)
+    return isinstance(inputs, list) and all(isinstance(one, dict) for one in inputs)
 
 
 def _session(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -> Any:
@@ -252,8 +269,8 @@ def _session(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -
     except Exception as error:  # of a dozen classes that the runtime does not share with others
         said = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path}: expected a graph of amvnet export, found: {said}; export anew") from None
-    found = [[one.name, *one.shape] for one in session.get_inputs()]
-    expected = [[one["name"], *one["shape"]] for one in graph["inputs"]]
+    found = [(one.name, one.shape) for one in session.get_inputs()]
+    expected = [(one.get("name"), one.get("shape")) for one in graph["inputs"]]
     if found != expected:
         raise InputError(f"{path}: expected the inputs {expected}, found {found}; export anew")
     return session
