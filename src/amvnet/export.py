@@ -1,4 +1,4 @@
-"""Trained networks as ONNX graphs beside a description of all that one needs to use them, checked before they appear."""
+"""Trained networks as ONNX, checked, beside a description of all that one needs to use them."""
 
 from __future__ import annotations
 
