@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amvnet import __version__, fusion_verbs, training_verbs, verbs, viewing_verbs
+from amvnet import __version__, export_verbs, fusion_verbs, training_verbs, verbs, viewing_verbs
 from amvnet.arguments import Parser, Positional, parser_of
 from amvnet.errors import InputError, SomeBroken
 from amvnet.terminal import say
@@ -32,6 +32,7 @@ VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "rank": (fusion_verbs.rank, {"data": {"metavar": "DATA"}}),
     "analyze": (training_verbs.analyze, {"data": {"metavar": "DATA"}}),
     "ablate": (training_verbs.ablate, {"recipe": {"metavar": "RECIPE"}}),
+    "export": (export_verbs.export, {}),
     "view": (viewing_verbs.view, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
     "bench": (verbs.bench, {}),
     "info": (verbs.info, {"weights": {"metavar": "W", "nargs": "?"}}),
@@ -68,6 +69,7 @@ USAGE = f"""usage: amvnet VERB ...
   rank       what to label next, and which labels look wrong
   analyze    the paper's figures, sweeps and tables
   ablate     the paper's ablation of the range-view network
+  export     the networks as ONNX, for C++ and TensorRT
   view       look at scans, labels and errors in 3D
   bench      time per stage on this machine
   info       what a weights file is, or what is installed

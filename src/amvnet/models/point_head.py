@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from amvnet.config import PointHeadConfig
+from amvnet.neighbours import nearest_others
 
 POINT_VALUES = 4  # x, y, z, intensity
 
@@ -60,24 +59,8 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
 
     Of a scan with fewer than n other points the last one is repeated; a lone point is its own neighbour.
     """
-    xyz = points[:, :3].cpu().numpy()
-    own = index.cpu().numpy()
-    if not len(own):
-        return index.new_zeros(0, n)
-    # A tree that is not balanced costs a third to build, and a tenth more to ask.
-    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
-    _, found = tree.query(xyz[own], k=np.arange(1, min(n + 1, len(xyz)) + 1), workers=-1)  # (U, <= n + 1)
-    return torch.from_numpy(_without_own(np.asarray(found), own, n)).to(points.device)
-
-
-def _without_own(found: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
-    """Drop each point from its own neighbours; the farthest where, among points in one place, it is not found."""
-    if found.shape[1] > 1:
-        is_own = found == own[:, None]
-        is_own[~is_own.any(axis=1), -1] = True
-        found = found[~is_own].reshape(len(own), -1)
-    missing = n - found.shape[1]
-    return np.pad(found, ((0, 0), (0, missing)), mode="edge") if missing > 0 else found
+    found = nearest_others(points[:, :3].cpu().numpy(), index.cpu().numpy(), n)
+    return torch.from_numpy(found).to(points.device)
 
 
 def _mlp(widths: tuple[int, ...]) -> nn.Sequential:
