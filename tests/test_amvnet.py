@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from itertools import permutations
 
@@ -27,6 +28,7 @@ from amvnet.models.layers import fold_batch_norms
 from amvnet.models.point_head import PointHead, head_features, nearest_neighbours, point_table
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
+from amvnet.views.polar_view import PolarGrid
 
 RandomScan = Callable[..., Scan]
 
@@ -88,6 +90,14 @@ def neighbours_by_loop(points: Tensor, own: int) -> list[tuple[float, int]]:
     return sorted((math.dist(row, rows[own]), i) for i, row in enumerate(rows) if i != own)
 
 
+@pytest.fixture(params=["pykdtree", "scipy"])
+def tree(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both libraries that find neighbours."""
+    if request.param == "scipy":
+        monkeypatch.setitem(sys.modules, "pykdtree.kdtree", None)  # as if it were not installed
+
+
+@pytest.mark.usefixtures("tree")
 def test_nearest_neighbours_equal_a_search_through_all_points() -> None:
     points, index = torch.randn(200, 4), torch.tensor([0, 7, 199, 42])
     found = nearest_neighbours(points, index, 15)
@@ -97,6 +107,7 @@ def test_nearest_neighbours_equal_a_search_through_all_points() -> None:
 
 @pytest.mark.parametrize("n", [1, 3, 12])
 @pytest.mark.parametrize("places", [1, 4, 20])
+@pytest.mark.usefixtures("tree")
 def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(places: int, n: int) -> None:
     points = torch.randn(places, 4, generator=torch.Generator().manual_seed(0))[torch.arange(40) % places]
     for own, row in enumerate(nearest_neighbours(points, torch.arange(40), n).tolist()):
@@ -106,11 +117,13 @@ def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(p
         assert [math.dist(points[i, :3].tolist(), points[own, :3].tolist()) for i in row] == nearest
 
 
+@pytest.mark.usefixtures("tree")
 def test_with_fewer_points_than_neighbours_the_last_one_is_repeated() -> None:
     points = torch.tensor([[0.0, 0, 0, 9], [5, 0, 0, 9], [1, 0, 0, 9], [3, 0, 0, 9]])
     assert nearest_neighbours(points, torch.tensor([0, 1]), 6).tolist() == [[2, 3, 1, 1, 1, 1], [3, 2, 0, 0, 0, 0]]
 
 
+@pytest.mark.usefixtures("tree")
 def test_a_lone_point_is_its_own_neighbour() -> None:
     assert nearest_neighbours(torch.ones(1, 4), torch.tensor([0]), 3).tolist() == [[0, 0, 0]]
 
@@ -227,10 +240,12 @@ class Constant(nn.Module):
 
     def __init__(self, *scores: float) -> None:
         super().__init__()
-        self.map = torch.tensor(scores).repeat(GRID.vertical)[None, :, None, None]
+        self.scores = torch.tensor(scores)
 
-    def forward(self, view: object) -> Tensor:
-        return self.map[:, :K].expand(1, K, 7, 21) if isinstance(view, Tensor) else self.map.expand(1, -1, 9, 11)
+    def forward(self, view: Tensor | PolarGrid) -> Tensor:
+        if isinstance(view, Tensor):
+            return self.scores[:, None, None].expand(1, K, 7, 21)
+        return self.scores.repeat(len(view.occupied), GRID.vertical)
 
 
 def whole_model(dull: float = 0.5) -> AMVNet:
@@ -254,6 +269,19 @@ def test_agreement_leaves_the_scores_alone(random_scan: RandomScan) -> None:
     assert model(PointBatch.of([random_scan(30)])).uncertain.all()
 
 
+@pytest.mark.parametrize("uncertain", [0, 1, 2500])
+@pytest.mark.parametrize("folded", [False, True])
+def test_scoring_points_from_the_table_equals_scoring_their_features(uncertain: int, folded: bool) -> None:
+    head = point_head(PointHeadConfig(), 19)
+    if folded:
+        fold_batch_norms(head)
+    points = torch.cat([20 * torch.randn(3000, 3), torch.rand(3000, 1)], dim=1)
+    table = point_table(points, *(3 * torch.randn(2, 3000, 19)).softmax(dim=2))
+    index, near = torch.randperm(3000)[:uncertain], torch.randint(3000, (uncertain, 15))
+    expected = head(*head_features(head.config, table, index, near))
+    torch.testing.assert_close(head.score(table, index, near), expected, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("brightest", [0, 1, 5])
 def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(random_scan: RandomScan, brightest: int) -> None:
     batch = PointBatch.of([random_scan(30)])
@@ -271,7 +299,7 @@ def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(random_scan
 def test_the_networks_scores_are_those_of_each_points_pixel_and_voxel(random_scan: RandomScan) -> None:
     model, batch = whole_model(), PointBatch.of([random_scan(30)])
     found, image, grid = model(batch), model.range_view.project(batch), model.polar_view.project(batch)
-    pixels, voxels = model.range_net(image.image)[0].flatten(1), model.polar_net(grid)[0].flatten(1)
+    pixels, voxels = model.range_net(image.image)[0].flatten(1), grid.to_map(model.polar_net(grid))[0].flatten(1)
     for i in range(30):
         torch.testing.assert_close(found.rv[i], pixels[:, image.pixel[i]].softmax(0))
         first = int(grid.voxel[i]) * K

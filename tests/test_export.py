@@ -124,7 +124,8 @@ def test_the_description_says_what_a_program_needs(exported: dict[str, tuple[Wei
             assert [one["name"] for one in ours] == [one.name for one in theirs], name
     shapes = {name: [one["shape"] for one in graph["inputs"]] for name, graph in said["graphs"].items()}
     assert shapes["point_head"] == [["uncertain", 36], ["uncertain", 4, 36]]
-    assert said["graphs"]["polar_map"]["outputs"][0]["shape"] == [1, 4 * 16, 12, 16]
+    assert said["graphs"]["polar_map"]["outputs"][0]["shape"][2:] == [12, 16]
+    assert said["graphs"]["polar_scores"]["outputs"][0]["shape"] == ["pillars", 4 * 16]
 
 
 def test_the_graphs_say_nothing_of_the_machine(exported: dict[str, tuple[Weights, Path]]) -> None:
@@ -185,7 +186,7 @@ def _change(folder: Path, *keys: str, to: object) -> None:
     [
         (lambda folder: (folder / "amvnet.json").unlink(), "amvnet.json"),
         (lambda folder: (folder / "amvnet.json").write_text("{"), "amvnet.json"),
-        (lambda folder: (folder / "amvnet.json").write_text("[]"), "format 1"),
+        (lambda folder: (folder / "amvnet.json").write_text("[]"), "format 2"),
         (lambda folder: _change(folder, "method", to=["rv"]), "method"),
         (lambda folder: _change(folder, "graphs", to=3), "range_net"),
         (lambda folder: _change(folder, "graphs", "polar_map", to={}), "polar_map"),
@@ -218,7 +219,13 @@ def test_the_verb_exports_and_its_mistakes_are_one_line(
     weights = exported["elevation"][0]
     path = save(without(weights, "range_net", "point_head"), tmp_path / "w.safetensors")
     assert amvnet("export", "--weights", path, "--out", tmp_path / "out")[0] == 0
-    assert files(tmp_path / "out") == {"amvnet.json", "polar_points.onnx", "polar_pillars.onnx", "polar_map.onnx"}
+    assert files(tmp_path / "out") == {
+        "amvnet.json",
+        "polar_points.onnx",
+        "polar_pillars.onnx",
+        "polar_map.onnx",
+        "polar_scores.onnx",
+    }
     assert OnnxSegmenter(tmp_path / "out")(scan_of(1).points).labels.any()
     code, line = amvnet("export", "--weights", tmp_path / "none", "--out", tmp_path / "none_out")
     assert code == 2

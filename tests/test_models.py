@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config import (
@@ -16,7 +17,7 @@ from amvnet.config import (
     PolarViewConfig,
     RangeNetConfig,
 )
-from amvnet.models.layers import AzimuthGRU, RingConv2d, fold_batch_norms, upsample, wrap_width
+from amvnet.models.layers import AzimuthGRU, PointLinear, RingConv2d, fold_batch_norms, upsample, wrap_width
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.scan import Scan
@@ -44,8 +45,8 @@ def run_range(net: nn.Module, *seeds: int) -> Tensor:
 
 def run_polar(net: nn.Module, *seeds: int) -> Tensor:
     clouds = [torch.randn(60, 4, generator=torch.Generator().manual_seed(s)) * 15 for s in seeds]
-    batch = PointBatch.of([Scan(cloud.numpy()) for cloud in clouds])
-    return net(PolarView(GRID).project(batch))
+    grid = PolarView(GRID).project(PointBatch.of([Scan(cloud.numpy()) for cloud in clouds]))
+    return grid.to_map(net(grid))
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,22 @@ def test_the_gradient_reaches_every_parameter_of_a_network(case: Case, training:
         assert parameter.grad.isfinite().all(), name
         # A bias before a norm has a gradient only where the norm's statistics are fixed.
         assert parameter.grad.any() or (training and name.endswith("bias")), name
+
+
+def test_a_network_gives_the_same_with_gradients_and_without(case: Case) -> None:
+    net = case.in_eval()
+    expected = case.run(net, 3)
+    with torch.inference_mode():
+        torch.testing.assert_close(case.run(net, 3), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 500])
+@pytest.mark.parametrize("sizes", [(1, 1), (9, 32), (42, 64)])
+def test_a_point_linear_layer_is_a_linear_layer(rows: int, sizes: tuple[int, int]) -> None:
+    layer, x = PointLinear(*sizes), torch.randn(rows, sizes[0], requires_grad=True)
+    found, expected = layer(x), F.linear(x, layer.weight, layer.bias)
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(*(torch.autograd.grad(y.square().sum(), x)[0] for y in (found, expected)))
 
 
 def test_a_network_is_deterministic_in_eval(case: Case) -> None:

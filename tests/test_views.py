@@ -237,6 +237,12 @@ def test_pool_is_the_maximum_over_each_pillar(random_scan: RandomScan) -> None:
         assert row == [max(values) for values in zip(*members, strict=True)]
 
 
+@pytest.mark.parametrize("part", [1, 100, 1000])
+def test_pooling_by_parts_is_pooling_of_all(random_scan: RandomScan, part: int) -> None:
+    grid = polar_grid(random_scan(400, 1), random_scan(300, 2))
+    assert torch.equal(grid.pool_by_parts(lambda x: 2 * x[:, :5] - 30, part), grid.pool(2 * grid.features[:, :5] - 30))
+
+
 def test_maps_hold_the_pillars_where_they_belong_and_zero_elsewhere(random_scan: RandomScan) -> None:
     grid = polar_grid(random_scan(100, 1), random_scan(100, 2))
     pillars = torch.randn(len(grid.occupied), 3)
@@ -244,13 +250,14 @@ def test_maps_hold_the_pillars_where_they_belong_and_zero_elsewhere(random_scan:
     for values, pillar in zip(pillars, grid.occupied.tolist(), strict=True):
         expected[pillar // (13 * 17), :, pillar // 17 % 13, pillar % 17] = values
     assert torch.equal(grid.to_map(pillars), expected)
+    assert torch.equal(grid.at_pillars(expected), pillars)
     assert (expected == 0).all(dim=1).any()
 
 
 def test_every_point_gets_the_scores_of_its_voxel(random_scan: RandomScan) -> None:
     scans = [random_scan(80, 1), random_scan(60, 2)]
-    scores = torch.randn(2, 5 * 3, 13, 17)
-    found = polar_grid(*scans).to_points(scores)
+    scores, grid = torch.randn(2, 5 * 3, 13, 17), polar_grid(*scans)
+    found = grid.to_points(grid.at_pillars(scores))
     expected = []
     for b, scan in enumerate(scans):
         for radius, angle, voxel in polar_view_by_loop(scan, POLAR)[0]:

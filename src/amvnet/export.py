@@ -37,7 +37,13 @@ EXTRA = ("onnx", "onnxscript", "onnxruntime")
 OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it
 LARGEST_DIFFERENCE = 1e-4  # of probabilities, and of features as shares of the largest
 POINTS = 5000  # of the made scan that the graphs are traced and checked with
-DYNAMIC = {"polar_points": "points", "polar_pillars": "pillars", "point_head": "uncertain"}  # name of the first axis
+# name of the first axis
+DYNAMIC = {
+    "polar_points": "points",
+    "polar_pillars": "pillars",
+    "polar_scores": "pillars",
+    "point_head": "uncertain",
+}
 
 
 @dataclass(frozen=True)
@@ -57,15 +63,15 @@ class Graph:
     compared: Callable[[Tensor], Tensor]
 
 
-class _PolarMap(nn.Module):
-    """What PolarNet does between the map of its pillars and the scores of its voxels."""
+class _Part(nn.Module):
+    """What a network does between two of its boundaries, as a module by itself."""
 
-    def __init__(self, net: PolarNet) -> None:
+    def __init__(self, net: nn.Module, part: Callable[[Tensor], Tensor]) -> None:
         super().__init__()
-        self.net = net
+        self.net, self.part = net, part
 
-    def forward(self, pillars: Tensor) -> Tensor:  # (1, C, R, A) -> (1, Z * K, R, A)
-        return self.net.scores(self.net.unet(pillars))
+    def forward(self, x: Tensor) -> Tensor:
+        return self.part(x)
 
 
 def export(
@@ -161,6 +167,7 @@ def _polar_graphs(model: AMVNet, batch: PointBatch, classes: int) -> dict[str, G
     assert isinstance(net, PolarNet)
     pooled = grid.pool(net.point_mlp(grid.features))
     plane = grid.to_map(net.compress(pooled)).contiguous()
+    decoded = grid.at_pillars(net.unet(plane))
 
     def by_voxel(scores: Tensor) -> Tensor:
         return scores.unflatten(1, (-1, classes)).softmax(dim=2)
@@ -168,7 +175,8 @@ def _polar_graphs(model: AMVNet, batch: PointBatch, classes: int) -> dict[str, G
     return {
         "polar_points": Graph(net.point_mlp, {"features": grid.features}, "point_features", _shares),
         "polar_pillars": Graph(net.compress, {"pooled": pooled}, "pillar_features", _shares),
-        "polar_map": Graph(_PolarMap(net), {"pillars": plane}, "scores", by_voxel),
+        "polar_map": Graph(_Part(net, net.unet), {"pillars": plane}, "decoded", _shares),
+        "polar_scores": Graph(_Part(net, net.score), {"decoded": decoded}, "scores", by_voxel),
     }
 
 

@@ -18,12 +18,13 @@ from amvnet.scan import Scan
 from amvnet.trees import from_dict
 
 DESCRIPTION = "amvnet.json"  # beside the graphs
-FORMAT = 1
+FORMAT = 2
+POLAR = ("polar_points", "polar_pillars", "polar_map", "polar_scores")
 GRAPHS = {
     "rv": ("range_net",),
-    "bev": ("polar_points", "polar_pillars", "polar_map"),
-    "ensemble": ("range_net", "polar_points", "polar_pillars", "polar_map"),
-    "amvnet": ("range_net", "polar_points", "polar_pillars", "polar_map", "point_head"),
+    "bev": POLAR,
+    "ensemble": ("range_net", *POLAR),
+    "amvnet": ("range_net", *POLAR, "point_head"),
 }  # by method
 CHANNELS = 6  # x, y, z, intensity, range, mask
 PART = 2048  # uncertain points that the head settles at a time
@@ -88,16 +89,17 @@ class OnnxSegmenter:
     def _check_sizes(self, folder: Path, k: int) -> None:
         """Raises InputError where the graphs have other sizes than the description."""
         a, b = self.range_view, self.polar_view
-        shapes = {
-            "range_net": [1, k, a.height, a.width],
-            "polar_map": [1, b.vertical * k, b.radial, b.angular],
+        last = {
+            "range_net": [k, a.height, a.width],
+            "polar_map": [b.radial, b.angular],
+            "polar_scores": [b.vertical * k],
             "point_head": [self.head.neighbours, 2 * k + 4],
         }
-        for name in set(shapes) & set(self._graphs):
+        for name in set(last) & set(self._graphs):
             graph = self._graphs[name]
-            found = graph.get_inputs()[1].shape[1:] if name == "point_head" else graph.get_outputs()[0].shape
-            if found != shapes[name]:
-                raise InputError(f"{folder}: expected {name} of size {shapes[name]}, found {found}; export anew")
+            shape = (graph.get_inputs()[1] if name == "point_head" else graph.get_outputs()[0]).shape
+            if (found := shape[-len(last[name]) :]) != last[name]:
+                raise InputError(f"{folder}: expected {name} of size {last[name]}, found {found}; export anew")
 
     def _scores(self, points: np.ndarray, ring: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """(P, K) scores and (P,) uncertain of the valid points."""
@@ -127,8 +129,10 @@ class OnnxSegmenter:
         plane = np.zeros((c.radial * c.angular, pillars.shape[1]), dtype=np.float32)
         plane[occupied] = pillars
         image = np.ascontiguousarray(plane.T).reshape(1, -1, c.radial, c.angular)
-        scores = self._run("polar_map", image)  # (1, Z * K, R, A)
-        return softmax(scores.reshape(c.vertical, -1, c.radial * c.angular)[voxel, :, pillar])
+        decoded = self._run("polar_map", image)[0].reshape(-1, c.radial * c.angular)[:, occupied]  # (C', M)
+        scores = self._run("polar_scores", np.ascontiguousarray(decoded.T))  # (M, Z * K)
+        slot = np.searchsorted(occupied, pillar)
+        return softmax(scores.reshape(len(occupied), c.vertical, -1)[slot, voxel])
 
     def _settle(self, points: np.ndarray, f: np.ndarray, g: np.ndarray, uncertain: np.ndarray) -> np.ndarray:
         """(U, K) class probabilities of the uncertain points, from themselves and their neighbours."""

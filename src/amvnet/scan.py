@@ -51,4 +51,6 @@ class Scan:
     @property
     def valid(self) -> np.ndarray:
         """(N,) bool: the points whose four values are all finite, and nearer than `FARTHEST` along each axis."""
-        return np.isfinite(self.points).all(axis=1) & (np.abs(self.points[:, :3]) < FARTHEST).all(axis=1)
+        # Column by column: a reduction over rows of four takes ten times as long. NaN is below nothing.
+        x, y, z, intensity = np.abs(self.points.T)
+        return (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST) & (intensity < np.inf)

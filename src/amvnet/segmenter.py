@@ -14,6 +14,7 @@ from torch import Tensor
 
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
+from amvnet.memory import keep_memory
 from amvnet.models.amvnet import ENSEMBLES, Scores, merge
 from amvnet.models.layers import fold_batch_norms
 from amvnet.scan import Scan
@@ -71,7 +72,9 @@ class Segmenter:
         if self.weights.model.assertion.name == "loss":
             raise InputError("expected an assertion that needs no labels, found loss; train the head with another one")
         self.device = _checked_device(device)
-        self.model = self.weights.build().to(device)
+        if device == "cpu":
+            keep_memory()
+        self.model = self.weights.build().to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         fold_batch_norms(self.model)
 
     @property

@@ -74,7 +74,8 @@ class Cloud:
             scale = scale or self.intensity_scale()
             if self.intensity is not None and scale is not None:
                 points[:, 3] = np.clip(self.intensity / scale, 0, 1)
-        points[(self.xyz == 0).all(axis=1), :3] = np.nan
+        x, y, z = self.xyz.T
+        points[(x == 0) & (y == 0) & (z == 0), :3] = np.nan
         scan = Scan(points, ring=self.ring, name=self.name)
         if not scan.valid.any():
             raise InputError(f"{self.name}: {_no_points(points[:, :3])}")

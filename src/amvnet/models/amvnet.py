@@ -9,14 +9,12 @@ from torch import Tensor, nn
 
 from amvnet.config import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
-from amvnet.models.point_head import PointHead, head_features, nearest_neighbours, point_table
+from amvnet.models.point_head import PointHead, nearest_neighbours, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.views.points import PointBatch
 from amvnet.views.polar_view import PolarView
 from amvnet.views.range_view import RangeView
-
-PART = 2048  # uncertain points that the head settles at a time
 
 
 @dataclass(frozen=True)
@@ -80,10 +78,7 @@ def refine(head: PointHead, points: Tensor, f: Tensor, g: Tensor, uncertain: Ten
 
 def settle(head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
     """h: (U, K) of the points with these indices (U,), whose neighbours are (U, n)."""
-    table = point_table(points, f, g)
-    # Part by part, each of which stays in a processor's cache.
-    parts = zip(index.split(PART), near.split(PART), strict=True)
-    return torch.cat([head(*head_features(head.config, table, i, n)) for i, n in parts]).softmax(dim=1)
+    return head.score(point_table(points, f, g), index, near).softmax(dim=1)
 
 
 def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:

@@ -6,11 +6,14 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from amvnet.config import PointHeadConfig
+from amvnet.models.layers import PointLinear
 from amvnet.neighbours import nearest_others
 
 POINT_VALUES = 4  # x, y, z, intensity
+PART = 1024  # uncertain points that are scored at a time, which stay in a processor's cache
 
 
 class PointHead(nn.Module):
@@ -24,12 +27,29 @@ class PointHead(nn.Module):
         self.config = config
         width = 2 * classes + POINT_VALUES
         self.mlp = _mlp((width, *config.hidden))
-        self.fc = nn.Sequential(_mlp((width + config.hidden[-1], config.fc)), nn.Linear(config.fc, classes))
+        self.fc = nn.Sequential(_mlp((width + config.hidden[-1], config.fc)), PointLinear(config.fc, classes))
 
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
         pooled = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1]).amax(dim=1)  # (U, hidden)
         return self.fc(torch.cat([pooled, point], dim=1))
+
+    def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
+        """The same as `forward(*head_features(...))`, with the first layer once a point and not once a neighbour.
+
+        W [f_k, g_k, x_k - x_i] = W [f_k, g_k, x_k] - W [0, 0, x_i]. The arguments are those of `head_features`.
+        """
+        first, rest = self.mlp[0], self.mlp[1:]
+        assert isinstance(first, nn.Linear)
+        done, found = first(table), []
+        for index, k in zip(uncertain.split(PART), near.split(PART), strict=True):
+            point = table.index_select(0, index)
+            shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
+            rows = done.index_select(0, k.flatten()).unflatten(0, k.shape) - shift[:, None]  # (part, n, hidden[0])
+            pooled = rest(rows.flatten(0, 1)).unflatten(0, k.shape).amax(dim=1)
+            point[:, -POINT_VALUES:-1] *= self.config.position_scale
+            found.append(self.fc(torch.cat([pooled, point], dim=1)))
+        return torch.cat(found)
 
 
 def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
@@ -66,5 +86,5 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
 def _mlp(widths: tuple[int, ...]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for channels, out in pairwise(widths):
-        layers += [nn.Linear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]
+        layers += [PointLinear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)

@@ -7,18 +7,20 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from amvnet.config import PolarNetConfig
-from amvnet.models.layers import ConvBlock, upsample
+from amvnet.models.layers import ConvBlock, PointLinear, linear, upsample
 from amvnet.views.polar_view import FEATURES, PolarGrid
+
+PART = 2048  # points that are encoded at a time
 
 
 class PolarNet(nn.Module):
-    """Points in the polar grid -> scores before softmax (B, Z * K, R, A), K for each voxel of a pillar."""
+    """Points in the polar grid -> scores before softmax (M, Z * K) of the M occupied pillars, K for each voxel."""
 
     def __init__(self, config: PolarNetConfig, vertical: int, classes: int) -> None:
         super().__init__()
         c = config
         self.point_mlp = _point_mlp(c.point_widths)
-        self.compress = nn.Sequential(nn.Linear(c.point_widths[-1], c.pillar), nn.ReLU(inplace=True))
+        self.compress = nn.Sequential(PointLinear(c.point_widths[-1], c.pillar), nn.ReLU(inplace=True))
         self.first = _double(c.pillar, c.widths[0])
         downs = zip(c.widths[:-1], c.widths[1:], strict=True)
         self.down = nn.ModuleList(_double(fine, coarse) for fine, coarse in downs)
@@ -28,8 +30,17 @@ class PolarNet(nn.Module):
         self.scores = nn.Conv2d(c.widths[0], vertical * classes, 1)
 
     def forward(self, grid: PolarGrid) -> Tensor:
-        pillars = self.compress(grid.pool(self.point_mlp(grid.features)))  # (M, pillar)
-        return self.scores(self.unet(grid.to_map(pillars)))
+        pillars = self.compress(self.pool(grid))  # (M, pillar)
+        # An empty pillar has no point to score, and most are empty.
+        return self.score(grid.at_pillars(self.unet(grid.to_map(pillars))))
+
+    def pool(self, grid: PolarGrid) -> Tensor:  # (M, point_widths[-1])
+        if torch.is_grad_enabled():
+            return grid.pool(self.point_mlp(grid.features))
+        return grid.pool_by_parts(self.point_mlp, PART)
+
+    def score(self, pillars: Tensor) -> Tensor:  # (M, widths[0]) -> (M, Z * K)
+        return linear(pillars, self.scores.weight.flatten(1), self.scores.bias)
 
     def unet(self, x: Tensor) -> Tensor:  # (B, pillar, R, A) -> (B, widths[0], R, A)
         x = self.first(x)
@@ -70,5 +81,5 @@ def _point_mlp(widths: tuple[int, ...]) -> nn.Sequential:
     """The shared MLP over points, with batch norm after the input and each layer but the last."""
     layers: list[nn.Module] = [nn.BatchNorm1d(FEATURES)]
     for channels, out in zip((FEATURES, *widths[:-2]), widths[:-1], strict=True):
-        layers += [nn.Linear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers, nn.Linear(widths[-2], widths[-1]))
+        layers += [PointLinear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, PointLinear(widths[-2], widths[-1]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -41,17 +42,32 @@ class PolarGrid:
         empty = features.new_zeros(len(self.occupied), features.shape[1])
         return empty.scatter_reduce(0, index, features, "amax", include_self=False)
 
+    def pool_by_parts(self, encode: Callable[[Tensor], Tensor], part: int) -> Tensor:
+        """`pool(encode(features))` of so many points at a time, which stay in a processor's cache; no gradients."""
+        pooled = None
+        for features, slot in zip(self.features.split(part), self.slot.split(part), strict=True):
+            encoded = encode(features)
+            if pooled is None:
+                pooled = encoded.new_full((len(self.occupied), encoded.shape[1]), -torch.inf)
+            pooled.scatter_reduce_(0, slot[:, None].expand_as(encoded), encoded, "amax")
+        assert pooled is not None
+        return pooled
+
     def to_map(self, pillars: Tensor) -> Tensor:
         """Features (M, C) of the occupied pillars -> a map (B, C, R, A), 0 where a pillar is empty."""
         b, r, a, _ = self.shape
         dense = pillars.new_zeros(b * r * a, pillars.shape[1]).index_copy(0, self.occupied, pillars)
         return dense.view(b, r, a, -1).permute(0, 3, 1, 2)
 
+    def at_pillars(self, maps: Tensor) -> Tensor:
+        """A map (B, C, R, A) -> (M, C) of the occupied pillars."""
+        return maps.permute(0, 2, 3, 1).flatten(0, 2)[self.occupied]
+
     def to_points(self, scores: Tensor) -> Tensor:
-        """Scores (B, Z * K, R, A) of the voxels, voxel by voxel -> (P, K), every point its voxel's."""
+        """Scores (M, Z * K) of the occupied pillars, voxel by voxel -> (P, K), every point its voxel's."""
         vertical = self.shape[3]
-        voxels = scores.permute(0, 2, 3, 1).reshape(-1, scores.shape[1] // vertical)
-        return voxels[self.pillar * vertical + self.voxel]
+        voxels = scores.unflatten(1, (vertical, scores.shape[1] // vertical)).flatten(0, 1)
+        return voxels.index_select(0, self.slot * vertical + self.voxel)
 
 
 class PolarView:

@@ -32,7 +32,7 @@ class RangeImage:
 
     def to_points(self, scores: Tensor) -> Tensor:
         """Scores (B, K, H, W) of the pixels -> (P, K), every point its pixel's."""
-        return scores.permute(0, 2, 3, 1).flatten(0, 2)[self.pixel]
+        return scores.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, self.pixel)
 
 
 class RangeView:
