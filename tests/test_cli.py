@@ -114,6 +114,8 @@ MISTAKES = {
     "unknown sensor": "simulate {out} --sensor eye",
     "nothing to time": "bench --weights {w}/w.safetensors --scan {w}/lone.bin --runs 0",
     "no head to time": "bench --weights {w}/headless.safetensors --scan {w}/lone.bin",
+    "more than all points to time": "bench --weights {w}/w.safetensors --scan {w}/lone.bin --uncertain 2",
+    "unknown engine to time": "bench --weights {w}/w.safetensors --scan {w}/lone.bin --engines tensorrt",
     "no scans": "simulate {out} --scans 0",
 }
 
@@ -306,5 +308,31 @@ def test_info_says_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_bench_times_every_stage(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "--weights", f"{world}/w.safetensors", "--scan", f"{world}/lone.bin", "--runs", "1"]) == 0
-    shown = capsys.readouterr().out
-    assert all(stage in shown for stage in ("300 points", "read", "RV", "BEV", "neighbours", "head", "fusion"))
+    shown = " ".join(capsys.readouterr().out.split())
+    assert all(stage in shown for stage in ("300 points", "read", "RV", "BEV", "neighbours", "head", "fusion", "limit"))
+
+
+def test_benchs_figures_add_up(world: Path, tmp_path: Path) -> None:
+    command = f"bench --weights {world}/w.safetensors --scan {world}/lone.bin --runs 3 --uncertain 0.25"
+    assert main([*command.split(), "--json", str(tmp_path / "b.json")]) == 0
+    (found,) = json.loads((tmp_path / "b.json").read_text())
+    assert (found["points"], found["uncertain"], found["runs"]) == (300, 75, 3)
+    stages = {name: spread["median"] for name, spread in found["stages_ms"].items()}
+    assert all(spread["low"] <= spread["median"] <= spread["high"] for spread in found["stages_ms"].values())
+    mean = stages.pop("mean")
+    assert 0 < mean < sum(stages.values())
+    assert sum(stages.values()) == pytest.approx(found["all_ms"]["median"], rel=0.5)
+    for name in ("RV", "BEV"):
+        network = found["networks"][name]
+        assert network["gflop_per_s"] == pytest.approx(network["gflop"] / stages[name] * 1e3)
+        assert network["share_of_limit"] == pytest.approx(
+            network["gflop_per_s"] / found["limit_gflop_per_s"]["float32"]
+        )
+    assert found["peak_memory_mib"] > 100
+
+
+def test_bench_times_a_recipe_with_random_weights(
+    tmp_path: Path, world: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "--recipe", f"{world}/recipe.yaml", "--scan", f"{world}/lone.bin", "--runs", "1"]) == 0
+    assert "10.0% of them uncertain" in " ".join(capsys.readouterr().out.split())

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import resource
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,6 +18,7 @@ from torch import Tensor, nn
 
 from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
+from amvnet.memory import peak_memory
 from amvnet.pictures import scan_figure
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
@@ -136,8 +135,7 @@ class Speed(Callback):
         """Bytes: the most that was taken on the CUDA device, or else by this process."""
         if torch.cuda.is_available() and torch.cuda.max_memory_allocated():
             return torch.cuda.max_memory_allocated()
-        unit = 1 if sys.platform == "darwin" else 1024
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+        return peak_memory()
 
 
 class Bar(RichProgressBar):

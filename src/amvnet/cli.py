@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amvnet import __version__, export_verbs, fusion_verbs, training_verbs, verbs, viewing_verbs
+from amvnet import __version__, bench_verbs, export_verbs, fusion_verbs, training_verbs, verbs, viewing_verbs
 from amvnet.arguments import Parser, Positional, parser_of
 from amvnet.errors import InputError, SomeBroken
 from amvnet.terminal import say
@@ -34,7 +34,7 @@ VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
     "ablate": (training_verbs.ablate, {"recipe": {"metavar": "RECIPE"}}),
     "export": (export_verbs.export, {}),
     "view": (viewing_verbs.view, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
-    "bench": (verbs.bench, {}),
+    "bench": (bench_verbs.bench, {}),
     "info": (verbs.info, {"weights": {"metavar": "W", "nargs": "?"}}),
 }
 

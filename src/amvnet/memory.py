@@ -1,8 +1,9 @@
-"""Keeps the memory of one scan for the next, where the C library would hand it back to the system in between."""
+"""Memory of this process: kept from one scan to the next, and how much it was at most."""
 
 from __future__ import annotations
 
 import ctypes
+import resource
 import sys
 
 # glibc's mallopt, from malloc.h
@@ -22,3 +23,8 @@ def keep_memory() -> bool:
     except (OSError, AttributeError):  # musl has none
         return False
     return bool(mallopt(M_MMAP_MAX, 0)) and bool(mallopt(M_TRIM_THRESHOLD, -1))
+
+
+def peak_memory() -> int:
+    """Bytes of memory that this process has taken at most."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)

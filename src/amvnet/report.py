@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from amvnet.bench import FUSION, Timing
+from amvnet.bench import MEAN, STAGES
 from amvnet.data.labels import Taxonomy
 from amvnet.recipes import recipe_names
 from amvnet.weights import built_in
@@ -68,20 +68,33 @@ def _rows(methods: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[list[str] 
         yield [f"mIoU, {same[0]['from_m']:.0f} to {same[0]['to_m']:.0f} m", *(_percent(b["miou"]) for b in same)]
 
 
-def timing_table(timing: Timing) -> Table:
-    """Time per stage of one scan, in all, and the fusion's share of it."""
-    seconds, total = timing.seconds, sum(timing.seconds.values())
-    share = f"{timing.uncertain / timing.points:.1%} of them uncertain"
-    table = Table(title=f"{timing.points:,} points, {share}", show_edge=False)
-    for title in ("stage", "ms", "share"):
-        table.add_column(title, justify="left" if title == "stage" else "right")
-    for stage, value in seconds.items():
-        table.add_row(stage, f"{1e3 * value:.1f}", f"{value / total:.1%}")
+def timing_table(report: Mapping[str, Any]) -> Table:
+    """One table of `bench.time_jobs`: time per stage, the fusion's share, and the networks' speed."""
+    points, uncertain = report["points"], report["uncertain"]
+    title = f"{report['engine']} on {report['device']}, {report['threads']} threads: {points:,} points, "
+    table = Table(title=title + f"{uncertain / points:.1%} of them uncertain", show_edge=False)
+    for name in ("stage", "ms", "half of the runs", "share", "GFLOP", "of the limit"):
+        table.add_column(name, justify="left" if name == "stage" else "right")
+    stages, total = report["stages_ms"], report["all_ms"]
+    for stage in STAGES:
+        share = f"{stages[stage]['median'] / total['median']:.1%}"
+        table.add_row(stage, *_times(stages[stage]), share, *_speed(report["networks"].get(stage)))
     table.add_section()
-    table.add_row("all", f"{1e3 * total:.1f}", "")
-    fusion = sum(seconds[stage] for stage in FUSION)
-    table.add_row("fusion", f"{1e3 * fusion:.1f}", f"{fusion / total:.1%}")
+    fusion = report["fusion_share"]
+    table.add_row("all", *_times(total), f"{report['all_over_networks']['median']:.2f} x networks")
+    table.add_row("fusion", "", f"{fusion['low']:.1%} to {fusion['high']:.1%}", f"{fusion['median']:.1%}")
+    table.add_row("ensemble instead of it", *_times(stages[MEAN]))
+    limits = ", ".join(f"{value:,.0f} GFLOP/s in {name}" for name, value in report["limit_gflop_per_s"].items())
+    table.caption = f"limit, a large matrix product: {limits}; peak memory {report['peak_memory_mib']:,.0f} MiB"
     return table
+
+
+def _times(spread: Mapping[str, float]) -> tuple[str, str]:
+    return f"{spread['median']:.1f}", f"{spread['low']:.1f} to {spread['high']:.1f}"
+
+
+def _speed(network: Mapping[str, float] | None) -> tuple[str, ...]:
+    return () if network is None else (f"{network['gflop']:.1f}", f"{network['share_of_limit']:.0%}")
 
 
 def installation_table() -> Table:

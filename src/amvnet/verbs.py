@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.errors import InputError
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from amvnet.evaluation import Evaluation
 
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
+EngineName = Literal["auto", "torch", "compile", "onnx"]
 FormatName = Literal["label", "npy", "ply", "pcd", "las"]
 WEIGHTS = "sim-hdl64e"
 
@@ -98,6 +98,7 @@ def predict(
     format: FormatName = "label",
     uncertain: bool = False,
     device: str = "cpu",
+    engine: EngineName = "auto",
     topic: str | None = None,
     sensor: str | None = None,
     height: float | None = None,
@@ -120,6 +121,7 @@ def predict(
         format: of lone scans' labels: raw ids alone (label, npy), or coloured points (ply, pcd, las).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         device: cpu, cuda, cuda:1, ...
+        engine: what runs the networks: torch, compile (a slow start), onnx (ONNX Runtime), or auto, the fastest here.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
         sensor: of lone scans, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
         height: of lone scans, the sensor's metres over the ground; default: measured.
@@ -128,6 +130,7 @@ def predict(
         rotate: of lone scans, yaw,pitch,roll in degrees that turn them level.
         offset: of lone scans, metres to add to x,y,z after that.
     """
+    from amvnet.engines import engage
     from amvnet.fitting import Fitting
     from amvnet.prediction import predict as segment
     from amvnet.segmenter import Segmenter
@@ -137,6 +140,7 @@ def predict(
     options = {"height": height, "intensity_scale": intensity_scale, "axes": axes, "rotate": rotate, "offset": offset}
     given = describe(sensor, **options)
     segmenter = Segmenter(weights, processes.device(device), method)
+    engage(segmenter, engine)
     fitting, chosen = Fitting(segmenter.weights, given, say), names_in(sequences)
     with progress("segmenting") as step:
         written = segment(
@@ -258,29 +262,6 @@ def info(weights: str | None = None) -> None:
         say(model_card(load(weights), weights, OURS if weights in built_in() else None).rstrip())
         return
     console.print(installation_table())
-
-
-def bench(weights: str = WEIGHTS, scan: Path | None = None, runs: int = 10, device: str = "cpu") -> None:
-    """Time the stages from a scan's file to its labels on this machine.
-
-    Args:
-        weights: a weights file, or the name of a built-in one.
-        scan: the scan to time with; by default a simulated one.
-        runs: how often; the medians are shown.
-        device: cpu, cuda, cuda:1, ...
-    """
-    from amvnet.bench import time_stages
-    from amvnet.data.files import read_scan
-    from amvnet.report import timing_table
-    from amvnet.segmenter import Segmenter
-    from amvnet.simulation import simulate as write
-
-    segmenter = Segmenter(weights, device)
-    with TemporaryDirectory() as folder:
-        if scan is None:
-            write(Path(folder), scans=1)
-        path = scan or Path(folder) / "sequences/00/velodyne/000000.bin"
-        console.print(timing_table(time_stages(segmenter, lambda: read_scan(path), runs)))
 
 
 def show_evaluation(evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None) -> None:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from amvnet.config import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
-from amvnet.models.point_head import PointHead, nearest_neighbours, point_table
+from amvnet.models.point_head import PointHead, nearest_neighbours, only_asked, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.views.points import PointBatch
@@ -78,7 +78,9 @@ def refine(head: PointHead, points: Tensor, f: Tensor, g: Tensor, uncertain: Ten
 
 def settle(head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
     """h: (U, K) of the points with these indices (U,), whose neighbours are (U, n)."""
-    return head.score(point_table(points, f, g), index, near).softmax(dim=1)
+    asked, (index, near) = only_asked(len(points), index, near)
+    table = point_table(*(values.index_select(0, asked) for values in (points, f, g)))
+    return head.score(table, index, near).softmax(dim=1)
 
 
 def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:

@@ -1,0 +1,59 @@
+"""The verb that times a machine: bench."""
+
+from __future__ import annotations
+
+from json import dumps
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from amvnet.inputs import names_in
+from amvnet.terminal import console, progress
+
+
+def bench(
+    weights: str = "sim-hdl64e",
+    recipe: str | None = None,
+    scan: Path | None = None,
+    runs: int = 10,
+    uncertain: float | None = None,
+    engines: str = "torch",
+    device: str = "cpu",
+    json: Path | None = None,
+) -> None:
+    """Time the stages from a scan's file to its labels on this machine, and compare the networks with its limit.
+
+    Args:
+        weights: a weights file, or the name of a built-in one.
+        recipe: the name of a recipe, or a YAML file, whose networks are timed with random weights instead.
+        scan: the scan to time with; by default a simulated one.
+        runs: how often, after two that warm up; medians are shown, and between what half of the runs lie.
+        uncertain: the share of the points that counts as uncertain; by default as the weights find, 0.1 with --recipe.
+        engines: torch, compile, onnx, or several with commas, which are timed in turn.
+        device: cpu, cuda, cuda:1, ...
+        json: also write the figures to this file.
+    """
+    from amvnet.bench import UNCERTAIN, Job, time_jobs, untrained
+    from amvnet.data.files import read_scan, whole_file, write_labels
+    from amvnet.engines import engage
+    from amvnet.recipes import load_recipe
+    from amvnet.report import timing_table
+    from amvnet.segmenter import Segmenter
+    from amvnet.simulation import simulate as write
+
+    given = untrained(load_recipe(recipe)) if recipe is not None else weights
+    share = UNCERTAIN if recipe is not None and uncertain is None else uncertain
+    with TemporaryDirectory() as folder:
+        if scan is None:
+            write(Path(folder), scans=1)
+        path, labels = scan or Path(folder) / "sequences/00/velodyne/000000.bin", Path(folder) / "labels.label"
+        jobs = []
+        for engine in names_in(engines) or []:
+            segmenter = Segmenter(given, device)
+            name = engage(segmenter, engine)
+            jobs.append(Job(segmenter, lambda: read_scan(path), lambda ids: write_labels(labels, ids), name, share))
+        with progress("timing") as step:
+            reports = time_jobs(jobs, runs, step)
+    console.print(*(timing_table(report) for report in reports), sep="\n")
+    if json is not None:
+        with whole_file(json) as part:
+            part.write_text(dumps(reports, indent=1))
