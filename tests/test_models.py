@@ -17,6 +17,7 @@ from amvnet.config import (
     PolarViewConfig,
     RangeNetConfig,
 )
+from amvnet.models.joined import convolve_joined
 from amvnet.models.layers import AzimuthGRU, PointLinear, RingConv2d, fold_batch_norms, upsample, wrap_width
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
@@ -141,6 +142,29 @@ def test_the_unet_of_polar_net_is_equivariant_to_a_shift_by_its_stride() -> None
     torch.testing.assert_close(net.unet(pillars.roll(4, 3)), net.unet(pillars).roll(4, 3), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.parametrize("sizes", [(3, 4, 3, 4), (3, 4, 6, 8), (5, 3, 5, 12), (1, 1, 2, 4), (2, 5, 6, 5), (3, 4, 5, 8)])
+@pytest.mark.parametrize("bias", [False, True])
+def test_a_joined_convolution_equals_one_over_the_upsampled_map(sizes: tuple[int, int, int, int], bias: bool) -> None:
+    h, w, full_h, full_w = sizes
+    convolution, coarse, fine = RingConv2d(5, 4), torch.randn(2, 3, h, w), torch.randn(2, 2, full_h, full_w)
+    convolution.bias = nn.Parameter(torch.randn(4)) if bias else None
+    together = torch.cat([upsample(coarse, fine), fine], dim=1)
+    expected = convolution(together)
+    with torch.inference_mode():
+        torch.testing.assert_close(convolve_joined(convolution, coarse, fine), expected, rtol=1e-4, atol=1e-5)
+    assert torch.equal(convolve_joined(convolution, coarse, fine), expected)
+
+
+def test_a_joined_convolution_costs_less() -> None:
+    convolution, coarse, fine = RingConv2d(96, 32), torch.randn(1, 64, 40, 60), torch.randn(1, 32, 80, 120)
+    costs = []
+    for gradients in (True, False):
+        with torch.set_grad_enabled(gradients), FlopCounterMode(display=False) as counter:
+            convolve_joined(convolution, coarse, fine)
+        costs.append(counter.get_total_flops())
+    assert costs[1] < 0.65 * costs[0]  # (4 / 9 * 64 + 32) / 96, and the edges
+
+
 def test_the_unet_of_polar_net_halves_odd_sizes_upwards() -> None:
     net, seen = CASES["polar"].in_eval(), []
     for down in net.down:
@@ -154,7 +178,7 @@ def test_the_paper_size_range_net_costs_500_gflops_and_decodes_the_strides_4_to_
     seen: list[int] = []
     for lateral in net.lateral:
         lateral.register_forward_hook(lambda _, inputs, __: seen.append(4096 // inputs[0].shape[-1]))
-    with torch.inference_mode(), FlopCounterMode(display=False) as counter:
+    with FlopCounterMode(display=False) as counter:  # with gradients, and so the plain way of `joined`
         assert net(image).shape == (1, 19, 64, 4096)
     assert sorted(seen) == [4, 8, 16, 32, 64, 128]
     assert counter.get_total_flops() == pytest.approx(500e9, rel=0.1)

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from amvnet.config import PolarNetConfig
-from amvnet.models.layers import ConvBlock, PointLinear, linear, upsample
+from amvnet.models.joined import joined
+from amvnet.models.layers import ConvBlock, PointLinear, linear
 from amvnet.views.polar_view import FEATURES, PolarGrid
 
 PART = 2048  # points that are encoded at a time
@@ -49,7 +50,8 @@ class PolarNet(nn.Module):
             x = down(F.max_pool2d(x, 2, ceil_mode=True))
             skips.append(x)
         for up, skip in zip(self.up, reversed(skips[:-1]), strict=True):
-            x = self.drop(up(torch.cat([upsample(x, skip), skip], dim=1)))
+            first, second = up.children()
+            x = self.drop(second(joined(first, x, skip)))
         return x
 
 

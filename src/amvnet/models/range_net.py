@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config import RangeNetConfig
+from amvnet.models.joined import joined
 from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
 from amvnet.views.range_view import CHANNELS
 
@@ -36,8 +37,7 @@ class RangeNet(nn.Module):
             full = self.stem(self.input_norm(image))  # (B, stem, H, W)
         maps = self.encode(full)
         decoded = self.decode(maps[FIRST_DECODED:])  # (B, decoder, H, W / 4)
-        merged = torch.cat([upsample(decoded, full), full], dim=1)
-        return self.scores(self.last(merged))
+        return self.scores(joined(self.last, decoded, full))
 
     def encode(self, x: Tensor) -> list[Tensor]:
         """The maps of width strides 2, 4, 8, ...; the last two have gone around the sensor."""
