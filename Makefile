@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A process for each processor, and one thread in each.
 SPREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow lint format clean
+.PHONY: demo test test-slow bench lint format clean
 
 demo: .venv/installed  ## simulate streets, segment, score and draw them
 	$(BIN)/amvnet demo --out demo
@@ -14,6 +14,10 @@ test: .venv/installed lint  ## style, types and the tests
 
 test-slow: .venv/installed  ## the tests that take minutes, too
 	$(SPREAD) $(BIN)/python -m pytest -n auto -m "slow or not slow"
+
+bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN="--scan FILE" for a scan of yours
+	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,compile
+	$(BIN)/amvnet bench --recipe semantickitti $(SCAN)
 
 lint: .venv/installed
 	$(BIN)/ruff check src tests benchmarks

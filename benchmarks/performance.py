@@ -20,15 +20,14 @@ from salsanext import CHANNELS, SalsaNext
 from torch import nn
 from torch.nn import functional as F
 
-import amvnet.engines
-import amvnet.memory
-import amvnet.models.amvnet
 import amvnet.models.layers
 import amvnet.models.polar_net
+import amvnet.models.range_net
 import amvnet.segmenter
-from amvnet.bench import FUSION, MEAN, STAGES, Job, _run, product_limits, untrained
+from amvnet.bench import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
 from amvnet.data.files import read_scan, write_labels
-from amvnet.engines import OnnxGraph, engage
+from amvnet.engines import OnnxGraph, cache_folder, engage
+from amvnet.models.layers import upsample
 from amvnet.models.point_head import head_features, point_table
 from amvnet.recipes import load_recipe
 from amvnet.segmenter import Segmenter
@@ -68,6 +67,15 @@ def without_parts() -> None:
     amvnet.models.polar_net.PART = 10**9
 
 
+def without_joining() -> None:
+    """Upsample the coarse maps, and convolve them at full size."""
+
+    def joined(block, coarse, fine):  # type: ignore[no-untyped-def]
+        return block(torch.cat([upsample(coarse, fine), fine], dim=1))
+
+    amvnet.models.polar_net.joined = amvnet.models.range_net.joined = joined
+
+
 def without_sharing() -> None:
     """The head's first layer for every neighbour of every uncertain point."""
 
@@ -86,6 +94,7 @@ TAKEN_AWAY: dict[str, tuple[Callable[[], None], ...]] = {
     "linear layers by matrix products": (without_convolved_rows,),
     "every voxel scored, occupied or not": (without_occupied_pillars,),
     "points of pillars encoded at once": (without_parts,),
+    "coarse maps upsampled before convolutions": (without_joining,),
     "neighbours by SciPy": (without_pykdtree,),
     "head's first layer once a neighbour": (without_sharing,),
 }
@@ -109,7 +118,7 @@ def measure(variant: str, engine: str, scan: Path, runs: int, recipe: str | None
             with torch.inference_mode():
                 salsanext(image)
             seconds = time.perf_counter() - started
-            run = _run(job)
+            run = run_once(job)
             rest = {"points": run.points, "uncertain": run.uncertain / run.points, "all": run.all}
             times.append({**run.seconds, "SalsaNext": seconds, **rest})
     median = {key: float(np.median([some[key] for some in times[WARM_UP:]])) for key in times[0]}
@@ -123,7 +132,7 @@ def yardstick(engine: str) -> tuple[nn.Module, torch.Tensor]:
     if engine == "compile":
         net = torch.compile(net)
     if engine == "onnx":
-        path = Path(TemporaryDirectory(delete=False).name) / "salsanext.onnx" if False else amvnet.engines.cache_folder() / "salsanext.onnx"
+        path = cache_folder() / "salsanext.onnx"
         path.parent.mkdir(parents=True, exist_ok=True)
         torch.onnx.export(net, (image.contiguous(),), path, dynamo=True, external_data=False, verbose=False)
         net = OnnxGraph(path, torch.get_num_threads())

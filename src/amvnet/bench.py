@@ -91,14 +91,14 @@ def time_jobs(
     limits = product_limits(jobs[0].segmenter.device)
     for number in range(runs + WARM_UP):
         for job, some in zip(jobs, found, strict=True):
-            some.append(_run(job))
+            some.append(run_once(job))
         step(number + 1, runs + WARM_UP)
     return [_report(job, some[WARM_UP:], limits) for job, some in zip(jobs, found, strict=True)]
 
 
 @torch.inference_mode()
-def _run(job: Job) -> Run:
-    """The steps of `AMVNet.forward`, each with a clock beside it."""
+def run_once(job: Job) -> Run:
+    """Time a job once: the steps of `AMVNet.forward`, each with a clock beside it."""
     model, device = job.segmenter.model, job.segmenter.device
     head = model.point_head
     assert head is not None
