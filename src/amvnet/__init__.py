@@ -34,13 +34,13 @@ _HOMES = {
 }
 
 
-def load(weights: str, device: str = "cpu", method: str = "amvnet") -> Segmenter:
+def load(weights: str, device: str = "cpu", method: str = "amvnet", precision: str = "float32") -> Segmenter:
     """A segmenter from a weights file, the name of built-in weights (`sim-hdl64e`), or the hub (`hf-hub:OWNER/NAME`).
 
     Raises:
         InputError: where there are no such weights, or they lack a part that the method needs.
     """
-    return import_module("amvnet.segmenter").Segmenter(weights, device, method)
+    return import_module("amvnet.segmenter").Segmenter(weights, device, method, precision)
 
 
 def __getattr__(name: str) -> Any:

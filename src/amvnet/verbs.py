@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 FormatName = Literal["label", "npy", "ply", "pcd", "las"]
+PrecisionName = Literal["float32", "bfloat16", "float16"]
 WEIGHTS = "sim-hdl64e"
 
 
@@ -98,6 +99,8 @@ def predict(
     format: FormatName = "label",
     uncertain: bool = False,
     device: str = "cpu",
+    precision: PrecisionName = "float32",
+    batch: int = 1,
     topic: str | None = None,
     sensor: str | None = None,
     height: float | None = None,
@@ -120,6 +123,8 @@ def predict(
         format: of lone scans' labels: raw ids alone (label, npy), or coloured points (ply, pcd, las).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         device: cpu, cuda, cuda:1, ...
+        precision: of the networks; float16 on a GPU only.
+        batch: scans that go through the networks at a time; more than one suits a GPU.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
         sensor: of lone scans, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
         height: of lone scans, the sensor's metres over the ground; default: measured.
@@ -136,12 +141,13 @@ def predict(
     processes = meet()
     options = {"height": height, "intensity_scale": intensity_scale, "axes": axes, "rotate": rotate, "offset": offset}
     given = describe(sensor, **options)
-    segmenter = Segmenter(weights, processes.device(device), method)
+    segmenter = Segmenter(weights, processes.device(device), method, precision)
     fitting, chosen = Fitting(segmenter.weights, given, say), names_in(sequences)
     with progress("segmenting") as step:
         written = segment(
-            inputs, segmenter, out, chosen, scores, step, split, topic, fitting, resume, processes, format, uncertain
-        )
+            inputs, segmenter, out, chosen, scores, step, split, topic, fitting, resume, processes, format, uncertain,
+            batch,
+        )  # fmt: skip
     say(f"{written} label files in {out}")
 
 
@@ -156,6 +162,7 @@ def evaluate(
     pictures: Path | None = None,
     taxonomy: Path | None = None,
     device: str = "cpu",
+    precision: PrecisionName = "float32",
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
 
@@ -170,6 +177,7 @@ def evaluate(
         pictures: folder for drawings of some scans from above.
         taxonomy: a semantic-kitti.yaml with other classes.
         device: cpu, cuda, cuda:1, ...
+        precision: of the networks; float16 on a GPU only.
     """
     from amvnet import jobs
     from amvnet.data.files import make_folder
@@ -183,7 +191,7 @@ def evaluate(
     dataset = open_data(data, taxonomy, None if given is None else jobs.own_classes(given.taxonomy))
     records = jobs.choose_records(dataset, names_in(sequences), split)
     if given is not None:
-        segmenter = Segmenter(given, processes.device(device), widest_method(given))
+        segmenter = Segmenter(given, processes.device(device), widest_method(given), precision)
         label = jobs.by_weights(dataset, segmenter, methods_in(methods))
     else:
         label = jobs.by_files(dataset, Path(str(predictions)))
@@ -260,7 +268,13 @@ def info(weights: str | None = None) -> None:
     console.print(installation_table())
 
 
-def bench(weights: str = WEIGHTS, scan: Path | None = None, runs: int = 10, device: str = "cpu") -> None:
+def bench(
+    weights: str = WEIGHTS,
+    scan: Path | None = None,
+    runs: int = 10,
+    device: str = "cpu",
+    precision: PrecisionName = "float32",
+) -> None:
     """Time the stages from a scan's file to its labels on this machine.
 
     Args:
@@ -268,6 +282,7 @@ def bench(weights: str = WEIGHTS, scan: Path | None = None, runs: int = 10, devi
         scan: the scan to time with; by default a simulated one.
         runs: how often; the medians are shown.
         device: cpu, cuda, cuda:1, ...
+        precision: of the networks; float16 on a GPU only.
     """
     from amvnet.bench import time_stages
     from amvnet.data.files import read_scan
@@ -275,7 +290,7 @@ def bench(weights: str = WEIGHTS, scan: Path | None = None, runs: int = 10, devi
     from amvnet.segmenter import Segmenter
     from amvnet.simulation import simulate as write
 
-    segmenter = Segmenter(weights, device)
+    segmenter = Segmenter(weights, device, precision=precision)
     with TemporaryDirectory() as folder:
         if scan is None:
             write(Path(folder), scans=1)

@@ -1,4 +1,4 @@
-"""The nearest other points of some points of a scan in plain tensor operations, for a GPU: exact, by blocks of points."""
+"""The nearest other points of some points of a scan in plain tensor operations, for a GPU: exact, by blocks."""
 
 from __future__ import annotations
 
@@ -60,7 +60,9 @@ def split_into_blocks(xyz: Tensor) -> Blocks:
     points = xyz[index.clamp_max(len(xyz) - 1)]  # (M, B, 3)
     low, high = points.amin(dim=1), points.amax(dim=1)
     copies = (index >= len(xyz))[..., None]
-    return Blocks(index.clamp_max(len(xyz)), points.masked_fill(copies, torch.inf).transpose(1, 2).contiguous(), low, high)
+    return Blocks(
+        index.clamp_max(len(xyz)), points.masked_fill(copies, torch.inf).transpose(1, 2).contiguous(), low, high
+    )
 
 
 def _split(xyz: Tensor, index: Tensor, ways: int) -> Tensor:

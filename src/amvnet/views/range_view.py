@@ -55,7 +55,8 @@ class RangeView:
         pixel = (batch.scan * c.height + self.rows(batch)) * c.width + self.columns(batch)
         nearest = _nearest(distance, pixel, batch.count * c.height * c.width)
         values = torch.cat([batch.points, distance[:, None], torch.ones_like(distance)[:, None]], dim=1)
-        image = torch.cat([values, values.new_zeros(1, CHANNELS)])[nearest]  # -1, no point, is the last row
+        padded = torch.cat([values, values.new_zeros(1, CHANNELS)])
+        image = padded.index_select(0, nearest % len(padded))  # -1, no point, is the last row
         return RangeImage(image.view(batch.count, c.height, c.width, CHANNELS).permute(0, 3, 1, 2), pixel, nearest)
 
     def columns(self, batch: PointBatch) -> Tensor:
