@@ -13,6 +13,7 @@ BLOCK = 128  # points of a block, at most
 NEAREST = 8  # blocks that are searched for a point's neighbours; 2 hold them for most points of a scan
 SPARE = 16  # so many more than are asked for are ranked anew in double precision; points that are repeated take room
 ROUNDING = 1e-6  # relative: a squared distance in float32 is nearer than this to the true one
+UNDERFLOW = 1e-37  # square metres: smaller ones float32 does not know so well
 MEMORY = 2**30  # bytes of what is computed at a time
 
 
@@ -99,8 +100,8 @@ def _in_blocks(xyz: Tensor, blocks: Blocks, own: Tensor, n: int) -> tuple[Tensor
     offset = xyz[index.clamp_max(len(xyz) - 1)].double() - asked[:, None].double()
     exact, order = offset.square().sum(dim=2).masked_fill(rough.isinf(), torch.inf).sort(dim=1)
     # What was left out is no nearer than the next block's box, or than the farthest of the candidates.
-    bound = torch.minimum(gap[:, -1], rough[:, -1]).double() * (1 - ROUNDING)
-    return index.gather(1, order[:, :n]), exact[:, n - 1] <= bound
+    bound = torch.minimum(gap[:, -1], rough[:, -1]).double() * (1 - ROUNDING) - UNDERFLOW
+    return index.gather(1, order[:, :n]), exact[:, n - 1] <= bound.clamp_min(0)
 
 
 def _gaps(blocks: Blocks, asked: Tensor) -> Tensor:
