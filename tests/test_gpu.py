@@ -44,6 +44,7 @@ def clouds() -> dict[str, np.ndarray]:
     clusters = rng.normal(0, 100, (20, 3))[rng.integers(0, 20, 5000)] + rng.normal(0, 0.01, (5000, 3))
     line = np.zeros((4000, 3))
     line[:, 1] = rng.random(4000) * 50
+    sphere = random / np.linalg.norm(random, axis=1, keepdims=True)
     return {
         "random": random,
         "clusters": clusters,
@@ -57,6 +58,8 @@ def clouds() -> dict[str, np.ndarray]:
         ),
         "nearly in one place": 9000 + rng.normal(0, 0.004, (3000, 3)),  # where float32 knows a millimetre
         "hardly apart": rng.normal(0, 1e-22, (3000, 3)),  # whose squares are 0 in float32
+        # Nearly as far from the centre, each of them: float32 does not know which are the nearest.
+        "on a sphere": np.concatenate([np.zeros((10, 3)), sphere[:300], random[:2000] * 10]),
         "few": random[:40],
     }
 
