@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from test_amvnet import whole_model
 from torch import Tensor, nn
-from worlds import amvnet, fails, files, fresh_weights, make_streets, street
+from worlds import amvnet, commands_of, fails, files, fresh_weights, make_streets, street
 
 from amvnet import Scan, Segmenter, simulate
 from amvnet.data.files import read_scan
@@ -370,6 +372,26 @@ def test_every_verb_that_segments_takes_a_precision(world: Path, tmp_path: Path,
         "bench": ("--runs", 1, "--scan", world / "scans/000000.bin"),
     }
     assert amvnet(verb, *inputs[verb], "--weights", world / "w.safetensors", "--precision", "bfloat16") == (0, "")
+
+
+def test_the_commands_of_the_page_run(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU; the benchmark, which is for other places, in its smallest size."""
+    monkeypatch.chdir(world)
+    stand_ins = {
+        "cuda": "cpu",
+        "semantickitti:/data/kitti/dataset": "data",
+        "runs/kitti": "w.safetensors",
+        "predictions": str(tmp_path),
+    }
+    *ours, _, _, smallest = commands_of("docs/gpu.md")
+    assert [words[:2] for words in ours] == [["amvnet", "predict"], ["amvnet", "evaluate"]]
+    for words in ours:
+        assert amvnet(*[stand_ins.get(word, word) for word in words[1:]]) == (0, "")
+    script = Path(__file__).parents[1] / smallest[1]
+    less = ["--batch", "1,2", "--part", "1", "--scan", "scans/000000.bin"]
+    done = subprocess.run([sys.executable, script, *smallest[2:], *less], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert [line.split()[0] for line in done.stdout.splitlines()].count("training") == 2
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
