@@ -5,9 +5,12 @@ from __future__ import annotations
 from json import dumps
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 
 from amvnet.inputs import names_in
 from amvnet.terminal import console, progress
+
+PrecisionName = Literal["float32", "bfloat16", "float16"]
 
 
 def bench(
@@ -18,6 +21,7 @@ def bench(
     uncertain: float | None = None,
     engines: str = "torch",
     device: str = "cpu",
+    precision: PrecisionName = "float32",
     json: Path | None = None,
 ) -> None:
     """Time the stages from a scan's file to its labels on this machine, and compare the networks with its limit.
@@ -30,6 +34,7 @@ def bench(
         uncertain: the share of the points that counts as uncertain; by default as the weights find, 0.1 with --recipe.
         engines: torch, compile, onnx, or several with commas, which are timed in turn.
         device: cpu, cuda, cuda:1, ...
+        precision: of the networks; float16 on a GPU only.
         json: also write the figures to this file.
     """
     from amvnet.bench import UNCERTAIN, Job, time_jobs, untrained
@@ -48,8 +53,9 @@ def bench(
         path, labels = scan or Path(folder) / "sequences/00/velodyne/000000.bin", Path(folder) / "labels.label"
         jobs = []
         for engine in names_in(engines) or []:
-            segmenter = Segmenter(given, device)
+            segmenter = Segmenter(given, device, precision=precision)
             name = engage(segmenter, engine)
+            name = name if precision == "float32" else f"{name}, {precision}"
             jobs.append(Job(segmenter, lambda: read_scan(path), lambda ids: write_labels(labels, ids), name, share))
         with progress("timing") as step:
             reports = time_jobs(jobs, runs, step)

@@ -15,6 +15,7 @@ from amvnet import __version__
 from amvnet.errors import InputError
 from amvnet.export import OPSET, check_libraries, export
 from amvnet.onnx_runner import DESCRIPTION
+from amvnet.precision import InPrecision
 from amvnet.segmenter import NEEDED, Segmenter
 from amvnet.views.range_view import CHANNELS
 
@@ -39,10 +40,14 @@ def engage(segmenter: Segmenter, engine: str) -> str:
     if engine != "torch":
         run = {"compile": _compiled, "onnx": _exported}[engine](segmenter)
         needed = NEEDED[segmenter.method]
+        model = segmenter.model
         if "range_net" in needed:
-            segmenter.model.range_net = run("range_net")
+            holder, name = (
+                (model.range_net, "net") if isinstance(model.range_net, InPrecision) else (model, "range_net")
+            )
+            setattr(holder, name, run("range_net"))
         if "polar_net" in needed:  # the instance's goes before the class's method of this name
-            object.__setattr__(segmenter.model.polar_net, "unet", run("polar_map"))
+            object.__setattr__(_inner(model.polar_net), "unet", run("polar_map"))
     return engine
 
 
@@ -50,8 +55,8 @@ def _compiled(segmenter: Segmenter) -> Run:
     model, sizes = segmenter.model, segmenter.weights.model
     a, b = sizes.range_view, sizes.polar_view
     parts: dict[str, tuple[Any, tuple[int, ...]]] = {
-        "range_net": (model.range_net, (1, a.height, a.width, CHANNELS)),
-        "polar_map": (model.polar_net.unet, (1, b.radial, b.angular, sizes.polar_net.pillar)),
+        "range_net": (_inner(model.range_net), (1, a.height, a.width, CHANNELS)),
+        "polar_map": (_inner(model.polar_net).unet, (1, b.radial, b.angular, sizes.polar_net.pillar)),
     }
 
     def run(name: str) -> Any:
@@ -68,9 +73,14 @@ def _compiled(segmenter: Segmenter) -> Run:
     return run
 
 
+def _inner(net: nn.Module) -> nn.Module:
+    return net.net if isinstance(net, InPrecision) else net
+
+
 def _exported(segmenter: Segmenter) -> Run:
-    if segmenter.device != "cpu":
-        raise InputError(f"expected the device cpu for the engine onnx, found {segmenter.device}; use compile")
+    if segmenter.device != "cpu" or segmenter.precision != "float32":
+        found = f"{segmenter.precision} on {segmenter.device}"
+        raise InputError(f"expected float32 on cpu for the engine onnx, found {found}; use compile")
     folder = exported(segmenter)
     return lambda name: OnnxGraph(folder / f"{name}.onnx", torch.get_num_threads())
 

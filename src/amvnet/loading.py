@@ -100,6 +100,7 @@ def loader(
         num_workers=workers,
         collate_fn=collate,
         persistent_workers=workers > 0,
+        pin_memory=torch.cuda.is_available(),  # so that batches go to a GPU while it computes
     )
 
 

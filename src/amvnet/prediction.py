@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,7 @@ def predict(
     processes: Processes = ALONE,
     kind: str = "label",
     uncertain: bool = False,
+    batch: int = 1,
 ) -> int:
     """Segment data sets, scan files, bags and folders of them; returns how many label files there are now.
 
@@ -125,6 +127,7 @@ def predict(
         processes: those that share the scans.
         kind: the format that the labels of lone scans are written in, of `data.outputs.KINDS`.
         uncertain: also write which points are uncertain, (N,) bool, as `.uncertain.npy`.
+        batch: scans that go through the networks at a time; the labels are the same up to rounding.
 
     Raises:
         InputError: before anything is written where an input is not there or its folder is `out`, or the method has
@@ -134,6 +137,8 @@ def predict(
     check_kind(kind)
     if uncertain and segmenter.method in ("rv", "bev"):
         raise InputError(f"expected a method of two networks for --uncertain, found {segmenter.method}; use amvnet")
+    if batch < 1:
+        raise InputError(f"expected one scan or more at a time, found {batch}; set --batch")
     out, fitting, by_ring = Path(out), fitting or Fitting(segmenter.weights), segmenter.by_ring()
 
     def by(place: Path, lone: bool) -> Segment:
@@ -142,8 +147,10 @@ def predict(
     tasks = tasks_in(inputs, Lone(segmenter.taxonomy, by, fitting, out, topic, kind, scores), sequences, split)
     parts = {part: segmenter.weights.digest(part) for part in segmenter.weights.parts}
     model = {"weights": parts, "method": segmenter.method, "sensor": repr(fitting.given)}
+    if segmenter.precision != "float32":
+        model["precision"] = segmenter.precision
     settings = {**model, "scores": scores, "uncertain": uncertain, "format": kind}
-    return run_tasks(tasks, out, settings, scores, uncertain, progress, resume, processes)
+    return run_tasks(tasks, out, settings, scores, uncertain, progress, resume, processes, batch)
 
 
 def tasks_in(inputs: Sequence[str], lone: Lone, sequences: Sequence[str] | None, split: str) -> list[Task]:
@@ -162,12 +169,13 @@ def run_tasks(
     progress: Progress = lambda done, total: None,
     resume: bool = False,
     processes: Processes = ALONE,
+    batch: int = 1,
 ) -> int:
     """Segment scans into `out`; `settings` is what their labels depend on. The rest is as of `predict`."""
     journal = Journal(out, settings, resume, processes)
     mine = [task for task in processes.share(tasks) if str(task.scores.relative_to(out)) not in journal.done]
     broken: list[str] = []
-    for done, (task, fault) in enumerate(_stream(mine, scores, uncertain)):
+    for done, (task, fault) in enumerate(_stream(mine, scores, uncertain, batch)):
         progress(done, len(mine))
         if fault is None:
             journal.add(str(task.scores.relative_to(out)))
@@ -185,27 +193,55 @@ def run_tasks(
     return len(tasks)
 
 
-def _stream(tasks: Sequence[Task], scores: bool, uncertain: bool) -> Iterator[tuple[Task, str | None]]:
+def _stream(tasks: Sequence[Task], scores: bool, uncertain: bool, batch: int = 1) -> Iterator[tuple[Task, str | None]]:
     """Each task when it is done, with what is wrong with its scan; only a few scans are in memory."""
     with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
         source, writing = iter(tasks), deque[tuple[Task, Future[None]]]()
-        reading = deque((task, reader.submit(task.read)) for task in islice(source, AHEAD))
+        reading = deque((task, reader.submit(task.read)) for task in islice(source, max(AHEAD, batch)))
         try:
             while reading:
-                task, coming = reading.popleft()
-                reading.extend((task, reader.submit(task.read)) for task in islice(source, 1))
-                try:
-                    result = task.segment(coming.result())
-                except InputError as error:
-                    yield task, str(error)
-                    continue
-                writing.append((task, writer.submit(_write, task, result, scores, uncertain)))
-                while len(writing) > AHEAD:
-                    yield _written(*writing.popleft())
+                some = [reading.popleft() for _ in range(min(batch, len(reading)))]
+                reading.extend((task, reader.submit(task.read)) for task in islice(source, len(some)))
+                for task, result in _segmented(some):
+                    if isinstance(result, InputError):
+                        yield task, str(result)
+                        continue
+                    writing.append((task, writer.submit(_write, task, result, scores, uncertain)))
+                    while len(writing) > AHEAD:
+                        yield _written(*writing.popleft())
             while writing:
                 yield _written(*writing.popleft())
         finally:
             reader.shutdown(wait=False, cancel_futures=True)
+
+
+Result = Segmentation | InputError
+
+
+def _segmented(some: Sequence[tuple[Task, Future[Scan]]]) -> Iterator[tuple[Task, Result]]:
+    """What is found for some tasks, or what is wrong with their scans."""
+    read: list[tuple[Task, Scan]] = []
+    for task, coming in some:
+        try:
+            read.append((task, coming.result()))
+        except InputError as error:
+            yield task, error
+    for segment, group in groupby(read, key=lambda one: one[0].segment):
+        tasks, scans = zip(*group, strict=True)
+        yield from zip(tasks, _together(segment, scans), strict=True)
+
+
+def _together(segment: Segment, scans: Sequence[Scan]) -> Iterator[Result]:
+    """By one pass of the networks, where they are what segments; one by one to find which scan is at fault."""
+    if len(scans) > 1 and isinstance(segment, Segmenter):
+        with suppress(InputError):
+            yield from segment.many(scans)
+            return
+    for scan in scans:
+        try:
+            yield segment(scan)
+        except InputError as error:
+            yield error
 
 
 def _write(task: Task, result: Segmentation, scores: bool, uncertain: bool) -> None:

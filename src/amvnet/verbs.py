@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 EngineName = Literal["auto", "torch", "compile", "onnx"]
 FormatName = Literal["label", "npy", "ply", "pcd", "las"]
+PrecisionName = Literal["float32", "bfloat16", "float16"]
 WEIGHTS = "sim-hdl64e"
 
 
@@ -99,6 +100,8 @@ def predict(
     uncertain: bool = False,
     device: str = "cpu",
     engine: EngineName = "auto",
+    precision: PrecisionName = "float32",
+    batch: int = 1,
     topic: str | None = None,
     sensor: str | None = None,
     height: float | None = None,
@@ -122,6 +125,8 @@ def predict(
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         device: cpu, cuda, cuda:1, ...
         engine: what runs the networks: torch, compile (a slow start), onnx (ONNX Runtime), or auto, the fastest here.
+        precision: of the networks; float16 on a GPU only.
+        batch: scans that go through the networks at a time; more than one suits a GPU.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
         sensor: of lone scans, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
         height: of lone scans, the sensor's metres over the ground; default: measured.
@@ -139,13 +144,14 @@ def predict(
     processes = meet()
     options = {"height": height, "intensity_scale": intensity_scale, "axes": axes, "rotate": rotate, "offset": offset}
     given = describe(sensor, **options)
-    segmenter = Segmenter(weights, processes.device(device), method)
+    segmenter = Segmenter(weights, processes.device(device), method, precision)
     engage(segmenter, engine)
     fitting, chosen = Fitting(segmenter.weights, given, say), names_in(sequences)
     with progress("segmenting") as step:
         written = segment(
-            inputs, segmenter, out, chosen, scores, step, split, topic, fitting, resume, processes, format, uncertain
-        )
+            inputs, segmenter, out, chosen, scores, step, split, topic, fitting, resume, processes, format, uncertain,
+            batch,
+        )  # fmt: skip
     say(f"{written} label files in {out}")
 
 
@@ -160,6 +166,7 @@ def evaluate(
     pictures: Path | None = None,
     taxonomy: Path | None = None,
     device: str = "cpu",
+    precision: PrecisionName = "float32",
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
 
@@ -174,6 +181,7 @@ def evaluate(
         pictures: folder for drawings of some scans from above.
         taxonomy: a semantic-kitti.yaml with other classes.
         device: cpu, cuda, cuda:1, ...
+        precision: of the networks; float16 on a GPU only.
     """
     from amvnet import jobs
     from amvnet.data.files import make_folder
@@ -187,7 +195,7 @@ def evaluate(
     dataset = open_data(data, taxonomy, None if given is None else jobs.own_classes(given.taxonomy))
     records = jobs.choose_records(dataset, names_in(sequences), split)
     if given is not None:
-        segmenter = Segmenter(given, processes.device(device), widest_method(given))
+        segmenter = Segmenter(given, processes.device(device), widest_method(given), precision)
         label = jobs.by_weights(dataset, segmenter, methods_in(methods))
     else:
         label = jobs.by_files(dataset, Path(str(predictions)))

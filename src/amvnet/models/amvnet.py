@@ -12,6 +12,7 @@ from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.point_head import PointHead, nearest_neighbours, only_asked, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
+from amvnet.models.streams import Arrangement, in_turn
 from amvnet.views.points import PointBatch
 from amvnet.views.polar_view import PolarView
 from amvnet.views.range_view import RangeView
@@ -43,10 +44,10 @@ class AMVNet(nn.Module):
         self.range_view, self.polar_view = range_view, polar_view
         self.range_net, self.polar_net = range_net, polar_net
         self.assertion, self.point_head = assertion, point_head
+        self.run: Arrangement = in_turn
 
     def forward(self, batch: PointBatch) -> Scores:
-        f = self.score_range_view(batch)
-        g = self.score_polar_view(batch)
+        f, g = self.run(self.score_range_view, self.score_polar_view, batch)
         uncertain = self.assertion(f, g, batch.points)
         h = self.refine(batch, f, g, uncertain)
         return Scores(merge(f, g, uncertain, h), uncertain, f, g)
@@ -86,7 +87,10 @@ def settle(head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor,
 def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
     """y: the head's scores for the uncertain points, the geometric mean of f and g for the others."""
     y = geometric_mean(f, g)
-    return y if h is None else y.index_put((uncertain,), h)
+    if h is None:
+        return y
+    # The second takes a processor twice the time, the first has it wait for a GPU.
+    return y.index_put((uncertain,), h) if y.is_cpu else y.masked_scatter(uncertain[:, None], h)
 
 
 def geometric_mean(f: Tensor, g: Tensor) -> Tensor:

@@ -9,11 +9,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from amvnet.config import PointHeadConfig
+from amvnet.models.block_search import nearest_others_by_blocks
 from amvnet.models.layers import PointLinear
 from amvnet.neighbours import nearest_others
 
 POINT_VALUES = 4  # x, y, z, intensity
-PART = 1024  # uncertain points that are scored at a time, which stay in a processor's cache
+# Uncertain points that are scored at a time: what a processor's cache holds; what keeps a GPU busy.
+PART, PART_ON_GPU = 1024, 2**16
 
 
 class PointHead(nn.Module):
@@ -41,8 +43,8 @@ class PointHead(nn.Module):
         """
         first, middle, last = self.mlp[0], self.mlp[1:-1], self.mlp[-1]
         assert isinstance(first, nn.Linear)
-        done, found = first(table), []
-        for index, k in zip(uncertain.split(PART), near.split(PART), strict=True):
+        done, found, part = first(table), [], PART if table.is_cpu else PART_ON_GPU
+        for index, k in zip(uncertain.split(part), near.split(part), strict=True):
             point = table.index_select(0, index)
             shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
             rows = done.index_select(0, k.flatten()).unflatten(0, k.shape).sub_(shift[:, None])  # (part, n, hidden[0])
@@ -89,6 +91,8 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
 
     Of a scan with fewer than n other points the last one is repeated; a lone point is its own neighbour.
     """
+    if points.is_cuda:
+        return nearest_others_by_blocks(points[:, :3], index, n)
     found = nearest_others(points[:, :3].cpu().numpy(), index.cpu().numpy(), n)
     return torch.from_numpy(found).to(points.device)
 

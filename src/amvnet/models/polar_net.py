@@ -11,7 +11,7 @@ from amvnet.models.joined import joined
 from amvnet.models.layers import ConvBlock, PointLinear, linear
 from amvnet.views.polar_view import FEATURES, PolarGrid
 
-PART = 2048  # points that are encoded at a time
+PART, PART_ON_GPU = 2048, 2**18  # points that are encoded at a time: what a cache holds; what keeps a GPU busy
 
 
 class PolarNet(nn.Module):
@@ -38,7 +38,7 @@ class PolarNet(nn.Module):
     def pool(self, grid: PolarGrid) -> Tensor:  # (M, point_widths[-1])
         if torch.is_grad_enabled():
             return grid.pool(self.point_mlp(grid.features))
-        return grid.pool_by_parts(self.point_mlp, PART)
+        return grid.pool_by_parts(self.point_mlp, PART if grid.features.is_cpu else PART_ON_GPU)
 
     def score(self, pillars: Tensor) -> Tensor:  # (M, widths[0]) -> (M, Z * K)
         return linear(pillars, self.scores.weight.flatten(1), self.scores.bias)

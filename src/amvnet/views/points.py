@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import numpy as np
 import torch
@@ -22,6 +23,7 @@ class PointBatch:
         count: B.
         ring: (P,) int64: index of the laser, or None.
         names: of the scans.
+        sizes: points of each scan, where the processor knows them: it need not ask a GPU then.
     """
 
     points: Tensor
@@ -29,26 +31,37 @@ class PointBatch:
     count: int
     ring: Tensor | None = None
     names: tuple[str, ...] = ()
+    sizes: tuple[int, ...] = ()
 
     def to(self, where: torch.device | torch.dtype | str) -> PointBatch:
-        """On a device, or with points of a floating-point type."""
+        """On a device, or with points of a floating-point type; from pinned memory to a GPU without waiting."""
         if isinstance(where, torch.dtype):
             return replace(self, points=self.points.to(where))
-        ring = None if self.ring is None else self.ring.to(where)
-        return PointBatch(self.points.to(where), self.scan.to(where), self.count, ring, self.names)
+        to_gpu = torch.device(where).type == "cuda"  # the other way, what comes could be read before it is there
+        return self._each(lambda values: values.to(where, non_blocking=to_gpu))
+
+    def pin_memory(self) -> PointBatch:
+        """In memory that a GPU copies from by itself; torch's loaders call it, too."""
+        return self._each(Tensor.pin_memory)
+
+    def _each(self, move: Callable[[Tensor], Tensor]) -> PointBatch:
+        ring = None if self.ring is None else move(self.ring)
+        return replace(self, points=move(self.points), scan=move(self.scan), ring=ring)
 
     def slices(self) -> list[slice]:
         """Where each scan's points stand."""
-        ends = torch.bincount(self.scan, minlength=self.count).cumsum(0).tolist()
-        return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+        sizes = self.sizes or torch.bincount(self.scan, minlength=self.count).tolist()
+        ends = list(accumulate(sizes))
+        return [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
 
     @classmethod
     def of(cls, scans: Sequence[Scan]) -> PointBatch:
         """The valid points of some scans (`Scan.valid`), in order."""
         kept = [scan.valid for scan in scans]
         points = np.concatenate([s.points[k] for s, k in zip(scans, kept, strict=True)]).astype(np.float32, copy=False)
-        index = np.repeat(np.arange(len(scans)), [k.sum() for k in kept])
+        sizes = tuple(int(k.sum()) for k in kept)
+        index = np.repeat(np.arange(len(scans)), sizes)
         rings = [s.ring[k] for s, k in zip(scans, kept, strict=True) if s.ring is not None]
         ring = torch.from_numpy(np.concatenate(rings).astype(np.int64)) if len(rings) == len(scans) else None
         names = tuple(scan.name for scan in scans)
-        return cls(torch.from_numpy(points), torch.from_numpy(index), len(scans), ring, names)
+        return cls(torch.from_numpy(points), torch.from_numpy(index), len(scans), ring, names, sizes)

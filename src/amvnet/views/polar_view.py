@@ -82,19 +82,23 @@ class PolarView:
     def project(self, batch: PointBatch) -> PolarGrid:
         """The polar grids of a batch of scans. Points outside the grid go to the nearest cell."""
         x, y, z = batch.points[:, :3].double().unbind(1)
-        polar = torch.stack([torch.sqrt(x * x + y * y), torch.atan2(y, x), z], dim=1)
-        low, high, cells = (polar.new_tensor(v) for v in (self._low, self._high, self._cells))
         # In double precision, so that a point at a cell's border falls the same way on every device.
-        cell = ((polar - low) / (high - low) * cells).floor().clamp_min(0).minimum(cells - 1)
-        centre = low + (cell + 0.5) * (high - low) / cells
-        features = torch.cat([polar - centre, polar], dim=1).to(batch.points.dtype)
-        radius, angle, voxel = cell.long().unbind(1)
+        polar = (torch.sqrt(x * x + y * y), torch.atan2(y, x), z)
+        placed = [_place(*axis) for axis in zip(polar, self._low, self._high, self._cells, strict=True)]
+        radius, angle, voxel = (cell for cell, _ in placed)
+        features = torch.stack([*(offset for _, offset in placed), *polar], dim=1).to(batch.points.dtype)
         c = self.config
         pillar = (batch.scan * c.radial + radius) * c.angular + angle
         shape = (batch.count, c.radial, c.angular, c.vertical)
         occupied, slot = _occupied(pillar, math.prod(shape[:3]))
         features = torch.cat([features, batch.points[:, [0, 1, 3]]], dim=1)
         return PolarGrid(features, pillar, voxel, occupied, slot, shape)
+
+
+def _place(values: Tensor, low: float, high: float, cells: int) -> tuple[Tensor, Tensor]:
+    """Along one axis the cell of each value (P,), int64, and how far the value is from its centre."""
+    cell = ((values - low) / (high - low) * cells).floor().clamp(0, cells - 1)
+    return cell.long(), values - (low + (cell + 0.5) * (high - low) / cells)
 
 
 def _occupied(pillar: Tensor, pillars: int) -> tuple[Tensor, Tensor]:

@@ -55,9 +55,8 @@ class RangeView:
         pixel = (batch.scan * c.height + self.rows(batch)) * c.width + self.columns(batch)
         nearest = _nearest(distance, pixel, batch.count * c.height * c.width)
         values = torch.cat([batch.points, distance[:, None], torch.ones_like(distance)[:, None]], dim=1)
-        seen = nearest >= 0
-        image = values.new_zeros(len(nearest), CHANNELS)
-        image[seen] = values[nearest[seen]]
+        padded = torch.cat([values, values.new_zeros(1, CHANNELS)])
+        image = padded.index_select(0, nearest % len(padded))  # -1, no point, is the last row
         return RangeImage(image.view(batch.count, c.height, c.width, CHANNELS).permute(0, 3, 1, 2), pixel, nearest)
 
     def columns(self, batch: PointBatch) -> Tensor:
@@ -79,10 +78,10 @@ class RangeView:
         height = self.config.height
         if ring is None:
             raise InputError("expected a scan with a ring index, found none; use a model with rows by elevation")
-        if len(ring) and not 0 <= int(ring.min()) <= int(ring.max()) < height:
+        low, high = torch.stack(ring.aminmax()).tolist() if len(ring) else (0, 0)  # a GPU is asked once
+        if not 0 <= low <= high < height:
             raise InputError(
-                f"expected ring indices from 0 to {height - 1}, found {int(ring.min())} to {int(ring.max())}; "
-                "use a model for this sensor"
+                f"expected ring indices from 0 to {height - 1}, found {low} to {high}; use a model for this sensor"
             )
         return height - 1 - ring  # ring 0 is the lowest laser
 
