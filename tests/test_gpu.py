@@ -24,7 +24,7 @@ from amvnet.models.block_search import nearest_others_by_blocks, split_into_bloc
 from amvnet.models.streams import SideBySide
 from amvnet.neighbours import nearest_others
 from amvnet.precision import InPrecision
-from amvnet.prediction import AHEAD, Task, _stream
+from amvnet.streaming import AHEAD, Task, stream
 from amvnet.views.points import PointBatch
 from amvnet.weights import save
 
@@ -357,7 +357,7 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
 
         return Task(str(place), read, segmenter, lambda _: (held.remove(place), Path())[1], Path())
 
-    done = [one.name for one, fault in _stream([task(place) for place in range(23)], False, False, 4) if not fault]
+    done = [one.name for one, fault in stream([task(place) for place in range(23)], False, False, 4) if not fault]
     assert done == [str(place) for place in range(23)]
     assert sizes == [4, 4, 4, 4, 4, 3]
     assert max(most) <= 2 * 4 + AHEAD + 2

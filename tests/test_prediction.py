@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from worlds import amvnet, files, fresh_weights, make_streets, street
 
 from amvnet import prediction
 from amvnet.journal import Journal
-from amvnet.segmenter import Segmenter
+from amvnet.scan import Scan
+from amvnet.segmenter import Segmentation, Segmenter
+from amvnet.streaming import AHEAD, Task, stream
 from amvnet.weights import save
 
 WEIGHTS = "w.safetensors"
@@ -75,8 +80,8 @@ def test_only_broken_scans_are_one_line(world: Path, tmp_path: Path) -> None:
 def test_a_killed_run_goes_on_where_it_stopped(world: Path, whole: Path, tmp_path: Path, kills: int) -> None:
     """SIGKILL in the midst of it, once or twice; what is done is not done again, and the end is the same."""
     out = tmp_path / "out"
-    slow = "import time; from amvnet import prediction, cli; write = prediction._write\n"
-    slow += "prediction._write = lambda *a: (time.sleep(0.1), write(*a))\nimport sys; sys.exit(cli.main())"
+    slow = "import time; from amvnet import streaming, cli; write = streaming._write\n"
+    slow += "streaming._write = lambda *a: (time.sleep(0.1), write(*a))\nimport sys; sys.exit(cli.main())"
     arguments = ["predict", str(world / "scans"), "--weights", str(world / WEIGHTS), "--out", str(out), "--resume"]
     times: dict[str, int] = {}
     for kill in range(1, kills + 1):
@@ -144,27 +149,52 @@ def settings_of(world: Path) -> dict[str, object]:
     return {"weights": parts, "method": "amvnet", "sensor": sensor, **kept}
 
 
-def test_few_scans_are_in_memory_however_many_there_are(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("at_once", [1, 3])
+def test_few_scans_are_in_memory_however_many_there_are(world: Path, at_once: int) -> None:
     """Counted: those that are read and not yet written."""
     held, most = set(), []
     segmenter = Segmenter(str(world / WEIGHTS))
 
-    def task(place: int) -> prediction.Task:
+    def task(place: int) -> Task:
         def read() -> object:
             held.add(place)
             most.append(len(held))
-            return prediction.Scan(street(place)[0])
+            return Scan(street(place)[0])
 
         def write(result: object) -> Path:
             time.sleep(0.02)  # slower than the reading
             held.remove(place)
             return Path()
 
-        return prediction.Task(str(place), read, segmenter, write, Path())  # type: ignore[arg-type]
+        return Task(str(place), read, segmenter, write, Path())  # type: ignore[arg-type]
 
-    done = [
-        one.name for one, fault in prediction._stream([task(place) for place in range(30)], False, False) if not fault
-    ]
+    tasks = [task(place) for place in range(30)]
+    done = [one.name for one, fault in stream(tasks, False, False, at_once=at_once) if not fault]
     assert done == [str(place) for place in range(30)]
-    assert max(most) <= 2 * prediction.AHEAD + 2
+    assert max(most) <= 2 * AHEAD + 2 + at_once
     assert not held
+
+
+@pytest.mark.parametrize("at_once", [2, 5])
+def test_scans_side_by_side_get_the_labels_they_get_one_by_one(
+    world: Path, whole: Path, tmp_path: Path, at_once: int
+) -> None:
+    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--at-once", at_once)
+    threads = torch.get_num_threads()
+    assert amvnet(*arguments) == (0, "")
+    same(tmp_path, whole)
+    assert torch.get_num_threads() == threads
+
+
+def test_scans_side_by_side_really_run_at_the_same_time() -> None:
+    """Each waits for the other."""
+    both = threading.Barrier(2, timeout=30)
+
+    def segment(scan: Scan) -> Segmentation:
+        both.wait()
+        return Segmentation(*np.zeros((3, len(scan))))
+
+    tasks = [
+        Task(str(n), lambda: Scan(np.zeros((5, 4), np.float32)), segment, lambda _: Path(), Path()) for n in (0, 1)
+    ]
+    assert [fault for _, fault in stream(tasks, False, False, at_once=2)] == [None, None]

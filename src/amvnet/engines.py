@@ -48,6 +48,7 @@ def engage(segmenter: Segmenter, engine: str) -> str:
             setattr(holder, name, run("range_net"))
         if "polar_net" in needed:  # the instance's goes before the class's method of this name
             object.__setattr__(_inner(model.polar_net), "unet", run("polar_map"))
+    segmenter.engine = engine
     return engine
 
 

@@ -10,10 +10,11 @@ from amvnet.data.labels import Taxonomy
 from amvnet.fitting import Fitting
 from amvnet.fusion import Fusion
 from amvnet.jobs import Progress
-from amvnet.prediction import Lone, Segment, run_tasks, tasks_in
+from amvnet.prediction import Lone, run_tasks, tasks_in
 from amvnet.scan import Scan
 from amvnet.score_files import ScorePair
 from amvnet.segmenter import Segmentation, checked_scan
+from amvnet.streaming import Segment
 from amvnet.weights import Weights
 
 

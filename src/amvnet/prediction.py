@@ -1,23 +1,19 @@
-"""Segments any number of scans: read, computed and written side by side, and gone on with after an interruption."""
+"""Segments any number of scans, and goes on after an interruption."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import groupby, islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from amvnet.data.catalog import is_dataset, open_dataset
-from amvnet.data.files import find_scans, whole_file
+from amvnet.data.files import find_scans
 from amvnet.data.formats import READERS, NamedScan, named_scans
 from amvnet.data.labels import Taxonomy
-from amvnet.data.outputs import check_kind, write_scan_labels, write_uncertain
+from amvnet.data.outputs import check_kind, write_scan_labels
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError, SomeBroken
 from amvnet.fitting import MEASURED, Fitting
@@ -26,26 +22,9 @@ from amvnet.journal import Journal
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmentation, Segmenter
+from amvnet.streaming import Segment, Task, stream
 
-AHEAD = 3  # scans that are read before they are asked for, and that may wait to be written
-Segment = Callable[[Scan], Segmentation]
 By = Callable[[Path, bool], Segment]  # for the scan whose scores lie at a place, and whether it is a lone one
-
-
-@dataclass(frozen=True)
-class Task:
-    """One scan to segment: how it is read, by what it is segmented, and where its labels go."""
-
-    name: str
-    read: Callable[[], Scan]
-    segment: Segment
-    write: Callable[[Segmentation], Path]
-    scores: Path
-
-    @property
-    def uncertain(self) -> Path:
-        """Where it is written which points are uncertain."""
-        return self.scores.with_suffix(".uncertain.npy")
 
 
 @dataclass
@@ -113,6 +92,7 @@ def predict(
     kind: str = "label",
     uncertain: bool = False,
     batch: int = 1,
+    at_once: int | None = None,
 ) -> int:
     """Segment data sets, scan files, bags and folders of them; returns how many label files there are now.
 
@@ -128,6 +108,8 @@ def predict(
         kind: the format that the labels of lone scans are written in, of `data.outputs.KINDS`.
         uncertain: also write which points are uncertain, (N,) bool, as `.uncertain.npy`.
         batch: scans that go through the networks at a time; the labels are the same up to rounding.
+        at_once: scans that are segmented side by side on a CPU, each by its share of the threads; None is as many as
+            there are threads, 4 at most, and 1 on a GPU or where another engine than torch shares out the threads.
 
     Raises:
         InputError: before anything is written where an input is not there or its folder is `out`, or the method has
@@ -137,8 +119,9 @@ def predict(
     check_kind(kind)
     if uncertain and segmenter.method in ("rv", "bev"):
         raise InputError(f"expected a method of two networks for --uncertain, found {segmenter.method}; use amvnet")
-    if batch < 1:
-        raise InputError(f"expected one scan or more at a time, found {batch}; set --batch")
+    for option, count in (("batch", batch), ("at-once", 1 if at_once is None else at_once)):
+        if count < 1:
+            raise InputError(f"expected one scan or more at a time, found {count}; set --{option}")
     out, fitting, by_ring = Path(out), fitting or Fitting(segmenter.weights), segmenter.by_ring()
 
     def by(place: Path, lone: bool) -> Segment:
@@ -150,7 +133,9 @@ def predict(
     if segmenter.precision != "float32":
         model["precision"] = segmenter.precision
     settings = {**model, "scores": scores, "uncertain": uncertain, "format": kind}
-    return run_tasks(tasks, out, settings, scores, uncertain, progress, resume, processes, batch)
+    return run_tasks(
+        tasks, out, settings, scores, uncertain, progress, resume, processes, batch, at_once or segmenter.at_once
+    )
 
 
 def tasks_in(inputs: Sequence[str], lone: Lone, sequences: Sequence[str] | None, split: str) -> list[Task]:
@@ -170,12 +155,13 @@ def run_tasks(
     resume: bool = False,
     processes: Processes = ALONE,
     batch: int = 1,
+    at_once: int = 1,
 ) -> int:
     """Segment scans into `out`; `settings` is what their labels depend on. The rest is as of `predict`."""
     journal = Journal(out, settings, resume, processes)
     mine = [task for task in processes.share(tasks) if str(task.scores.relative_to(out)) not in journal.done]
     broken: list[str] = []
-    for done, (task, fault) in enumerate(_stream(mine, scores, uncertain, batch)):
+    for done, (task, fault) in enumerate(stream(mine, scores, uncertain, batch, at_once)):
         progress(done, len(mine))
         if fault is None:
             journal.add(str(task.scores.relative_to(out)))
@@ -191,77 +177,6 @@ def run_tasks(
         kept = len(tasks) - len(broken)
         raise SomeBroken(f"{kept} of {len(tasks)} scans are segmented, {len(broken)} are broken", broken)
     return len(tasks)
-
-
-def _stream(tasks: Sequence[Task], scores: bool, uncertain: bool, batch: int = 1) -> Iterator[tuple[Task, str | None]]:
-    """Each task when it is done, with what is wrong with its scan; only a few scans are in memory."""
-    with ThreadPoolExecutor(1) as reader, ThreadPoolExecutor(1) as writer:
-        source, writing = iter(tasks), deque[tuple[Task, Future[None]]]()
-        reading = deque((task, reader.submit(task.read)) for task in islice(source, max(AHEAD, batch)))
-        try:
-            while reading:
-                some = [reading.popleft() for _ in range(min(batch, len(reading)))]
-                reading.extend((task, reader.submit(task.read)) for task in islice(source, len(some)))
-                for task, result in _segmented(some):
-                    if isinstance(result, InputError):
-                        yield task, str(result)
-                        continue
-                    writing.append((task, writer.submit(_write, task, result, scores, uncertain)))
-                    while len(writing) > AHEAD:
-                        yield _written(*writing.popleft())
-            while writing:
-                yield _written(*writing.popleft())
-        finally:
-            reader.shutdown(wait=False, cancel_futures=True)
-
-
-Result = Segmentation | InputError
-
-
-def _segmented(some: Sequence[tuple[Task, Future[Scan]]]) -> Iterator[tuple[Task, Result]]:
-    """What is found for some tasks, or what is wrong with their scans."""
-    read: list[tuple[Task, Scan]] = []
-    for task, coming in some:
-        try:
-            read.append((task, coming.result()))
-        except InputError as error:
-            yield task, error
-    for segment, group in groupby(read, key=lambda one: one[0].segment):
-        tasks, scans = zip(*group, strict=True)
-        yield from zip(tasks, _together(segment, scans), strict=True)
-
-
-def _together(segment: Segment, scans: Sequence[Scan]) -> Iterator[Result]:
-    """By one pass of the networks, where they are what segments; one by one to find which scan is at fault."""
-    if len(scans) > 1 and isinstance(segment, Segmenter):
-        with suppress(InputError):
-            yield from segment.many(scans)
-            return
-    for scan in scans:
-        try:
-            yield segment(scan)
-        except InputError as error:
-            yield error
-
-
-def _write(task: Task, result: Segmentation, scores: bool, uncertain: bool) -> None:
-    if scores:
-        write_scores(task.scores, result)
-    if uncertain:
-        write_uncertain(task.uncertain, result.uncertain)
-    task.write(result)
-
-
-def _written(task: Task, writing: Future[None]) -> tuple[Task, None]:
-    writing.result()  # raises what went wrong
-    return task, None
-
-
-def write_scores(path: Path, result: Segmentation) -> None:
-    """Both networks' probabilities, (N, K) float16, as `rv` and `bev` of an `.npz`."""
-    found = {name: v.astype(np.float16) for name, v in (("rv", result.rv), ("bev", result.bev)) if v is not None}
-    with whole_file(path) as part:
-        np.savez_compressed(part, **found)  # type: ignore[arg-type]  # of the arrays, none is an option
 
 
 def _tasks(text: str, lone: Lone, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:

@@ -25,6 +25,7 @@ from amvnet.views.range_view import RangeView
 from amvnet.weights import Weights, load
 
 Method = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
+MOST_AT_ONCE = 4  # scans, so that their memory is bounded on a processor of many cores
 METHODS: tuple[Method, ...] = get_args(Method)
 COMPARED: tuple[Method, ...] = ("rv", "bev", "ensemble", "amvnet")  # in the paper's tables by class
 NEEDED: dict[str, tuple[str, ...]] = {
@@ -80,6 +81,7 @@ class Segmenter:
         self.method = _checked_method(method, self.weights)
         if self.weights.model.assertion.name == "loss":
             raise InputError("expected an assertion that needs no labels, found loss; train the head with another one")
+        self.engine = "torch"
         self.device, self.precision = _checked_device(device), precision
         check_precision(precision, device)
         if device == "cpu":
@@ -87,6 +89,11 @@ class Segmenter:
         self.model = self.weights.build().to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         fold_batch_norms(self.model)
         _arrange(self.model, device, precision)
+
+    @property
+    def at_once(self) -> int:
+        """How many scans are best segmented side by side, each by its share of torch's threads."""
+        return min(torch.get_num_threads(), MOST_AT_ONCE) if self.device == "cpu" and self.engine == "torch" else 1
 
     @property
     def taxonomy(self) -> Taxonomy:

@@ -102,6 +102,7 @@ def predict(
     engine: EngineName = "auto",
     precision: PrecisionName = "float32",
     batch: int = 1,
+    at_once: int | None = None,
     topic: str | None = None,
     sensor: str | None = None,
     height: float | None = None,
@@ -127,6 +128,7 @@ def predict(
         engine: what runs the networks: torch, compile (a slow start), onnx (ONNX Runtime), or auto, the fastest here.
         precision: of the networks; float16 on a GPU only.
         batch: scans that go through the networks at a time; more than one suits a GPU.
+        at_once: scans that are segmented side by side on a CPU; default: as many as there are threads, 4 at most.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
         sensor: of lone scans, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
         height: of lone scans, the sensor's metres over the ground; default: measured.
@@ -150,7 +152,7 @@ def predict(
     with progress("segmenting") as step:
         written = segment(
             inputs, segmenter, out, chosen, scores, step, split, topic, fitting, resume, processes, format, uncertain,
-            batch,
+            batch, at_once,
         )  # fmt: skip
     say(f"{written} label files in {out}")
 
