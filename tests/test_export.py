@@ -279,7 +279,9 @@ def test_the_page_runs(
     monkeypatch.chdir(tmp_path)
     quick = without(exported["elevation"][0], "range_net", "point_head")
     save(quick, tmp_path / "weights.safetensors")
-    scan_of(1).points.tofile(tmp_path / "scan.bin")
+    (tmp_path / "scans").mkdir()
+    for path in ("scan.bin", "scans/0.bin"):
+        scan_of(1).points.tofile(tmp_path / path)
     for words in commands_of("docs/export.md"):
         if words[0] == "amvnet":
             small = ["weights.safetensors" if word == "sim-hdl64e" else word for word in words]

@@ -74,12 +74,7 @@ class _Part(nn.Module):
 
 @dataclass(frozen=True)
 class Exported:
-    """What was measured of the graphs, by name.
-
-    Attributes:
-        differences: by how much each differs from torch; of those in int8, before they were.
-        agreement: of those in int8, the share of the points whose label stays.
-    """
+    """By how much each graph differs from torch (before int8), and what share of labels stays in those in int8."""
 
     differences: dict[str, float]
     agreement: dict[str, float]
@@ -133,17 +128,15 @@ def _write_all(
         for name, graph in graphs.items():
             progress(len(written), total)
             written[name] = _write(graph, name, part / f"{name}.onnx")
-    differences = {name: one["difference"] for name, one in written.items()}
+    measured = Exported({name: one["difference"] for name, one in written.items()}, {})
     said = describe(segmenter, written)
     _save(said, part / DESCRIPTION)  # which the graphs are run by
-    agreement: dict[str, float] = {}
     progress(len(graphs), total)
     for name, anew in quantise(part, convolutions, scans):
-        del written[name]["difference"]
-        written[name] |= anew
-        agreement[name] = anew["agreement"]
-        progress(len(graphs) + len(agreement), total)
-    return said, Exported(differences, agreement)
+        said["graphs"][name] = {key: value for key, value in written[name].items() if key != "difference"} | anew
+        measured.agreement[name] = anew["agreement"]
+        progress(len(graphs) + len(measured.agreement), total)
+    return said, measured
 
 
 def _save(said: dict[str, Any], path: Path) -> None:
