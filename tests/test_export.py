@@ -37,8 +37,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Weight
     found = {}
     for rows, taxonomy in TAXONOMIES.items():
         found[rows] = fresh_weights(taxonomy), tmp_path_factory.mktemp(rows)
-        differences = export(*found[rows])
-        assert 0 <= max(differences.values()) <= 1e-4
+        assert 0 <= max(export(*found[rows]).differences.values()) <= 1e-4
     return found
 
 
@@ -280,7 +279,9 @@ def test_the_page_runs(
     monkeypatch.chdir(tmp_path)
     quick = without(exported["elevation"][0], "range_net", "point_head")
     save(quick, tmp_path / "weights.safetensors")
-    scan_of(1).points.tofile(tmp_path / "scan.bin")
+    (tmp_path / "scans").mkdir()
+    for path in ("scan.bin", "scans/0.bin"):
+        scan_of(1).points.tofile(tmp_path / path)
     for words in commands_of("docs/export.md"):
         if words[0] == "amvnet":
             small = ["weights.safetensors" if word == "sim-hdl64e" else word for word in words]

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import json
-import logging
 import os
 import shutil
 import uuid
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +22,9 @@ from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
+from amvnet.onnx_files import digest, one_line, quiet, strip
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
+from amvnet.quantising import FIRST_KEPT, calibration_scans, quantise
 from amvnet.scan import FARTHEST, Scan
 from amvnet.segmenter import Segmenter, widest_method
 from amvnet.trees import to_dict
@@ -74,38 +72,75 @@ class _Part(nn.Module):
         return self.part(x)
 
 
+@dataclass(frozen=True)
+class Exported:
+    """By how much each graph differs from torch (before int8), and what share of labels stays in those in int8."""
+
+    differences: dict[str, float]
+    agreement: dict[str, float]
+
+
 def export(
-    weights: Weights | Path | str, out: Path | str, progress: Callable[[int, int], None] = lambda done, total: None
-) -> dict[str, float]:
-    """Write the graphs and `amvnet.json` into a folder; returns by how much each graph differs from torch.
+    weights: Weights | Path | str,
+    out: Path | str,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    int8: str | None = None,
+) -> Exported:
+    """Write the graphs and `amvnet.json` into a folder.
+
+    Args:
+        int8: put the convolutions into int8, calibrated with these scans: as `predict` takes them, or `simulated`.
 
     Raises:
-        InputError: where a library is missing, the weights have no network or need labels, or a graph cannot be
-            written, or differs by more than `LARGEST_DIFFERENCE`; then the folder is as it was.
+        InputError: where a library is missing, the weights have no network or need labels, there are no scans, or a
+            graph cannot be written, differs by more than `LARGEST_DIFFERENCE`, or gives too many points other
+            labels in int8; then the folder is as it was.
     """
     check_libraries()
     given = weights if isinstance(weights, Weights) else load(weights)
     segmenter = Segmenter(given, method=widest_method(given))
+    scans = [] if int8 is None else calibration_scans(int8, segmenter)
     out = Path(out)
     make_folder(out)
     part = out / f".{uuid.uuid4().hex}.part"
     part.mkdir()
     try:
-        with torch.no_grad():
-            graphs = _graphs(segmenter)
-            written = {}
-            for done, (name, graph) in enumerate(graphs.items()):
-                progress(done, len(graphs))
-                written[name] = _write(graph, name, part / f"{name}.onnx")
+        said, measured = _write_all(segmenter, scans, part, progress)
         (out / DESCRIPTION).unlink(missing_ok=True)  # so that it never speaks of another export's graphs
-        for name in graphs:
+        for name in said["graphs"]:
             os.replace(part / f"{name}.onnx", out / f"{name}.onnx")
     finally:
         shutil.rmtree(part, ignore_errors=True)
     with whole_file(out / DESCRIPTION) as file:
-        file.write_text(json.dumps(describe(segmenter, written), indent=1) + "\n", encoding="utf-8")
-    progress(len(graphs), len(graphs))
-    return {name: said["difference"] for name, said in written.items()}
+        _save(said, file)
+    return measured
+
+
+def _write_all(
+    segmenter: Segmenter, scans: Sequence[Scan], part: Path, progress: Callable[[int, int], None]
+) -> tuple[dict[str, Any], Exported]:
+    """Write the graphs, in int8 where there are scans; returns the description, and what was measured."""
+    written: dict[str, dict[str, Any]] = {}
+    with torch.no_grad():
+        graphs = _graphs(segmenter)
+        convolutions = [name for name in graphs if scans and name in FIRST_KEPT]
+        total = len(graphs) + len(convolutions)
+        for name, graph in graphs.items():
+            progress(len(written), total)
+            written[name] = _write(graph, name, part / f"{name}.onnx")
+    measured = Exported({name: one["difference"] for name, one in written.items()}, {})
+    said = describe(segmenter, written)
+    _save(said, part / DESCRIPTION)  # which the graphs are run by
+    progress(len(graphs), total)
+    for name, anew in quantise(part, convolutions, scans):
+        said["graphs"][name] = {key: value for key, value in written[name].items() if key != "difference"} | anew
+        measured.agreement[name] = anew["agreement"]
+        progress(len(graphs) + len(measured.agreement), total)
+    return said, measured
+
+
+def _save(said: dict[str, Any], path: Path) -> None:
+    path.write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
 
 
 def check_libraries() -> None:
@@ -218,7 +253,7 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
     if name in DYNAMIC:
         axis = torch.export.Dim(DYNAMIC[name], min=1)
         axes = tuple({0: axis} for _ in graph.inputs)
-    with _quiet(), _one_line(name):
+    with quiet("torch.onnx"), one_line(name, "torch.onnx", "torch and onnxscript"):
         torch.onnx.export(
             *(graph.module, tuple(graph.inputs.values()), path),
             input_names=list(graph.inputs),
@@ -229,7 +264,7 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
             external_data=False,
             verbose=False,
         )
-    _strip(path)
+    strip(path)
     inputs, outputs, found = _run(path, graph)
     difference = _difference(graph, expected, found)
     if not difference <= LARGEST_DIFFERENCE:
@@ -237,20 +272,8 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
             f"{name}: expected at most {LARGEST_DIFFERENCE:g} of difference between ONNX Runtime and torch, found "
             f"{difference:.2g}; use other versions of {', '.join(EXTRA)}"
         )
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    said = {"file": path.name, "sha256": digest, "inputs": inputs, "outputs": outputs}
+    said = {"file": path.name, "precision": "float32", "sha256": digest(path), "inputs": inputs, "outputs": outputs}
     return {**said, "difference": difference}
-
-
-def _strip(path: Path) -> None:
-    """Take out the exporter's notes, which name places on this machine."""
-    import onnx
-
-    model = onnx.load(path)
-    graph = model.graph
-    for holder in (model, graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output):
-        holder.ClearField("metadata_props")
-    onnx.save(model, path)
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:
@@ -270,31 +293,3 @@ def _difference(graph: Graph, expected: Tensor, found: Tensor) -> float:
     if expected.shape != found.shape:
         return float("inf")
     return float((graph.compared(expected) - graph.compared(found)).abs().max())
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the exporter's notes for developers."""
-    logger = logging.getLogger("torch.onnx")
-    before = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(before)
-
-
-@contextmanager
-def _one_line(name: str) -> Iterator[None]:
-    """What the exporter complains of as one line; its errors share no class and span pages."""
-    try:
-        yield
-    except OSError:
-        raise
-    except Exception as error:
-        kind = type(error).__name__
-        raise InputError(
-            f"{name}: expected a graph of torch.onnx, found {kind}; upgrade torch and onnxscript"
-        ) from error
