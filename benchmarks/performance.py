@@ -1,6 +1,6 @@
 """What a scan costs on this machine's CPU, beside SalsaNext, and what each measure for speed gives: by taking it away.
 
-python benchmarks/performance.py [--scan FILE] [--rounds N] [--runs N] [--engines torch,onnx] [--recipe semantickitti]
+python benchmarks/performance.py [--scan FILE] [--rounds N] [--runs N] [--engines torch,onnx] [--uncertain SHARE]
 """
 
 from __future__ import annotations
@@ -101,7 +101,9 @@ TAKEN_AWAY: dict[str, tuple[Callable[[], None], ...]] = {
 TAKEN_AWAY["all of these"] = tuple(taken for some in TAKEN_AWAY.values() for taken in some)
 
 
-def measure(variant: str, engine: str, scan: Path, runs: int, recipe: str | None) -> dict[str, float]:
+def measure(
+    variant: str, engine: str, scan: Path, runs: int, recipe: str | None, share: float | None
+) -> dict[str, float]:
     """Median seconds of each stage and of SalsaNext's forward pass, in turn, in this process."""
     for take_away in TAKEN_AWAY[variant]:
         take_away()
@@ -110,7 +112,6 @@ def measure(variant: str, engine: str, scan: Path, runs: int, recipe: str | None
     salsanext, image = yardstick(engine)
     with TemporaryDirectory() as folder:
         target = Path(folder) / "labels.label"
-        share = 0.1 if recipe else None
         job = Job(segmenter, lambda: read_scan(scan), lambda ids: write_labels(target, ids), engine, share)
         times: list[dict[str, float]] = []
         for _ in range(runs + WARM_UP):
@@ -146,10 +147,13 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--engines", default="torch")
     parser.add_argument("--recipe")
+    parser.add_argument("--uncertain", type=float)  # share of the points; by default as the weights find
+    parser.add_argument("--short", action="store_true")  # the engines alone
     parser.add_argument("--variant")  # of one process of ours
     options = parser.parse_args()
     if options.variant:
-        print(json.dumps(measure(options.variant, options.engines, options.scan, options.runs, options.recipe)))
+        what = options.variant, options.engines, options.scan, options.runs, options.recipe, options.uncertain
+        print(json.dumps(measure(*what)))
         return
     with TemporaryDirectory() as folder:
         if options.scan is None:
@@ -160,13 +164,14 @@ def main() -> None:
 def compare(options: argparse.Namespace, scan: Path) -> None:
     """Every variant of each engine in processes of their own, round by round; the tables of docs/performance.md."""
     variants = [("as it is", engine) for engine in options.engines.split(",")]
-    variants += [(name, "torch") for name in TAKEN_AWAY if name != "as it is"]
+    variants += [(name, "torch") for name in TAKEN_AWAY if name != "as it is" and not options.short]
     found: dict[tuple[str, str], list[dict[str, float]]] = {key: [] for key in variants}
     for number in range(options.rounds):
         for variant, engine in variants:
             command = [sys.executable, __file__, "--scan", str(scan), "--runs", str(options.runs)]
             command += ["--variant", variant, "--engines", engine]
             command += ["--recipe", options.recipe] if options.recipe else []
+            command += ["--uncertain", str(options.uncertain)] if options.uncertain is not None else []
             printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
             found[variant, engine].append(json.loads(printed.splitlines()[-1]))
             print(f"round {number + 1}: {engine}, {variant}", file=sys.stderr)

@@ -22,7 +22,7 @@ from amvnet.models.assertions import cosine_similarity
 from amvnet.models.layers import linear
 from amvnet.models.point_head import nearest_neighbours
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter
+from amvnet.segmenter import Segmenter, label_ids
 from amvnet.views.points import PointBatch
 from amvnet.weights import PARTS, Weights, state_of
 
@@ -32,7 +32,7 @@ FUSION = ("compare", "neighbours", "head", "merge")
 MEAN = "mean"  # what the ensemble does instead of the fusion
 WARM_UP = 2  # runs that do not count
 PRODUCT = (4096, 1024, 1024)  # of the matrices whose product is the machine's limit
-PRODUCT_RUNS = 7
+PRODUCT_RUNS = 3  # before each round
 UNCERTAIN = 0.1  # of the points, where random weights have nothing to say about it
 MEBIBYTE = 2**20
 
@@ -88,8 +88,10 @@ def time_jobs(
         if job.share is not None and not 0 <= job.share <= 1:
             raise InputError(f"expected a share of uncertain points from 0 to 1, found {job.share}; give another")
     found: list[list[Run]] = [[] for _ in jobs]
-    limits = product_limits(jobs[0].segmenter.device)
+    limits: dict[str, float] = {}
     for number in range(runs + WARM_UP):
+        for kind, speed in product_limits(jobs[0].segmenter.device).items():
+            limits[kind] = max(speed, limits.get(kind, 0))
         for job, some in zip(jobs, found, strict=True):
             some.append(run_once(job))
         step(number + 1, runs + WARM_UP)
@@ -113,7 +115,7 @@ def run_once(job: Job) -> Run:
     with clock("BEV"):
         g = grid.to_points(model.polar_net(grid)).float().softmax(dim=1)
     with clock(MEAN):
-        geometric_mean(f, g).argmax(dim=1).cpu()
+        label_ids(geometric_mean(f, g)).cpu()
     with clock("compare"):
         uncertain = model.assertion(f, g, batch.points) if job.share is None else _least(f, g, job.share)
         index = uncertain.nonzero()[:, 0]
@@ -122,7 +124,7 @@ def run_once(job: Job) -> Run:
     with clock("head"):
         h = settle(head, batch.points, f, g, index, near)
     with clock("merge"):
-        labels = merge(f, g, uncertain, h).argmax(dim=1).add_(1).cpu().numpy()
+        labels = label_ids(merge(f, g, uncertain, h)).cpu().numpy()
     with clock("write"):
         job.write(labels)
     return Run(clock.seconds, len(f), len(index))
