@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import cKDTree
+from torch.nn import functional as F
 from worlds import fails, files, fresh_weights
 
 import amvnet
 from amvnet import engines
+from amvnet.data.catalog import open_dataset
 from amvnet.engines import cache_folder, engage
+from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
-from amvnet.segmenter import Segmenter
+from amvnet.models.point_head import head_features, point_table
+from amvnet.scan import Scan
+from amvnet.segmenter import Segmenter, in_place
+from amvnet.simulation import simulate
+from amvnet.views.points import PointBatch
+from amvnet.weights import Weights
 
 
 @pytest.fixture(autouse=True)
@@ -118,3 +128,56 @@ def test_a_segmenters_norms_are_folded_and_its_kernels_keep_their_channels_last(
     for convolution, norm, _ in blocks:
         assert isinstance(norm, torch.nn.Identity)
         assert convolution.weight.is_contiguous(memory_format=torch.channels_last)
+
+
+def plainly(weights: Weights, scan: Scan) -> np.ndarray:
+    """Labels without any measure for speed: norms as they are, matrix products, whole maps, every voxel, SciPy."""
+    model, batch = weights.build(), PointBatch.of([scan])
+    f = model.score_range_view(batch)
+    net, grid = model.polar_net, model.polar_view.project(batch)
+    decoded = net.unet(grid.to_map(net.compress(grid.pool(net.point_mlp(grid.features)))))
+    voxels = net.scores(decoded)[0].unflatten(0, (grid.shape[3], -1)).flatten(2)  # (Z, K, R * A)
+    g = voxels[grid.voxel, :, grid.pillar].softmax(dim=1)
+    uncertain = model.assertion(f, g, batch.points)
+    index = uncertain.nonzero()[:, 0]
+    near = torch.from_numpy(nearest_by_scipy(batch.points[:, :3].numpy(), index.numpy()))
+    merged = torch.sqrt(f * g)
+    for i, n in zip(index.split(2000), near.split(2000), strict=True):
+        rows = head_features(model.point_head.config, point_table(batch.points, f, g), i, n)
+        merged[i] = model.point_head(*rows).softmax(dim=1)
+    return in_place(merged.argmax(dim=1) + 1, scan.valid)
+
+
+def nearest_by_scipy(xyz: np.ndarray, own: np.ndarray, n: int = 15) -> np.ndarray:
+    """The n nearest others; where the point itself is not among the n + 1 nearest, others lie in its place."""
+    found = cKDTree(xyz, balanced_tree=False, compact_nodes=False).query(xyz[own], k=n + 1)[1]
+    return np.array([[i for i in row if i != self][:n] for self, row in zip(own, found, strict=True)])
+
+
+def scans_to_compare() -> list[tuple[str, str]]:
+    """Weights and data sets: simulated, and real ones where they are at hand."""
+    found = [("sim-hdl64e", "simulated:hdl64e"), ("sim-hdl32e", "simulated:hdl32e")]
+    if real := os.environ.get("AMVNET_REAL_DATA"):
+        found += [("sim-hdl64e", f"semantickitti:{real}/semantickitti"), ("sim-hdl32e", f"nuscenes:{real}/nuscenes")]
+    return found
+
+
+@pytest.mark.parametrize(("weights", "data"), scans_to_compare())
+def test_what_makes_it_fast_leaves_the_labels_as_they_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: str, data: str
+) -> None:
+    kind, place = data.split(":", 1)
+    if kind == "simulated":
+        pytest.importorskip("embreex")
+        simulate(tmp_path, sensor=place, scans=2, sequences=1, seed=7)
+        data = ("semantickitti:" if place == "hdl64e" else "nuscenes:") + str(tmp_path)
+    dataset, segmenter = open_dataset(data), Segmenter(weights)
+    equal = []
+    for record in dataset.records(dataset.sequences("all"))[:: 20 if kind == "semantickitti" else 4][:4]:
+        scan = dataset.read(record, labels=False)
+        with torch.enable_grad(), monkeypatch.context() as patched:  # with gradients: the plain way of `joined`
+            patched.setattr(layers, "linear", F.linear)
+            plain = plainly(segmenter.weights, scan)
+        equal.append((plain == segmenter(scan).labels).mean())
+    assert len(equal) >= 1
+    assert np.mean(equal) >= 0.9999

@@ -46,8 +46,10 @@ def whole(world: Path) -> Path:
 
 
 def same(a: Path, b: Path) -> None:
-    assert files(a) == files(b)
-    for name in files(a):
+    """The same files, but for what a SIGKILL in the midst of writing leaves under a hidden name."""
+    found = {name for name in files(a) if ".part" not in name}
+    assert found == files(b)
+    for name in found:
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
 
 
