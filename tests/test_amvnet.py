@@ -25,7 +25,7 @@ from amvnet.config import (
 from amvnet.models.amvnet import AMVNet, arithmetic_mean, build_amvnet, geometric_mean, maximum, merge
 from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
 from amvnet.models.layers import fold_batch_norms
-from amvnet.models.point_head import PointHead, head_features, nearest_neighbours, point_table
+from amvnet.models.point_head import PointHead, head_features, nearest_neighbours, only_asked, point_table
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch
 from amvnet.views.polar_view import PolarGrid
@@ -280,6 +280,14 @@ def test_scoring_points_from_the_table_equals_scoring_their_features(uncertain: 
     index, near = torch.randperm(3000)[:uncertain], torch.randint(3000, (uncertain, 15))
     expected = head(*head_features(head.config, table, index, near))
     torch.testing.assert_close(head.score(table, index, near), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_only_the_points_that_are_asked_for_are_taken() -> None:
+    a, b = torch.tensor([7, 3]), torch.tensor([[3, 9, 9], [0, 7, 3]])
+    asked, (of_a, of_b) = only_asked(12, a, b)
+    assert asked.tolist() == [0, 3, 7, 9]
+    assert torch.equal(asked[of_a], a)
+    assert torch.equal(asked[of_b], b)
 
 
 @pytest.mark.parametrize("brightest", [0, 1, 5])

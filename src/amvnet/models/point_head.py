@@ -61,7 +61,12 @@ def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
 
 
 def only_asked(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """The points, of so many, that occur in some tensors of indices: (M,), and the tensors as places among these."""
+    """The points, of so many, that occur in some tensors of indices: (M,), and the tensors as places among these.
+
+    On a GPU all of them: it would be waited for to count them.
+    """
+    if not indices[0].is_cpu:
+        return torch.arange(count, device=indices[0].device), list(indices)
     seen = torch.zeros(count, dtype=torch.bool, device=indices[0].device)
     for some in indices:
         seen[some.flatten()] = True
