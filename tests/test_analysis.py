@@ -29,7 +29,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_streets(root / "data")
     write_recipe(root / "recipe.yaml")
     save(fresh_weights(), root / "weights.safetensors")
-    options = ("--data", root / "data", "--out", root / "run", "--training.head.epochs", 1)
+    options = ("--data", root / "data", "--out", root / "run", "--training.head.epochs", 4)
     assert amvnet("train", root / "recipe.yaml", *options) == (0, "")
     return root
 

@@ -15,7 +15,7 @@ from worlds import fails, files, fresh_weights
 import amvnet
 from amvnet import engines
 from amvnet.data.catalog import open_dataset
-from amvnet.engines import cache_folder, engage
+from amvnet.engines import cache_folder, engage, exported
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
 from amvnet.models.point_head import head_features, point_table
@@ -26,10 +26,16 @@ from amvnet.views.points import PointBatch
 from amvnet.weights import Weights
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache for all tests: an export takes ten seconds."""
+    return tmp_path_factory.mktemp("cache")
+
+
 @pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
+def cache(shared: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("AMVNET_CACHE", str(shared))
+    return shared
 
 
 def scan(seed: int, points: int = 4000) -> np.ndarray:
@@ -56,13 +62,21 @@ def check_equal(weights: object, engine: str) -> None:
 def test_onnx_says_what_torch_says_and_exports_once(cache: Path) -> None:
     pytest.importorskip("onnxruntime")
     check_equal(fresh_weights(), "onnx")
-    (folder,) = (cache / "onnx").iterdir()
+    folder = exported(Segmenter(fresh_weights()))
+    assert folder.is_relative_to(cache)
     written = {name: (folder / name).stat().st_mtime_ns for name in files(folder)}
     assert "amvnet.json" in written
     engage(Segmenter(fresh_weights()), "onnx")
     assert {name: (folder / name).stat().st_mtime_ns for name in files(folder)} == written
-    engage(Segmenter(fresh_weights(seed=1)), "onnx")
-    assert len(list((cache / "onnx").iterdir())) == 2
+
+
+def test_other_weights_have_another_export(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Path] = []
+    monkeypatch.setattr(engines, "export", lambda weights, folder: asked.append(folder))
+    monkeypatch.setattr(engines, "check_libraries", lambda: None)
+    for seed in (7, 8, 7):
+        exported(Segmenter(fresh_weights(seed=seed)))
+    assert asked[0] == asked[2] != asked[1]
 
 
 def test_onnx_runs_the_methods_of_one_network() -> None:
@@ -112,6 +126,7 @@ def test_auto_is_torch_as_it_is() -> None:
 
 
 def test_the_cache_lies_where_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "cache"))
     assert cache_folder() == tmp_path / "cache"
     monkeypatch.delenv("AMVNET_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "caches"))

@@ -52,7 +52,7 @@ def stream(
         computing = deque[Future[list[tuple[Task, Result]]]]()
         try:
             while reading or computing:
-                while reading and len(computing) <= at_once:  # one waits, so that none has to
+                while reading and len(computing) < at_once + (at_once > 1):  # one waits, so that no thread has to
                     some = [reading.popleft() for _ in range(min(batch, len(reading)))]
                     reading.extend(islice(read, len(some)))
                     computing.append(computer.submit(_segmented, some))
