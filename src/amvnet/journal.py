@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from amvnet.data.files import make_folder, whole_file
+from amvnet.data.files import PARTS, make_folder, whole_file
 from amvnet.errors import InputError
 from amvnet.processes import ALONE, Processes
 
@@ -33,8 +33,9 @@ class Journal:
         self.done = self._left(dict(settings)) if resume else set()
         processes.wait()  # all have read before any writes
         make_folder(folder)
-        if processes.first:
-            for path in folder.glob(PATTERN):
+        if processes.first and (left := list(folder.glob(PATTERN))):
+            # And what a run that was killed in the midst of writing left half-written.
+            for path in [*left, *folder.rglob(PARTS)]:
                 path.unlink()
         processes.wait()
         self.path = folder / PATTERN.replace("*", str(processes.rank))

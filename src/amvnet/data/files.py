@@ -17,6 +17,8 @@ from amvnet.data.raw import count_rows as count_rows
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
+PARTS = f".{'[0-9a-f]' * 32}.part*"  # the names of files that `whole_file` has not finished
+
 
 @contextmanager
 def whole_file(path: Path | str) -> Iterator[Path]:

@@ -12,6 +12,7 @@ from amvnet.config import PointHeadConfig
 from amvnet.models.block_search import nearest_others_by_blocks
 from amvnet.models.layers import PointLinear
 from amvnet.neighbours import nearest_others
+from amvnet.views.points import occurring
 
 POINT_VALUES = 4  # x, y, z, intensity
 # Uncertain points that are scored at a time: what a processor's cache holds; what keeps a GPU busy.
@@ -67,11 +68,7 @@ def only_asked(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     """
     if not indices[0].is_cpu:
         return torch.arange(count, device=indices[0].device), list(indices)
-    seen = torch.zeros(count, dtype=torch.bool, device=indices[0].device)
-    for some in indices:
-        seen[some.flatten()] = True
-    place = seen.cumsum(0) - 1
-    return seen.nonzero()[:, 0], [place[some] for some in indices]
+    return occurring(count, *indices)
 
 
 def head_features(config: PointHeadConfig, table: Tensor, uncertain: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:

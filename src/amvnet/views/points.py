@@ -13,6 +13,18 @@ from torch import Tensor
 from amvnet.scan import Scan
 
 
+def occurring(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """Which of 0..count - 1 occur in some tensors of indices, ascending (M,), and the tensors as places among these.
+
+    As `unique`, without a sort.
+    """
+    seen = torch.zeros(count, dtype=torch.bool, device=indices[0].device)
+    for some in indices:
+        seen[some.flatten()] = True
+    place = seen.cumsum(0) - 1
+    return seen.nonzero()[:, 0], [place[some] for some in indices]
+
+
 @dataclass(frozen=True)
 class PointBatch:
     """The points of B scans, one after the other.

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from amvnet.config import PolarViewConfig
-from amvnet.views.points import PointBatch
+from amvnet.views.points import PointBatch, occurring
 
 FEATURES = 9  # offset to the voxel's centre (3), polar coordinates (3), x, y, intensity
 
@@ -90,7 +90,7 @@ class PolarView:
         c = self.config
         pillar = (batch.scan * c.radial + radius) * c.angular + angle
         shape = (batch.count, c.radial, c.angular, c.vertical)
-        occupied, slot = _occupied(pillar, math.prod(shape[:3]))
+        occupied, (slot,) = occurring(math.prod(shape[:3]), pillar)
         features = torch.cat([features, batch.points[:, [0, 1, 3]]], dim=1)
         return PolarGrid(features, pillar, voxel, occupied, slot, shape)
 
@@ -99,10 +99,3 @@ def _place(values: Tensor, low: float, high: float, cells: int) -> tuple[Tensor,
     """Along one axis the cell of each value (P,), int64, and how far the value is from its centre."""
     cell = ((values - low) / (high - low) * cells).floor().clamp(0, cells - 1)
     return cell.long(), values - (low + (cell + 0.5) * (high - low) / cells)
-
-
-def _occupied(pillar: Tensor, pillars: int) -> tuple[Tensor, Tensor]:
-    """The pillars that hold points, and each point's place among them; as `unique`, without a sort."""
-    seen = torch.zeros(pillars, dtype=torch.bool, device=pillar.device)
-    seen[pillar] = True
-    return seen.nonzero()[:, 0], (seen.cumsum(0) - 1)[pillar]
