@@ -19,14 +19,14 @@ from tempfile import TemporaryDirectory
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config import ModelConfig, PolarNetConfig, PolarViewConfig, RangeNetConfig, RangeViewConfig, Recipe
+from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import ModelConfig, PolarNetConfig, PolarViewConfig, RangeNetConfig, RangeViewConfig, Recipe
 from amvnet.data.files import read_scan
 from amvnet.data.labels import SEMANTICKITTI
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.block_search import nearest_others_by_blocks
 from amvnet.neighbours import nearest_others
-from amvnet.recipes import load_recipe
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter
 from amvnet.simulation import simulate

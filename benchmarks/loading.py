@@ -8,9 +8,9 @@ from __future__ import annotations
 import sys
 import time
 
+from amvnet.config.recipes import load_recipe
 from amvnet.data.catalog import open_dataset
 from amvnet.loading import ScanSet, loader
-from amvnet.recipes import load_recipe
 
 ROUNDS = 2  # the first one starts the processes and fills the disk's cache
 

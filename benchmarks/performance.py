@@ -25,11 +25,11 @@ import amvnet.models.polar_net
 import amvnet.models.range_net
 import amvnet.segmenter
 from amvnet.bench import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
+from amvnet.config.recipes import load_recipe
 from amvnet.data.files import read_scan, write_labels
 from amvnet.engines import OnnxGraph, cache_folder, engage
 from amvnet.models.layers import upsample
 from amvnet.models.point_head import head_features, point_table
-from amvnet.recipes import load_recipe
 from amvnet.segmenter import Segmenter
 from amvnet.simulation import simulate
 

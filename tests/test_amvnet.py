@@ -13,7 +13,7 @@ from test_models import CASES
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config import (
+from amvnet.config.schema import (
     AssertionConfig,
     ModelConfig,
     PointHeadConfig,

@@ -15,7 +15,7 @@ from worlds import amvnet, files, fresh_weights, make_streets, street, without, 
 
 from amvnet import analysis, jobs
 from amvnet.analysis import BINS, SWEPT, analyze
-from amvnet.config import AssertionConfig
+from amvnet.config.schema import AssertionConfig
 from amvnet.data.catalog import open_dataset
 from amvnet.evaluation import confusion, metrics
 from amvnet.models.amvnet import arithmetic_mean, maximum

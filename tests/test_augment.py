@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amvnet.config import AugmentConfig
+from amvnet.config.schema import AugmentConfig
 from amvnet.data.augment import augment, mix, rotation
 from amvnet.scan import Scan
 

@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import yaml
 
-from amvnet.config import ModelConfig, Recipe
+from amvnet.config.nested import from_dict, merge_trees, to_dict
+from amvnet.config.recipes import load_recipe, recipe_names
+from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.errors import InputError
-from amvnet.recipes import load_recipe, recipe_names
-from amvnet.trees import from_dict, merge_trees, to_dict
 
 
 def write(folder: Path, text: str) -> str:

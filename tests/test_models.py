@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config import (
+from amvnet.config.schema import (
     PolarNetConfig,
     PolarViewConfig,
     RangeNetConfig,

@@ -12,7 +12,7 @@ from zipfile import ZipFile
 import pytest
 from worlds import GOLDEN, amvnet, commands_of, files, make_streets, write_recipe
 
-from amvnet.recipes import recipe_names
+from amvnet.config.recipes import recipe_names
 from amvnet.weights import load
 
 TEST = tuple(str(sequence) for sequence in range(11, 22))

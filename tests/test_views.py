@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from amvnet.config import PolarViewConfig, RangeViewConfig
+from amvnet.config.schema import PolarViewConfig, RangeViewConfig
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 from amvnet.views.points import PointBatch

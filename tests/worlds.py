@@ -17,11 +17,11 @@ import torch
 import yaml
 
 from amvnet.cli import main
-from amvnet.config import ModelConfig
+from amvnet.config.nested import from_dict, merge_trees
+from amvnet.config.schema import ModelConfig
 from amvnet.data.labels import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
-from amvnet.trees import from_dict, merge_trees
 from amvnet.weights import Weights, state_of
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from amvnet import jobs
-from amvnet.config import Recipe
+from amvnet.config.schema import Recipe
 from amvnet.data.labels import Taxonomy
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError

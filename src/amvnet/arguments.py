@@ -13,7 +13,7 @@ from jsonargparse import ArgumentParser, set_parsing_settings
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
-    from amvnet.config import Recipe
+    from amvnet.config.schema import Recipe
 
 Positional = Mapping[str, dict[str, Any]]
 
@@ -63,7 +63,7 @@ def _add_option(parser: Parser, name: str, kind: Any, default: Any, text: str | 
 
 def _add_recipe(parser: Parser, recipe: Recipe) -> None:
     """Every value of the recipe as an option, with dots: --training.rv.epochs 40."""
-    from amvnet.config import ModelConfig, TrainingConfig
+    from amvnet.config.schema import ModelConfig, TrainingConfig
 
     parser.add_argument("--model", type=ModelConfig, default=recipe.model)
     parser.add_argument("--training", type=TrainingConfig, default=recipe.training)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config import Recipe
+from amvnet.config.schema import Recipe
 from amvnet.data.labels import TAXONOMIES
 from amvnet.errors import InputError
 from amvnet.memory import peak_memory

@@ -38,9 +38,9 @@ def bench(
         json: also write the figures to this file.
     """
     from amvnet.bench import UNCERTAIN, Job, time_jobs, untrained
+    from amvnet.config.recipes import load_recipe
     from amvnet.data.files import read_scan, whole_file, write_labels
     from amvnet.engines import engage
-    from amvnet.recipes import load_recipe
     from amvnet.report import timing_table
     from amvnet.segmenter import Segmenter
     from amvnet.simulation import simulate as write

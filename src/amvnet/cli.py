@@ -16,7 +16,7 @@ from amvnet.errors import InputError, SomeBroken
 from amvnet.terminal import say
 
 if TYPE_CHECKING:
-    from amvnet.config import Recipe
+    from amvnet.config.schema import Recipe
 
 DONE, FAILED, WRONG_INPUT, SOME_BROKEN = 0, 1, 2, 3
 SHARED = ("train", "predict", "evaluate", "ablate")  # the verbs that several processes can share
@@ -45,8 +45,8 @@ def _parser(verb: str, recipe: Recipe | None = None) -> Parser:
 
 def _with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
     """The arguments of a verb that takes a recipe: read once to find it, and once more with its values as defaults."""
-    from amvnet.config import Recipe
-    from amvnet.recipes import load_recipe
+    from amvnet.config.recipes import load_recipe
+    from amvnet.config.schema import Recipe
 
     if {"-h", "--help"} & set(arguments):
         recipe = Recipe() if arguments[0].startswith("-") else load_recipe(arguments[0])

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from amvnet import __version__
+from amvnet.config.nested import to_dict
 from amvnet.data.files import make_folder, whole_file
 from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet
@@ -27,7 +28,6 @@ from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
 from amvnet.quantising import FIRST_KEPT, calibration_scans, quantise
 from amvnet.scan import FARTHEST, Scan
 from amvnet.segmenter import Segmenter, widest_method
-from amvnet.trees import to_dict
 from amvnet.views.points import PointBatch
 from amvnet.weights import Weights, load
 

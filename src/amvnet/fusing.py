@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from amvnet.config import ModelConfig
+from amvnet.config.schema import ModelConfig
 from amvnet.data.labels import Taxonomy
 from amvnet.fitting import Fitting
 from amvnet.fusion import Fusion

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from amvnet.config import AssertionConfig
+from amvnet.config.schema import AssertionConfig
 from amvnet.errors import InputError
 from amvnet.models.amvnet import Scores, merge, refine
 from amvnet.models.assertions import Assertion, Disagreement, build_assertion

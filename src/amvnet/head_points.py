@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.utils import data
 
-from amvnet.config import ModelConfig, PointHeadConfig, TrainingConfig
+from amvnet.config.schema import ModelConfig, PointHeadConfig, TrainingConfig
 from amvnet.data.records import Dataset
 from amvnet.errors import InputError
 from amvnet.evaluation import confusion

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from amvnet.config import HeadTraining
+from amvnet.config.schema import HeadTraining
 from amvnet.head_points import HeadBatch, HeadPoints
 from amvnet.models.point_head import PointHead
 from amvnet.training import Stage

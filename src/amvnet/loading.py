@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils import data
 
-from amvnet.config import AugmentConfig
+from amvnet.config.schema import AugmentConfig
 from amvnet.data.augment import augment, mix
 from amvnet.data.files import whole_file
 from amvnet.data.records import Dataset, ScanRecord

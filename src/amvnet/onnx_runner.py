@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.config import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
+from amvnet.config.nested import from_dict
+from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
 from amvnet.errors import InputError
 from amvnet.neighbours import nearest_others
 from amvnet.scan import Scan
-from amvnet.trees import from_dict
 
 DESCRIPTION = "amvnet.json"  # beside the graphs
 FORMAT = 2

@@ -11,8 +11,8 @@ import torch
 from rich.table import Table
 
 from amvnet.bench import MEAN, STAGES
+from amvnet.config.recipes import recipe_names
 from amvnet.data.labels import Taxonomy
-from amvnet.recipes import recipe_names
 from amvnet.weights import built_in
 
 TITLES = {

@@ -12,13 +12,13 @@ from typing import Any
 
 import yaml
 
-from amvnet.config import Recipe
+from amvnet.config.nested import to_dict
+from amvnet.config.schema import Recipe
 from amvnet.data.files import whole_file
 from amvnet.data.records import Dataset, ScanRecord
 from amvnet.errors import InputError
 from amvnet.score_files import ScorePair
 from amvnet.training import LAST
-from amvnet.trees import to_dict
 from amvnet.weights import SIZES, Weights
 
 SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from amvnet import weights as weights_file
 from amvnet.callbacks import KeepWeights, Pictures, Speed
-from amvnet.config import NetworkTraining, Recipe, StageName
+from amvnet.config.schema import NetworkTraining, Recipe, StageName
 from amvnet.data.files import whole_file
 from amvnet.data.labels import NUSCENES, SEMANTICKITTI
 from amvnet.data.records import Dataset, ScanRecord

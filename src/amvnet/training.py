@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from amvnet.callbacks import Bar, Curves, EpochLines, SeedBatches, Speed
-from amvnet.config import HeadTraining, NetworkTraining, TrainingConfig
+from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import confusion, metrics

@@ -18,13 +18,13 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from amvnet import hub
-from amvnet.config import ModelConfig
+from amvnet.config.nested import from_dict, to_dict
+from amvnet.config.schema import ModelConfig
 from amvnet.data.files import whole_file
 from amvnet.data.labels import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
-from amvnet.trees import from_dict, to_dict
 
 SIZES = {
     "range_net": ("range_view", "range_net"),

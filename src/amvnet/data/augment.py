@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from amvnet.config import AugmentConfig
+from amvnet.config.schema import AugmentConfig
 from amvnet.scan import Scan
 
 

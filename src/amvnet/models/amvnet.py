@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from amvnet.config import ModelConfig
+from amvnet.config.schema import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.point_head import PointHead, nearest_neighbours, only_asked, point_table
 from amvnet.models.polar_net import PolarNet

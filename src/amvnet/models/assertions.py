@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from amvnet.config import AssertionConfig
+from amvnet.config.schema import AssertionConfig
 
 TINY = 1e-12  # keeps the logarithm of a probability finite
 

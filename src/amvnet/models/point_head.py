@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from amvnet.config import PointHeadConfig
+from amvnet.config.schema import PointHeadConfig
 from amvnet.models.block_search import nearest_others_by_blocks
 from amvnet.models.layers import PointLinear
 from amvnet.neighbours import nearest_others

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from amvnet.config import PolarNetConfig
+from amvnet.config.schema import PolarNetConfig
 from amvnet.models.joined import joined
 from amvnet.models.layers import ConvBlock, PointLinear, linear
 from amvnet.views.polar_view import FEATURES, PolarGrid

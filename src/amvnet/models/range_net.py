@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from amvnet.config import RangeNetConfig
+from amvnet.config.schema import RangeNetConfig
 from amvnet.models.joined import joined
 from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
 from amvnet.views.range_view import CHANNELS

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from amvnet.config import RangeViewConfig
+from amvnet.config.schema import RangeViewConfig
 from amvnet.errors import InputError
 from amvnet.views.points import PointBatch
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import yaml
 
-from amvnet.config import Recipe
+from amvnet.config.nested import from_dict, merge_trees
+from amvnet.config.schema import Recipe
 from amvnet.errors import InputError
-from amvnet.trees import from_dict, merge_trees
 
 
 def recipe_names() -> tuple[str, ...]:

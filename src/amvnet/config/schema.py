@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from amvnet.ranges import Checked, Count, NotNegative, Positive, Range, Share
+from amvnet.config.bounds import Checked, Count, NotNegative, Positive, Range, Share
 
 StageName = Literal["rv", "bev", "head"]
 
