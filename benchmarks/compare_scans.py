@@ -13,8 +13,8 @@ from matplotlib import pyplot as plt
 from rich.console import Console
 from rich.table import Table
 
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import Taxonomy
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.scan import Scan
 
 RANGES = (0, 1, 5, 10, 15, 20, 30, 40, 50, 80)  # metres

@@ -21,8 +21,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import ModelConfig, PolarNetConfig, PolarViewConfig, RangeNetConfig, RangeViewConfig, Recipe
-from amvnet.data.files import read_scan
-from amvnet.data.labels import SEMANTICKITTI
+from amvnet.data.scan_files import read_scan
+from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.block_search import nearest_others_by_blocks

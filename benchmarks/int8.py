@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation import Evaluation
 from amvnet.onnx_runner import OnnxSegmenter, disagree
 from amvnet.scan import Scan

@@ -9,7 +9,7 @@ import sys
 import time
 
 from amvnet.config.recipes import load_recipe
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 from amvnet.loading import ScanSet, loader
 
 ROUNDS = 2  # the first one starts the processes and fills the disk's cache

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.clouds import Cloud
-from amvnet.data.semantickitti import SemanticKitti
+from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.formats.cloud import Cloud
 from amvnet.evaluation import Evaluation
 from amvnet.fitting import Fitting
 from amvnet.segmenter import Segmenter

@@ -26,7 +26,7 @@ import amvnet.models.range_net
 import amvnet.segmenter
 from amvnet.bench import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
 from amvnet.config.recipes import load_recipe
-from amvnet.data.files import read_scan, write_labels
+from amvnet.data.scan_files import read_scan, write_labels
 from amvnet.engines import OnnxGraph, cache_folder, engage
 from amvnet.models.layers import upsample
 from amvnet.models.point_head import head_features, point_table

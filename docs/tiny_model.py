@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 
 
 def cell(points):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from worlds import GOLDEN, write_scan
 
-from amvnet.data.labels import SEMANTICKITTI
+from amvnet.data.taxonomy import SEMANTICKITTI
 
 TEST = tuple(str(number) for number in range(11, 22))
 Entries = dict[str, bytes]  # name -> content, folders with a last slash

@@ -16,7 +16,7 @@ from worlds import amvnet, files, fresh_weights, make_streets, street, without, 
 from amvnet import analysis, jobs
 from amvnet.analysis import BINS, SWEPT, analyze
 from amvnet.config.schema import AssertionConfig
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation import confusion, metrics
 from amvnet.models.amvnet import arithmetic_mean, maximum
 from amvnet.segmenter import Segmenter

@@ -15,7 +15,7 @@ from worlds import GOLDEN, amvnet, files, fresh_weights, make_streets, street, w
 
 from amvnet import runner
 from amvnet.cli import VERBS, main
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.segmenter import Segmenter
 from amvnet.weights import save
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from worlds import fails
 
-from amvnet.data.catalog import Dataset, is_dataset, open_dataset
-from amvnet.data.labels import SEMANTICKITTI, Taxonomy
-from amvnet.data.nuscenes import MINI_TRAIN, MINI_VAL, VAL
+from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, VAL
+from amvnet.data.datasets.open import Dataset, is_dataset, open_dataset
+from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 
 COUNTS = (7, 5)  # points of the two scans of each sequence
 REAL = os.environ.get("AMVNET_REAL_DATA")

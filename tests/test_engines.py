@@ -14,7 +14,7 @@ from worlds import fails, files, fresh_weights
 
 import amvnet
 from amvnet import engines
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 from amvnet.engines import cache_folder, engage, exported
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock

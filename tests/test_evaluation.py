@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation, confusion, metrics
 

@@ -16,7 +16,7 @@ import pytest
 import torch
 from worlds import amvnet, commands_of, fails, files, fresh_weights, street, without
 
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan

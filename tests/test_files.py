@@ -11,8 +11,8 @@ import pytest
 import yaml
 from worlds import fails, label_map
 
-from amvnet.data.files import find_scans, read_scan, whole_file, write_labels
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
+from amvnet.data.scan_files import find_scans, read_scan, whole_file, write_labels
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
 
 # --- lone files ---
 

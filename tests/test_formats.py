@@ -26,11 +26,11 @@ from scan_files import (
 )
 from worlds import fails
 
-from amvnet.data.clouds import MAX_POINTS
-from amvnet.data.files import find_scans, read_scan
-from amvnet.data.formats import named_scans, read_cloud, stem
-from amvnet.data.pcd import unpack_lzf
-from amvnet.data.pointcloud2 import read_message
+from amvnet.data.formats.cloud import MAX_POINTS
+from amvnet.data.formats.detect import named_scans, read_cloud, stem
+from amvnet.data.formats.pcd import unpack_lzf
+from amvnet.data.formats.pointcloud2 import read_message
+from amvnet.data.scan_files import find_scans, read_scan
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 LAS_STEP = 0.0006  # LAS holds millimetres
@@ -419,7 +419,7 @@ def test_real_files_of_other_formats_are_read(name: str, count: int, scale: floa
 @pytest.mark.skipif(not REAL, reason="AMVNET_REAL_DATA does not name a folder")
 @pytest.mark.parametrize(("name", "count"), [("semantickitti", 80), ("nuscenes", 10)])
 def test_every_real_scan_is_read_by_itself_as_in_its_data_set(name: str, count: int) -> None:
-    from amvnet.data.catalog import open_dataset
+    from amvnet.data.datasets.open import open_dataset
 
     dataset: Any = open_dataset(str(Path(REAL or "") / name))
     records = dataset.records(dataset.sequences("all"))

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin
 from scan_files import WRITERS, some_points, write_bag2
 
-from amvnet.data.formats import named_scans
+from amvnet.data.formats.detect import named_scans
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from worlds import amvnet, commands_of, fails, files, fresh_weights, make_streets, street
 
 from amvnet import Scan, Segmenter, simulate
-from amvnet.data.files import read_scan
+from amvnet.data.scan_files import read_scan
 from amvnet.models import block_search
 from amvnet.models.amvnet import merge
 from amvnet.models.block_search import nearest_others_by_blocks, split_into_blocks

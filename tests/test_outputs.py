@@ -18,9 +18,9 @@ from scan_files import some_points, write_bag1, write_pcd
 from worlds import amvnet, fails, files, fresh_weights, make_streets, without
 
 from amvnet import verbs
-from amvnet.data.formats import read_cloud
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.data.outputs import KINDS, write_scan_labels
+from amvnet.data.formats.detect import read_cloud
+from amvnet.data.label_files import KINDS, write_scan_labels
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.segmenter import Segmenter
 from amvnet.weights import save
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from amvnet.data.labels import NUSCENES
+from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
 from amvnet.pictures import UNCERTAIN, WRONG, draw_scan
 

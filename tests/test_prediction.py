@@ -15,7 +15,7 @@ import torch
 from worlds import amvnet, files, fresh_weights, make_streets, street
 
 from amvnet import prediction
-from amvnet.data.files import whole_file
+from amvnet.data.scan_files import whole_file
 from amvnet.journal import Journal
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmentation, Segmenter

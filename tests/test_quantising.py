@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from worlds import amvnet, fails, files, fresh_weights, street, without
 
-from amvnet.data.labels import NUSCENES
+from amvnet.data.taxonomy import NUSCENES
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.weights import Weights, save
 

@@ -18,8 +18,8 @@ from worlds import amvnet, files, fresh_weights, make_streets, without
 
 from amvnet import Scan, Segmenter
 from amvnet.clusters import CELL, cluster
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking import clusters_of, doubts_of, rank
 from amvnet.weights import save
 

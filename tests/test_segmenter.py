@@ -12,7 +12,7 @@ from worlds import THRESHOLD, fails, fresh_weights, street, without
 
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
-from amvnet.data.labels import NUSCENES
+from amvnet.data.taxonomy import NUSCENES
 from amvnet.segmenter import METHODS
 from amvnet.weights import save
 

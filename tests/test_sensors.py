@@ -16,8 +16,8 @@ from scan_files import pcd_bytes, write_bag1
 from worlds import amvnet, fails, files, fresh_weights, make_streets
 
 from amvnet.cli import main
-from amvnet.data.clouds import Cloud
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.fitting import MEASURED, Fitting
 from amvnet.measuring import ground_height, measure
@@ -98,7 +98,7 @@ def test_a_firing_order_and_chance_are_no_order_of_lasers() -> None:
 @pytest.mark.skipif(not REAL, reason="AMVNET_REAL_DATA does not name a folder")
 @pytest.mark.parametrize(("name", "beams"), [("semantickitti", 64), ("nuscenes", 32)])
 def test_real_sensors_stand_where_they_do(name: str, beams: int) -> None:
-    from amvnet.data.catalog import open_dataset
+    from amvnet.data.datasets.open import open_dataset
 
     dataset = open_dataset(str(Path(REAL or "") / name))
     records = dataset.records(dataset.sequences("all"))[::5]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from worlds import fails
 
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 from amvnet.simulation import simulate, writing
 from amvnet.simulation.layouts import NuScenesLayout
 

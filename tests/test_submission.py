@@ -14,8 +14,8 @@ from test_data import make_nuscenes
 from worlds import GOLDEN, amvnet, commands_of, fails, files, fresh_weights, street, write_scan
 
 from amvnet import submission
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.submission_rules import TEST_SCANS, rules_for
 from amvnet.weights import save
 

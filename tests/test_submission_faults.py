@@ -15,7 +15,7 @@ from submissions import Case, Entries, measured
 from worlds import amvnet
 
 from amvnet import submission
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 from amvnet.errors import InputError
 from amvnet.submission_rules import rules_for
 

@@ -18,10 +18,10 @@ from worlds import GOLDEN, amvnet, commands_of, files, fresh_weights, make_stree
 
 from amvnet import page as pages
 from amvnet import view
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.data.nuscenes import NuScenes
-from amvnet.data.semantickitti import SemanticKitti
+from amvnet.data.datasets.nuscenes import NuScenes
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.frames import RIGHT, WRONG, Frame
 from amvnet.segmenter import Segmenter
 from amvnet.weights import save

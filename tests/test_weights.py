@@ -15,7 +15,7 @@ from safetensors.torch import save_file
 from worlds import fresh_weights, street, without
 
 from amvnet.config.nested import to_dict
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.segmenter import Segmenter
 from amvnet.weights import PARTS, Weights, load, save

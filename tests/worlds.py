@@ -19,7 +19,7 @@ import yaml
 from amvnet.cli import main
 from amvnet.config.nested import from_dict, merge_trees
 from amvnet.config.schema import ModelConfig
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
 from amvnet.weights import Weights, state_of

@@ -13,8 +13,8 @@ import torch
 
 from amvnet import jobs
 from amvnet.config.schema import Recipe
-from amvnet.data.labels import Taxonomy
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation, metrics
 from amvnet.models.amvnet import ENSEMBLES, merge, refine

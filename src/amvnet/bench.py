@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.schema import Recipe
-from amvnet.data.labels import TAXONOMIES
+from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.errors import InputError
 from amvnet.memory import peak_memory
 from amvnet.models.amvnet import build_amvnet, geometric_mean, merge, settle

@@ -39,7 +39,7 @@ def bench(
     """
     from amvnet.bench import UNCERTAIN, Job, time_jobs, untrained
     from amvnet.config.recipes import load_recipe
-    from amvnet.data.files import read_scan, whole_file, write_labels
+    from amvnet.data.scan_files import read_scan, whole_file, write_labels
     from amvnet.engines import engage
     from amvnet.report import timing_table
     from amvnet.segmenter import Segmenter

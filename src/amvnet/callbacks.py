@@ -16,8 +16,8 @@ import torch
 from lightning.pytorch.callbacks import Callback, RichProgressBar
 from torch import Tensor, nn
 
-from amvnet.data.files import whole_file
-from amvnet.data.labels import Taxonomy
+from amvnet.data.scan_files import whole_file
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.memory import peak_memory
 from amvnet.pictures import scan_figure
 from amvnet.scan import Scan

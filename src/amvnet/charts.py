@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.analysis import BINS, Analysis, Swept
-from amvnet.data.files import whole_file
+from amvnet.data.scan_files import whole_file
 from amvnet.evaluation import metrics
 
 SIZE = (6.0, 3.6)  # inches

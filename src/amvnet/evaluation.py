@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.labels import Taxonomy
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
 EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)  # metres; those of SemanticKITTI's evaluation by distance

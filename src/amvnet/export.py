@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from amvnet import __version__
 from amvnet.config.nested import to_dict
-from amvnet.data.files import make_folder, whole_file
+from amvnet.data.scan_files import make_folder, whole_file
 from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.point_head import head_features, point_table

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from amvnet.config.schema import RangeViewConfig
-from amvnet.data.clouds import Cloud
+from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
 from amvnet.measuring import Measured, elevations, measure
 from amvnet.scan import Scan

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.catalog import is_dataset, open_dataset
-from amvnet.data.files import find_scans, read_labels
-from amvnet.data.formats import NamedScan, ending_of, named_scans, stem
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.open import is_dataset, open_dataset
+from amvnet.data.formats.detect import NamedScan, ending_of, named_scans, stem
+from amvnet.data.scan_files import find_scans, read_labels
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.errors import InputError
 from amvnet.fitting import Fitting
 from amvnet.jobs import Progress, check_classes, choose_records, own_classes

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from amvnet.config.schema import ModelConfig
-from amvnet.data.labels import Taxonomy
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.fitting import Fitting
 from amvnet.fusion import Fusion
 from amvnet.jobs import Progress

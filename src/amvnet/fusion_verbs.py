@@ -10,7 +10,7 @@ from amvnet.inputs import names_in, open_data, scores_in
 from amvnet.terminal import progress, say
 
 if TYPE_CHECKING:
-    from amvnet.data.labels import Taxonomy
+    from amvnet.data.taxonomy import Taxonomy
     from amvnet.weights import Weights
 
 
@@ -82,7 +82,7 @@ def rank(
         device: cpu, cuda, cuda:1, ...
     """
     from amvnet import ranking
-    from amvnet.data.files import make_folder
+    from amvnet.data.scan_files import make_folder
     from amvnet.jobs import choose_records, own_classes
     from amvnet.ranking_pictures import draw
     from amvnet.segmenter import Segmenter, widest_method
@@ -104,9 +104,9 @@ def rank(
 
 def _classes(inputs: list[str], text: str | None, head: Weights | None) -> Taxonomy:
     """The classes: the head's, or those that are named, or those of the first input."""
-    from amvnet.data.catalog import is_dataset, open_dataset
-    from amvnet.data.files import find_scans
-    from amvnet.data.labels import NUSCENES, SEMANTICKITTI, TAXONOMIES, taxonomy_from_yaml
+    from amvnet.data.datasets.open import is_dataset, open_dataset
+    from amvnet.data.scan_files import find_scans
+    from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, taxonomy_from_yaml
 
     if head is not None and text is not None:
         raise InputError("expected no --taxonomy beside --head, which says its classes; leave it out")

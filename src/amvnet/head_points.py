@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.utils import data
 
 from amvnet.config.schema import ModelConfig, PointHeadConfig, TrainingConfig
-from amvnet.data.records import Dataset
+from amvnet.data.datasets.base import Dataset
 from amvnet.errors import InputError
 from amvnet.evaluation import confusion
 from amvnet.head_sources import Source

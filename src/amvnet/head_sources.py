@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from amvnet.data.records import ScanRecord
+from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.models.assertions import Disagreement
 from amvnet.models.point_head import PointHead

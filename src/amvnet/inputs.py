@@ -10,8 +10,8 @@ from amvnet.errors import InputError
 from amvnet.terminal import silence
 
 if TYPE_CHECKING:
-    from amvnet.data.labels import Taxonomy
-    from amvnet.data.records import ScanRecord
+    from amvnet.data.datasets.base import ScanRecord
+    from amvnet.data.taxonomy import Taxonomy
     from amvnet.processes import Processes
     from amvnet.score_files import ScorePair, Which
 
@@ -30,8 +30,8 @@ def meet(cuda: bool = False) -> Processes:
 
 def open_data(data: str, taxonomy: Path | None, otherwise: Taxonomy | None = None) -> Any:
     """The data set that a verb is given, with a user's YAML file of classes, or other classes, if any."""
-    from amvnet.data.catalog import open_dataset
-    from amvnet.data.labels import taxonomy_from_yaml
+    from amvnet.data.datasets.open import open_dataset
+    from amvnet.data.taxonomy import taxonomy_from_yaml
 
     return open_dataset(data, otherwise if taxonomy is None else taxonomy_from_yaml(taxonomy))
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.labels import TAXONOMIES, Taxonomy
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation
 from amvnet.pictures import draw_scan

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from amvnet.data.files import PARTS, make_folder, whole_file
+from amvnet.data.scan_files import PARTS, make_folder, whole_file
 from amvnet.errors import InputError
 from amvnet.processes import ALONE, Processes
 

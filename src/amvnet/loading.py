@@ -14,8 +14,8 @@ from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.augment import augment, mix
-from amvnet.data.files import whole_file
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan

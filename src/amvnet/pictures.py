@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.files import whole_file
-from amvnet.data.labels import Taxonomy
+from amvnet.data.scan_files import whole_file
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
 REACH = 50.0  # metres from the sensor to each side

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.catalog import is_dataset, open_dataset
-from amvnet.data.files import find_scans
-from amvnet.data.formats import READERS, NamedScan, named_scans
-from amvnet.data.labels import Taxonomy
-from amvnet.data.outputs import check_kind, write_scan_labels
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.open import is_dataset, open_dataset
+from amvnet.data.formats.detect import READERS, NamedScan, named_scans
+from amvnet.data.label_files import check_kind, write_scan_labels
+from amvnet.data.scan_files import find_scans
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken
 from amvnet.fitting import MEASURED, Fitting
 from amvnet.jobs import Progress, check_classes, choose_records, own_classes

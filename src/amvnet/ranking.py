@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from amvnet.clusters import cluster
-from amvnet.data.files import whole_file
-from amvnet.data.labels import Taxonomy
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.scan_files import whole_file
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.jobs import Progress, check_classes
 from amvnet.models.assertions import cosine_similarity

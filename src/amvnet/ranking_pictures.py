@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.records import Dataset
+from amvnet.data.datasets.base import Dataset
 from amvnet.pictures import draw_scan
 from amvnet.ranking import By, Ranking, clusters_of, doubts_of
 from amvnet.segmenter import Segmenter, checked_scan

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from amvnet.bench import MEAN, STAGES
 from amvnet.config.recipes import recipe_names
-from amvnet.data.labels import Taxonomy
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.weights import built_in
 
 TITLES = {

@@ -14,8 +14,8 @@ import yaml
 
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import Recipe
-from amvnet.data.files import whole_file
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
 from amvnet.score_files import ScorePair
 from amvnet.training import LAST

@@ -20,9 +20,9 @@ from torch import Tensor, nn
 from amvnet import weights as weights_file
 from amvnet.callbacks import KeepWeights, Pictures, Speed
 from amvnet.config.schema import NetworkTraining, Recipe, StageName
-from amvnet.data.files import whole_file
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.data.records import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.scan_files import whole_file
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.head_points import gather_points, head_loader
 from amvnet.head_sources import Networks, Source, scored_with, source_of

@@ -13,7 +13,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from amvnet.data.records import ScanRecord
+from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from amvnet.data.labels import Taxonomy
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.memory import keep_memory
 from amvnet.models.amvnet import ENSEMBLES, AMVNet, Scores, merge

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from amvnet.data.files import whole_file
-from amvnet.data.outputs import write_uncertain
+from amvnet.data.label_files import write_uncertain
+from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmentation, Segmenter

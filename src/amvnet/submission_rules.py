@@ -12,12 +12,12 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from amvnet.data import files
-from amvnet.data.labels import Taxonomy
-from amvnet.data.nuscenes import NuScenes
-from amvnet.data.predictions import check_size, train_ids
-from amvnet.data.records import Dataset, ScanRecord
-from amvnet.data.semantickitti import SemanticKitti
+from amvnet.data import scan_files as files
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.nuscenes import NuScenes
+from amvnet.data.datasets.predictions import check_size, train_ids
+from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
 # Scans of SemanticKITTI's test sequences (KITTI odometry 11 to 21); its server wants every one.

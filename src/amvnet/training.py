@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader
 
 from amvnet.callbacks import Bar, Curves, EpochLines, SeedBatches, Speed
 from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
-from amvnet.data.labels import Taxonomy
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import confusion, metrics
 from amvnet.losses import polar_view_loss, range_view_loss

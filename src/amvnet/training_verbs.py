@@ -101,7 +101,7 @@ def analyze(
     from amvnet.analysis import analyze as score
     from amvnet.analysis import sweep_neighbours
     from amvnet.config.recipes import load_recipe
-    from amvnet.data.files import make_folder
+    from amvnet.data.scan_files import make_folder
     from amvnet.runner import Run
     from amvnet.segmenter import Segmenter
     from amvnet.weights import load

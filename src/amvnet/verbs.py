@@ -12,7 +12,7 @@ from amvnet.inputs import meet, methods_in, names_in, open_data
 from amvnet.terminal import console, progress, say
 
 if TYPE_CHECKING:
-    from amvnet.data.labels import Taxonomy
+    from amvnet.data.taxonomy import Taxonomy
     from amvnet.evaluation import Evaluation
 
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
@@ -31,7 +31,7 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
         weights: a weights file, or the name of a built-in one.
     """
     from amvnet import jobs
-    from amvnet.data.semantickitti import SemanticKitti
+    from amvnet.data.datasets.semantickitti import SemanticKitti
     from amvnet.prediction import predict as segment
     from amvnet.segmenter import Segmenter
     from amvnet.simulation import simulate as write
@@ -186,7 +186,7 @@ def evaluate(
         precision: of the networks; float16 on a GPU only.
     """
     from amvnet import jobs
-    from amvnet.data.files import make_folder
+    from amvnet.data.scan_files import make_folder
     from amvnet.segmenter import Segmenter, widest_method
     from amvnet.weights import load
 
@@ -276,7 +276,7 @@ def info(weights: str | None = None) -> None:
 
 def show_evaluation(evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None) -> None:
     """Print the table, and write the same figures as JSON."""
-    from amvnet.data.files import whole_file
+    from amvnet.data.scan_files import whole_file
     from amvnet.report import evaluation_table
 
     figures = evaluation.report(dataset)

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.files import whole_file
-from amvnet.data.labels import Taxonomy
+from amvnet.data.scan_files import whole_file
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 from amvnet.report import TITLES

@@ -37,7 +37,7 @@ def view(
         taxonomy: the classes of labels without a data set: semantickitti, nuscenes or a YAML file.
         device: cpu, cuda, cuda:1, ...
     """
-    from amvnet.data.files import make_folder
+    from amvnet.data.scan_files import make_folder
     from amvnet.frames import choose_frames
     from amvnet.segmenter import Segmenter, widest_method
     from amvnet.view import check_rerun, check_window

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.files import whole_file
+from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan

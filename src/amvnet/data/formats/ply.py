@@ -11,8 +11,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from amvnet.data.clouds import Cloud, check_number, cloud_of, picked_or_refused, refusing
-from amvnet.data.pcd import HEADER, read_rows, read_text
+from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused, refusing
+from amvnet.data.formats.pcd import HEADER, read_rows, read_text
 from amvnet.errors import InputError
 
 TYPES = {

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data import files
-from amvnet.data.labels import NUSCENES, UNKNOWN, Taxonomy
-from amvnet.data.predictions import read_prediction
-from amvnet.data.records import ScanRecord
+from amvnet.data import scan_files as files
+from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.predictions import read_prediction
+from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.labels import INSTANCE_MASK, Taxonomy
+from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy
 from amvnet.errors import InputError
 
 WIDTHS = (1, 2, 4, 8)  # bytes of the number types that labels are written in by mistake

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from amvnet.data.arrays import read_npy, read_npz
-from amvnet.data.bags import METADATA, Bag
-from amvnet.data.clouds import Cloud
-from amvnet.data.las import read_las
-from amvnet.data.pcd import read_pcd
-from amvnet.data.ply import read_ply
-from amvnet.data.raw import NUSCENES_ENDING, columns_of, read_raw
+from amvnet.data.formats.bags import METADATA, Bag
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.las import read_las
+from amvnet.data.formats.numpy_files import read_npy, read_npz
+from amvnet.data.formats.pcd import read_pcd
+from amvnet.data.formats.ply import read_ply
+from amvnet.data.formats.raw import NUSCENES_ENDING, columns_of, read_raw
 from amvnet.errors import InputError
 
 READERS: dict[str, Callable[[Path], Cloud]] = {

@@ -9,8 +9,8 @@ from typing import BinaryIO
 
 import numpy as np
 
-from amvnet.data.clouds import Cloud, check_number, cloud_of, picked_or_refused, refusing, rings
-from amvnet.data.raw import ring_column
+from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused, refusing, rings
+from amvnet.data.formats.raw import ring_column
 from amvnet.errors import InputError
 
 COLUMNS = ("x", "y", "z", "intensity")

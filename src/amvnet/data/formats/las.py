@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.clouds import Cloud, check_number, cloud_of, refusing
+from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, refusing
 from amvnet.errors import InputError
 
 ADVICE = "write the file again"
@@ -81,7 +81,7 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
 
 def _read_apart(path: Path, count: int) -> dict[str, np.ndarray]:
     """The same in another process: on broken bytes lazrs (0.8) takes any amount of memory, or ends its process."""
-    code = "import sys; from amvnet.data.las import write_columns; write_columns(sys.argv[1])"
+    code = "import sys; from amvnet.data.formats.las import write_columns; write_columns(sys.argv[1])"
     threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each takes of the memory allowed
     found = subprocess.run(
         [sys.executable, "-c", code, str(path.absolute())],

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.clouds import MAX_POINTS, MOST_RINGS, Cloud, check_number
+from amvnet.data.formats.cloud import MAX_POINTS, MOST_RINGS, Cloud, check_number
 from amvnet.errors import InputError
 
 KITTI_COLUMNS = 4  # x, y, z, intensity

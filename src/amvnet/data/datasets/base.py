@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from amvnet.data.labels import Taxonomy
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.scan import Scan
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amvnet.data.labels import Taxonomy
-from amvnet.data.nuscenes import NuScenes
-from amvnet.data.records import Dataset, ScanRecord
-from amvnet.data.semantickitti import SemanticKitti
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.nuscenes import NuScenes
+from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
 __all__ = ["Dataset", "ScanRecord", "is_dataset", "open_dataset"]

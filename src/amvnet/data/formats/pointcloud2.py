@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.clouds import Cloud, check_number, cloud_of, picked_or_refused
+from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused
 from amvnet.errors import InputError
 
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # by the message's numbers

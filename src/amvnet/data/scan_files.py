@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.formats import ENDINGS, is_bag_folder, is_scan, read_cloud
-from amvnet.data.raw import FULL_INTENSITY, KITTI_COLUMNS, NUSCENES_COLUMNS, read_table, ring_column
-from amvnet.data.raw import count_rows as count_rows
+from amvnet.data.formats.detect import ENDINGS, is_bag_folder, is_scan, read_cloud
+from amvnet.data.formats.raw import FULL_INTENSITY, KITTI_COLUMNS, NUSCENES_COLUMNS, read_table, ring_column
+from amvnet.data.formats.raw import count_rows as count_rows
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 

@@ -12,7 +12,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from amvnet.data.clouds import Cloud, check_number, cloud_of, picked_or_refused, refusing
+from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused, refusing
 from amvnet.errors import InputError
 
 HEADER = 65_536  # bytes that a header has at most

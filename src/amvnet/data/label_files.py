@@ -8,8 +8,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from amvnet.data.files import check_count, whole_file, write_labels
-from amvnet.data.labels import Taxonomy
+from amvnet.data.scan_files import check_count, whole_file, write_labels
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
 Kind = Literal["label", "npy", "ply", "pcd", "las"]

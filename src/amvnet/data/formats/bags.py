@@ -8,8 +8,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from amvnet.data.clouds import Cloud, refusing
-from amvnet.data.pointcloud2 import read_message
+from amvnet.data.formats.cloud import Cloud, refusing
+from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.errors import InputError
 
 TYPE = "sensor_msgs/msg/PointCloud2"
