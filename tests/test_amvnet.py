@@ -26,9 +26,9 @@ from amvnet.models.amvnet import AMVNet, arithmetic_mean, build_amvnet, geometri
 from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
 from amvnet.models.layers import fold_batch_norms
 from amvnet.models.point_head import PointHead, head_features, nearest_neighbours, only_asked, point_table
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarGrid
 from amvnet.scan import Scan
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarGrid
 
 RandomScan = Callable[..., Scan]
 

@@ -17,7 +17,7 @@ import torch
 from worlds import amvnet, commands_of, fails, files, fresh_weights, street, without
 
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.neighbours import nearest_others
+from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan
 from amvnet.segmenter import Method, Segmenter

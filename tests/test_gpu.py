@@ -18,14 +18,14 @@ from worlds import amvnet, commands_of, fails, files, fresh_weights, make_street
 
 from amvnet import Scan, Segmenter, simulate
 from amvnet.data.scan_files import read_scan
-from amvnet.models import block_search
+from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import merge
-from amvnet.models.block_search import nearest_others_by_blocks, split_into_blocks
+from amvnet.models.neighbours import nearest_others
+from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
+from amvnet.models.precision import InPrecision
 from amvnet.models.streams import SideBySide
-from amvnet.neighbours import nearest_others
-from amvnet.precision import InPrecision
+from amvnet.models.views.points import PointBatch
 from amvnet.streaming import AHEAD, Task, stream
-from amvnet.views.points import PointBatch
 from amvnet.weights import save
 
 N = 15

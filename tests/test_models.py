@@ -17,13 +17,13 @@ from amvnet.config.schema import (
     PolarViewConfig,
     RangeNetConfig,
 )
-from amvnet.models.joined import convolve_joined
 from amvnet.models.layers import AzimuthGRU, PointLinear, RingConv2d, fold_batch_norms, upsample, wrap_width
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
+from amvnet.models.upsampled_conv import convolve_joined
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarView
 from amvnet.scan import Scan
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarView
 
 RandomScan = Callable[..., Scan]
 

@@ -12,10 +12,10 @@ import torch
 
 from amvnet.config.schema import PolarViewConfig, RangeViewConfig
 from amvnet.errors import InputError
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarGrid, PolarView
+from amvnet.models.views.range_view import RangeImage, RangeView
 from amvnet.scan import Scan
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarGrid, PolarView
-from amvnet.views.range_view import RangeImage, RangeView
 
 RandomScan = Callable[..., Scan]
 

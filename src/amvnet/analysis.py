@@ -19,11 +19,11 @@ from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation, metrics
 from amvnet.models.amvnet import ENSEMBLES, merge, refine
 from amvnet.models.assertions import Disagreement, cosine_similarity
+from amvnet.models.views.points import PointBatch
 from amvnet.processes import ALONE, Processes
 from amvnet.runner import Run
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter, checked_scan, in_place, labels_in_place
-from amvnet.views.points import PointBatch
 from amvnet.weights import Weights
 
 BINS = 100  # of the cosine similarity, which is in [0, 1]

@@ -21,9 +21,9 @@ from amvnet.models.amvnet import build_amvnet, geometric_mean, merge, settle
 from amvnet.models.assertions import cosine_similarity
 from amvnet.models.layers import linear
 from amvnet.models.point_head import nearest_neighbours
+from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter, label_ids
-from amvnet.views.points import PointBatch
 from amvnet.weights import PARTS, Weights, state_of
 
 STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")

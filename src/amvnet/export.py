@@ -23,12 +23,12 @@ from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
+from amvnet.models.views.points import PointBatch
 from amvnet.onnx_files import digest, one_line, quiet, strip
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
 from amvnet.quantising import FIRST_KEPT, calibration_scans, quantise
 from amvnet.scan import FARTHEST, Scan
 from amvnet.segmenter import Segmenter, widest_method
-from amvnet.views.points import PointBatch
 from amvnet.weights import Weights, load
 
 EXTRA = ("onnx", "onnxscript", "onnxruntime")

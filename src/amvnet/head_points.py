@@ -23,9 +23,9 @@ from amvnet.loading import ScanSet, collate
 from amvnet.models.amvnet import geometric_mean
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
+from amvnet.models.views.points import PointBatch
 from amvnet.processes import ALONE, Processes, device_of
 from amvnet.scan import Scan
-from amvnet.views.points import PointBatch
 
 # p_i (U, 2 K + 4), S_i (U, n, 2 K + 4), train ids (U,), and for how many points of its scan each stands (U,)
 HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]

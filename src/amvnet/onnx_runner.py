@@ -14,7 +14,7 @@ import numpy as np
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
 from amvnet.errors import InputError
-from amvnet.neighbours import nearest_others
+from amvnet.models.neighbours import nearest_others
 from amvnet.scan import Scan
 
 DESCRIPTION = "amvnet.json"  # beside the graphs

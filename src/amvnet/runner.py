@@ -30,11 +30,11 @@ from amvnet.head_training import HeadStage
 from amvnet.loading import ScanSet, count_classes, loader
 from amvnet.losses import class_weights
 from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.models.views.points import PointBatch
 from amvnet.processes import ALONE, Processes
 from amvnet.run_folder import SETTINGS, check_begun, describe, names_of, settings
 from amvnet.score_files import ScorePair
 from amvnet.training import Course, PolarStage, RangeStage, Stage, fit
-from amvnet.views.points import PointBatch
 from amvnet.weights import Weights, state_of
 
 PART = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}

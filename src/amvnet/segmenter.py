@@ -17,11 +17,11 @@ from amvnet.errors import InputError
 from amvnet.memory import keep_memory
 from amvnet.models.amvnet import ENSEMBLES, AMVNet, Scores, merge
 from amvnet.models.layers import fold_batch_norms
+from amvnet.models.precision import InPrecision, Precision, check_precision
 from amvnet.models.streams import SideBySide
-from amvnet.precision import InPrecision, Precision, check_precision
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
-from amvnet.views.points import PointBatch
-from amvnet.views.range_view import RangeView
 from amvnet.weights import Weights, load
 
 Method = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]

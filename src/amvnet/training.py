@@ -24,10 +24,10 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import confusion, metrics
 from amvnet.losses import polar_view_loss, range_view_loss
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarView
+from amvnet.models.views.range_view import RangeView
 from amvnet.processes import ALONE, Processes, device_of, environment, synced
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarView
-from amvnet.views.range_view import RangeView
 
 Batch = tuple[PointBatch, Tensor]
 MOMENTUM_CYCLE = 0.1  # by so much the one-cycle schedule lowers the momentum

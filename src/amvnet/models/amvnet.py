@@ -13,9 +13,9 @@ from amvnet.models.point_head import PointHead, nearest_neighbours, only_asked, 
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.streams import Arrangement, in_turn
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarView
-from amvnet.views.range_view import RangeView
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarView
+from amvnet.models.views.range_view import RangeView
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from amvnet.config.schema import PointHeadConfig
-from amvnet.models.block_search import nearest_others_by_blocks
 from amvnet.models.layers import PointLinear
-from amvnet.neighbours import nearest_others
-from amvnet.views.points import occurring
+from amvnet.models.neighbours import nearest_others
+from amvnet.models.neighbours_gpu import nearest_others_by_blocks
+from amvnet.models.views.points import occurring
 
 POINT_VALUES = 4  # x, y, z, intensity
 # Uncertain points that are scored at a time: what a processor's cache holds; what keeps a GPU busy.

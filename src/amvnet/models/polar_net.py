@@ -7,9 +7,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from amvnet.config.schema import PolarNetConfig
-from amvnet.models.joined import joined
 from amvnet.models.layers import ConvBlock, PointLinear, linear
-from amvnet.views.polar_view import FEATURES, PolarGrid
+from amvnet.models.upsampled_conv import joined
+from amvnet.models.views.polar_view import FEATURES, PolarGrid
 
 PART, PART_ON_GPU = 2048, 2**18  # points that are encoded at a time: what a cache holds; what keeps a GPU busy
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import RangeNetConfig
-from amvnet.models.joined import joined
 from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
-from amvnet.views.range_view import CHANNELS
+from amvnet.models.upsampled_conv import joined
+from amvnet.models.views.range_view import CHANNELS
 
 FIRST_DECODED = 1  # the decoder takes the stages from the second on: width stride 4
 RECURRENT = 2  # so many of the last stages are followed by a GRU

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from amvnet.views.points import PointBatch
+from amvnet.models.views.points import PointBatch
 
 Score = Callable[[PointBatch], Tensor]
 

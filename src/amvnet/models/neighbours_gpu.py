@@ -36,7 +36,7 @@ class Blocks:
 def nearest_others_by_blocks(xyz: Tensor, own: Tensor, n: int) -> Tensor:
     """(U, n) int64 indices of the n nearest other points of each point in `own`; the tensors stay where they are.
 
-    As `amvnet.neighbours.nearest_others`, but for the choice among points that are equally near: of a scan with fewer
+    As `amvnet.models.neighbours.nearest_others`, but for the choice among points that are equally near: of a scan with fewer
     than n other points the last one is repeated; a lone point is its own neighbour.
 
     Args:

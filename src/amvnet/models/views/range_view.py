@@ -10,7 +10,7 @@ from torch import Tensor
 
 from amvnet.config.schema import RangeViewConfig
 from amvnet.errors import InputError
-from amvnet.views.points import PointBatch
+from amvnet.models.views.points import PointBatch
 
 CHANNELS = 6  # x, y, z, intensity, range, mask
 _INDEX_BITS = 32  # the lower half of a key of _nearest is a point's index, the upper half its range

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from amvnet.config.schema import PolarViewConfig
-from amvnet.views.points import PointBatch, occurring
+from amvnet.models.views.points import PointBatch, occurring
 
 FEATURES = 9  # offset to the voxel's centre (3), polar coordinates (3), x, y, intensity
 
