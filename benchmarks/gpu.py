@@ -32,7 +32,7 @@ from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter
 from amvnet.simulation import simulate
 from amvnet.training import NetworkStage, PolarStage, RangeStage
-from amvnet.weights import Weights, state_of
+from amvnet.weights.file import Weights, state_of
 
 CLASSES = SEMANTICKITTI.size
 TINY = ModelConfig(

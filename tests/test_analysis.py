@@ -20,7 +20,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation import confusion, metrics
 from amvnet.models.amvnet import arithmetic_mean, maximum
 from amvnet.segmenter import Segmenter
-from amvnet.weights import Weights, load, save
+from amvnet.weights.file import Weights, load, save
 
 
 @pytest.fixture(scope="module")

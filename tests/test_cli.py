@@ -17,7 +17,7 @@ from amvnet import runner
 from amvnet.cli import VERBS, main
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.segmenter import Segmenter
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 OVERALL = {"miou", "miou_present", "accuracy", "fwiou", "iou"}
 RAW_IDS = set(SEMANTICKITTI.train_to_raw[1:])

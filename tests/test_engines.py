@@ -23,7 +23,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter, in_place
 from amvnet.simulation import simulate
-from amvnet.weights import Weights
+from amvnet.weights.file import Weights
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan
 from amvnet.segmenter import Method, Segmenter
-from amvnet.weights import Weights, save
+from amvnet.weights.file import Weights, save
 
 DOCS = Path(__file__).parents[1] / "docs"
 POINTS = 6000

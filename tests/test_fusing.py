@@ -17,7 +17,7 @@ from worlds import amvnet, files, fresh_weights, make_streets, street, write_rec
 
 from amvnet import fuse
 from amvnet.segmenter import Segmenter
-from amvnet.weights import load, save
+from amvnet.weights.file import load, save
 
 DOCS = Path(__file__).parent.parent / "docs"
 PLACE = "sequences/08/predictions/000000"

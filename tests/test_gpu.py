@@ -26,7 +26,7 @@ from amvnet.models.precision import InPrecision
 from amvnet.models.streams import SideBySide
 from amvnet.models.views.points import PointBatch
 from amvnet.streaming import AHEAD, Task, stream
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 N = 15
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]

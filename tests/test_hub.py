@@ -14,8 +14,8 @@ from worlds import amvnet as verb
 from worlds import fails, fresh_weights, street, without
 
 import amvnet
-from amvnet.model_card import model_card
-from amvnet.weights import load, save
+from amvnet.weights.card import model_card
+from amvnet.weights.file import load, save
 
 NAME = "hf-hub:somebody/streets"
 POINTS = street(3, 300)[0]

@@ -22,7 +22,7 @@ from amvnet.data.formats.detect import read_cloud
 from amvnet.data.label_files import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.segmenter import Segmenter
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 COUNT = 60
 LOST = 7  # the place of a point with NaN

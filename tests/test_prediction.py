@@ -20,7 +20,7 @@ from amvnet.journal import Journal
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmentation, Segmenter
 from amvnet.streaming import AHEAD, Task, stream
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 WEIGHTS = "w.safetensors"
 

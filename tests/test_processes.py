@@ -16,7 +16,7 @@ from worlds import amvnet, files, make_streets, without, write_recipe
 
 from amvnet.loading import EpochSampler
 from amvnet.processes import Processes, SyncedBatchNorm, synced
-from amvnet.weights import Weights, load, save
+from amvnet.weights.file import Weights, load, save
 
 # DropBlock draws for each process anew, and so as no single process does. In double precision, as AdamW divides each
 # gradient by its size, so that of one that is next to nothing the rounding decides.

@@ -15,7 +15,7 @@ from worlds import amvnet, fails, files, fresh_weights, street, without
 
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.onnx_runner import OnnxSegmenter
-from amvnet.weights import Weights, save
+from amvnet.weights.file import Weights, save
 
 POINTS = 3000
 QUANTISED = ("range_net", "polar_map")

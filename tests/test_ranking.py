@@ -21,7 +21,7 @@ from amvnet.clusters import CELL, cluster
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking import clusters_of, doubts_of, rank
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 DOCS = Path(__file__).parent.parent / "docs"
 WEIGHTS = fresh_weights()

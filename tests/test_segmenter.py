@@ -14,7 +14,7 @@ import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.segmenter import METHODS
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 K = 19
 POINTS = street(5, 600)[0]

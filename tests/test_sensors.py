@@ -25,7 +25,7 @@ from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter
 from amvnet.sensors import AXES, HEIGHTS, SENSORS, Sensor, describe, rotation
 from amvnet.simulation.sensors import HDL32E, HDL64E
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 VLP32C = (-25, -15.6, -11.3, -8.8, -7.3, -6.1, -5.3, -4.7, *np.linspace(-4, 1.667, 18), 2.3, 3.3, 4.7, 7, 10.3, 15)

@@ -17,7 +17,7 @@ from amvnet import submission
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.submission_rules import TEST_SCANS, rules_for
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 # ---- good archives
 

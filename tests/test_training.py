@@ -21,7 +21,7 @@ from worlds import GOLDEN, amvnet, files, label_map, make_streets, write_recipe
 
 from amvnet import runner
 from amvnet.callbacks import KeepWeights
-from amvnet.weights import PARTS, Weights, load
+from amvnet.weights.file import PARTS, Weights, load
 
 STILL = ("--training.augment.yaw", 0, "--training.augment.scale", 0, "--training.augment.flip", 0)
 SURE = ("--model.polar_net.dropblock", 0)  # a compiled network draws other numbers

@@ -13,7 +13,7 @@ import pytest
 from worlds import GOLDEN, amvnet, commands_of, files, make_streets, write_recipe
 
 from amvnet.config.recipes import recipe_names
-from amvnet.weights import load
+from amvnet.weights.file import load
 
 TEST = tuple(str(sequence) for sequence in range(11, 22))
 ONCE = {name: {"epochs": 1} for name in ("rv", "bev", "head")}

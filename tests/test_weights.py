@@ -18,7 +18,7 @@ from amvnet.config.nested import to_dict
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.segmenter import Segmenter
-from amvnet.weights import PARTS, Weights, load, save
+from amvnet.weights.file import PARTS, Weights, load, save
 
 
 @pytest.fixture(scope="module")

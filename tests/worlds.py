@@ -22,7 +22,7 @@ from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
-from amvnet.weights import Weights, state_of
+from amvnet.weights.file import Weights, state_of
 
 GOLDEN = Path(__file__).parent / "golden"
 CAR, ROAD, SIDEWALK, BUILDING, UNLABELLED = 10, 40, 48, 50, 0  # raw ids of SemanticKITTI

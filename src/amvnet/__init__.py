@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from amvnet.fusion import fuse
     from amvnet.scan import Scan
     from amvnet.segmenter import Segmentation, Segmenter
-    from amvnet.sharing import push
     from amvnet.simulation import simulate
+    from amvnet.weights.push import push
 
 __all__ = ["InputError", "Scan", "Segmentation", "Segmenter", "fuse", "load", "push", "simulate"]
 __version__ = version("amvnet")
@@ -29,7 +29,7 @@ _HOMES = {
     "Segmentation": "amvnet.segmenter",
     "Segmenter": "amvnet.segmenter",
     "fuse": "amvnet.fusion",
-    "push": "amvnet.sharing",
+    "push": "amvnet.weights.push",
     "simulate": "amvnet.simulation",
 }
 

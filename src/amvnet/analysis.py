@@ -24,7 +24,7 @@ from amvnet.processes import ALONE, Processes
 from amvnet.runner import Run
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter, checked_scan, in_place, labels_in_place
-from amvnet.weights import Weights
+from amvnet.weights.file import Weights
 
 BINS = 100  # of the cosine similarity, which is in [0, 1]
 SWEPT = 98  # bins of the lower similarities for which the head is asked: tau is swept up to 0.98

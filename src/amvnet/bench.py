@@ -24,7 +24,7 @@ from amvnet.models.point_head import nearest_neighbours
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter, label_ids
-from amvnet.weights import PARTS, Weights, state_of
+from amvnet.weights.file import PARTS, Weights, state_of
 
 STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")
 NETWORKS = ("RV", "BEV")

@@ -29,7 +29,7 @@ from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
 from amvnet.quantising import FIRST_KEPT, calibration_scans, quantise
 from amvnet.scan import FARTHEST, Scan
 from amvnet.segmenter import Segmenter, widest_method
-from amvnet.weights import Weights, load
+from amvnet.weights.file import Weights, load
 
 EXTRA = ("onnx", "onnxscript", "onnxruntime")
 OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it

@@ -17,7 +17,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
 from amvnet.sensors import HEIGHTS, SENSORS, Sensor
-from amvnet.weights import Weights
+from amvnet.weights.file import Weights
 
 MEASURED = 5  # scans of a source that are measured; then their median stays
 STEADY = 0.4  # metres: where heights of a source differ by more, each of its scans counts for itself

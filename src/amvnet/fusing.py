@@ -15,7 +15,7 @@ from amvnet.scan import Scan
 from amvnet.score_files import ScorePair
 from amvnet.segmenter import Segmentation, checked_scan
 from amvnet.streaming import Segment
-from amvnet.weights import Weights
+from amvnet.weights.file import Weights
 
 
 def fuse(

@@ -16,7 +16,7 @@ from amvnet.models.point_head import PointHead
 from amvnet.scan import Scan
 from amvnet.score_files import SURE, check_probabilities
 from amvnet.segmenter import Segmentation, checked_scan, segmentation
-from amvnet.weights import Weights, load
+from amvnet.weights.file import Weights, load
 
 Head = PointHead | Weights | Path | str | None
 

@@ -11,7 +11,7 @@ from amvnet.terminal import progress, say
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
-    from amvnet.weights import Weights
+    from amvnet.weights.file import Weights
 
 
 def fuse(
@@ -48,7 +48,7 @@ def fuse(
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
     """
     from amvnet.fusing import fuse as run
-    from amvnet.weights import load
+    from amvnet.weights.file import load
 
     pair = scores_in(scores_a, scores_b, key_a, key_b, logits)
     assert pair is not None
@@ -86,7 +86,7 @@ def rank(
     from amvnet.jobs import choose_records, own_classes
     from amvnet.ranking_pictures import draw
     from amvnet.segmenter import Segmenter, widest_method
-    from amvnet.weights import load
+    from amvnet.weights.file import load
 
     given = load(weights)
     dataset = open_data(data, None, own_classes(given.taxonomy))

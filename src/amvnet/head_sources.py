@@ -17,7 +17,7 @@ from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.score_files import SURE, ScorePair
-from amvnet.weights import Weights
+from amvnet.weights.file import Weights
 
 Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]  # f and g of a scan's valid points, (P, K)
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from amvnet.bench import MEAN, STAGES
 from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.weights import built_in
+from amvnet.weights.file import built_in
 
 TITLES = {
     "rv": "RV",

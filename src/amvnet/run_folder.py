@@ -19,7 +19,7 @@ from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
 from amvnet.score_files import ScorePair
 from amvnet.training import LAST
-from amvnet.weights import SIZES, Weights
+from amvnet.weights.file import SIZES, Weights
 
 SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with
 

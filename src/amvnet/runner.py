@@ -17,7 +17,6 @@ import numpy as np
 import yaml
 from torch import Tensor, nn
 
-from amvnet import weights as weights_file
 from amvnet.callbacks import KeepWeights, Pictures, Speed
 from amvnet.config.schema import NetworkTraining, Recipe, StageName
 from amvnet.data.datasets.base import Dataset, ScanRecord
@@ -35,7 +34,8 @@ from amvnet.processes import ALONE, Processes
 from amvnet.run_folder import SETTINGS, check_begun, describe, names_of, settings
 from amvnet.score_files import ScorePair
 from amvnet.training import Course, PolarStage, RangeStage, Stage, fit
-from amvnet.weights import Weights, state_of
+from amvnet.weights import file as weights_file
+from amvnet.weights.file import Weights, state_of
 
 PART = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 PICTURED_SCANS = 2

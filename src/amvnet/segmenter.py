@@ -22,7 +22,7 @@ from amvnet.models.streams import SideBySide
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
-from amvnet.weights import Weights, load
+from amvnet.weights.file import Weights, load
 
 Method = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 MOST_AT_ONCE = 4  # scans, so that their memory is bounded on a processor of many cores

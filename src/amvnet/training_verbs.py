@@ -53,10 +53,10 @@ def train(
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.
     """
-    from amvnet import weights
     from amvnet.jobs import split_records
     from amvnet.processes import device_of
     from amvnet.runner import Run
+    from amvnet.weights import file as weights
 
     _calm_lightning()
     processes = meet(device_of(recipe.training.accelerator) == "cuda")
@@ -104,7 +104,7 @@ def analyze(
     from amvnet.data.scan_files import make_folder
     from amvnet.runner import Run
     from amvnet.segmenter import Segmenter
-    from amvnet.weights import load
+    from amvnet.weights.file import load
 
     if (neighbours is None) != (recipe is None):
         raise InputError("expected --neighbours and --recipe together, found one of them; give both or neither")

@@ -188,7 +188,7 @@ def evaluate(
     from amvnet import jobs
     from amvnet.data.scan_files import make_folder
     from amvnet.segmenter import Segmenter, widest_method
-    from amvnet.weights import load
+    from amvnet.weights.file import load
 
     if (weights is None) == (predictions is None):
         raise InputError("expected either --weights or --predictions, found both or neither; give one of them")
@@ -264,9 +264,9 @@ def info(weights: str | None = None) -> None:
     Args:
         weights: a weights file, or the name of a built-in one: its model card, in Markdown.
     """
-    from amvnet.model_card import OURS, model_card
     from amvnet.report import installation_table
-    from amvnet.weights import built_in, load
+    from amvnet.weights.card import OURS, model_card
+    from amvnet.weights.file import built_in, load
 
     if weights is not None:
         say(model_card(load(weights), weights, OURS if weights in built_in() else None).rstrip())

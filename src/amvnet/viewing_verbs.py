@@ -41,7 +41,7 @@ def view(
     from amvnet.frames import choose_frames
     from amvnet.segmenter import Segmenter, widest_method
     from amvnet.view import check_rerun, check_window
-    from amvnet.weights import load
+    from amvnet.weights.file import load
 
     if labels is not None and weights is not None:
         raise InputError("expected --labels or --weights, found both; give one of them")

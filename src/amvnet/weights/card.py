@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from amvnet.weights import Weights
+from amvnet.weights.file import Weights
 
 TITLES = {"range_net": "Range-view network", "polar_net": "Bird's-eye-view network", "point_head": "Point head"}
 LISTED = 12  # names that are listed in full

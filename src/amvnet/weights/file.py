@@ -17,7 +17,6 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from amvnet import hub
 from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.data.scan_files import whole_file
@@ -25,6 +24,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
+from amvnet.weights import hub
 
 SIZES = {
     "range_net": ("range_view", "range_net"),

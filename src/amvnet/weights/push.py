@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from amvnet.hub import FILE, PREFIX, check_name, client, one_line
-from amvnet.model_card import front_matter, model_card
-from amvnet.weights import Weights, load, save
+from amvnet.weights.card import front_matter, model_card
+from amvnet.weights.file import Weights, load, save
+from amvnet.weights.hub import FILE, PREFIX, check_name, client, one_line
 
 CARD = "README.md"
 
