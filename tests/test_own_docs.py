@@ -90,7 +90,7 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
 
 
 def test_the_names_of_sensors_are_those_that_are_known() -> None:
-    from amvnet.sensors import SENSORS
+    from amvnet.sensors.lidars import SENSORS
 
     text = (DOCS / "own_sensor.md").read_text(encoding="utf-8")
     listed = re.findall(r"(?s)A name states lasers and field of view: (.*?)\. Where", text)[0]

@@ -19,11 +19,11 @@ from amvnet.cli import main
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.fitting import MEASURED, Fitting
-from amvnet.measuring import ground_height, measure
 from amvnet.scan import Scan
 from amvnet.segmenter import Segmenter
-from amvnet.sensors import AXES, HEIGHTS, SENSORS, Sensor, describe, rotation
+from amvnet.sensors.adapt import MEASURED, Fitting
+from amvnet.sensors.lidars import AXES, HEIGHTS, SENSORS, Sensor, describe, rotation
+from amvnet.sensors.measure import ground_height, measure
 from amvnet.simulation.sensors import HDL32E, HDL64E
 from amvnet.weights.file import save
 

@@ -138,10 +138,10 @@ def predict(
         offset: of lone scans, metres to add to x,y,z after that.
     """
     from amvnet.engines import engage
-    from amvnet.fitting import Fitting
     from amvnet.prediction import predict as segment
     from amvnet.segmenter import Segmenter
-    from amvnet.sensors import describe
+    from amvnet.sensors.adapt import Fitting
+    from amvnet.sensors.lidars import describe
 
     processes = meet()
     options = {"height": height, "intensity_scale": intensity_scale, "axes": axes, "rotate": rotate, "offset": offset}

@@ -12,11 +12,11 @@ import numpy as np
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
-from amvnet.measuring import Measured, elevations, measure
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
-from amvnet.sensors import HEIGHTS, SENSORS, Sensor
+from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
+from amvnet.sensors.measure import Measured, elevations, measure
 from amvnet.weights.file import Weights
 
 MEASURED = 5  # scans of a source that are measured; then their median stays
