@@ -23,13 +23,13 @@ from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import ModelConfig, PolarNetConfig, PolarViewConfig, RangeNetConfig, RangeViewConfig, Recipe
 from amvnet.data.scan_files import read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter
 from amvnet.simulation import simulate
 from amvnet.training import NetworkStage, PolarStage, RangeStage
 from amvnet.weights.file import Weights, state_of

@@ -16,7 +16,7 @@ import numpy as np
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
 from amvnet.evaluation import Evaluation
-from amvnet.segmenter import Segmenter
+from amvnet.inference.segmenter import Segmenter
 from amvnet.sensors.adapt import Fitting
 from amvnet.simulation import simulate
 from amvnet.simulation.sensors import HDL64E, SENSORS, Sensor

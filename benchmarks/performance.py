@@ -20,17 +20,17 @@ from salsanext import CHANNELS, SalsaNext
 from torch import nn
 from torch.nn import functional as F
 
+import amvnet.inference.segmenter
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
-import amvnet.segmenter
-from amvnet.bench import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
 from amvnet.config.recipes import load_recipe
 from amvnet.data.scan_files import read_scan, write_labels
 from amvnet.engines import OnnxGraph, cache_folder, engage
+from amvnet.inference.segmenter import Segmenter
+from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
 from amvnet.models.layers import upsample
 from amvnet.models.point_head import head_features, point_table
-from amvnet.segmenter import Segmenter
 from amvnet.simulation import simulate
 
 WIDTH, HEIGHT = 2048, 64  # of the range image that SalsaNext is timed on
@@ -38,11 +38,11 @@ WARM_UP = 2
 
 
 def without_memory() -> None:
-    amvnet.segmenter.keep_memory = lambda: False
+    amvnet.inference.segmenter.keep_memory = lambda: False
 
 
 def without_folding() -> None:
-    amvnet.segmenter.fold_batch_norms = lambda model: None
+    amvnet.inference.segmenter.fold_batch_norms = lambda model: None
 
 
 def without_convolved_rows() -> None:
@@ -84,7 +84,7 @@ def without_sharing() -> None:
         parts = zip(index.split(2048), near.split(2048), strict=True)
         return torch.cat([head(*head_features(head.config, table, i, n)) for i, n in parts]).softmax(dim=1)
 
-    amvnet.bench.settle = settle
+    amvnet.inference.timing.settle = settle
 
 
 TAKEN_AWAY: dict[str, tuple[Callable[[], None], ...]] = {

@@ -18,8 +18,8 @@ from amvnet.analysis import BINS, SWEPT, analyze
 from amvnet.config.schema import AssertionConfig
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation import confusion, metrics
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import arithmetic_mean, maximum
-from amvnet.segmenter import Segmenter
 from amvnet.weights.file import Weights, load, save
 
 

@@ -16,7 +16,7 @@ from worlds import GOLDEN, amvnet, files, fresh_weights, make_streets, street, w
 from amvnet import runner
 from amvnet.cli import VERBS, main
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.segmenter import Segmenter
+from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import save
 
 OVERALL = {"miou", "miou_present", "accuracy", "fwiou", "iou"}

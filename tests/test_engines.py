@@ -16,12 +16,12 @@ import amvnet
 from amvnet import engines
 from amvnet.data.datasets.open import open_dataset
 from amvnet.engines import cache_folder, engage, exported
+from amvnet.inference.segmenter import Segmenter, in_place
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter, in_place
 from amvnet.simulation import simulate
 from amvnet.weights.file import Weights
 

@@ -17,10 +17,10 @@ import torch
 from worlds import amvnet, commands_of, fails, files, fresh_weights, street, without
 
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.inference.segmenter import Method, Segmenter
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan
-from amvnet.segmenter import Method, Segmenter
 from amvnet.weights.file import Weights, save
 
 DOCS = Path(__file__).parents[1] / "docs"

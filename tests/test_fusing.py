@@ -16,7 +16,7 @@ import yaml
 from worlds import amvnet, files, fresh_weights, make_streets, street, write_recipe
 
 from amvnet import fuse
-from amvnet.segmenter import Segmenter
+from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import load, save
 
 DOCS = Path(__file__).parent.parent / "docs"

@@ -18,6 +18,7 @@ from worlds import amvnet, commands_of, fails, files, fresh_weights, make_street
 
 from amvnet import Scan, Segmenter, simulate
 from amvnet.data.scan_files import read_scan
+from amvnet.inference.pipeline import AHEAD, Task, stream
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import merge
 from amvnet.models.neighbours import nearest_others
@@ -25,7 +26,6 @@ from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_bl
 from amvnet.models.precision import InPrecision
 from amvnet.models.streams import SideBySide
 from amvnet.models.views.points import PointBatch
-from amvnet.streaming import AHEAD, Task, stream
 from amvnet.weights.file import save
 
 N = 15
@@ -312,8 +312,8 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
     arguments = ("predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path)
     assert amvnet(*arguments) == (0, "")
     whole = {name: (tmp_path / name).read_bytes() for name in files(tmp_path)}
-    from amvnet.journal import Journal
-    from amvnet.prediction import Fitting
+    from amvnet.inference.journal import Journal
+    from amvnet.inference.predict import Fitting
 
     weights = Segmenter(world / "w.safetensors").weights
     settings = {

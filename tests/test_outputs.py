@@ -21,7 +21,7 @@ from amvnet import verbs
 from amvnet.data.formats.detect import read_cloud
 from amvnet.data.label_files import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.segmenter import Segmenter
+from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import save
 
 COUNT = 60

@@ -14,12 +14,12 @@ import pytest
 import torch
 from worlds import amvnet, files, fresh_weights, make_streets, street
 
-from amvnet import prediction
 from amvnet.data.scan_files import whole_file
-from amvnet.journal import Journal
+from amvnet.inference import predict as prediction
+from amvnet.inference.journal import Journal
+from amvnet.inference.pipeline import AHEAD, Task, stream
+from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmentation, Segmenter
-from amvnet.streaming import AHEAD, Task, stream
 from amvnet.weights.file import save
 
 WEIGHTS = "w.safetensors"

@@ -19,8 +19,8 @@ from amvnet.cli import main
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
+from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter
 from amvnet.sensors.adapt import MEASURED, Fitting
 from amvnet.sensors.lidars import AXES, HEIGHTS, SENSORS, Sensor, describe, rotation
 from amvnet.sensors.measure import ground_height, measure

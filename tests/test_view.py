@@ -23,7 +23,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.frames import RIGHT, WRONG, Frame
-from amvnet.segmenter import Segmenter
+from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import save
 
 __all__ = ["browser"]

@@ -17,7 +17,7 @@ from worlds import fresh_weights, street, without
 from amvnet.config.nested import to_dict
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.segmenter import Segmenter
+from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import PARTS, Weights, load, save
 
 

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from amvnet.errors import InputError
-    from amvnet.fusion import fuse
+    from amvnet.inference.fusion import fuse
+    from amvnet.inference.segmenter import Segmentation, Segmenter
     from amvnet.scan import Scan
-    from amvnet.segmenter import Segmentation, Segmenter
     from amvnet.simulation import simulate
     from amvnet.weights.push import push
 
@@ -26,9 +26,9 @@ __version__ = version("amvnet")
 _HOMES = {
     "InputError": "amvnet.errors",
     "Scan": "amvnet.scan",
-    "Segmentation": "amvnet.segmenter",
-    "Segmenter": "amvnet.segmenter",
-    "fuse": "amvnet.fusion",
+    "Segmentation": "amvnet.inference.segmenter",
+    "Segmenter": "amvnet.inference.segmenter",
+    "fuse": "amvnet.inference.fusion",
     "push": "amvnet.weights.push",
     "simulate": "amvnet.simulation",
 }
@@ -42,7 +42,7 @@ def load(
     Raises:
         InputError: where there are no such weights, or they lack a part that the method needs, or the engine a library.
     """
-    segmenter = import_module("amvnet.segmenter").Segmenter(weights, device, method, precision)
+    segmenter = import_module("amvnet.inference.segmenter").Segmenter(weights, device, method, precision)
     if engine != "torch":
         import_module("amvnet.engines").engage(segmenter, engine)
     return segmenter

@@ -17,13 +17,13 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation, metrics
+from amvnet.inference.segmenter import Segmenter, checked_scan, in_place, labels_in_place
 from amvnet.models.amvnet import ENSEMBLES, merge, refine
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.views.points import PointBatch
 from amvnet.processes import ALONE, Processes
 from amvnet.runner import Run
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter, checked_scan, in_place, labels_in_place
 from amvnet.weights.file import Weights
 
 BINS = 100  # of the cosine similarity, which is in [0, 1]

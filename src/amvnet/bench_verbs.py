@@ -37,12 +37,12 @@ def bench(
         precision: of the networks; float16 on a GPU only.
         json: also write the figures to this file.
     """
-    from amvnet.bench import UNCERTAIN, Job, time_jobs, untrained
     from amvnet.config.recipes import load_recipe
     from amvnet.data.scan_files import read_scan, whole_file, write_labels
     from amvnet.engines import engage
+    from amvnet.inference.segmenter import Segmenter
+    from amvnet.inference.timing import UNCERTAIN, Job, time_jobs, untrained
     from amvnet.report import timing_table
-    from amvnet.segmenter import Segmenter
     from amvnet.simulation import simulate as write
 
     given = untrained(load_recipe(recipe)) if recipe is not None else weights

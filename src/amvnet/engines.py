@@ -14,10 +14,10 @@ from torch import Tensor, nn
 from amvnet import __version__
 from amvnet.errors import InputError
 from amvnet.export import OPSET, check_libraries, export
+from amvnet.inference.segmenter import NEEDED, Segmenter
 from amvnet.models.precision import InPrecision
 from amvnet.models.views.range_view import CHANNELS
 from amvnet.onnx_runner import DESCRIPTION
-from amvnet.segmenter import NEEDED, Segmenter
 
 ENGINES = ("auto", "torch", "compile", "onnx")
 FASTEST = "torch"  # without a long start, see docs/performance.md; what "auto" takes

@@ -20,6 +20,7 @@ from amvnet import __version__
 from amvnet.config.nested import to_dict
 from amvnet.data.scan_files import make_folder, whole_file
 from amvnet.errors import InputError
+from amvnet.inference.segmenter import Segmenter, widest_method
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
@@ -28,7 +29,6 @@ from amvnet.onnx_files import digest, one_line, quiet, strip
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
 from amvnet.quantising import FIRST_KEPT, calibration_scans, quantise
 from amvnet.scan import FARTHEST, Scan
-from amvnet.segmenter import Segmenter, widest_method
 from amvnet.weights.file import Weights, load
 
 EXTRA = ("onnx", "onnxscript", "onnxruntime")

@@ -47,7 +47,7 @@ def fuse(
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the head's or data's.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
     """
-    from amvnet.fusing import fuse as run
+    from amvnet.inference.fuse_files import fuse as run
     from amvnet.weights.file import load
 
     pair = scores_in(scores_a, scores_b, key_a, key_b, logits)
@@ -83,9 +83,9 @@ def rank(
     """
     from amvnet import ranking
     from amvnet.data.scan_files import make_folder
+    from amvnet.inference.segmenter import Segmenter, widest_method
     from amvnet.jobs import choose_records, own_classes
     from amvnet.ranking_pictures import draw
-    from amvnet.segmenter import Segmenter, widest_method
     from amvnet.weights.file import load
 
     given = load(weights)

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
+from amvnet.inference.score_files import SURE, ScorePair
 from amvnet.models.assertions import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.score_files import SURE, ScorePair
 from amvnet.weights.file import Weights
 
 Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]  # f and g of a scan's valid points, (P, K)

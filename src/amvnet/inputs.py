@@ -12,8 +12,8 @@ from amvnet.terminal import silence
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import ScanRecord
     from amvnet.data.taxonomy import Taxonomy
+    from amvnet.inference.score_files import ScorePair, Which
     from amvnet.processes import Processes
-    from amvnet.score_files import ScorePair, Which
 
 SHOWN = 20  # names of sequences in a line
 
@@ -53,7 +53,7 @@ def names_in(text: str | None) -> list[str] | None:
 
 def methods_in(text: str) -> list[str]:
     """Methods with commas. Raises InputError where one is none."""
-    from amvnet.segmenter import METHODS
+    from amvnet.inference.segmenter import METHODS
 
     names = names_in(text) or []
     if wrong := [name for name in names if name not in METHODS]:
@@ -73,7 +73,7 @@ def scores_in(
     a: Path | None, b: Path | None, key_a: str | None, key_b: str | None, logits: Which | None
 ) -> ScorePair | None:
     """Two models' scores; None where no option names any. Raises InputError where a folder is missing."""
-    from amvnet.score_files import ScorePair
+    from amvnet.inference.score_files import ScorePair
 
     if a is not None and b is not None:
         return ScorePair.of(a, b, key_a, key_b, logits)

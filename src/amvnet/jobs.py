@@ -11,10 +11,10 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import Evaluation
+from amvnet.inference.segmenter import COMPARED, Segmenter, checked_scan
 from amvnet.pictures import draw_scan
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
-from amvnet.segmenter import COMPARED, Segmenter, checked_scan
 
 Progress = Callable[[int, int], None]  # done, in all
 PICTURES = 4  # scans that are drawn, evenly spaced

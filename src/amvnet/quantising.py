@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from amvnet.errors import InputError
+from amvnet.inference.predict import Lone, Task, tasks_in
+from amvnet.inference.segmenter import Segmenter
 from amvnet.onnx_files import digest, one_line, quiet, strip
 from amvnet.onnx_runner import OnnxSegmenter
-from amvnet.prediction import Lone, Task, tasks_in
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter
 from amvnet.sensors.adapt import Fitting
 
 SIMULATED = "simulated"  # in place of a data set: streets of the weights' sensor

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from rich.table import Table
 
-from amvnet.bench import MEAN, STAGES
 from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.inference.timing import MEAN, STAGES
 from amvnet.weights.file import built_in
 
 TITLES = {

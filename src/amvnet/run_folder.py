@@ -17,7 +17,7 @@ from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
-from amvnet.score_files import ScorePair
+from amvnet.inference.score_files import ScorePair
 from amvnet.training import LAST
 from amvnet.weights.file import SIZES, Weights
 

@@ -26,13 +26,13 @@ from amvnet.errors import InputError
 from amvnet.head_points import gather_points, head_loader
 from amvnet.head_sources import Networks, Source, scored_with, source_of
 from amvnet.head_training import HeadStage
+from amvnet.inference.score_files import ScorePair
 from amvnet.loading import ScanSet, count_classes, loader
 from amvnet.losses import class_weights
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.processes import ALONE, Processes
 from amvnet.run_folder import SETTINGS, check_begun, describe, names_of, settings
-from amvnet.score_files import ScorePair
 from amvnet.training import Course, PolarStage, RangeStage, Stage, fit
 from amvnet.weights import file as weights_file
 from amvnet.weights.file import Weights, state_of

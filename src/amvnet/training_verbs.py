@@ -102,8 +102,8 @@ def analyze(
     from amvnet.analysis import sweep_neighbours
     from amvnet.config.recipes import load_recipe
     from amvnet.data.scan_files import make_folder
+    from amvnet.inference.segmenter import Segmenter
     from amvnet.runner import Run
-    from amvnet.segmenter import Segmenter
     from amvnet.weights.file import load
 
     if (neighbours is None) != (recipe is None):

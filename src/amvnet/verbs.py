@@ -32,8 +32,8 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
     """
     from amvnet import jobs
     from amvnet.data.datasets.semantickitti import SemanticKitti
-    from amvnet.prediction import predict as segment
-    from amvnet.segmenter import Segmenter
+    from amvnet.inference.predict import predict as segment
+    from amvnet.inference.segmenter import Segmenter
     from amvnet.simulation import simulate as write
 
     segmenter = Segmenter(weights)
@@ -138,8 +138,8 @@ def predict(
         offset: of lone scans, metres to add to x,y,z after that.
     """
     from amvnet.engines import engage
-    from amvnet.prediction import predict as segment
-    from amvnet.segmenter import Segmenter
+    from amvnet.inference.predict import predict as segment
+    from amvnet.inference.segmenter import Segmenter
     from amvnet.sensors.adapt import Fitting
     from amvnet.sensors.lidars import describe
 
@@ -187,7 +187,7 @@ def evaluate(
     """
     from amvnet import jobs
     from amvnet.data.scan_files import make_folder
-    from amvnet.segmenter import Segmenter, widest_method
+    from amvnet.inference.segmenter import Segmenter, widest_method
     from amvnet.weights.file import load
 
     if (weights is None) == (predictions is None):

@@ -39,7 +39,7 @@ def view(
     """
     from amvnet.data.scan_files import make_folder
     from amvnet.frames import choose_frames
-    from amvnet.segmenter import Segmenter, widest_method
+    from amvnet.inference.segmenter import Segmenter, widest_method
     from amvnet.view import check_rerun, check_window
     from amvnet.weights.file import load
 

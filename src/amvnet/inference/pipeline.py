@@ -17,8 +17,8 @@ import torch
 from amvnet.data.label_files import write_uncertain
 from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
+from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmentation, Segmenter
 
 AHEAD = 3  # scans that are read before they are asked for, and that may wait to be written
 Segment = Callable[[Scan], Segmentation]

@@ -16,6 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.schema import Recipe
 from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.errors import InputError
+from amvnet.inference.segmenter import Segmenter, label_ids
 from amvnet.memory import peak_memory
 from amvnet.models.amvnet import build_amvnet, geometric_mean, merge, settle
 from amvnet.models.assertions import cosine_similarity
@@ -23,7 +24,6 @@ from amvnet.models.layers import linear
 from amvnet.models.point_head import nearest_neighbours
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter, label_ids
 from amvnet.weights.file import PARTS, Weights, state_of
 
 STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")

@@ -10,12 +10,12 @@ import torch
 
 from amvnet.config.schema import AssertionConfig
 from amvnet.errors import InputError
+from amvnet.inference.score_files import SURE, check_probabilities
+from amvnet.inference.segmenter import Segmentation, checked_scan, segmentation
 from amvnet.models.amvnet import Scores, merge, refine
 from amvnet.models.assertions import Assertion, Disagreement, build_assertion
 from amvnet.models.point_head import PointHead
 from amvnet.scan import Scan
-from amvnet.score_files import SURE, check_probabilities
-from amvnet.segmenter import Segmentation, checked_scan, segmentation
 from amvnet.weights.file import Weights, load
 
 Head = PointHead | Weights | Path | str | None

@@ -16,13 +16,13 @@ from amvnet.data.label_files import check_kind, write_scan_labels
 from amvnet.data.scan_files import find_scans
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken
+from amvnet.inference.journal import Journal
+from amvnet.inference.pipeline import Segment, Task, stream
+from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.jobs import Progress, check_classes, choose_records, own_classes
-from amvnet.journal import Journal
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmentation, Segmenter
 from amvnet.sensors.adapt import MEASURED, Fitting
-from amvnet.streaming import Segment, Task, stream
 
 By = Callable[[Path, bool], Segment]  # for the scan whose scores lie at a place, and whether it is a lone one
 
