@@ -17,7 +17,7 @@ import numpy as np
 import onnxruntime
 
 from amvnet.data.datasets.open import open_dataset
-from amvnet.evaluation import Evaluation
+from amvnet.evaluation.metrics import Evaluation
 from amvnet.onnx_runner import OnnxSegmenter, disagree
 from amvnet.scan import Scan
 

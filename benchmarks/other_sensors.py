@@ -15,7 +15,7 @@ import numpy as np
 
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
-from amvnet.evaluation import Evaluation
+from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.sensors.adapt import Fitting
 from amvnet.simulation import simulate

@@ -13,11 +13,12 @@ import torch
 from matplotlib.image import imread
 from worlds import amvnet, files, fresh_weights, make_streets, street, without, write_recipe, write_scan
 
-from amvnet import analysis, jobs
-from amvnet.analysis import BINS, SWEPT, analyze
 from amvnet.config.schema import AssertionConfig
 from amvnet.data.datasets.open import open_dataset
-from amvnet.evaluation import confusion, metrics
+from amvnet.evaluation import analysis
+from amvnet.evaluation import scoring as jobs
+from amvnet.evaluation.analysis import BINS, SWEPT, analyze
+from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import arithmetic_mean, maximum
 from amvnet.weights.file import Weights, load, save

@@ -12,7 +12,7 @@ import pytest
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
-from amvnet.evaluation import Evaluation, confusion, metrics
+from amvnet.evaluation.metrics import Evaluation, confusion, metrics
 
 GOLDEN = Path(__file__).parent / "golden"
 

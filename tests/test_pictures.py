@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
-from amvnet.pictures import UNCERTAIN, WRONG, draw_scan
+from amvnet.evaluation.top_view import UNCERTAIN, WRONG, draw_scan
 
 PATCH = 400  # points of one class in one block, dense enough to fill pixels
 

@@ -18,9 +18,9 @@ from torch import Tensor, nn
 
 from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.evaluation.top_view import scan_figure
 from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
-from amvnet.pictures import scan_figure
 from amvnet.scan import Scan
 
 PICTURED = 10  # times in a training that the pictures are drawn, at most about

@@ -83,8 +83,8 @@ def rank(
     """
     from amvnet import ranking
     from amvnet.data.scan_files import make_folder
+    from amvnet.evaluation.scoring import choose_records, own_classes
     from amvnet.inference.segmenter import Segmenter, widest_method
-    from amvnet.jobs import choose_records, own_classes
     from amvnet.ranking_pictures import draw
     from amvnet.weights.file import load
 

@@ -17,7 +17,7 @@ from torch.utils import data
 from amvnet.config.schema import ModelConfig, PointHeadConfig, TrainingConfig
 from amvnet.data.datasets.base import Dataset
 from amvnet.errors import InputError
-from amvnet.evaluation import confusion
+from amvnet.evaluation.metrics import confusion
 from amvnet.head_sources import Source
 from amvnet.loading import ScanSet, collate
 from amvnet.models.amvnet import geometric_mean

@@ -16,8 +16,8 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.evaluation.scoring import Progress, check_classes
 from amvnet.inference.segmenter import Segmenter, checked_scan, in_place
-from amvnet.jobs import Progress, check_classes
 from amvnet.models.assertions import cosine_similarity
 from amvnet.scan import Scan
 

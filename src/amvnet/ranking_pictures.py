@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset
+from amvnet.evaluation.top_view import draw_scan
 from amvnet.inference.segmenter import Segmenter, checked_scan
-from amvnet.pictures import draw_scan
 from amvnet.ranking import By, Ranking, clusters_of, doubts_of
 
 PICTURES = 12  # clusters that are drawn

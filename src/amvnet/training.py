@@ -22,7 +22,7 @@ from amvnet.callbacks import Bar, Curves, EpochLines, SeedBatches, Speed
 from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.evaluation import confusion, metrics
+from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.losses import polar_view_loss, range_view_loss
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarView

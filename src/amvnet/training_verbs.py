@@ -12,7 +12,7 @@ from amvnet.inputs import listed, meet, names_in, numbers_in, open_data, scores_
 from amvnet.terminal import on_terminal, progress, say
 
 if TYPE_CHECKING:
-    from amvnet.analysis import Swept
+    from amvnet.evaluation.analysis import Swept
 
 
 def train(
@@ -53,7 +53,7 @@ def train(
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.
     """
-    from amvnet.jobs import split_records
+    from amvnet.evaluation.scoring import split_records
     from amvnet.processes import device_of
     from amvnet.runner import Run
     from amvnet.weights import file as weights
@@ -97,11 +97,12 @@ def analyze(
         train_sequences: sequences or scenes that these heads learn from, with commas; default: the official split.
         device: cpu, cuda, cuda:1, ...
     """
-    from amvnet import charts, jobs
-    from amvnet.analysis import analyze as score
-    from amvnet.analysis import sweep_neighbours
     from amvnet.config.recipes import load_recipe
     from amvnet.data.scan_files import make_folder
+    from amvnet.evaluation import charts
+    from amvnet.evaluation import scoring as jobs
+    from amvnet.evaluation.analysis import analyze as score
+    from amvnet.evaluation.analysis import sweep_neighbours
     from amvnet.inference.segmenter import Segmenter
     from amvnet.runner import Run
     from amvnet.weights.file import load
@@ -148,8 +149,9 @@ def ablate(
         val_sequences: sequences or scenes to score, with commas; default: the official split.
         device: where the trained networks are scored: cpu, cuda, cuda:1, ...
     """
-    from amvnet import charts, jobs
-    from amvnet.analysis import ablate as compare
+    from amvnet.evaluation import charts
+    from amvnet.evaluation import scoring as jobs
+    from amvnet.evaluation.analysis import ablate as compare
     from amvnet.processes import device_of
 
     _calm_lightning()

@@ -13,7 +13,7 @@ from amvnet.terminal import console, progress, say
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
-    from amvnet.evaluation import Evaluation
+    from amvnet.evaluation.metrics import Evaluation
 
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 EngineName = Literal["auto", "torch", "compile", "onnx"]
@@ -30,8 +30,8 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
         seed: of the streets; by default one that the weights never saw.
         weights: a weights file, or the name of a built-in one.
     """
-    from amvnet import jobs
     from amvnet.data.datasets.semantickitti import SemanticKitti
+    from amvnet.evaluation import scoring as jobs
     from amvnet.inference.predict import predict as segment
     from amvnet.inference.segmenter import Segmenter
     from amvnet.simulation import simulate as write
@@ -185,8 +185,8 @@ def evaluate(
         device: cpu, cuda, cuda:1, ...
         precision: of the networks; float16 on a GPU only.
     """
-    from amvnet import jobs
     from amvnet.data.scan_files import make_folder
+    from amvnet.evaluation import scoring as jobs
     from amvnet.inference.segmenter import Segmenter, widest_method
     from amvnet.weights.file import load
 

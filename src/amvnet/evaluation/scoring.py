@@ -10,9 +10,9 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
-from amvnet.evaluation import Evaluation
+from amvnet.evaluation.metrics import Evaluation
+from amvnet.evaluation.top_view import draw_scan
 from amvnet.inference.segmenter import COMPARED, Segmenter, checked_scan
-from amvnet.pictures import draw_scan
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
 

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from amvnet import jobs
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.evaluation import Evaluation, metrics
+from amvnet.evaluation import scoring as jobs
+from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.inference.segmenter import Segmenter, checked_scan, in_place, labels_in_place
 from amvnet.models.amvnet import ENSEMBLES, merge, refine
 from amvnet.models.assertions import Disagreement, cosine_similarity
