@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.clusters import cluster
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.scan_files import write_labels
+from amvnet.ranking.clusters import cluster
 
 SHARE, LEAST = 0.01, 10  # of the things that have so many points
 ALIKE = [

@@ -17,10 +17,10 @@ import torch
 from worlds import amvnet, files, fresh_weights, make_streets, without
 
 from amvnet import Scan, Segmenter
-from amvnet.clusters import CELL, cluster
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.ranking import clusters_of, doubts_of, rank
+from amvnet.ranking.clusters import CELL, cluster
+from amvnet.ranking.rank import clusters_of, doubts_of, rank
 from amvnet.weights.file import save
 
 DOCS = Path(__file__).parent.parent / "docs"

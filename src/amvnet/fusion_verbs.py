@@ -81,11 +81,11 @@ def rank(
         pictures: folder for drawings of the first clusters from above.
         device: cpu, cuda, cuda:1, ...
     """
-    from amvnet import ranking
     from amvnet.data.scan_files import make_folder
     from amvnet.evaluation.scoring import choose_records, own_classes
     from amvnet.inference.segmenter import Segmenter, widest_method
-    from amvnet.ranking_pictures import draw
+    from amvnet.ranking import rank as ranking
+    from amvnet.ranking.pictures import draw
     from amvnet.weights.file import load
 
     given = load(weights)

@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from amvnet.clusters import cluster
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
@@ -19,6 +18,7 @@ from amvnet.errors import InputError
 from amvnet.evaluation.scoring import Progress, check_classes
 from amvnet.inference.segmenter import Segmenter, checked_scan, in_place
 from amvnet.models.assertions import cosine_similarity
+from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan
 
 By = Literal["disagreement", "labels"]

@@ -9,7 +9,7 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset
 from amvnet.evaluation.top_view import draw_scan
 from amvnet.inference.segmenter import Segmenter, checked_scan
-from amvnet.ranking import By, Ranking, clusters_of, doubts_of
+from amvnet.ranking.rank import By, Ranking, clusters_of, doubts_of
 
 PICTURES = 12  # clusters that are drawn
 REACH = 8.0  # metres from the cluster to each side
