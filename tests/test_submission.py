@@ -13,10 +13,10 @@ from submissions import TEST, Case, measured, write_files
 from test_data import make_nuscenes
 from worlds import GOLDEN, amvnet, commands_of, fails, files, fresh_weights, street, write_scan
 
-from amvnet import submission
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.submission_rules import TEST_SCANS, rules_for
+from amvnet.submission import pack as submission
+from amvnet.submission.rules import TEST_SCANS, rules_for
 from amvnet.weights.file import save
 
 # ---- good archives

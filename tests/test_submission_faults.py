@@ -14,10 +14,10 @@ import pytest
 from submissions import Case, Entries, measured
 from worlds import amvnet
 
-from amvnet import submission
 from amvnet.data.datasets.open import open_dataset
 from amvnet.errors import InputError
-from amvnet.submission_rules import rules_for
+from amvnet.submission import pack as submission
+from amvnet.submission.rules import rules_for
 
 # ---- archives that break a rule
 

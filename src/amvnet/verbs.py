@@ -238,8 +238,8 @@ def submit(
         use_map: nuScenes: the method was given the semantic map.
         use_external: nuScenes: the method was given data that are not of nuScenes.
     """
-    from amvnet import submission
-    from amvnet.submission_rules import Sources, rules_for
+    from amvnet.submission import pack as submission
+    from amvnet.submission.rules import Sources, rules_for
 
     sources = Sources(use_camera, use_lidar, use_radar, use_map, use_external)
     rules = rules_for(open_data(data, None), split, names_in(sequences))

@@ -6,9 +6,9 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from amvnet.archives import Archive, opened, written
 from amvnet.errors import InputError
-from amvnet.submission_rules import Rules, Sources
+from amvnet.submission.rules import Rules, Sources
+from amvnet.submission.zips import Archive, opened, written
 
 ENDING = ".zip"
 SHOWN = 5  # folders in a message
