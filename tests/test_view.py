@@ -16,14 +16,14 @@ import pytest
 from pages import Browser, Page, browser, places, read_page
 from worlds import GOLDEN, amvnet, commands_of, files, fresh_weights, make_streets, street, without
 
-from amvnet import page as pages
-from amvnet import view
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.frames import RIGHT, WRONG, Frame
 from amvnet.inference.segmenter import Segmenter
+from amvnet.viewing import page as pages
+from amvnet.viewing import rerun_log as view
+from amvnet.viewing.frames import RIGHT, WRONG, Frame
 from amvnet.weights.file import save
 
 __all__ = ["browser"]

@@ -10,7 +10,7 @@ from amvnet.inputs import names_in
 from amvnet.terminal import progress, say
 
 if TYPE_CHECKING:
-    from amvnet.frames import Frames
+    from amvnet.viewing.frames import Frames
 
 
 def view(
@@ -38,9 +38,9 @@ def view(
         device: cpu, cuda, cuda:1, ...
     """
     from amvnet.data.scan_files import make_folder
-    from amvnet.frames import choose_frames
     from amvnet.inference.segmenter import Segmenter, widest_method
-    from amvnet.view import check_rerun, check_window
+    from amvnet.viewing.frames import choose_frames
+    from amvnet.viewing.rerun_log import check_rerun, check_window
     from amvnet.weights.file import load
 
     if labels is not None and weights is not None:
@@ -62,8 +62,8 @@ def view(
 
 def _show(chosen: Frames, title: str, html: Path | None, save: Path | None) -> None:
     """Make the frames once, for all that was asked for."""
-    from amvnet.page import write_page
-    from amvnet.view import open_window, save_recording
+    from amvnet.viewing.page import write_page
+    from amvnet.viewing.rerun_log import open_window, save_recording
 
     with progress("looking") as step:
         made = chosen.each(step)

@@ -14,8 +14,8 @@ import numpy as np
 from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 from amvnet.report import TITLES
+from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 
 TIMELINE = "scan"
 DOT, LARGE_DOT = 1.2, 1.8  # radius of points on the screen

@@ -18,8 +18,8 @@ import numpy as np
 
 from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 from amvnet.report import TITLES
+from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
 MOST_POINTS = 400_000  # of one scan; of more, every second or third is drawn, so that a telephone can
 REACH = 500.0  # metres along each axis; farther points are left out, so that positions stay within 1.6 cm of the truth
@@ -182,7 +182,7 @@ def _ramp(name: str, start: float, end: float) -> list[list[int]]:
 
 
 def _source(name: str) -> str:
-    return (resources.files("amvnet") / "viewer" / name).read_text(encoding="utf-8")
+    return (resources.files("amvnet.viewing") / "page_assets" / name).read_text(encoding="utf-8")
 
 
 def _hash(text: str) -> str:
