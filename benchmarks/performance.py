@@ -26,7 +26,7 @@ import amvnet.models.polar_net
 import amvnet.models.range_net
 from amvnet.config.recipes import load_recipe
 from amvnet.data.scan_files import read_scan, write_labels
-from amvnet.engines import OnnxGraph, cache_folder, engage
+from amvnet.export.engines import OnnxGraph, cache_folder, engage
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
 from amvnet.models.layers import upsample

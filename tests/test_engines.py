@@ -13,9 +13,9 @@ from torch.nn import functional as F
 from worlds import fails, files, fresh_weights
 
 import amvnet
-from amvnet import engines
 from amvnet.data.datasets.open import open_dataset
-from amvnet.engines import cache_folder, engage, exported
+from amvnet.export import engines
+from amvnet.export.engines import cache_folder, engage, exported
 from amvnet.inference.segmenter import Segmenter, in_place
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
@@ -114,7 +114,7 @@ def test_without_a_compiler_compile_is_one_line(monkeypatch: pytest.MonkeyPatch)
 def test_other_engines_and_missing_libraries_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     fails(lambda: engage(Segmenter(fresh_weights()), "tensorrt"), "tensorrt", "onnx")
     fails(lambda: amvnet.load("sim-hdl64e", engine="tensorrt"), "tensorrt")
-    monkeypatch.setattr("amvnet.export.EXTRA", ("no_such_library",))
+    monkeypatch.setattr("amvnet.export.onnx.EXTRA", ("no_such_library",))
     fails(lambda: engage(Segmenter(fresh_weights()), "onnx"), "no_such_library", "amvnet[export]")
 
 

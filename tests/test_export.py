@@ -32,7 +32,7 @@ TAXONOMIES = {"elevation": SEMANTICKITTI, "ring": NUSCENES}  # by what fresh_wei
 def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Weights, Path]]:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library)
-    from amvnet.export import export
+    from amvnet.export.onnx import export
 
     found = {}
     for rows, taxonomy in TAXONOMIES.items():
@@ -243,7 +243,7 @@ def test_the_verb_exports_and_its_mistakes_are_one_line(
 def test_a_graph_that_differs_leaves_no_files(
     exported: dict[str, tuple[Weights, Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from amvnet import export as module
+    from amvnet.export import onnx as module
 
     run = module._run
 

@@ -39,7 +39,7 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def exported(weights: Weights, scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """The same graphs as they were before, in float32, and in int8."""
-    from amvnet import export as module
+    from amvnet.export import onnx as module
 
     float32, int8, quantise = tmp_path_factory.mktemp("a") / "float32", tmp_path_factory.mktemp("b"), module.quantise
 
@@ -135,8 +135,8 @@ def test_one_scan_and_rows_by_ring_do(scans: Path, tmp_path: Path) -> None:
 def test_mistakes_are_one_line_and_leave_no_files(
     case: str, weights: Weights, scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from amvnet import quantising
-    from amvnet.export import export
+    from amvnet.export import int8 as quantising
+    from amvnet.export.onnx import export
 
     given, word = tmp_path / "given", "expected"
     if case not in ("none", "other sensor"):

@@ -44,7 +44,7 @@ def load(
     """
     segmenter = import_module("amvnet.inference.segmenter").Segmenter(weights, device, method, precision)
     if engine != "torch":
-        import_module("amvnet.engines").engage(segmenter, engine)
+        import_module("amvnet.export.engines").engage(segmenter, engine)
     return segmenter
 
 

@@ -39,7 +39,7 @@ def bench(
     """
     from amvnet.config.recipes import load_recipe
     from amvnet.data.scan_files import read_scan, whole_file, write_labels
-    from amvnet.engines import engage
+    from amvnet.export.engines import engage
     from amvnet.inference.segmenter import Segmenter
     from amvnet.inference.timing import UNCERTAIN, Job, time_jobs, untrained
     from amvnet.report import timing_table

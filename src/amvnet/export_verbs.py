@@ -16,7 +16,7 @@ def export(weights: str, out: Path, int8: str | None = None) -> None:
         int8: put the convolutions into 8-bit integers, for CPUs, calibrated with these scans: a data set, scan files
             or a folder of them as predict takes them, or the word simulated.
     """
-    from amvnet.export import export as run
+    from amvnet.export.onnx import export as run
 
     with progress("exporting") as step:
         measured = run(weights, out, step, int8)

@@ -137,7 +137,7 @@ def predict(
         rotate: of lone scans, yaw,pitch,roll in degrees that turn them level.
         offset: of lone scans, metres to add to x,y,z after that.
     """
-    from amvnet.engines import engage
+    from amvnet.export.engines import engage
     from amvnet.inference.predict import predict as segment
     from amvnet.inference.segmenter import Segmenter
     from amvnet.sensors.adapt import Fitting

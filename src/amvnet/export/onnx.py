@@ -20,14 +20,14 @@ from amvnet import __version__
 from amvnet.config.nested import to_dict
 from amvnet.data.scan_files import make_folder, whole_file
 from amvnet.errors import InputError
+from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
+from amvnet.export.onnx_files import digest, one_line, quiet, strip
 from amvnet.inference.segmenter import Segmenter, widest_method
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
-from amvnet.onnx_files import digest, one_line, quiet, strip
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
-from amvnet.quantising import FIRST_KEPT, calibration_scans, quantise
 from amvnet.scan import FARTHEST, Scan
 from amvnet.weights.file import Weights, load
 
