@@ -31,7 +31,7 @@ from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.simulation import simulate
-from amvnet.training import NetworkStage, PolarStage, RangeStage
+from amvnet.training.stages import NetworkStage, PolarStage, RangeStage
 from amvnet.weights.file import Weights, state_of
 
 CLASSES = SEMANTICKITTI.size

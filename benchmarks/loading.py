@@ -10,7 +10,7 @@ import time
 
 from amvnet.config.recipes import load_recipe
 from amvnet.data.datasets.open import open_dataset
-from amvnet.loading import ScanSet, loader
+from amvnet.training.loaders import ScanSet, loader
 
 ROUNDS = 2  # the first one starts the processes and fills the disk's cache
 

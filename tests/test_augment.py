@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from amvnet.config.schema import AugmentConfig
-from amvnet.data.augment import augment, mix, rotation
 from amvnet.scan import Scan
+from amvnet.training.augment import augment, mix, rotation
 
 RandomScan = Callable[..., Scan]
 STILL = AugmentConfig(scale=0.0, flip=0.0, jitter=0.0, yaw=0.0)

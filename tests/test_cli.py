@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from worlds import GOLDEN, amvnet, files, fresh_weights, make_streets, street, without, write_recipe
 
-from amvnet import runner
 from amvnet.cli import VERBS, main
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
+from amvnet.training import run as runner
 from amvnet.weights.file import save
 
 OVERALL = {"miou", "miou_present", "accuracy", "fwiou", "iou"}

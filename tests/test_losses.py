@@ -10,7 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from amvnet.losses import FREQUENCY_FLOOR, class_weights, dice, lovasz_softmax, polar_view_loss, range_view_loss
+from amvnet.training.losses import (
+    FREQUENCY_FLOOR,
+    class_weights,
+    dice,
+    lovasz_softmax,
+    polar_view_loss,
+    range_view_loss,
+)
 
 K = 5
 LOSSES = pytest.mark.parametrize("loss", [range_view_loss, polar_view_loss])

@@ -14,8 +14,8 @@ import torch
 from torch import nn
 from worlds import amvnet, files, make_streets, without, write_recipe
 
-from amvnet.loading import EpochSampler
 from amvnet.processes import Processes, SyncedBatchNorm, synced
+from amvnet.training.loaders import EpochSampler
 from amvnet.weights.file import Weights, load, save
 
 # DropBlock draws for each process anew, and so as no single process does. In double precision, as AdamW divides each

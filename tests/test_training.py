@@ -19,8 +19,8 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from worlds import GOLDEN, amvnet, files, label_map, make_streets, write_recipe
 
-from amvnet import runner
-from amvnet.callbacks import KeepWeights
+from amvnet.training import run as runner
+from amvnet.training.callbacks import KeepWeights
 from amvnet.weights.file import PARTS, Weights, load
 
 STILL = ("--training.augment.yaw", 0, "--training.augment.scale", 0, "--training.augment.flip", 0)

@@ -55,7 +55,7 @@ def train(
     """
     from amvnet.evaluation.scoring import split_records
     from amvnet.processes import device_of
-    from amvnet.runner import Run
+    from amvnet.training.run import Run
     from amvnet.weights import file as weights
 
     _calm_lightning()
@@ -104,7 +104,7 @@ def analyze(
     from amvnet.evaluation.analysis import analyze as score
     from amvnet.evaluation.analysis import sweep_neighbours
     from amvnet.inference.segmenter import Segmenter
-    from amvnet.runner import Run
+    from amvnet.training.run import Run
     from amvnet.weights.file import load
 
     if (neighbours is None) != (recipe is None):

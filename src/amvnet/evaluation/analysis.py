@@ -22,8 +22,8 @@ from amvnet.models.amvnet import ENSEMBLES, merge, refine
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.views.points import PointBatch
 from amvnet.processes import ALONE, Processes
-from amvnet.runner import Run
 from amvnet.scan import Scan
+from amvnet.training.run import Run
 from amvnet.weights.file import Weights
 
 BINS = 100  # of the cosine similarity, which is in [0, 1]

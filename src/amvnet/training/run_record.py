@@ -18,7 +18,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
 from amvnet.inference.score_files import ScorePair
-from amvnet.training import LAST
+from amvnet.training.stages import LAST
 from amvnet.weights.file import SIZES, Weights
 
 SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with

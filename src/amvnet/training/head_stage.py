@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from amvnet.config.schema import HeadTraining
-from amvnet.head_points import HeadBatch, HeadPoints
 from amvnet.models.point_head import PointHead
-from amvnet.training import Stage
+from amvnet.training.head_points import HeadBatch, HeadPoints
+from amvnet.training.stages import Stage
 
 
 class HeadStage(Stage):

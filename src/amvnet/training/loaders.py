@@ -13,13 +13,13 @@ from torch import Tensor
 from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
-from amvnet.data.augment import augment, mix
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
+from amvnet.training.augment import augment, mix
 
 Key = tuple[int, int]  # epoch, place in the list of scans
 

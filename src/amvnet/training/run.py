@@ -17,23 +17,23 @@ import numpy as np
 import yaml
 from torch import Tensor, nn
 
-from amvnet.callbacks import KeepWeights, Pictures, Speed
 from amvnet.config.schema import NetworkTraining, Recipe, StageName
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.head_points import gather_points, head_loader
-from amvnet.head_sources import Networks, Source, scored_with, source_of
-from amvnet.head_training import HeadStage
 from amvnet.inference.score_files import ScorePair
-from amvnet.loading import ScanSet, count_classes, loader
-from amvnet.losses import class_weights
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.processes import ALONE, Processes
-from amvnet.run_folder import SETTINGS, check_begun, describe, names_of, settings
-from amvnet.training import Course, PolarStage, RangeStage, Stage, fit
+from amvnet.training.callbacks import KeepWeights, Pictures, Speed
+from amvnet.training.head_points import gather_points, head_loader
+from amvnet.training.head_scores import Networks, Source, scored_with, source_of
+from amvnet.training.head_stage import HeadStage
+from amvnet.training.loaders import ScanSet, count_classes, loader
+from amvnet.training.losses import class_weights
+from amvnet.training.run_record import SETTINGS, check_begun, describe, names_of, settings
+from amvnet.training.stages import Course, PolarStage, RangeStage, Stage, fit
 from amvnet.weights import file as weights_file
 from amvnet.weights.file import Weights, state_of
 
