@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from worlds import GOLDEN, amvnet, files, fresh_weights, make_streets, street, without, write_recipe
 
-from amvnet.cli import VERBS, main
+from amvnet.cli.main import VERBS, main
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
 from amvnet.training import run as runner

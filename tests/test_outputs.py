@@ -17,7 +17,7 @@ from pypcd4 import PointCloud
 from scan_files import some_points, write_bag1, write_pcd
 from worlds import amvnet, fails, files, fresh_weights, make_streets, without
 
-from amvnet import verbs
+from amvnet.cli.commands import predict as verbs
 from amvnet.data.formats.detect import read_cloud
 from amvnet.data.label_files import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI

@@ -12,7 +12,7 @@ import pytest
 from scan_files import write_bag1, write_pcd
 from test_sensors import LASERS, place
 
-from amvnet.cli import main
+from amvnet.cli.main import main
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = ("own_scans.md", "own_sensor.md")

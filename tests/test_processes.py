@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from worlds import amvnet, files, make_streets, without, write_recipe
 
-from amvnet.processes import Processes, SyncedBatchNorm, synced
+from amvnet.distributed import Processes, SyncedBatchNorm, synced
 from amvnet.training.loaders import EpochSampler
 from amvnet.weights.file import Weights, load, save
 

@@ -262,7 +262,9 @@ def test_fusing_with_weights_without_a_head_is_refused(result: Segmentation) -> 
 
 
 def test_importing_the_package_does_not_import_torch() -> None:
-    code = "import sys, amvnet, amvnet.cli; print({'torch', 'lightning', 'matplotlib', 'scipy'} & set(sys.modules))"
+    code = (
+        "import sys, amvnet, amvnet.cli.main; print({'torch', 'lightning', 'matplotlib', 'scipy'} & set(sys.modules))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from scan_files import pcd_bytes, write_bag1
 from worlds import amvnet, fails, files, fresh_weights, make_streets
 
-from amvnet.cli import main
+from amvnet.cli.main import main
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError

@@ -16,7 +16,7 @@ import pytest
 import torch
 import yaml
 
-from amvnet.cli import main
+from amvnet.cli.main import main
 from amvnet.config.nested import from_dict, merge_trees
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy

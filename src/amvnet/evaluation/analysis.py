@@ -14,6 +14,7 @@ import torch
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation import scoring as jobs
 from amvnet.evaluation.metrics import Evaluation, metrics
@@ -21,7 +22,6 @@ from amvnet.inference.segmenter import Segmenter, checked_scan, in_place, labels
 from amvnet.models.amvnet import ENSEMBLES, merge, refine
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.views.points import PointBatch
-from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
 from amvnet.training.run import Run
 from amvnet.weights.file import Weights

@@ -9,11 +9,11 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
+from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import draw_scan
 from amvnet.inference.segmenter import COMPARED, Segmenter, checked_scan
-from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
 
 Progress = Callable[[int, int], None]  # done, in all

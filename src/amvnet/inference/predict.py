@@ -15,12 +15,12 @@ from amvnet.data.formats.detect import READERS, NamedScan, named_scans
 from amvnet.data.label_files import check_kind, write_scan_labels
 from amvnet.data.scan_files import find_scans
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError, SomeBroken
 from amvnet.evaluation.scoring import Progress, check_classes, choose_records, own_classes
 from amvnet.inference.journal import Journal
 from amvnet.inference.pipeline import Segment, Task, stream
 from amvnet.inference.segmenter import Segmentation, Segmenter
-from amvnet.processes import ALONE, Processes
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import MEASURED, Fitting
 

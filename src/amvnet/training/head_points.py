@@ -16,13 +16,13 @@ from torch.utils import data
 
 from amvnet.config.schema import ModelConfig, PointHeadConfig, TrainingConfig
 from amvnet.data.datasets.base import Dataset
+from amvnet.distributed import ALONE, Processes, device_of
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
 from amvnet.models.amvnet import geometric_mean
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
 from amvnet.models.views.points import PointBatch
-from amvnet.processes import ALONE, Processes, device_of
 from amvnet.scan import Scan
 from amvnet.training.head_scores import Source
 from amvnet.training.loaders import ScanSet, collate

@@ -21,11 +21,11 @@ from amvnet.config.schema import NetworkTraining, Recipe, StageName
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.inference.score_files import ScorePair
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
-from amvnet.processes import ALONE, Processes
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
 from amvnet.training.head_points import gather_points, head_loader
 from amvnet.training.head_scores import Networks, Source, scored_with, source_of

@@ -20,12 +20,12 @@ from torch.utils.data import DataLoader
 
 from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.distributed import ALONE, Processes, device_of, environment, synced
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarView
 from amvnet.models.views.range_view import RangeView
-from amvnet.processes import ALONE, Processes, device_of, environment, synced
 from amvnet.training.callbacks import Bar, Curves, EpochLines, SeedBatches, Speed
 from amvnet.training.losses import polar_view_loss, range_view_loss
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from amvnet.cli.console import progress, say
+from amvnet.cli.options import names_in, open_data, scores_in
 from amvnet.errors import InputError
-from amvnet.inputs import names_in, open_data, scores_in
-from amvnet.terminal import progress, say
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy

@@ -10,10 +10,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from amvnet import __version__, bench_verbs, export_verbs, fusion_verbs, training_verbs, verbs, viewing_verbs
-from amvnet.arguments import Parser, Positional, parser_of
+from amvnet import __version__
+from amvnet.cli.commands import bench as bench_verbs
+from amvnet.cli.commands import export as export_verbs
+from amvnet.cli.commands import fuse as fusion_verbs
+from amvnet.cli.commands import predict as verbs
+from amvnet.cli.commands import train as training_verbs
+from amvnet.cli.commands import view as viewing_verbs
+from amvnet.cli.console import say
+from amvnet.cli.parser import Parser, Positional, parser_of
 from amvnet.errors import InputError, SomeBroken
-from amvnet.terminal import say
 
 if TYPE_CHECKING:
     from amvnet.config.schema import Recipe
@@ -125,7 +131,7 @@ def _several() -> bool:
     """Whether torchrun or SLURM has started several processes."""
     if not {"WORLD_SIZE", "SLURM_STEP_ID"} & set(os.environ):
         return False
-    from amvnet.processes import started
+    from amvnet.distributed import started
 
     return started() > 1
 

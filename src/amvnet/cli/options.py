@@ -6,21 +6,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from amvnet.cli.console import silence
 from amvnet.errors import InputError
-from amvnet.terminal import silence
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import ScanRecord
     from amvnet.data.taxonomy import Taxonomy
+    from amvnet.distributed import Processes
     from amvnet.inference.score_files import ScorePair, Which
-    from amvnet.processes import Processes
 
 SHOWN = 20  # names of sequences in a line
 
 
 def meet(cuda: bool = False) -> Processes:
     """The processes of this job, where torchrun or SLURM has started several; only the first one prints."""
-    from amvnet.processes import join
+    from amvnet.distributed import join
 
     found = join(cuda)
     if not found.first:

@@ -7,9 +7,9 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from amvnet.cli.console import console, progress, say
+from amvnet.cli.options import meet, methods_in, names_in, open_data
 from amvnet.errors import InputError
-from amvnet.inputs import meet, methods_in, names_in, open_data
-from amvnet.terminal import console, progress, say
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
@@ -264,7 +264,7 @@ def info(weights: str | None = None) -> None:
     Args:
         weights: a weights file, or the name of a built-in one: its model card, in Markdown.
     """
-    from amvnet.report import installation_table
+    from amvnet.cli.tables import installation_table
     from amvnet.weights.card import OURS, model_card
     from amvnet.weights.file import built_in, load
 
@@ -276,8 +276,8 @@ def info(weights: str | None = None) -> None:
 
 def show_evaluation(evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None) -> None:
     """Print the table, and write the same figures as JSON."""
+    from amvnet.cli.tables import evaluation_table
     from amvnet.data.scan_files import whole_file
-    from amvnet.report import evaluation_table
 
     figures = evaluation.report(dataset)
     console.print(evaluation_table(figures, taxonomy))

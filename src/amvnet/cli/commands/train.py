@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from amvnet.cli.console import on_terminal, progress, say
+from amvnet.cli.options import listed, meet, names_in, numbers_in, open_data, scores_in
 from amvnet.errors import InputError
-from amvnet.inputs import listed, meet, names_in, numbers_in, open_data, scores_in
-from amvnet.terminal import on_terminal, progress, say
 
 if TYPE_CHECKING:
     from amvnet.evaluation.analysis import Swept
@@ -53,8 +53,8 @@ def train(
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.
     """
+    from amvnet.distributed import device_of
     from amvnet.evaluation.scoring import split_records
-    from amvnet.processes import device_of
     from amvnet.training.run import Run
     from amvnet.weights import file as weights
 
@@ -149,10 +149,10 @@ def ablate(
         val_sequences: sequences or scenes to score, with commas; default: the official split.
         device: where the trained networks are scored: cpu, cuda, cuda:1, ...
     """
+    from amvnet.distributed import device_of
     from amvnet.evaluation import charts
     from amvnet.evaluation import scoring as jobs
     from amvnet.evaluation.analysis import ablate as compare
-    from amvnet.processes import device_of
 
     _calm_lightning()
     processes = meet(device_of(recipe.training.accelerator) == "cuda")

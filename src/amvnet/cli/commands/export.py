@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from amvnet.terminal import progress, say
+from amvnet.cli.console import progress, say
 
 
 def export(weights: str, out: Path, int8: str | None = None) -> None:

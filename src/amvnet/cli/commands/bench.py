@@ -7,8 +7,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
-from amvnet.inputs import names_in
-from amvnet.terminal import console, progress
+from amvnet.cli.console import console, progress
+from amvnet.cli.options import names_in
 
 PrecisionName = Literal["float32", "bfloat16", "float16"]
 
@@ -37,12 +37,12 @@ def bench(
         precision: of the networks; float16 on a GPU only.
         json: also write the figures to this file.
     """
+    from amvnet.cli.tables import timing_table
     from amvnet.config.recipes import load_recipe
     from amvnet.data.scan_files import read_scan, whole_file, write_labels
     from amvnet.export.engines import engage
     from amvnet.inference.segmenter import Segmenter
     from amvnet.inference.timing import UNCERTAIN, Job, time_jobs, untrained
-    from amvnet.report import timing_table
     from amvnet.simulation import simulate as write
 
     given = untrained(load_recipe(recipe)) if recipe is not None else weights
