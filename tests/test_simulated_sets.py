@@ -63,7 +63,7 @@ def test_a_stopped_simulation_goes_on_to_the_same_bytes(
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks Linux which processes there are")
 def test_no_process_outlives_one_that_was_killed(tmp_path: Path) -> None:
     command = ["simulate", str(tmp_path), "--sequences", "2", "--scans", "1000", "--processes", "2"]
-    parent = subprocess.Popen([sys.executable, "-m", "amvnet.cli.main", *command], stderr=subprocess.DEVNULL)
+    parent = subprocess.Popen([sys.executable, "-m", "amvnet", *command], stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while not list(tmp_path.rglob("*.bin")) and time.monotonic() < deadline:
         time.sleep(0.1)

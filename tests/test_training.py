@@ -367,7 +367,7 @@ def test_a_killed_run_resumes_to_the_same_weights(world: Path, run: Path, tmp_pa
         for earlier in ("rv", "bev"):
             shutil.copytree(run / earlier, out / earlier)
     arguments = [world / "recipe.yaml", "--data", world / "data", "--out", out, "--stage", stage]
-    command = [sys.executable, "-m", "amvnet.cli.main", "train", *map(str, arguments)]
+    command = [sys.executable, "-m", "amvnet", "train", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while not (out / stage / "last.ckpt").exists() and process.poll() is None:
         time.sleep(0.002)
@@ -386,7 +386,7 @@ def test_a_full_disk_stops_with_a_line_and_the_last_good_state(world: Path, tmp_
     """No file may grow beyond some bytes, which is what a full disk looks like to a program."""
     out = tmp_path / "run"
     arguments = [world / "recipe.yaml", "--data", world / "data", "--out", out, "--stage", "rv"]
-    command = [sys.executable, "-m", "amvnet.cli.main", "train", *map(str, arguments)]
+    command = [sys.executable, "-m", "amvnet", "train", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while not (out / "rv" / "last.ckpt").exists() and process.poll() is None:
         time.sleep(0.002)
@@ -410,7 +410,7 @@ def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_p
     """The libraries' own notes stay out of stderr, and what is trained is not lost."""
     shutil.copytree(world / "data", tmp_path / "data")
     arguments = [world / "recipe.yaml", "--data", tmp_path / "data", "--out", tmp_path / "run"]
-    command = [sys.executable, "-m", "amvnet.cli.main", "train", *map(str, arguments)]
+    command = [sys.executable, "-m", "amvnet", "train", *map(str, arguments)]
     subprocess.run([*command, "--stage", "rv"], capture_output=True, check=True)
     (tmp_path / "data/sequences/08/labels/000001.label").write_bytes(b"1234")  # is met after an epoch of training
     done = subprocess.run([*command, "--stage", "bev"], capture_output=True, text=True, check=False)

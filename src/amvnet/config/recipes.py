@@ -12,10 +12,12 @@ from amvnet.config.nested import from_dict, merge_trees
 from amvnet.config.schema import Recipe
 from amvnet.errors import InputError
 
+_FOLDER = resources.files("amvnet.config") / "recipes"
+
 
 def recipe_names() -> tuple[str, ...]:
     """The built-in recipes."""
-    files = resources.files(__name__).iterdir()
+    files = _FOLDER.iterdir()
     return tuple(sorted(f.name.removesuffix(".yaml") for f in files if f.name.endswith(".yaml")))
 
 
@@ -50,7 +52,7 @@ def _tree(name_or_path: str, above: tuple[str, ...]) -> dict[str, Any]:
 
 def _text(name_or_path: str) -> str:
     if name_or_path in recipe_names():
-        return (resources.files(__name__) / f"{name_or_path}.yaml").read_text(encoding="utf-8")
+        return (_FOLDER / f"{name_or_path}.yaml").read_text(encoding="utf-8")
     if not Path(name_or_path).is_file():
         raise InputError(
             f"expected a recipe's name or a YAML file, found {name_or_path!r}; "
