@@ -17,7 +17,8 @@ import torch
 from worlds import amvnet, commands_of, fails, files, fresh_weights, street, without
 
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.inference.segmenter import Method, Segmenter
+from amvnet.inference.methods import Method
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan

@@ -11,8 +11,9 @@ import pytest
 import yaml
 from worlds import fails, label_map
 
-from amvnet.data.scan_files import find_scans, read_scan, whole_file, write_labels
+from amvnet.data.scan_files import find_scans, read_scan, write_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
+from amvnet.files import whole_file
 
 # --- lone files ---
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from worlds import amvnet, files, fresh_weights, make_streets, street
 
-from amvnet.data.scan_files import whole_file
+from amvnet.files import whole_file
 from amvnet.inference import predict as prediction
 from amvnet.inference.journal import Journal
 from amvnet.inference.pipeline import AHEAD, Task, stream

@@ -14,8 +14,9 @@ import torch
 from torch import nn
 from worlds import amvnet, files, make_streets, without, write_recipe
 
-from amvnet.distributed import Processes, SyncedBatchNorm, synced
+from amvnet.distributed import Processes
 from amvnet.training.loaders import EpochSampler
+from amvnet.training.sync_batch_norm import SyncedBatchNorm, synced
 from amvnet.weights.file import Weights, load, save
 
 # DropBlock draws for each process anew, and so as no single process does. In double precision, as AdamW divides each

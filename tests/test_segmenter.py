@@ -13,7 +13,7 @@ from worlds import THRESHOLD, fails, fresh_weights, street, without
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
 from amvnet.data.taxonomy import NUSCENES
-from amvnet.inference.segmenter import METHODS
+from amvnet.inference.methods import METHODS
 from amvnet.weights.file import save
 
 K = 19

@@ -11,12 +11,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from amvnet import __version__
-from amvnet.cli.commands import bench as bench_verbs
-from amvnet.cli.commands import export as export_verbs
-from amvnet.cli.commands import fuse as fusion_verbs
-from amvnet.cli.commands import predict as verbs
-from amvnet.cli.commands import train as training_verbs
-from amvnet.cli.commands import view as viewing_verbs
+from amvnet.cli.commands.ablate import ablate
+from amvnet.cli.commands.analyze import analyze
+from amvnet.cli.commands.bench import bench
+from amvnet.cli.commands.demo import demo
+from amvnet.cli.commands.evaluate import evaluate
+from amvnet.cli.commands.export import export
+from amvnet.cli.commands.fuse import fuse
+from amvnet.cli.commands.info import info
+from amvnet.cli.commands.predict import predict
+from amvnet.cli.commands.rank import rank
+from amvnet.cli.commands.simulate import simulate
+from amvnet.cli.commands.submit import submit
+from amvnet.cli.commands.train import train
+from amvnet.cli.commands.view import view
 from amvnet.cli.console import say
 from amvnet.cli.parser import Parser, Positional, parser_of
 from amvnet.errors import InputError, SomeBroken
@@ -28,20 +36,20 @@ DONE, FAILED, WRONG_INPUT, SOME_BROKEN = 0, 1, 2, 3
 SHARED = ("train", "predict", "evaluate", "ablate")  # the verbs that several processes can share
 
 VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
-    "demo": (verbs.demo, {}),
-    "simulate": (verbs.simulate, {"out": {"metavar": "OUT", "type": Path}}),
-    "train": (training_verbs.train, {"recipe": {"metavar": "RECIPE"}}),
-    "predict": (verbs.predict, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
-    "evaluate": (verbs.evaluate, {"data": {"metavar": "DATA"}}),
-    "submit": (verbs.submit, {"data": {"metavar": "DATA"}}),
-    "fuse": (fusion_verbs.fuse, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
-    "rank": (fusion_verbs.rank, {"data": {"metavar": "DATA"}}),
-    "analyze": (training_verbs.analyze, {"data": {"metavar": "DATA"}}),
-    "ablate": (training_verbs.ablate, {"recipe": {"metavar": "RECIPE"}}),
-    "export": (export_verbs.export, {}),
-    "view": (viewing_verbs.view, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
-    "bench": (bench_verbs.bench, {}),
-    "info": (verbs.info, {"weights": {"metavar": "W", "nargs": "?"}}),
+    "demo": (demo, {}),
+    "simulate": (simulate, {"out": {"metavar": "OUT", "type": Path}}),
+    "train": (train, {"recipe": {"metavar": "RECIPE"}}),
+    "predict": (predict, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
+    "evaluate": (evaluate, {"data": {"metavar": "DATA"}}),
+    "submit": (submit, {"data": {"metavar": "DATA"}}),
+    "fuse": (fuse, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
+    "rank": (rank, {"data": {"metavar": "DATA"}}),
+    "analyze": (analyze, {"data": {"metavar": "DATA"}}),
+    "ablate": (ablate, {"recipe": {"metavar": "RECIPE"}}),
+    "export": (export, {}),
+    "view": (view, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
+    "bench": (bench, {}),
+    "info": (info, {"weights": {"metavar": "W", "nargs": "?"}}),
 }
 
 

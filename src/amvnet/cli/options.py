@@ -53,7 +53,7 @@ def names_in(text: str | None) -> list[str] | None:
 
 def methods_in(text: str) -> list[str]:
     """Methods with commas. Raises InputError where one is none."""
-    from amvnet.inference.segmenter import METHODS
+    from amvnet.inference.methods import METHODS
 
     names = names_in(text) or []
     if wrong := [name for name in names if name not in METHODS]:

@@ -12,17 +12,10 @@ from rich.table import Table
 
 from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.inference.methods import TITLES
 from amvnet.inference.timing import MEAN, STAGES
 from amvnet.weights.file import built_in
 
-TITLES = {
-    "rv": "RV",
-    "bev": "BEV",
-    "arithmetic": "arithmetic mean",
-    "maximum": "maximum",
-    "ensemble": "ensemble",
-    "amvnet": "AMVNet",
-}
 PACKAGES = (
     "amvnet",
     "torch",

@@ -8,9 +8,10 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from amvnet.data.scan_files import check_count, whole_file, write_labels
+from amvnet.data.scan_files import check_count, write_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 
 Kind = Literal["label", "npy", "ply", "pcd", "las"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

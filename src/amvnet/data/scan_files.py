@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import uuid
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,31 +12,8 @@ from amvnet.data.formats.detect import ENDINGS, is_bag_folder, is_scan, read_clo
 from amvnet.data.formats.raw import FULL_INTENSITY, KITTI_COLUMNS, NUSCENES_COLUMNS, read_table, ring_column
 from amvnet.data.formats.raw import count_rows as count_rows
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 from amvnet.scan import Scan
-
-PARTS = f".{'[0-9a-f]' * 32}.part*"  # the names of files that `whole_file` has not finished
-
-
-@contextmanager
-def whole_file(path: Path | str) -> Iterator[Path]:
-    """Let a file appear whole or not at all: write to the path this yields, a rename does the rest.
-
-    The temporary file lies in the same folder (made where it is missing) and keeps the ending of
-    `path`. It is removed where the block raises.
-
-    Raises:
-        InputError: where the folder cannot be made or the file not be written.
-    """
-    path = Path(path)
-    make_folder(path.parent)
-    part = path.with_name(f".{uuid.uuid4().hex}.part{path.suffix}")
-    try:
-        yield part
-        os.replace(part, path)
-    except (PermissionError, IsADirectoryError) as error:
-        raise InputError(f"{path}: expected a file that can be written, found {error.strerror}; give another") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def read_scan(path: Path | str) -> Scan:
@@ -117,18 +91,6 @@ def read_labels(path: Path, dtype: DTypeLike, count: int, to_train: Callable[[np
         return to_train(raw)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def make_folder(path: Path) -> None:
-    """Make a folder and those above it.
-
-    Raises:
-        InputError: where it cannot be made.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: expected a folder to write to, found {error.strerror}; give another") from None
 
 
 def write_labels(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint32) -> Path:

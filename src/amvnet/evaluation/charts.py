@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.scan_files import whole_file
 from amvnet.evaluation.analysis import BINS, Analysis, Swept
 from amvnet.evaluation.metrics import metrics
+from amvnet.files import whole_file
 
 SIZE = (6.0, 3.6)  # inches
 DOTS_PER_INCH = 160

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 
 REACH = 50.0  # metres from the sensor to each side
 PANEL = 4.6  # inches, width and height of one panel

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from amvnet import __version__
 from amvnet.errors import InputError
 from amvnet.export.onnx import OPSET, check_libraries, export
-from amvnet.inference.segmenter import NEEDED, Segmenter
+from amvnet.inference.methods import NEEDED
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.precision import InPrecision
 from amvnet.models.views.range_view import CHANNELS
 from amvnet.onnx_runner import DESCRIPTION

@@ -12,8 +12,9 @@ import numpy as np
 
 from amvnet.errors import InputError
 from amvnet.export.onnx_files import digest, one_line, quiet, strip
-from amvnet.inference.predict import Lone, Task, tasks_in
+from amvnet.inference.predict import Task
 from amvnet.inference.segmenter import Segmenter
+from amvnet.inference.tasks import Lone, tasks_in
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import Fitting

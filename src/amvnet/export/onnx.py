@@ -18,11 +18,12 @@ from torch import Tensor, nn
 
 from amvnet import __version__
 from amvnet.config.nested import to_dict
-from amvnet.data.scan_files import make_folder, whole_file
 from amvnet.errors import InputError
 from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, one_line, quiet, strip
-from amvnet.inference.segmenter import Segmenter, widest_method
+from amvnet.files import make_folder, whole_file
+from amvnet.inference.methods import widest_method
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet

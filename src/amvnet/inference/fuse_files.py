@@ -7,12 +7,13 @@ from pathlib import Path
 
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.evaluation.scoring import Progress
 from amvnet.inference.fusion import Fusion
 from amvnet.inference.pipeline import Segment
-from amvnet.inference.predict import Lone, run_tasks, tasks_in
+from amvnet.inference.predict import run_tasks
 from amvnet.inference.score_files import ScorePair
 from amvnet.inference.segmenter import Segmentation, checked_scan
+from amvnet.inference.tasks import Lone, tasks_in
+from amvnet.progress import Progress
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import Fitting
 from amvnet.weights.file import Weights

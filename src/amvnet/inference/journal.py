@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from amvnet.data.scan_files import PARTS, make_folder, whole_file
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
+from amvnet.files import PARTS, make_folder, whole_file
 
 PATTERN = ".unfinished-*.jsonl"  # one of each process; they are gone when the run is over
 

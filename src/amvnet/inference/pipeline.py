@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from amvnet.data.label_files import write_uncertain
-from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
 

@@ -6,7 +6,6 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -14,6 +13,7 @@ from torch import Tensor
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.inference.methods import COMPARED, METHODS, NEEDED, Method
 from amvnet.memory import keep_memory
 from amvnet.models.amvnet import ENSEMBLES, AMVNet, Scores, merge
 from amvnet.models.layers import fold_batch_norms
@@ -24,16 +24,7 @@ from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights, load
 
-Method = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 MOST_AT_ONCE = 4  # scans, so that their memory is bounded on a processor of many cores
-METHODS: tuple[Method, ...] = get_args(Method)
-COMPARED: tuple[Method, ...] = ("rv", "bev", "ensemble", "amvnet")  # in the paper's tables by class
-NEEDED: dict[str, tuple[str, ...]] = {
-    "rv": ("range_net",),
-    "bev": ("polar_net",),
-    **dict.fromkeys(ENSEMBLES, ("range_net", "polar_net")),
-    "amvnet": ("range_net", "polar_net", "point_head"),
-}
 
 
 @dataclass(frozen=True)
@@ -207,12 +198,6 @@ def _checked_device(name: str) -> str:
     except (RuntimeError, AssertionError, NotImplementedError):
         raise InputError(f"expected a device of this machine, found {name!r}; use cpu") from None
     return name
-
-
-def widest_method(weights: Weights) -> Method:
-    """The last method, in the order of the paper's tables, that the weights have the parts for."""
-    found = [method for method in METHODS if set(NEEDED[method]) <= set(weights.parts)]
-    return found[-1] if found else METHODS[-1]
 
 
 def segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:

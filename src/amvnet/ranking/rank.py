@@ -12,12 +12,13 @@ import numpy as np
 import torch
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.scan_files import whole_file
+from amvnet.data.datasets.select import check_classes
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.evaluation.scoring import Progress, check_classes
+from amvnet.files import whole_file
 from amvnet.inference.segmenter import Segmenter, checked_scan, in_place
 from amvnet.models.assertions import cosine_similarity
+from amvnet.progress import Progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan
 

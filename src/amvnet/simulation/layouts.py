@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from amvnet.data.scan_files import whole_file
+from amvnet.files import whole_file
 from amvnet.simulation.materials import MOVING, NUSCENES_CATEGORIES, SEMANTICKITTI_IDS
 
 Row = dict[str, Any]

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan
 from amvnet.simulation.lidar import require_embree

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what every unpacker knows
 ENCRYPTED = 0x1  # bit of an entry's flags

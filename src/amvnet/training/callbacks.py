@@ -16,9 +16,9 @@ import torch
 from lightning.pytorch.callbacks import Callback, RichProgressBar
 from torch import Tensor, nn
 
-from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.evaluation.top_view import scan_figure
+from amvnet.files import whole_file
 from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan

@@ -14,9 +14,9 @@ from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.scan_files import whole_file
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.training.augment import augment, mix

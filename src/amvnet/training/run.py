@@ -19,21 +19,22 @@ from torch import Tensor, nn
 
 from amvnet.config.schema import NetworkTraining, Recipe, StageName
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 from amvnet.inference.score_files import ScorePair
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
+from amvnet.training.fit import Course, fit
 from amvnet.training.head_points import gather_points, head_loader
 from amvnet.training.head_scores import Networks, Source, scored_with, source_of
 from amvnet.training.head_stage import HeadStage
 from amvnet.training.loaders import ScanSet, count_classes, loader
 from amvnet.training.losses import class_weights
 from amvnet.training.run_record import SETTINGS, check_begun, describe, names_of, settings
-from amvnet.training.stages import Course, PolarStage, RangeStage, Stage, fit
+from amvnet.training.stages import PolarStage, RangeStage, Stage
 from amvnet.weights import file as weights_file
 from amvnet.weights.file import Weights, state_of
 

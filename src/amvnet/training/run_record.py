@@ -15,10 +15,10 @@ import yaml
 from amvnet.config.nested import to_dict
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.scan_files import whole_file
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 from amvnet.inference.score_files import ScorePair
-from amvnet.training.stages import LAST
+from amvnet.training.fit import LAST
 from amvnet.weights.file import SIZES, Weights
 
 SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with

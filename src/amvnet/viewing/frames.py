@@ -10,13 +10,14 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import is_dataset, open_dataset
+from amvnet.data.datasets.select import check_classes, choose_records, own_classes
 from amvnet.data.formats.detect import NamedScan, ending_of, named_scans, stem
 from amvnet.data.scan_files import find_scans, read_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.errors import InputError
-from amvnet.evaluation.scoring import Progress, check_classes, choose_records, own_classes
 from amvnet.inference.segmenter import Segmenter, checked_scan, in_place, labels_in_place
 from amvnet.models.assertions import cosine_similarity
+from amvnet.progress import Progress
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import Fitting
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.cli.tables import TITLES
-from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.files import whole_file
+from amvnet.inference.methods import TITLES
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
 MOST_POINTS = 400_000  # of one scan; of more, every second or third is drawn, so that a telephone can

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.cli.tables import TITLES
-from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import whole_file
+from amvnet.inference.methods import TITLES
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 
 TIMELINE = "scan"

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.schema import ModelConfig
-from amvnet.data.scan_files import whole_file
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import whole_file
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
 from amvnet.weights import hub

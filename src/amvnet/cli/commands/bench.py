@@ -39,8 +39,9 @@ def bench(
     """
     from amvnet.cli.tables import timing_table
     from amvnet.config.recipes import load_recipe
-    from amvnet.data.scan_files import read_scan, whole_file, write_labels
+    from amvnet.data.scan_files import read_scan, write_labels
     from amvnet.export.engines import engage
+    from amvnet.files import whole_file
     from amvnet.inference.segmenter import Segmenter
     from amvnet.inference.timing import UNCERTAIN, Job, time_jobs, untrained
     from amvnet.simulation import simulate as write

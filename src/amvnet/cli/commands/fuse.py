@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import names_in, open_data, scores_in
+from amvnet.cli.options import names_in, scores_in
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,49 +57,6 @@ def fuse(
     with progress("fusing") as step:
         written, uncertain = run(inputs, pair, given, classes, out, names_in(sequences), step, split, tau, topic)
     say(f"{written} label files in {out}; the two models disagree on {uncertain:.1%} of the points")
-
-
-def rank(
-    data: str,
-    weights: str,
-    out: Path,
-    by: Literal["disagreement", "labels"] = "disagreement",
-    split: Literal["train", "val", "test", "all"] = "all",
-    sequences: str | None = None,
-    pictures: Path | None = None,
-    device: str = "cpu",
-) -> None:
-    """Say which clusters of points, and which scans, to look at next: to label them, or to correct their labels.
-
-    Args:
-        data: the data set.
-        weights: a weights file with both networks, or the name of a built-in one.
-        out: the table of the clusters, FILE.csv; that of the scans is written beside it, FILE-scans.csv.
-        by: what is doubted: disagreement of the two views (what to label next), or labels that both contradict.
-        split: the official split.
-        sequences: sequences or scenes instead, with commas.
-        pictures: folder for drawings of the first clusters from above.
-        device: cpu, cuda, cuda:1, ...
-    """
-    from amvnet.data.scan_files import make_folder
-    from amvnet.evaluation.scoring import choose_records, own_classes
-    from amvnet.inference.segmenter import Segmenter, widest_method
-    from amvnet.ranking import rank as ranking
-    from amvnet.ranking.pictures import draw
-    from amvnet.weights.file import load
-
-    given = load(weights)
-    dataset = open_data(data, None, own_classes(given.taxonomy))
-    records = choose_records(dataset, names_in(sequences), split)
-    segmenter = Segmenter(given, device, widest_method(given))
-    for folder in (out.parent, *([] if pictures is None else [pictures])):  # so that nothing is scored in vain
-        make_folder(folder)
-    with progress("scoring") as step:
-        found = ranking.rank(dataset, records, segmenter, by, step)
-    scans = ranking.write(found, dataset.taxonomy, out)
-    say(f"{len(found.clusters)} clusters in {out}, {len(records)} scans in {scans}")
-    if pictures is not None:
-        say(f"{len(draw(found, dataset, segmenter, by, pictures))} pictures in {pictures}")
 
 
 def _classes(inputs: list[str], text: str | None, head: Weights | None) -> Taxonomy:

@@ -37,8 +37,9 @@ def view(
         taxonomy: the classes of labels without a data set: semantickitti, nuscenes or a YAML file.
         device: cpu, cuda, cuda:1, ...
     """
-    from amvnet.data.scan_files import make_folder
-    from amvnet.inference.segmenter import Segmenter, widest_method
+    from amvnet.files import make_folder
+    from amvnet.inference.methods import widest_method
+    from amvnet.inference.segmenter import Segmenter
     from amvnet.viewing.frames import choose_frames
     from amvnet.viewing.rerun_log import check_rerun, check_window
     from amvnet.weights.file import load
