@@ -25,7 +25,9 @@ def main(data: str, recipe: str = "semantickitti", processes: str = "2") -> None
             for batch, _labels in batches:
                 points += len(batch.points)
             seconds = time.perf_counter() - started
-        print(f"{workers} processes: {len(scans) / seconds:.1f} scans/s of {points // len(scans)} points")
+        print(
+            f"{workers} processes: {len(scans) / seconds:.1f} scans/s of {points // len(scans)} points"
+        )
 
 
 if __name__ == "__main__":

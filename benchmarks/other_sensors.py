@@ -58,12 +58,17 @@ def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record)
         fitted = fit(Cloud(scan.points[:, :3], scan.points[:, 3], name=name), name)
-        for evaluation, labels in zip(found.values(), (segmenter(scan).labels, by_row(fitted).labels), strict=True):
+        for evaluation, labels in zip(
+            found.values(), (segmenter(scan).labels, by_row(fitted).labels), strict=True
+        ):
             assert scan.labels is not None
             evaluation.add(scan.points, scan.labels, {"amvnet": labels}, None)
     for way, evaluation in found.items():
         figures = evaluation.report(name)["methods"]["amvnet"]
-        print(f"{name:14} {way:9} {100 * figures['miou_present']:.1f} ({100 * figures['accuracy']:.1f})", flush=True)
+        print(
+            f"{name:14} {way:9} {100 * figures['miou_present']:.1f} ({100 * figures['accuracy']:.1f})",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -108,7 +108,11 @@ def test_without_a_compiler_compile_is_one_line(monkeypatch: pytest.MonkeyPatch)
         return run
 
     monkeypatch.setattr(torch, "compile", broken)
-    fails(lambda: engage(Segmenter(fresh_weights()), "compile"), "no working C++ compiler", "engine torch")
+    fails(
+        lambda: engage(Segmenter(fresh_weights()), "compile"),
+        "no working C++ compiler",
+        "engine torch",
+    )
 
 
 def test_other_engines_and_missing_libraries_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,14 +170,19 @@ def plainly(weights: Weights, scan: Scan) -> np.ndarray:
 def nearest_by_scipy(xyz: np.ndarray, own: np.ndarray, n: int = 15) -> np.ndarray:
     """The n nearest others; where the point itself is not among the n + 1 nearest, others lie in its place."""
     found = cKDTree(xyz, balanced_tree=False, compact_nodes=False).query(xyz[own], k=n + 1)[1]
-    return np.array([[i for i in row if i != self][:n] for self, row in zip(own, found, strict=True)])
+    return np.array(
+        [[i for i in row if i != self][:n] for self, row in zip(own, found, strict=True)]
+    )
 
 
 def scans_to_compare() -> list[tuple[str, str]]:
     """Weights and data sets: simulated, and real ones where they are at hand."""
     found = [("sim-hdl64e", "simulated:hdl64e"), ("sim-hdl32e", "simulated:hdl32e")]
     if real := os.environ.get("AMVNET_REAL_DATA"):
-        found += [("sim-hdl64e", f"semantickitti:{real}/semantickitti"), ("sim-hdl32e", f"nuscenes:{real}/nuscenes")]
+        found += [
+            ("sim-hdl64e", f"semantickitti:{real}/semantickitti"),
+            ("sim-hdl32e", f"nuscenes:{real}/nuscenes"),
+        ]
     return found
 
 
@@ -188,9 +197,14 @@ def test_what_makes_it_fast_leaves_the_labels_as_they_are(
         data = ("semantickitti:" if place == "hdl64e" else "nuscenes:") + str(tmp_path)
     dataset, segmenter = open_dataset(data), Segmenter(weights)
     equal = []
-    for record in dataset.records(dataset.sequences("all"))[:: 20 if kind == "semantickitti" else 4][:4]:
+    for record in dataset.records(dataset.sequences("all"))[
+        :: 20 if kind == "semantickitti" else 4
+    ][:4]:
         scan = dataset.read(record, labels=False)
-        with torch.enable_grad(), monkeypatch.context() as patched:  # with gradients: the plain way of `joined`
+        with (
+            torch.enable_grad(),
+            monkeypatch.context() as patched,
+        ):  # with gradients: the plain way of `joined`
             patched.setattr(layers, "linear", F.linear)
             plain = plainly(segmenter.weights, scan)
         equal.append((plain == segmenter(scan).labels).mean())

@@ -45,7 +45,9 @@ def by_flooding(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
                 continue
             found[one] = number
             ahead += [
-                c for c in set(cells) if c[3] == one[3] and max(abs(a - b) for a, b in zip(c, one, strict=True)) <= 1
+                c
+                for c in set(cells)
+                if c[3] == one[3] and max(abs(a - b) for a, b in zip(c, one, strict=True)) <= 1
             ]
     return np.array([found[c] for c in cells])
 
@@ -74,9 +76,13 @@ class Said(Segmenter):
         super().__init__(WEIGHTS)
         self.said = [torch.from_numpy(one.astype(np.float32)) for one in (f, g)]
 
-    def scores_by_method(self, scan: Scan, methods: Sequence[str] = ()) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    def scores_by_method(
+        self, scan: Scan, methods: Sequence[str] = ()
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         f, g = (one[torch.from_numpy(scan.valid)] for one in self.said)
-        return {"rv": f, "bev": g}, self.model.assertion(f, g, torch.from_numpy(scan.points[scan.valid]))
+        return {"rv": f, "bev": g}, self.model.assertion(
+            f, g, torch.from_numpy(scan.points[scan.valid])
+        )
 
 
 def sure(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
@@ -115,7 +121,9 @@ def test_a_disagreement_is_one_cluster_where_it_is() -> None:
 
 def test_a_label_is_doubted_only_where_both_views_contradict_it() -> None:
     points, thing = things()
-    labels = np.where(thing == 0, WALL, np.where(thing == 1, ROAD, 0)).astype(np.uint8)  # wrong, half wrong, none
+    labels = np.where(thing == 0, WALL, np.where(thing == 1, ROAD, 0)).astype(
+        np.uint8
+    )  # wrong, half wrong, none
     f, g = sure(np.full(301, CAR)), sure(np.where(thing == 1, ROAD, CAR))
     doubts = doubts_of(Scan(points, labels), Said(f, g), "labels")
     rows, of = clusters_of(doubts)
@@ -150,7 +158,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for by in ("disagreement", "labels"):
         out = ("--out", root / f"{by}.csv", "--by", by)
         drawn = ("--pictures", root / by) if by == "labels" else ()
-        assert amvnet("rank", root / "data", "--weights", root / "w.safetensors", *out, *drawn) == (0, "")
+        assert amvnet("rank", root / "data", "--weights", root / "w.safetensors", *out, *drawn) == (
+            0,
+            "",
+        )
     return root
 
 
@@ -195,7 +206,11 @@ def test_scans_without_labels_are_ranked_alike(world: Path, tmp_path: Path) -> N
 
 
 def test_wrong_input_is_one_line_and_leaves_nothing(world: Path, tmp_path: Path) -> None:
-    for weights, word in (("rv", "both networks"), ("nuscenes", "classes"), ("none", "weights file")):
+    for weights, word in (
+        ("rv", "both networks"),
+        ("nuscenes", "classes"),
+        ("none", "weights file"),
+    ):
         arguments = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path / "next.csv")
         code, error = amvnet("rank", world / "data", *arguments)
         assert (code, error.count("\n")) == (2, 1)
@@ -207,7 +222,13 @@ def test_a_scan_is_read_when_it_is_its_turn(world: Path, monkeypatch: pytest.Mon
     dataset, turns = open_dataset(str(world / "data")), []
     read = type(dataset).read
     monkeypatch.setattr(type(dataset), "read", lambda *args: turns.append("read") or read(*args))
-    rank(dataset, dataset.records(["00", "01"]), Segmenter(WEIGHTS), "labels", lambda done, total: turns.append("turn"))
+    rank(
+        dataset,
+        dataset.records(["00", "01"]),
+        Segmenter(WEIGHTS),
+        "labels",
+        lambda done, total: turns.append("turn"),
+    )
     assert turns == ["turn", "read"] * 4 + ["turn"]
 
 
@@ -221,7 +242,11 @@ def test_every_command_of_the_page_runs_and_finds_most(
     monkeypatch.chdir(tmp_path)
     shutil.copy(DOCS / "mislabel.py", tmp_path)
     page = (DOCS / "ranking.md").read_text()
-    commands = [line for block in re.findall(r"```bash\n(.*?)```", page, re.S) for line in block.splitlines()]
+    commands = [
+        line
+        for block in re.findall(r"```bash\n(.*?)```", page, re.S)
+        for line in block.splitlines()
+    ]
     assert len(commands) == 5
     for command in commands:
         words = shlex.split(command.replace("--sequences 10 --scans 2", "--sequences 3 --scans 1"))

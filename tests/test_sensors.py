@@ -28,7 +28,23 @@ from amvnet.simulation.sensors import HDL32E, HDL64E
 from amvnet.weights.file import save
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
-VLP32C = (-25, -15.6, -11.3, -8.8, -7.3, -6.1, -5.3, -4.7, *np.linspace(-4, 1.667, 18), 2.3, 3.3, 4.7, 7, 10.3, 15)
+VLP32C = (
+    -25,
+    -15.6,
+    -11.3,
+    -8.8,
+    -7.3,
+    -6.1,
+    -5.3,
+    -4.7,
+    *np.linspace(-4, 1.667, 18),
+    2.3,
+    3.3,
+    4.7,
+    7,
+    10.3,
+    15,
+)
 LASERS: dict[str, Any] = {
     "vlp16": np.linspace(-15, 15, 16),
     "vlp32c": VLP32C,
@@ -50,7 +66,9 @@ def place(
     with np.errstate(divide="ignore"):
         flat = np.minimum(np.where(down < 0, -height / down, np.inf), wall)
     flat *= 1 + rng.normal(0, 0.001, len(flat))
-    xyz = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), flat * np.tan(elevation)], axis=1)
+    xyz = np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), flat * np.tan(elevation)], axis=1
+    )
     return np.column_stack([xyz, rng.random(len(xyz))]).astype(np.float32), laser
 
 
@@ -102,7 +120,10 @@ def test_real_sensors_stand_where_they_do(name: str, beams: int) -> None:
 
     dataset = open_dataset(str(Path(REAL or "") / name))
     records = dataset.records(dataset.sequences("all"))[::5]
-    found = [measure(scan.points[scan.valid], scan.ring) for scan in (dataset.read(r, labels=False) for r in records)]
+    found = [
+        measure(scan.points[scan.valid], scan.ring)
+        for scan in (dataset.read(r, labels=False) for r in records)
+    ]
     expected = HEIGHTS[f"hdl{beams}e"]
     heights = [m.height for m in found if m.height is not None]
     assert len(heights) == len(records)
@@ -114,7 +135,9 @@ def test_real_sensors_stand_where_they_do(name: str, beams: int) -> None:
 # --- fitting
 
 
-def _fitting(given: Sensor | None = None, sensor: str = "hdl64e", nuscenes: bool = False) -> tuple[Fitting, list[str]]:
+def _fitting(
+    given: Sensor | None = None, sensor: str = "hdl64e", nuscenes: bool = False
+) -> tuple[Fitting, list[str]]:
     said: list[str] = []
     weights = replace(fresh_weights(NUSCENES if nuscenes else SEMANTICKITTI), sensor=sensor)
     return Fitting(weights, given, said.append), said
@@ -151,7 +174,9 @@ def test_a_given_height_counts_whatever_the_ground_says() -> None:
 
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("turn", [(0, 0, 0), (90, 0, 0), (30, 10, -5)])
-def test_any_frame_that_is_described_gives_the_same_scan(axes: str, turn: tuple[float, float, float]) -> None:
+def test_any_frame_that_is_described_gives_the_same_scan(
+    axes: str, turn: tuple[float, float, float]
+) -> None:
     points, _ = place(LASERS["os1-64"], 1.2)
     points[5] = 0
     expected = _fitting()[0](_cloud(points), "a")
@@ -165,9 +190,15 @@ def test_any_frame_that_is_described_gives_the_same_scan(axes: str, turn: tuple[
 
 
 def test_rotations_are_yaw_pitch_and_roll() -> None:
-    np.testing.assert_allclose(rotation(90, 0, 0) @ [1, 0, 0], [0, 1, 0], atol=1e-12)  # ahead comes to the left
-    np.testing.assert_allclose(rotation(0, 90, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-12)  # ahead comes down
-    np.testing.assert_allclose(rotation(0, 0, 90) @ [0, 1, 0], [0, 0, 1], atol=1e-12)  # left comes up
+    np.testing.assert_allclose(
+        rotation(90, 0, 0) @ [1, 0, 0], [0, 1, 0], atol=1e-12
+    )  # ahead comes to the left
+    np.testing.assert_allclose(
+        rotation(0, 90, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-12
+    )  # ahead comes down
+    np.testing.assert_allclose(
+        rotation(0, 0, 90) @ [0, 1, 0], [0, 0, 1], atol=1e-12
+    )  # left comes up
     for axes in AXES.values():
         assert np.linalg.det(np.array(axes)) == pytest.approx(1)  # no mirror
 
@@ -218,7 +249,12 @@ def test_what_was_assumed_is_said_once_for_a_source() -> None:
     points[:, 3] *= 255
     fit, said = _fitting()
     for seed in range(3):
-        fit(_cloud(place(LASERS["vlp16"], 0.9, seed=seed)[0] * np.array([1, 1, 1, 255], np.float32)), "drive")
+        fit(
+            _cloud(
+                place(LASERS["vlp16"], 0.9, seed=seed)[0] * np.array([1, 1, 1, 255], np.float32)
+            ),
+            "drive",
+        )
     assert len(said) == 1
     for word in (
         "a.pcd",
@@ -260,7 +296,11 @@ def test_a_scan_whose_origin_is_on_the_ground_or_below_is_moved(up: float) -> No
     _equal(_fitting()[0](_cloud(on_ground), "a"), _fitting()[0](_cloud(points), "a"), atol=0.05)
 
 
-coordinate = st.floats(width=32) | st.floats(-50, 50, width=32) | st.sampled_from([0.0, 1.0, -1.7, 1e4, 3e38])
+coordinate = (
+    st.floats(width=32)
+    | st.floats(-50, 50, width=32)
+    | st.sampled_from([0.0, 1.0, -1.7, 1e4, 3e38])
+)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True, database=None)
@@ -270,10 +310,17 @@ coordinate = st.floats(width=32) | st.floats(-50, 50, width=32) | st.sampled_fro
     ring=st.booleans(),
     sensor=st.sampled_from(["hdl64e", "hdl32e", "homemade"]),
     nuscenes=st.booleans(),
-    given_sensor=st.sampled_from([None, Sensor(fov_up=-40), SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]),
+    given_sensor=st.sampled_from(
+        [None, Sensor(fov_up=-40), SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]
+    ),
 )
 def test_any_numbers_end_in_a_scan_or_one_line(
-    rows: list[Any], repeated: int, ring: bool, sensor: str, nuscenes: bool, given_sensor: Sensor | None
+    rows: list[Any],
+    repeated: int,
+    ring: bool,
+    sensor: str,
+    nuscenes: bool,
+    given_sensor: Sensor | None,
 ) -> None:
     points = np.array(rows * repeated, np.float32).reshape(-1, 4)
     cloud = _cloud(points, np.arange(len(points)) % 40 if ring else None)
@@ -291,7 +338,9 @@ def test_any_numbers_end_in_a_scan_or_one_line(
 
 def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
-    path.write_text("beams: 16\nfov_up: 15\nfov_down: -15\nheight: 0.4\naxes: z-forward\nrotate: [0, -5, 0]\n")
+    path.write_text(
+        "beams: 16\nfov_up: 15\nfov_down: -15\nheight: 0.4\naxes: z-forward\nrotate: [0, -5, 0]\n"
+    )
     assert describe(str(path)) == Sensor("robot", 16, 15, -15, 0.4, None, "z-forward", (0, -5, 0))
     assert describe(str(path), height=0.5, offset="0,0,1e-1").height == 0.5
     assert describe(None, rotate="90, 0,0").rotate == (90, 0, 0)
@@ -365,28 +414,62 @@ def test_labels_stand_at_the_lines_of_their_points(world: Path, tmp_path: Path) 
     for weights in ("w", "ring"):
         out = tmp_path / weights
         assert (
-            amvnet("predict", tmp_path / "a.pcd", "--weights", world / f"{weights}.safetensors", "--out", out)[0] == 0
+            amvnet(
+                "predict",
+                tmp_path / "a.pcd",
+                "--weights",
+                world / f"{weights}.safetensors",
+                "--out",
+                out,
+            )[0]
+            == 0
         )
         labels = np.fromfile(out / "a.label", np.uint32)
         assert len(labels) == len(points)
         assert np.array_equal(labels == 0, lost)
 
 
-def test_a_bag_is_segmented_scan_by_scan(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ("--weights", world / "w.safetensors", "--out", tmp_path, "--topic", "/top", "--scores")
+def test_a_bag_is_segmented_scan_by_scan(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = (
+        "--weights",
+        world / "w.safetensors",
+        "--out",
+        tmp_path,
+        "--topic",
+        "/top",
+        "--scores",
+    )
     assert main(["predict", str(world / "drive.bag"), *map(str, options)]) == 0
     shown = capsys.readouterr().out
     assert files(tmp_path) == {f"drive/{i:06d}.{end}" for i in range(3) for end in ("label", "npz")}
     assert shown.count("assumed") == 1
-    assert amvnet("predict", world / "robot.bin", "--weights", world / "w.safetensors", "--out", tmp_path)[0] == 0
+    assert (
+        amvnet(
+            "predict", world / "robot.bin", "--weights", world / "w.safetensors", "--out", tmp_path
+        )[0]
+        == 0
+    )
     expected = (tmp_path / "robot.label").read_bytes()
     assert {path.read_bytes() for path in (tmp_path / "drive").glob("*.label")} == {expected}
 
 
 def test_options_override_what_is_measured(world: Path, tmp_path: Path) -> None:
     labels = {}
-    for name, options in {"measured": (), "stated": ("--height", 0.9), "other": ("--height", 2.9)}.items():
-        call = ("predict", world / "robot.bin", "--weights", world / "w.safetensors", "--out", tmp_path / name)
+    for name, options in {
+        "measured": (),
+        "stated": ("--height", 0.9),
+        "other": ("--height", 2.9),
+    }.items():
+        call = (
+            "predict",
+            world / "robot.bin",
+            "--weights",
+            world / "w.safetensors",
+            "--out",
+            tmp_path / name,
+        )
         assert amvnet(*call, *options)[0] == 0
         labels[name] = np.fromfile(tmp_path / name / "robot.label", np.uint32)
     assert np.mean(labels["measured"] == labels["stated"]) > 0.95

@@ -42,12 +42,20 @@ def downloads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def run(words: list[str], folder: Path) -> None:
     """One command of a page, with tiny recipes, the test's folder for /data, and two processes for eight."""
     words = [word.replace("/data/", f"{folder}/data/") for word in words]
-    words = [f"{word}.tiny.yaml" if word in recipe_names() and "amvnet" in words else word for word in words]
+    words = [
+        f"{word}.tiny.yaml" if word in recipe_names() and "amvnet" in words else word
+        for word in words
+    ]
     if words[0] == "amvnet":
         assert amvnet(*words[1:]) == (0, ""), words
         return
     if words[0] == "torchrun":
-        words = [sys.executable, "-m", "torch.distributed.run", *("2" if word == "8" else word for word in words[1:])]
+        words = [
+            sys.executable,
+            "-m",
+            "torch.distributed.run",
+            *("2" if word == "8" else word for word in words[1:]),
+        ]
         words = ["cpu" if word == "cuda" else word for word in words]
     else:
         words[0] = {"python": sys.executable}[words[0]]

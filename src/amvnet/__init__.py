@@ -35,14 +35,20 @@ _HOMES = {
 
 
 def load(
-    weights: str, device: str = "cpu", method: str = "amvnet", precision: str = "float32", engine: str = "torch"
+    weights: str,
+    device: str = "cpu",
+    method: str = "amvnet",
+    precision: str = "float32",
+    engine: str = "torch",
 ) -> Segmenter:
     """A segmenter from a weights file, the name of built-in weights (`sim-hdl64e`), or the hub (`hf-hub:OWNER/NAME`).
 
     Raises:
         InputError: where there are no such weights, or they lack a part that the method needs, or the engine a library.
     """
-    segmenter = import_module("amvnet.inference.segmenter").Segmenter(weights, device, method, precision)
+    segmenter = import_module("amvnet.inference.segmenter").Segmenter(
+        weights, device, method, precision
+    )
     if engine != "torch":
         import_module("amvnet.export.engines").engage(segmenter, engine)
     return segmenter

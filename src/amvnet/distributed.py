@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from lightning.fabric.plugins.environments import ClusterEnvironment
 
 T = TypeVar("T")
-PATIENCE = timedelta(days=7)  # one process may read for hours while the others wait; a dead one ends them all
+PATIENCE = timedelta(
+    days=7
+)  # one process may read for hours while the others wait; a dead one ends them all
 
 
 @dataclass(frozen=True)
@@ -76,7 +78,11 @@ ALONE = Processes()
 
 def environment() -> ClusterEnvironment:
     """Who started the processes: torchrun, SLURM's srun, or nobody."""
-    from lightning.fabric.plugins.environments import LightningEnvironment, SLURMEnvironment, TorchElasticEnvironment
+    from lightning.fabric.plugins.environments import (
+        LightningEnvironment,
+        SLURMEnvironment,
+        TorchElasticEnvironment,
+    )
 
     if TorchElasticEnvironment.detect():
         return TorchElasticEnvironment()
@@ -88,7 +94,11 @@ def environment() -> ClusterEnvironment:
 
 def started() -> int:
     """How many processes were started for this job, by what the environment says."""
-    return int(os.environ.get("WORLD_SIZE", "1")) if dist.is_torchelastic_launched() else _slurm_tasks()
+    return (
+        int(os.environ.get("WORLD_SIZE", "1"))
+        if dist.is_torchelastic_launched()
+        else _slurm_tasks()
+    )
 
 
 def _slurm_tasks() -> int:
@@ -125,7 +135,9 @@ def device_of(accelerator: str) -> str:
     """
     cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
     known = {"cpu": "cpu", "auto": "cuda" if cuda else "mps" if mps else "cpu"}
-    known |= {"gpu": "cuda", "cuda": "cuda"} if cuda else {"gpu": "mps", "mps": "mps"} if mps else {}
+    known |= (
+        {"gpu": "cuda", "cuda": "cuda"} if cuda else {"gpu": "mps", "mps": "mps"} if mps else {}
+    )
     if accelerator not in known:
         raise InputError(
             f"expected an accelerator of this machine ({', '.join(known)}), found {accelerator!r}; use one of them"

@@ -31,7 +31,9 @@ def whole_file(path: Path | str) -> Iterator[Path]:
         yield part
         os.replace(part, path)
     except (PermissionError, IsADirectoryError) as error:
-        raise InputError(f"{path}: expected a file that can be written, found {error.strerror}; give another") from None
+        raise InputError(
+            f"{path}: expected a file that can be written, found {error.strerror}; give another"
+        ) from None
     finally:
         part.unlink(missing_ok=True)
 
@@ -45,4 +47,6 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{path}: expected a folder to write to, found {error.strerror}; give another") from None
+        raise InputError(
+            f"{path}: expected a folder to write to, found {error.strerror}; give another"
+        ) from None

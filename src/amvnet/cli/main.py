@@ -68,7 +68,11 @@ def _with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
         recipe = load_recipe(_parser(verb, Recipe()).parse_args(list(arguments)).recipe)
     parser = _parser(verb, recipe)
     made = vars(parser.instantiate(parser.parse_args(list(arguments))))
-    return made | {"recipe": dataclasses.replace(recipe, model=made.pop("model"), training=made.pop("training"))}
+    return made | {
+        "recipe": dataclasses.replace(
+            recipe, model=made.pop("model"), training=made.pop("training")
+        )
+    }
 
 
 USAGE = f"""usage: amvnet VERB ...
@@ -111,7 +115,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"amvnet: {error}", file=sys.stderr)
         return SOME_BROKEN
     except OSError as error:  # a full disk, say; what was there before is still whole
-        print(f"amvnet: {error.filename or 'the disk'}: {error.strerror}; mend this and go on", file=sys.stderr)
+        print(
+            f"amvnet: {error.filename or 'the disk'}: {error.strerror}; mend this and go on",
+            file=sys.stderr,
+        )
         return FAILED
     except KeyboardInterrupt:
         print("amvnet: interrupted", file=sys.stderr)
@@ -126,12 +133,20 @@ def run(verb: str, arguments: Sequence[str]) -> None:
         InputError: where the verb, its arguments or what they name cannot be used.
     """
     if verb not in VERBS:
-        raise InputError(f"expected a verb of {', '.join(VERBS)}, found {verb!r}; see amvnet --help")
+        raise InputError(
+            f"expected a verb of {', '.join(VERBS)}, found {verb!r}; see amvnet --help"
+        )
     _quiet()
     if verb not in SHARED and _several():
-        raise InputError(f"expected {', '.join(SHARED)} for several processes, found {verb}; run it in one")
+        raise InputError(
+            f"expected {', '.join(SHARED)} for several processes, found {verb}; run it in one"
+        )
     takes_recipe = "recipe" in VERBS[verb][1]
-    call = _with_recipe(verb, arguments) if takes_recipe else vars(_parser(verb).parse_args(list(arguments)))
+    call = (
+        _with_recipe(verb, arguments)
+        if takes_recipe
+        else vars(_parser(verb).parse_args(list(arguments)))
+    )
     VERBS[verb][0](**call)
 
 

@@ -39,7 +39,9 @@ def open_data(data: str, taxonomy: Path | None, otherwise: Taxonomy | None = Non
 def listed(records: Sequence[ScanRecord]) -> str:
     """How many scans there are, of which sequences."""
     names = sorted({record.sequence for record in records})
-    shown = ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
+    shown = ", ".join(names[:SHOWN]) + (
+        f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    )
     return f"{len(records)} scans of {shown}" if records else "none"
 
 
@@ -47,7 +49,9 @@ def names_in(text: str | None) -> list[str] | None:
     """Names with commas; None where the option was left out. Raises InputError where there is none in it."""
     names = None if text is None else [name.strip() for name in text.split(",") if name.strip()]
     if names == []:
-        raise InputError(f"expected names of sequences with commas, found {text!r}; name some, or leave the option out")
+        raise InputError(
+            f"expected names of sequences with commas, found {text!r}; name some, or leave the option out"
+        )
     return names
 
 
@@ -57,7 +61,9 @@ def methods_in(text: str) -> list[str]:
 
     names = names_in(text) or []
     if wrong := [name for name in names if name not in METHODS]:
-        raise InputError(f"expected methods of {', '.join(METHODS)}, found {wrong[0]!r}; use some of them")
+        raise InputError(
+            f"expected methods of {', '.join(METHODS)}, found {wrong[0]!r}; use some of them"
+        )
     return names
 
 

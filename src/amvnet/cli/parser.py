@@ -26,7 +26,9 @@ class Parser(ArgumentParser):
         raise InputError(f"{line}; see {self.prog} --help")
 
 
-def parser_of(verb: str, function: Callable[..., None], positional: Positional, recipe: Recipe | None) -> Parser:
+def parser_of(
+    verb: str, function: Callable[..., None], positional: Positional, recipe: Recipe | None
+) -> Parser:
     """The parser of a verb, from its function's signature and docstring; with a recipe, its values are options too.
 
     Args:
@@ -36,7 +38,9 @@ def parser_of(verb: str, function: Callable[..., None], positional: Positional, 
     help_of = {param.arg_name: param.description for param in docs.params}
     shown = " ".join(str(options["metavar"]) for options in positional.values())
     usage = f"amvnet {verb} {shown} [options]".replace("  ", " ")
-    parser = Parser(prog=f"amvnet {verb}", usage=usage, description=docs.short_description, allow_abbrev=False)
+    parser = Parser(
+        prog=f"amvnet {verb}", usage=usage, description=docs.short_description, allow_abbrev=False
+    )
     for name, options in positional.items():
         parser.add_argument(name, help=help_of.get(name), **options)
     set_parsing_settings(docstring_parse_attribute_docstrings=True)  # the help of a recipe's values

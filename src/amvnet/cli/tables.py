@@ -29,13 +29,21 @@ PACKAGES = (
     "rosbags",
     "huggingface_hub",
 )
-OVERALL = {"miou": "mIoU", "miou_present": "mIoU, classes present", "accuracy": "accuracy", "fwiou": "fwIoU"}
+OVERALL = {
+    "miou": "mIoU",
+    "miou_present": "mIoU, classes present",
+    "accuracy": "accuracy",
+    "fwiou": "fwIoU",
+}
 
 
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     """One table of an `Evaluation.report`: a row per class, a column per method, the overall figures below."""
     methods = report["methods"]
-    table = Table(title=f"{report['dataset']}: {report['scans']} scans, {report['points']:,} points", show_edge=False)
+    table = Table(
+        title=f"{report['dataset']}: {report['scans']} scans, {report['points']:,} points",
+        show_edge=False,
+    )
     table.add_column("IoU in %")
     for name in methods:
         table.add_column(TITLES.get(name, name), justify="right")
@@ -58,7 +66,10 @@ def _rows(methods: Mapping[str, Any], taxonomy: Taxonomy) -> Iterator[list[str] 
     yield None
     bins = [m["by_distance"] for m in methods.values()]
     for same in zip(*bins, strict=True):
-        yield [f"mIoU, {same[0]['from_m']:.0f} to {same[0]['to_m']:.0f} m", *(_percent(b["miou"]) for b in same)]
+        yield [
+            f"mIoU, {same[0]['from_m']:.0f} to {same[0]['to_m']:.0f} m",
+            *(_percent(b["miou"]) for b in same),
+        ]
 
 
 def timing_table(report: Mapping[str, Any]) -> Table:
@@ -75,10 +86,16 @@ def timing_table(report: Mapping[str, Any]) -> Table:
     table.add_section()
     fusion = report["fusion_share"]
     table.add_row("all", *_times(total), f"{report['all_over_networks']['median']:.2f} x networks")
-    table.add_row("fusion", "", f"{fusion['low']:.1%} to {fusion['high']:.1%}", f"{fusion['median']:.1%}")
+    table.add_row(
+        "fusion", "", f"{fusion['low']:.1%} to {fusion['high']:.1%}", f"{fusion['median']:.1%}"
+    )
     table.add_row("ensemble instead of it", *_times(stages[MEAN]))
-    limits = ", ".join(f"{value:,.0f} GFLOP/s in {name}" for name, value in report["limit_gflop_per_s"].items())
-    table.caption = f"limit, a large matrix product: {limits}; peak memory {report['peak_memory_mib']:,.0f} MiB"
+    limits = ", ".join(
+        f"{value:,.0f} GFLOP/s in {name}" for name, value in report["limit_gflop_per_s"].items()
+    )
+    table.caption = (
+        f"limit, a large matrix product: {limits}; peak memory {report['peak_memory_mib']:,.0f} MiB"
+    )
     return table
 
 
@@ -87,7 +104,9 @@ def _times(spread: Mapping[str, float]) -> tuple[str, str]:
 
 
 def _speed(network: Mapping[str, float] | None) -> tuple[str, ...]:
-    return () if network is None else (f"{network['gflop']:.1f}", f"{network['share_of_limit']:.0%}")
+    return (
+        () if network is None else (f"{network['gflop']:.1f}", f"{network['share_of_limit']:.0%}")
+    )
 
 
 def installation_table() -> Table:

@@ -22,7 +22,9 @@ class Range:
 
     def __repr__(self) -> str:
         low, high = ("above", "below") if self.open else ("at least", "at most")
-        return f"{low} {self.low:g}" + ("" if math.isinf(self.high) else f" and {high} {self.high:g}")
+        return f"{low} {self.low:g}" + (
+            "" if math.isinf(self.high) else f" and {high} {self.high:g}"
+        )
 
 
 Count = Annotated[int, Range(1)]
@@ -41,8 +43,12 @@ class Checked:
             if isinstance(value, tuple):
                 kind = get_args(kind)[0]
             for allowed in getattr(kind, "__metadata__", ()):
-                if wrong := [v for v in (value if isinstance(value, tuple) else (value,)) if v not in allowed]:
-                    raise InputError(f"{name}: expected a number {allowed}, found {wrong[0]}; correct the value")
+                if wrong := [
+                    v for v in (value if isinstance(value, tuple) else (value,)) if v not in allowed
+                ]:
+                    raise InputError(
+                        f"{name}: expected a number {allowed}, found {wrong[0]}; correct the value"
+                    )
 
     def check(self, holds: bool, expected: str, found: str) -> None:
         """Raises InputError unless something holds."""

@@ -44,7 +44,9 @@ def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
     changes = {}
     for key, value in tree.items():
         if key not in kinds:
-            raise InputError(f"{where}: expected one of {', '.join(kinds)}, found {key!r}; correct the key")
+            raise InputError(
+                f"{where}: expected one of {', '.join(kinds)}, found {key!r}; correct the key"
+            )
         changes[key] = _value(getattr(default, key), value, kinds[key], f"{where}: {key}")
     try:
         return dataclasses.replace(cast(Any, default), **changes)
@@ -62,10 +64,18 @@ def _value(default: Any, value: Any, kind: Any, where: str) -> Any:
     elif allowed := get_args(kind):  # of a Literal
         if value in allowed:
             return value
-        raise InputError(f"{where}: expected one of {', '.join(allowed)}, found {value!r}; correct the value")
-    elif isinstance(default, float) and isinstance(value, int | float | str) and not isinstance(value, bool):
+        raise InputError(
+            f"{where}: expected one of {', '.join(allowed)}, found {value!r}; correct the value"
+        )
+    elif (
+        isinstance(default, float)
+        and isinstance(value, int | float | str)
+        and not isinstance(value, bool)
+    ):
         with contextlib.suppress(ValueError):
             return float(value)  # YAML takes 2e-3 for text
     elif type(value) is type(default):
         return value
-    raise InputError(f"{where}: expected a value like {default!r}, found {value!r}; correct the value")
+    raise InputError(
+        f"{where}: expected a value like {default!r}, found {value!r}; correct the value"
+    )

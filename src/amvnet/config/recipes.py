@@ -35,18 +35,26 @@ def load_recipe(name_or_path: str) -> Recipe:
 def _tree(name_or_path: str, above: tuple[str, ...]) -> dict[str, Any]:
     """The keys and values of a recipe and of those below it; `above` are the ones that build on it."""
     if name_or_path in above:
-        raise InputError(f"{name_or_path}: expected a base that ends, found this recipe in its own bases; name another")
+        raise InputError(
+            f"{name_or_path}: expected a base that ends, found this recipe in its own bases; name another"
+        )
     try:
         tree = yaml.safe_load(_text(name_or_path)) or {}
     except yaml.YAMLError as error:
-        raise InputError(f"{name_or_path}: expected YAML, found {str(error).splitlines()[0]}; mend the file") from None
+        raise InputError(
+            f"{name_or_path}: expected YAML, found {str(error).splitlines()[0]}; mend the file"
+        ) from None
     if not isinstance(tree, dict):
-        raise InputError(f"{name_or_path}: expected keys and values, found {type(tree).__name__}; mend the file")
+        raise InputError(
+            f"{name_or_path}: expected keys and values, found {type(tree).__name__}; mend the file"
+        )
     base = tree.pop("base", None)
     if base is None:
         return tree
     if not isinstance(base, str):
-        raise InputError(f"{name_or_path}: expected the name of a recipe as base, found {base!r}; correct the value")
+        raise InputError(
+            f"{name_or_path}: expected the name of a recipe as base, found {base!r}; correct the value"
+        )
     return merge_trees(_tree(base, (*above, name_or_path)), tree)
 
 
@@ -61,4 +69,6 @@ def _text(name_or_path: str) -> str:
     try:
         return Path(name_or_path).read_text(encoding="utf-8")
     except UnicodeDecodeError:
-        raise InputError(f"{name_or_path}: expected a YAML file, found bytes that are no text; give a recipe") from None
+        raise InputError(
+            f"{name_or_path}: expected a YAML file, found bytes that are no text; give a recipe"
+        ) from None

@@ -31,7 +31,11 @@ class RangeViewConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check(self.fov_up > self.fov_down, "fov_up above fov_down", f"{self.fov_up} and {self.fov_down}")
+        self.check(
+            self.fov_up > self.fov_down,
+            "fov_up above fov_down",
+            f"{self.fov_up} and {self.fov_down}",
+        )
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,11 @@ class RangeNetConfig(Checked):
         super().__post_init__()
         stages = len(self.widths), len(self.blocks), len(self.height_strides)
         fit = len(set(stages)) == 1 and stages[0] > 1
-        self.check(fit, "as many widths, blocks and height_strides, two or more", "{}, {} and {}".format(*stages))
+        self.check(
+            fit,
+            "as many widths, blocks and height_strides, two or more",
+            "{}, {} and {}".format(*stages),
+        )
 
 
 @dataclass(frozen=True)
@@ -107,7 +115,9 @@ class PolarNetConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check(len(self.point_widths) > 1, "two or more point_widths", str(len(self.point_widths)))
+        self.check(
+            len(self.point_widths) > 1, "two or more point_widths", str(len(self.point_widths))
+        )
         self.check(len(self.widths) > 0, "one or more widths", "none")
 
 
@@ -206,7 +216,11 @@ class NetworkTraining(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check(self.batch % self.accumulate == 0, f"a batch of a multiple of {self.accumulate}", str(self.batch))
+        self.check(
+            self.batch % self.accumulate == 0,
+            f"a batch of a multiple of {self.accumulate}",
+            str(self.batch),
+        )
 
 
 @dataclass(frozen=True)

@@ -37,16 +37,25 @@ DATA binary
 def check_kind(kind: str) -> None:
     """Raises InputError where a format is unknown, or laspy is missing for it; to be asked before anything is done."""
     if kind not in KINDS:
-        raise InputError(f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them")
+        raise InputError(
+            f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them"
+        )
     if kind == "las":
         try:
             import laspy  # noqa: F401
         except ImportError:
-            raise InputError('expected laspy to write LAS, found none; do pip install "amvnet[formats]"') from None
+            raise InputError(
+                'expected laspy to write LAS, found none; do pip install "amvnet[formats]"'
+            ) from None
 
 
 def write_scan_labels(
-    stem: Path, kind: str, xyz: np.ndarray, ids: np.ndarray, taxonomy: Taxonomy, uncertain: np.ndarray | None = None
+    stem: Path,
+    kind: str,
+    xyz: np.ndarray,
+    ids: np.ndarray,
+    taxonomy: Taxonomy,
+    uncertain: np.ndarray | None = None,
 ) -> Path:
     """Write the labels of a scan, one row for each of its points in their order; whole or not at all.
 
@@ -83,7 +92,9 @@ def write_scan_labels(
         if kind == "npy":
             np.save(part, raw)
         else:
-            POINT_WRITERS[kind](part, xyz, raw, np.asarray(taxonomy.colors, dtype=np.uint8)[ids], uncertain)
+            POINT_WRITERS[kind](
+                part, xyz, raw, np.asarray(taxonomy.colors, dtype=np.uint8)[ids], uncertain
+            )
     return path
 
 
@@ -97,17 +108,29 @@ def write_uncertain(path: Path, uncertain: np.ndarray) -> Path:
 Columns = dict[str, np.ndarray]
 
 
-def _write_ply(path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None) -> None:
+def _write_ply(
+    path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None
+) -> None:
     columns = _coordinates(xyz) | dict(zip(("red", "green", "blue"), colors.T, strict=True))
     table = _table(columns | {"class": raw.astype(np.int32)} | _flags(uncertain))
     properties = [f"property {PLY_TYPES[dtype.str[1:]]} {name}" for name, dtype in _fields(table)]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}", *properties, "end_header\n"]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(table)}",
+        *properties,
+        "end_header\n",
+    ]
     path.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
 
 
-def _write_pcd(path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None) -> None:
+def _write_pcd(
+    path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None
+) -> None:
     red, green, blue = colors.astype(np.uint32).T
-    packed = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")  # PCL keeps the three bytes as a float's
+    packed = (
+        (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+    )  # PCL keeps the three bytes as a float's
     table = _table(_coordinates(xyz) | {"rgb": packed, "label": raw} | _flags(uncertain))
     fields = _fields(table)
     header = PCD_HEADER.format(
@@ -120,7 +143,9 @@ def _write_pcd(path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray,
     path.write_bytes(header.encode("ascii") + table.tobytes())
 
 
-def _write_las(path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None) -> None:
+def _write_las(
+    path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None
+) -> None:
     """The class is a dimension of its own: LAS's has a byte, and other meanings for its numbers."""
     import laspy
 
@@ -128,16 +153,22 @@ def _write_las(path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray,
     extra = {"class": np.where(held, raw, 0).astype(np.uint16)} | _flags(uncertain)
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales, header.offsets = np.full(3, LAS_STEP), offset
-    header.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()])
+    header.add_extra_dims(
+        [laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()]
+    )
     las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header))
     las.X, las.Y, las.Z = places.T
-    las.red, las.green, las.blue = colors.T.astype(np.uint16) * 256  # as the specification brings 8 bits to 16
+    las.red, las.green, las.blue = (
+        colors.T.astype(np.uint16) * 256
+    )  # as the specification brings 8 bits to 16
     for name, values in extra.items():
         las[name] = values
     las.write(str(path))
 
 
-POINT_WRITERS: dict[str, Callable[[Path, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], None]] = {
+POINT_WRITERS: dict[
+    str, Callable[[Path, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], None]
+] = {
     "ply": _write_ply,
     "pcd": _write_pcd,
     "las": _write_las,
@@ -151,7 +182,9 @@ def _las_places(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     The median is what a few broken points, however far, cannot move.
     """
     finite = np.isfinite(xyz).all(axis=1)
-    middle = np.round(np.median(xyz[finite].astype(np.float64), axis=0)) if finite.any() else np.zeros(3)
+    middle = (
+        np.round(np.median(xyz[finite].astype(np.float64), axis=0)) if finite.any() else np.zeros(3)
+    )
     offset = middle if (np.abs(middle) > LAS_REACH / 2).any() else np.zeros(3)
     apart = xyz.astype(np.float64) - offset
     held = finite & (np.abs(apart) < LAS_REACH).all(axis=1)
@@ -172,7 +205,9 @@ def _flags(uncertain: np.ndarray | None) -> Columns:
 def _table(columns: Columns) -> np.ndarray:
     """(N,) records, packed and little endian."""
     (count,) = {len(values) for values in columns.values()}
-    table = np.empty(count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    table = np.empty(
+        count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
+    )
     for name, values in columns.items():
         table[name] = values
     return table

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from amvnet.data.formats.detect import ENDINGS, is_bag_folder, is_scan, read_cloud
-from amvnet.data.formats.raw import FULL_INTENSITY, KITTI_COLUMNS, NUSCENES_COLUMNS, read_table, ring_column
+from amvnet.data.formats.raw import (
+    FULL_INTENSITY,
+    KITTI_COLUMNS,
+    NUSCENES_COLUMNS,
+    read_table,
+    ring_column,
+)
 from amvnet.data.formats.raw import count_rows as count_rows
 from amvnet.errors import InputError
 from amvnet.files import whole_file
@@ -44,10 +50,14 @@ def find_scans(path: Path | str) -> list[Path]:
     if path.is_file() or is_bag_folder(path):
         return [path]
     if not path.is_dir():
-        raise InputError(f"{path}: expected a scan file or a folder of scans, found nothing; check the path")
+        raise InputError(
+            f"{path}: expected a scan file or a folder of scans, found nothing; check the path"
+        )
     if found := sorted(entry for entry in path.iterdir() if is_scan(entry)):
         return found
-    raise InputError(f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; give the folder of scans")
+    raise InputError(
+        f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; give the folder of scans"
+    )
 
 
 def check_points(points: np.ndarray, path: Path) -> np.ndarray:
@@ -59,7 +69,9 @@ def check_points(points: np.ndarray, path: Path) -> np.ndarray:
     if not len(points):
         raise InputError(f"{path}: expected a scan with points, found 0 points; leave the file out")
     if not np.isfinite(points[:, :3]).all(axis=1).any():
-        raise InputError(f"{path}: expected finite coordinates, found NaN or infinity in every point; leave it out")
+        raise InputError(
+            f"{path}: expected finite coordinates, found NaN or infinity in every point; leave it out"
+        )
     return np.ascontiguousarray(points, dtype=np.float32)
 
 
@@ -76,7 +88,9 @@ def read_nuscenes(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return points, ring_column(table[:, 4], path)
 
 
-def read_labels(path: Path, dtype: DTypeLike, count: int, to_train: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def read_labels(
+    path: Path, dtype: DTypeLike, count: int, to_train: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
     """Read `count` raw labels of `dtype` and turn them into (N,) uint8 train ids by `to_train`.
 
     Raises:

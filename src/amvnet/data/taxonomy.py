@@ -13,7 +13,9 @@ import yaml
 
 from amvnet.errors import InputError
 
-INSTANCE_MASK = 0xFFFF  # the lower half of a raw SemanticKITTI label is the class, the upper one the instance
+INSTANCE_MASK = (
+    0xFFFF  # the lower half of a raw SemanticKITTI label is the class, the upper one the instance
+)
 UNKNOWN = -1
 
 
@@ -173,14 +175,31 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{path}: expected a label map (YAML), found {reason}; correct the file") from None
-    required = ("labels", "color_map", "learning_map", "learning_map_inv", "learning_ignore", "split")
-    missing = [key for key in required if not isinstance(config, dict) or not isinstance(config.get(key), dict)]
+        raise InputError(
+            f"{path}: expected a label map (YAML), found {reason}; correct the file"
+        ) from None
+    required = (
+        "labels",
+        "color_map",
+        "learning_map",
+        "learning_map_inv",
+        "learning_ignore",
+        "split",
+    )
+    missing = [
+        key
+        for key in required
+        if not isinstance(config, dict) or not isinstance(config.get(key), dict)
+    ]
     missing += (
-        [] if "split" in missing else [f"split.{k}" for k in ("train", "valid", "test") if k not in config["split"]]
+        []
+        if "split" in missing
+        else [f"split.{k}" for k in ("train", "valid", "test") if k not in config["split"]]
     )
     if missing:
-        raise InputError(f"{path}: expected the tables {', '.join(required)}, found no {', '.join(missing)}; add them")
+        raise InputError(
+            f"{path}: expected the tables {', '.join(required)}, found no {', '.join(missing)}; add them"
+        )
     try:
         return _from_config(path.stem, config)
     except InputError as error:
@@ -203,9 +222,14 @@ def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
         name="semantickitti" if name == "semantic-kitti" else name,
         classes=tuple(str(config["labels"][raw]) for raw in raws[1:]),
         colors=tuple((r, g, b) for r, g, b in colors),
-        raw_to_train={int(raw): order.get(train, 0) for raw, train in config["learning_map"].items()},
+        raw_to_train={
+            int(raw): order.get(train, 0) for raw, train in config["learning_map"].items()
+        },
         train_to_raw=tuple(int(raw) for raw in raws),
-        splits={ours: tuple(f"{int(s):02d}" for s in config["split"][theirs]) for ours, theirs in splits.items()},
+        splits={
+            ours: tuple(f"{int(s):02d}" for s in config["split"][theirs])
+            for ours, theirs in splits.items()
+        },
         counts_absent=True,
     )
 
@@ -240,9 +264,7 @@ _IGNORED = (
     "movable_object.debris movable_object.pushable_pullable static.other static_object.bicycle_rack vehicle.ego "
     "vehicle.emergency.ambulance vehicle.emergency.police"
 )
-_PEDESTRIANS = (
-    "human.pedestrian.adult human.pedestrian.child human.pedestrian.construction_worker human.pedestrian.police_officer"
-)
+_PEDESTRIANS = "human.pedestrian.adult human.pedestrian.child human.pedestrian.construction_worker human.pedestrian.police_officer"
 _NUSCENES = (
     ("ignore", (0, 0, 0), _IGNORED),
     ("barrier", (112, 128, 144), "movable_object.barrier"),
@@ -281,10 +303,14 @@ NUSCENES = Taxonomy(
     name="nuscenes",
     classes=tuple(name for name, _, _ in _NUSCENES[1:]),
     colors=tuple(color for _, color, _ in _NUSCENES),
-    raw_to_train={fine: train for train, (_, _, fines) in enumerate(_NUSCENES) for fine in fines.split()},
+    raw_to_train={
+        fine: train for train, (_, _, fines) in enumerate(_NUSCENES) for fine in fines.split()
+    },
     train_to_raw=tuple(range(len(_NUSCENES))),
     splits={},
     counts_absent=False,
 )
 
-TAXONOMIES: Mapping[str, Taxonomy] = {taxonomy.name: taxonomy for taxonomy in (SEMANTICKITTI, NUSCENES)}
+TAXONOMIES: Mapping[str, Taxonomy] = {
+    taxonomy.name: taxonomy for taxonomy in (SEMANTICKITTI, NUSCENES)
+}

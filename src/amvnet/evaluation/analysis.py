@@ -84,7 +84,9 @@ def analyze(
     """
     assertion = segmenter.model.assertion
     if segmenter.method != "amvnet" or not isinstance(assertion, Disagreement):
-        raise InputError("expected weights with both networks, a head and the disagreement assertion; train these")
+        raise InputError(
+            "expected weights with both networks, a head and the disagreement assertion; train these"
+        )
     size = dataset.taxonomy.size + 1
     found = Analysis(
         Evaluation(dataset.taxonomy),
@@ -103,7 +105,9 @@ def _add(found: Analysis, scan: Scan, segmenter: Segmenter) -> None:
     model, batch = segmenter.model, PointBatch.of([scan]).to(segmenter.device)
     f, g = model.score_range_view(batch), model.score_polar_view(batch)
     uncertain = model.assertion(f, g, batch.points)
-    place = (cosine_similarity(f, g) * BINS).ceil().long().clamp(1, BINS) - 1  # in (place, place + 1] / BINS
+    place = (cosine_similarity(f, g) * BINS).ceil().long().clamp(
+        1, BINS
+    ) - 1  # in (place, place + 1] / BINS
     asked = (place < SWEPT) | uncertain
     assert model.point_head is not None
     h = refine(model.point_head, batch.points, f, g, asked)
@@ -123,7 +127,9 @@ def _add(found: Analysis, scan: Scan, segmenter: Segmenter) -> None:
     found.head += _by_bin(bins[swept], truth[swept], head[swept], SWEPT, size)
 
 
-def _by_bin(bins: np.ndarray, truth: np.ndarray, ids: np.ndarray, count: int, size: int) -> np.ndarray:
+def _by_bin(
+    bins: np.ndarray, truth: np.ndarray, ids: np.ndarray, count: int, size: int
+) -> np.ndarray:
     """(count, size, size) confusion matrices of points by their bin."""
     place = (bins * size + truth) * size + ids
     return np.bincount(place, minlength=count * size * size).reshape(count, size, size)

@@ -40,7 +40,9 @@ def write_all(found: Analysis, dataset: str, out: Path) -> list[Path]:
     ]
 
 
-def write_sweep(swept: Sequence[Swept], name: str, used: float, dataset: str, path: Path) -> list[Path]:
+def write_sweep(
+    swept: Sequence[Swept], name: str, used: float, dataset: str, path: Path
+) -> list[Path]:
     """Figure 8 of the paper: what a parameter does to mIoU, and to the share of uncertain points."""
     figure, axes = _figure(f"{name} on {dataset}")
     values = [one.value for one in swept]
@@ -50,7 +52,9 @@ def write_sweep(swept: Sequence[Swept], name: str, used: float, dataset: str, pa
     axes.axvline(used, color="0.6", linewidth=0.8, linestyle=":")
     share = axes.twinx()
     shares = [100 * one.uncertain for one in swept]
-    share.plot(values, shares, color="tab:orange", linestyle="--", marker=marker, label="uncertain points")
+    share.plot(
+        values, shares, color="tab:orange", linestyle="--", marker=marker, label="uncertain points"
+    )
     share.set_ylabel("uncertain points (%)")
     share.set_ylim(bottom=0)
     lines = [*axes.get_lines()[:1], *share.get_lines()]
@@ -71,11 +75,17 @@ def _similarity(found: Analysis, dataset: str, path: Path) -> list[Path]:
     figure, axes = _figure(f"agreement of the two networks on {dataset}")
     edges = np.arange(BINS + 1) / BINS
     axes.stairs(np.maximum(found.points, 0.5), edges, fill=True, color="0.55")
-    axes.axvline(found.tau, color="black", linewidth=0.8, linestyle=":", label=f"tau = {found.tau:g}")
-    axes.set(xlabel="cosine similarity of the two scores", ylabel="points", yscale="log", xlim=(0, 1))
+    axes.axvline(
+        found.tau, color="black", linewidth=0.8, linestyle=":", label=f"tau = {found.tau:g}"
+    )
+    axes.set(
+        xlabel="cosine similarity of the two scores", ylabel="points", yscale="log", xlim=(0, 1)
+    )
     axes.legend(frameon=False, loc="upper left")
     total = max(found.points.sum(), 1)
-    rows = [(edges[i], edges[i + 1], int(n), 100 * float(n / total)) for i, n in enumerate(found.points)]
+    rows = [
+        (edges[i], edges[i + 1], int(n), 100 * float(n / total)) for i, n in enumerate(found.points)
+    ]
     return _write(path, ("above", "up to", "points", "points %"), rows, figure)
 
 
@@ -88,20 +98,32 @@ def _distance(found: Analysis, dataset: str, path: Path) -> list[Path]:
     for name, (title, marker, line) in STYLES.items():
         values = [_percent(one["miou_present"]) for one in report[name]["by_distance"]]
         shown = [np.nan if value is None else value for value in values]
-        axes.plot(middles, shown, label=title, marker=marker, linestyle=line, color="black", markersize=4)
+        axes.plot(
+            middles, shown, label=title, marker=marker, linestyle=line, color="black", markersize=4
+        )
     axes.set(xlabel="distance from the sensor (m)", ylabel="mIoU, classes present (%)")
     axes.legend(frameon=False)
     rows = [
-        (one["from_m"], one["to_m"], *(_percent(report[name]["by_distance"][i]["miou_present"]) for name in STYLES))
+        (
+            one["from_m"],
+            one["to_m"],
+            *(_percent(report[name]["by_distance"][i]["miou_present"]) for name in STYLES),
+        )
         for i, one in enumerate(bins)
     ]
-    return _write(path, ("from m", "to m", *(f"{title} %" for title, _, _ in STYLES.values())), rows, figure)
+    return _write(
+        path, ("from m", "to m", *(f"{title} %" for title, _, _ in STYLES.values())), rows, figure
+    )
 
 
 def _classes(found: Analysis, path: Path) -> list[Path]:
     """Table 3 of the paper: IoU by class."""
-    by_method = {name: metrics(found.evaluation.matrices[name][0], found.taxonomy) for name in STYLES}
-    rows: list[Row] = [(c, *(_percent(m["iou"][c]) for m in by_method.values())) for c in found.taxonomy.classes]
+    by_method = {
+        name: metrics(found.evaluation.matrices[name][0], found.taxonomy) for name in STYLES
+    }
+    rows: list[Row] = [
+        (c, *(_percent(m["iou"][c]) for m in by_method.values())) for c in found.taxonomy.classes
+    ]
     rows.append(("mIoU", *(_percent(m["miou"]) for m in by_method.values())))
     rows.append(("fwIoU", *(_percent(m["fwiou"]) for m in by_method.values())))
     return _write(path, ("IoU %", *(title for title, _, _ in STYLES.values())), rows)
@@ -118,7 +140,9 @@ def _methods(found: Analysis, path: Path) -> list[Path]:
         reached = metrics(matrices[0], found.taxonomy)
         figures = (_percent(reached[key]) for key in ("miou", "miou_present", "accuracy", "fwiou"))
         rows.append((titles.get(name, name), *figures))
-    return _write(path, ("method", "mIoU %", "mIoU % of the classes present", "accuracy %", "fwIoU %"), rows)
+    return _write(
+        path, ("method", "mIoU %", "mIoU % of the classes present", "accuracy %", "fwIoU %"), rows
+    )
 
 
 def _percent(value: float | None) -> float | None:

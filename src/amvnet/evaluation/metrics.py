@@ -12,7 +12,14 @@ import numpy as np
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
-EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)  # metres; those of SemanticKITTI's evaluation by distance
+EDGES = (
+    0.0,
+    10.0,
+    20.0,
+    30.0,
+    40.0,
+    50.0,
+)  # metres; those of SemanticKITTI's evaluation by distance
 
 
 def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarray:
@@ -71,7 +78,9 @@ def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
         "miou_present": _ratio(iou[true > 0].sum(), (true > 0).sum()),
         "accuracy": _ratio(hit.sum(), predicted.sum()),
         "fwiou": _ratio((true * iou).sum(), true.sum()),
-        "iou": {name: float(iou[c]) if union[c] else None for c, name in enumerate(taxonomy.classes)},
+        "iou": {
+            name: float(iou[c]) if union[c] else None for c, name in enumerate(taxonomy.classes)
+        },
     }
 
 
@@ -123,7 +132,9 @@ class Evaluation:
         masks = self._masks(points)
         size = self.taxonomy.size
         counts = {
-            method: np.stack([confusion(truth, ids, size), *(confusion(truth[m], ids[m], size) for m in masks)])
+            method: np.stack(
+                [confusion(truth, ids, size), *(confusion(truth[m], ids[m], size) for m in masks)]
+            )
             for method, ids in predictions.items()
         }
         self._count(counts)
@@ -139,7 +150,10 @@ class Evaluation:
         Raises:
             InputError: where its classes or its bins are other ones.
         """
-        if (self.taxonomy.classes, tuple(self.edges)) != (other.taxonomy.classes, tuple(other.edges)):
+        if (self.taxonomy.classes, tuple(self.edges)) != (
+            other.taxonomy.classes,
+            tuple(other.edges),
+        ):
             raise InputError(
                 f"expected an evaluation of {self.taxonomy.name} with edges {tuple(self.edges)}, "
                 f"found {other.taxonomy.name} with {tuple(other.edges)}; merge equal ones"
@@ -169,7 +183,12 @@ class Evaluation:
 
     def _figures(self, stack: np.ndarray) -> dict[str, Any]:
         bins = [
-            {"from_m": float(near), "to_m": float(far), "points": int(matrix.sum()), **metrics(matrix, self.taxonomy)}
+            {
+                "from_m": float(near),
+                "to_m": float(far),
+                "points": int(matrix.sum()),
+                **metrics(matrix, self.taxonomy),
+            }
             for (near, far), matrix in zip(pairwise(self.edges), stack[1:], strict=True)
         ]
         return {**metrics(stack[0], self.taxonomy), "by_distance": bins}

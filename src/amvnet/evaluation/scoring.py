@@ -45,11 +45,15 @@ def evaluate(
         mine.add(scan.points, scan.labels, found, uncertain)
         if pictures is not None and record.name in drawn:
             path = pictures / f"{record.name.replace('/', '_')}.png"
-            draw_scan(path, scan.points, dataset.taxonomy, found, scan.labels, uncertain, record.name)
+            draw_scan(
+                path, scan.points, dataset.taxonomy, found, scan.labels, uncertain, record.name
+            )
     return sum(processes.gather(mine), Evaluation(dataset.taxonomy))
 
 
-def labelled(dataset: Dataset, records: Sequence[ScanRecord], progress: Progress) -> Iterator[tuple[ScanRecord, Scan]]:
+def labelled(
+    dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
+) -> Iterator[tuple[ScanRecord, Scan]]:
     """Read scans that must have labels.
 
     Raises:
@@ -59,7 +63,9 @@ def labelled(dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
         progress(done, len(records))
         scan = dataset.read(record)
         if scan.labels is None:
-            raise InputError(f"{scan.name}: expected labels to compare with, found none; name labelled sequences")
+            raise InputError(
+                f"{scan.name}: expected labels to compare with, found none; name labelled sequences"
+            )
         yield record, scan
     progress(len(records), len(records))
 

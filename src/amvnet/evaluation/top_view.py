@@ -103,12 +103,19 @@ def scan_figure(
     seen = np.unique(np.concatenate([*panels.values(), *([] if truth is None else [truth])]))
     errors = truth is not None and bool(panels)
     return _figure(
-        points, rows, _entries(taxonomy, seen, errors, marked if uncertain is not None else ""), title, reach
+        points,
+        rows,
+        _entries(taxonomy, seen, errors, marked if uncertain is not None else ""),
+        title,
+        reach,
     )
 
 
 def _check(
-    count: int, panels: Mapping[str, np.ndarray], truth: np.ndarray | None, uncertain: np.ndarray | None
+    count: int,
+    panels: Mapping[str, np.ndarray],
+    truth: np.ndarray | None,
+    uncertain: np.ndarray | None,
 ) -> None:
     if not panels and truth is None:
         raise InputError("expected a prediction or a truth to draw, found neither; give one")
@@ -135,7 +142,10 @@ def _rows(
     if truth is None:
         return [[*shown, *doubts]]
     known = truth > 0
-    errors = [_chosen(f"errors of {n}", (ids != truth) & known, known.sum(), WRONG) for n, ids in panels.items()]
+    errors = [
+        _chosen(f"errors of {n}", (ids != truth) & known, known.sum(), WRONG)
+        for n, ids in panels.items()
+    ]
     first: list[_Panel | None] = [_Panel("truth", palette[truth], known), *shown]
     second: list[_Panel | None] = [doubts[0] if doubts else None, *errors]
     return [first, second] if doubts or errors else [first]
@@ -147,16 +157,26 @@ def _chosen(title: str, chosen: np.ndarray, count: int, color: Color) -> _Panel:
     return _Panel(f"{title} ({share:.1%})", np.where(chosen[:, None], color, PLAIN), chosen)
 
 
-def _entries(taxonomy: Taxonomy, seen: np.ndarray, errors: bool, marked: str) -> list[tuple[str, Color]]:
+def _entries(
+    taxonomy: Taxonomy, seen: np.ndarray, errors: bool, marked: str
+) -> list[tuple[str, Color]]:
     """(name, colour) of the legend: the classes that appear, then what the other panels show."""
     palette = [(r / 255, g / 255, b / 255) for r, g, b in taxonomy.colors]
     entries = [(taxonomy.classes[c - 1], palette[c]) for c in seen.tolist() if c]
-    extras = {"ignored": (0 in seen, IGNORED), "wrong": (errors, WRONG), marked: (bool(marked), UNCERTAIN)}
+    extras = {
+        "ignored": (0 in seen, IGNORED),
+        "wrong": (errors, WRONG),
+        marked: (bool(marked), UNCERTAIN),
+    }
     return entries + [(name, color) for name, (appears, color) in extras.items() if appears]
 
 
 def _figure(
-    points: np.ndarray, rows: list[list[_Panel | None]], entries: list[tuple[str, Color]], title: str, reach: float
+    points: np.ndarray,
+    rows: list[list[_Panel | None]],
+    entries: list[tuple[str, Color]],
+    title: str,
+    reach: float,
 ) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -180,7 +200,15 @@ def _draw(axes: Any, points: np.ndarray, panel: _Panel, reach: float) -> None:
     order = np.argsort(points[inside, 2], kind="stable")  # what is higher hides what is below
     order = order[np.argsort(panel.on_top[inside][order], kind="stable")]
     xy, colors = points[inside, :2][order], panel.colors[inside][order]
-    axes.scatter(xy[:, 0], xy[:, 1], c=colors, s=DOT * REACH / reach, marker="o", linewidths=0, rasterized=True)
+    axes.scatter(
+        xy[:, 0],
+        xy[:, 1],
+        c=colors,
+        s=DOT * REACH / reach,
+        marker="o",
+        linewidths=0,
+        rasterized=True,
+    )
     axes.plot(0, 0, marker="+", color=INK, markersize=7)
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", facecolor=GROUND)
     axes.set_title(panel.title, color=INK, fontsize=11)
@@ -194,7 +222,10 @@ def _draw(axes: Any, points: np.ndarray, panel: _Panel, reach: float) -> None:
 def _legend(figure: Any, entries: list[tuple[str, Color]], columns: int) -> None:
     from matplotlib.patches import Patch
 
-    handles = [Patch(facecolor=color, edgecolor="0.5", linewidth=0.5, label=name) for name, color in entries]
+    handles = [
+        Patch(facecolor=color, edgecolor="0.5", linewidth=0.5, label=name)
+        for name, color in entries
+    ]
     figure.legend(
         handles=handles,
         loc="outside lower center",

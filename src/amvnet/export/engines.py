@@ -36,7 +36,9 @@ def engage(segmenter: Segmenter, engine: str) -> str:
         InputError: where there is no such engine, or it lacks a library, a compiler or the device.
     """
     if engine not in ENGINES:
-        raise InputError(f"expected an engine of {', '.join(ENGINES)}, found {engine!r}; use one of them")
+        raise InputError(
+            f"expected an engine of {', '.join(ENGINES)}, found {engine!r}; use one of them"
+        )
     engine = FASTEST if engine == "auto" else engine
     if engine != "torch":
         run = {"compile": _compiled, "onnx": _exported}[engine](segmenter)
@@ -44,7 +46,9 @@ def engage(segmenter: Segmenter, engine: str) -> str:
         model = segmenter.model
         if "range_net" in needed:
             holder, name = (
-                (model.range_net, "net") if isinstance(model.range_net, InPrecision) else (model, "range_net")
+                (model.range_net, "net")
+                if isinstance(model.range_net, InPrecision)
+                else (model, "range_net")
             )
             setattr(holder, name, run("range_net"))
         if "polar_net" in needed:  # the instance's goes before the class's method of this name
@@ -58,7 +62,10 @@ def _compiled(segmenter: Segmenter) -> Run:
     a, b = sizes.range_view, sizes.polar_view
     parts: dict[str, tuple[Any, tuple[int, ...]]] = {
         "range_net": (_inner(model.range_net), (1, a.height, a.width, CHANNELS)),
-        "polar_map": (_inner(model.polar_net).unet, (1, b.radial, b.angular, sizes.polar_net.pillar)),
+        "polar_map": (
+            _inner(model.polar_net).unet,
+            (1, b.radial, b.angular, sizes.polar_net.pillar),
+        ),
     }
 
     def run(name: str) -> Any:
@@ -69,7 +76,9 @@ def _compiled(segmenter: Segmenter) -> Run:
                 compiled(torch.zeros(shape, device=segmenter.device).permute(0, 3, 1, 2))
         except Exception as error:  # of a dozen classes; most often there is no C++ compiler
             said = (str(error).splitlines() or [""])[0]
-            raise InputError(f"expected torch.compile to work, found {said}; use the engine torch") from error
+            raise InputError(
+                f"expected torch.compile to work, found {said}; use the engine torch"
+            ) from error
         return compiled
 
     return run
@@ -97,7 +106,12 @@ def exported(segmenter: Segmenter) -> Path:
     """The folder of a segmenter's exported networks; they are exported where that has not been done."""
     check_libraries()
     weights = segmenter.weights
-    told = [*(weights.digest(part) for part in weights.parts), repr(weights.model), __version__, torch.__version__]
+    told = [
+        *(weights.digest(part) for part in weights.parts),
+        repr(weights.model),
+        __version__,
+        torch.__version__,
+    ]
     folder = cache_folder() / "onnx" / hashlib.sha256(repr((told, OPSET)).encode()).hexdigest()[:16]
     if not (folder / DESCRIPTION).is_file():
         export(weights, folder)
@@ -115,10 +129,14 @@ class OnnxGraph(nn.Module):
         options.intra_op_num_threads = threads
         # Threads that wait for the next graph would take the processor from torch's.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        self.session = onnxruntime.InferenceSession(
+            str(path), options, providers=["CPUExecutionProvider"]
+        )
         self.input = self.session.get_inputs()[0].name
 
     def forward(self, x: Tensor) -> Tensor:
         if len(x) != 1:
-            raise InputError(f"expected one scan at a time for the engine onnx, found {len(x)}; use torch")
+            raise InputError(
+                f"expected one scan at a time for the engine onnx, found {len(x)}; use torch"
+            )
         return torch.from_numpy(self.session.run(None, {self.input: x.contiguous().numpy()})[0])

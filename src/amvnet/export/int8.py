@@ -41,13 +41,17 @@ def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
 
     sensor = segmenter.weights.sensor
     if sensor not in SENSORS:
-        raise InputError(f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; name scans")
+        raise InputError(
+            f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; name scans"
+        )
     with TemporaryDirectory() as folder:
         simulate(folder, sensor=sensor, sequences=SCANS, scans=1, seed=SEED)
         return _read(folder, segmenter)
 
 
-def quantise(folder: Path, names: Sequence[str], scans: Sequence[Scan]) -> Iterator[tuple[str, dict[str, Any]]]:
+def quantise(
+    folder: Path, names: Sequence[str], scans: Sequence[Scan]
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """Replace exported graphs by ones in int8.
 
     Args:
@@ -75,7 +79,14 @@ def quantise(folder: Path, names: Sequence[str], scans: Sequence[Scan]) -> Itera
                 f"{name}: expected {LEAST_AGREEMENT:.0%} of the labels to stay in int8, found {agreement:.0%}; "
                 "calibrate with more scans, or leave out --int8"
             )
-        yield name, {"precision": "int8", "sha256": digest(folder / f"{name}.onnx"), "agreement": agreement}
+        yield (
+            name,
+            {
+                "precision": "int8",
+                "sha256": digest(folder / f"{name}.onnx"),
+                "agreement": agreement,
+            },
+        )
 
 
 class _Recorder(OnnxSegmenter):
@@ -87,7 +98,9 @@ class _Recorder(OnnxSegmenter):
 
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
         if name in self.given:
-            self.given[name].append({self.description["graphs"][name]["inputs"][0]["name"]: inputs[0]})
+            self.given[name].append(
+                {self.description["graphs"][name]["inputs"][0]["name"]: inputs[0]}
+            )
         return super()._run(name, *inputs)
 
 
@@ -95,11 +108,15 @@ def _read(text: str, segmenter: Segmenter) -> list[Scan]:
     by: Callable[[Path, bool], Segmenter] = lambda place, lone: segmenter  # noqa: E731  nothing is segmented
     with TemporaryDirectory() as nowhere:
         fitting = Fitting(segmenter.weights)
-        tasks = tasks_in([text], Lone(segmenter.taxonomy, by, fitting, Path(nowhere), None), None, "all")
+        tasks = tasks_in(
+            [text], Lone(segmenter.taxonomy, by, fitting, Path(nowhere), None), None, "all"
+        )
         scans = [task.read() for task in _spaced(tasks)]
     found = [scan for scan in scans if scan.valid.any()]
     if not found:
-        raise InputError(f"{text}: expected scans to calibrate with, found none with a finite point; name others")
+        raise InputError(
+            f"{text}: expected scans to calibrate with, found none with a finite point; name others"
+        )
     return found
 
 
@@ -114,7 +131,11 @@ def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarr
     for scan in scans:
         points = scan.points[scan.valid]
         ring = None if scan.ring is None else scan.ring[scan.valid]
-        scores = runner.score_range_view(points, ring) if name == "range_net" else runner.score_polar_view(points)
+        scores = (
+            runner.score_range_view(points, ring)
+            if name == "range_net"
+            else runner.score_polar_view(points)
+        )
         found.append(scores.argmax(axis=1))
     return np.concatenate(found)
 

@@ -107,7 +107,9 @@ def export(
     part.mkdir()
     try:
         said, measured = _write_all(segmenter, scans, part, progress)
-        (out / DESCRIPTION).unlink(missing_ok=True)  # so that it never speaks of another export's graphs
+        (out / DESCRIPTION).unlink(
+            missing_ok=True
+        )  # so that it never speaks of another export's graphs
         for name in said["graphs"]:
             os.replace(part / f"{name}.onnx", out / f"{name}.onnx")
     finally:
@@ -134,7 +136,9 @@ def _write_all(
     _save(said, part / DESCRIPTION)  # which the graphs are run by
     progress(len(graphs), total)
     for name, anew in quantise(part, convolutions, scans):
-        said["graphs"][name] = {key: value for key, value in written[name].items() if key != "difference"} | anew
+        said["graphs"][name] = {
+            key: value for key, value in written[name].items() if key != "difference"
+        } | anew
         measured.agreement[name] = anew["agreement"]
         progress(len(graphs) + len(measured.agreement), total)
     return said, measured
@@ -150,7 +154,9 @@ def check_libraries() -> None:
         try:
             importlib.import_module(name)
         except ImportError:
-            raise InputError(f"expected {name} to export, found none; pip install 'amvnet[export]'") from None
+            raise InputError(
+                f"expected {name} to export, found none; pip install 'amvnet[export]'"
+            ) from None
 
 
 def describe(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, Any]:
@@ -175,7 +181,8 @@ def describe(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, Any]:
         **({"point_head": head} if "point_head" in graphs else {}),
         "taxonomy": classes.name,
         "classes": [
-            {"id": id, "name": name, "raw_id": raw, "color": list(color)} for id, (name, raw, color) in enumerate(rows)
+            {"id": id, "name": name, "raw_id": raw, "color": list(color)}
+            for id, (name, raw, color) in enumerate(rows)
         ],
         "opset": OPSET,
         "graphs": graphs,
@@ -189,7 +196,9 @@ def _graphs(segmenter: Segmenter) -> dict[str, Graph]:
     found = {}
     if segmenter.method != "bev":
         image = model.range_view.project(batch).image
-        found["range_net"] = Graph(model.range_net, {"image": image.contiguous()}, "scores", _probabilities)
+        found["range_net"] = Graph(
+            model.range_net, {"image": image.contiguous()}, "scores", _probabilities
+        )
     if segmenter.method != "rv":
         found |= _polar_graphs(model, batch, classes)
     if model.point_head is not None and segmenter.method == "amvnet":
@@ -209,7 +218,9 @@ def _polar_graphs(model: AMVNet, batch: PointBatch, classes: int) -> dict[str, G
         return scores.unflatten(1, (-1, classes)).softmax(dim=2)
 
     return {
-        "polar_points": Graph(net.point_mlp, {"features": grid.features}, "point_features", _shares),
+        "polar_points": Graph(
+            net.point_mlp, {"features": grid.features}, "point_features", _shares
+        ),
         "polar_pillars": Graph(net.compress, {"pooled": pooled}, "pillar_features", _shares),
         "polar_map": Graph(_Part(net, net.unet), {"pillars": plane}, "decoded", _shares),
         "polar_scores": Graph(_Part(net, net.score), {"decoded": decoded}, "scores", by_voxel),
@@ -231,7 +242,10 @@ def _made_scan(segmenter: Segmenter) -> PointBatch:
     """Points all around the sensor, in and beyond the views, with rings."""
     rng = np.random.default_rng(0)
     view = segmenter.weights.model.polar_view
-    azimuth, distance = rng.uniform(-np.pi, np.pi, POINTS), rng.uniform(1, 1.2 * view.radius_max, POINTS)
+    azimuth, distance = (
+        rng.uniform(-np.pi, np.pi, POINTS),
+        rng.uniform(1, 1.2 * view.radius_max, POINTS),
+    )
     height = rng.uniform(view.z_min, view.z_max, POINTS)
     xyz = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), height], axis=1)
     points = np.column_stack([xyz, rng.random(POINTS)]).astype(np.float32)
@@ -273,7 +287,13 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
             f"{name}: expected at most {LARGEST_DIFFERENCE:g} of difference between ONNX Runtime and torch, found "
             f"{difference:.2g}; use other versions of {', '.join(EXTRA)}"
         )
-    said = {"file": path.name, "precision": "float32", "sha256": digest(path), "inputs": inputs, "outputs": outputs}
+    said = {
+        "file": path.name,
+        "precision": "float32",
+        "sha256": digest(path),
+        "inputs": inputs,
+        "outputs": outputs,
+    }
     return {**said, "difference": difference}
 
 

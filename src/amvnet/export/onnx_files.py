@@ -23,7 +23,15 @@ def strip(path: Path) -> None:
 
     model = onnx.load(path)
     graph = model.graph
-    for holder in (model, graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output):
+    for holder in (
+        model,
+        graph,
+        *graph.node,
+        *graph.initializer,
+        *graph.value_info,
+        *graph.input,
+        *graph.output,
+    ):
         holder.ClearField("metadata_props")
     onnx.save(model, path)
 
@@ -51,4 +59,6 @@ def one_line(name: str, writer: str, libraries: str) -> Iterator[None]:
         raise
     except Exception as error:
         kind = type(error).__name__
-        raise InputError(f"{name}: expected a graph of {writer}, found {kind}; upgrade {libraries}") from error
+        raise InputError(
+            f"{name}: expected a graph of {writer}, found {kind}; upgrade {libraries}"
+        ) from error

@@ -66,7 +66,9 @@ class Fusion:
             )
 
 
-def fuse(points: np.ndarray, f: np.ndarray, g: np.ndarray, head: Head = None, tau: float | None = None) -> np.ndarray:
+def fuse(
+    points: np.ndarray, f: np.ndarray, g: np.ndarray, head: Head = None, tau: float | None = None
+) -> np.ndarray:
     """The late fusion alone, for any two models' scores (section 3.2 of the paper).
 
     Args:
@@ -93,6 +95,8 @@ def _head(head: Head, tau: float | None) -> tuple[PointHead | None, Assertion]:
     if isinstance(head, Weights):
         config, head = head.model.assertion, head.build_head()
     if tau is None and config.name == "loss":
-        raise InputError("expected an assertion that needs no labels, found loss; train the head with another one")
+        raise InputError(
+            "expected an assertion that needs no labels, found loss; train the head with another one"
+        )
     assertion = build_assertion(config) if tau is None else Disagreement(tau)
     return None if head is None else copy.deepcopy(head).cpu().eval(), assertion

@@ -27,7 +27,11 @@ class Journal:
     """
 
     def __init__(
-        self, folder: Path, settings: Mapping[str, Any], resume: bool = False, processes: Processes = ALONE
+        self,
+        folder: Path,
+        settings: Mapping[str, Any],
+        resume: bool = False,
+        processes: Processes = ALONE,
     ) -> None:
         self.processes, self.folder = processes, folder
         self.done = self._left(dict(settings)) if resume else set()
@@ -40,14 +44,20 @@ class Journal:
         processes.wait()
         self.path = folder / PATTERN.replace("*", str(processes.rank))
         with whole_file(self.path) as part:
-            part.write_text("".join(f"{json.dumps(line)}\n" for line in (dict(settings), *sorted(self.done))))
+            part.write_text(
+                "".join(f"{json.dumps(line)}\n" for line in (dict(settings), *sorted(self.done)))
+            )
 
     def _left(self, settings: dict[str, Any]) -> set[str]:
         done: set[str] = set()
         for path in self.folder.glob(PATTERN):
             begun, *names = _lines(path)
             if begun != settings:
-                other = [key for key in settings if not isinstance(begun, dict) or begun.get(key) != settings[key]]
+                other = [
+                    key
+                    for key in settings
+                    if not isinstance(begun, dict) or begun.get(key) != settings[key]
+                ]
                 raise InputError(
                     f"{self.folder}: expected what the interrupted run was begun with, found another "
                     f"{', '.join(other)}; go on with that, or leave --resume out to begin anew"

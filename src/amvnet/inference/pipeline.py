@@ -45,14 +45,20 @@ def stream(
     tasks: Sequence[Task], scores: bool, uncertain: bool, batch: int = 1, at_once: int = 1
 ) -> Iterator[tuple[Task, str | None]]:
     """Each task when it is done, in order, with what is wrong with its scan; only a few scans are in memory."""
-    with ThreadPoolExecutor(1) as reader, computers(at_once) as computer, ThreadPoolExecutor(1) as writer:
+    with (
+        ThreadPoolExecutor(1) as reader,
+        computers(at_once) as computer,
+        ThreadPoolExecutor(1) as writer,
+    ):
         source, writing = iter(tasks), deque[tuple[Task, Future[None]]]()
         read = ((task, reader.submit(task.read)) for task in source)
         reading = deque(islice(read, max(AHEAD, batch * at_once)))
         computing = deque[Future[list[tuple[Task, Result]]]]()
         try:
             while reading or computing:
-                while reading and len(computing) < at_once + (at_once > 1):  # one waits, so that no thread has to
+                while reading and len(computing) < at_once + (
+                    at_once > 1
+                ):  # one waits, so that no thread has to
                     some = [reading.popleft() for _ in range(min(batch, len(reading)))]
                     reading.extend(islice(read, len(some)))
                     computing.append(computer.submit(_segmented, some))
@@ -142,6 +148,10 @@ def _written(task: Task, writing: Future[None]) -> tuple[Task, None]:
 
 def write_scores(path: Path, result: Segmentation) -> None:
     """Both networks' probabilities, (N, K) float16, as `rv` and `bev` of an `.npz`."""
-    found = {name: v.astype(np.float16) for name, v in (("rv", result.rv), ("bev", result.bev)) if v is not None}
+    found = {
+        name: v.astype(np.float16)
+        for name, v in (("rv", result.rv), ("bev", result.bev))
+        if v is not None
+    }
     with whole_file(path) as part:
         np.savez_compressed(part, **found)  # type: ignore[arg-type]  # of the arrays, none is an option

@@ -58,7 +58,9 @@ def predict(
     """
     check_kind(kind)
     if uncertain and segmenter.method in ("rv", "bev"):
-        raise InputError(f"expected a method of two networks for --uncertain, found {segmenter.method}; use amvnet")
+        raise InputError(
+            f"expected a method of two networks for --uncertain, found {segmenter.method}; use amvnet"
+        )
     for option, count in (("batch", batch), ("at-once", 1 if at_once is None else at_once)):
         if count < 1:
             raise InputError(f"expected one scan or more at a time, found {count}; set --{option}")
@@ -67,14 +69,25 @@ def predict(
     def by(place: Path, lone: bool) -> Segment:
         return by_ring if lone else segmenter
 
-    tasks = tasks_in(inputs, Lone(segmenter.taxonomy, by, fitting, out, topic, kind, scores), sequences, split)
+    tasks = tasks_in(
+        inputs, Lone(segmenter.taxonomy, by, fitting, out, topic, kind, scores), sequences, split
+    )
     parts = {part: segmenter.weights.digest(part) for part in segmenter.weights.parts}
     model = {"weights": parts, "method": segmenter.method, "sensor": repr(fitting.given)}
     if segmenter.precision != "float32":
         model["precision"] = segmenter.precision
     settings = {**model, "scores": scores, "uncertain": uncertain, "format": kind}
     return run_tasks(
-        tasks, out, settings, scores, uncertain, progress, resume, processes, batch, at_once or segmenter.at_once
+        tasks,
+        out,
+        settings,
+        scores,
+        uncertain,
+        progress,
+        resume,
+        processes,
+        batch,
+        at_once or segmenter.at_once,
     )
 
 
@@ -92,7 +105,11 @@ def run_tasks(
 ) -> int:
     """Segment scans into `out`; `settings` is what their labels depend on. The rest is as of `predict`."""
     journal = Journal(out, settings, resume, processes)
-    mine = [task for task in processes.share(tasks) if str(task.scores.relative_to(out)) not in journal.done]
+    mine = [
+        task
+        for task in processes.share(tasks)
+        if str(task.scores.relative_to(out)) not in journal.done
+    ]
     broken: list[str] = []
     for done, (task, fault) in enumerate(stream(mine, scores, uncertain, batch, at_once)):
         progress(done, len(mine))
@@ -108,5 +125,7 @@ def run_tasks(
         raise InputError(broken[0] + more)
     if broken:
         kept = len(tasks) - len(broken)
-        raise SomeBroken(f"{kept} of {len(tasks)} scans are segmented, {len(broken)} are broken", broken)
+        raise SomeBroken(
+            f"{kept} of {len(tasks)} scans are segmented, {len(broken)} are broken", broken
+        )
     return len(tasks)

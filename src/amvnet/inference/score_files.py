@@ -17,7 +17,9 @@ from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
-SURE = 1e-7  # two models that are wholly sure of different classes have a product of 0 for every class
+SURE = (
+    1e-7  # two models that are wholly sure of different classes have a product of 0 for every class
+)
 ROUNDING = 0.02  # by which a row of K float16 probabilities, or of ones with two decimals, may miss a sum of 1
 ENDINGS = (".npz", ".npy")
 TAIL = 4096  # bytes at the end of a file: the checksums of an .npz, the last points of an .npy
@@ -61,18 +63,26 @@ class ScoreFolder:
         path = self.find(place)
         found = self._array(path)
         if found.ndim != 2 or len(found) != len(scan) or found.shape[1] != classes:
-            more = "drop the column of points without a class" if found.shape[-1:] == (classes + 1,) else "give those"
+            more = (
+                "drop the column of points without a class"
+                if found.shape[-1:] == (classes + 1,)
+                else "give those"
+            )
             raise InputError(
                 f"{path}: expected scores of shape ({len(scan)}, {classes}), one row per point and one column per "
                 f"class, found {found.shape}; {more}"
             )
         if found.dtype.kind != "f":
-            raise InputError(f"{path}: expected float scores, found {found.dtype}; save class probabilities")
+            raise InputError(
+                f"{path}: expected float scores, found {found.dtype}; save class probabilities"
+            )
         found = found.astype(np.float32)
         if self.logits:
             check_finite(found[scan.valid], str(path))
             return _softmax(found)
-        check_probabilities(found[scan.valid], str(path), f"apply softmax, or say --logits {self.side}")
+        check_probabilities(
+            found[scan.valid], str(path), f"apply softmax, or say --logits {self.side}"
+        )
         return found
 
     def _array(self, path: Path) -> np.ndarray:
@@ -103,7 +113,9 @@ class ScorePair:
     b: ScoreFolder
 
     @classmethod
-    def of(cls, a: Path, b: Path, key_a: str | None, key_b: str | None, logits: Which | None) -> ScorePair:
+    def of(
+        cls, a: Path, b: Path, key_a: str | None, key_b: str | None, logits: Which | None
+    ) -> ScorePair:
         """From what a user says.
 
         Raises:
@@ -111,7 +123,9 @@ class ScorePair:
         """
         for folder in (a, b):
             if not folder.is_dir():
-                raise InputError(f"{folder}: expected a folder of scores, found none; check the path")
+                raise InputError(
+                    f"{folder}: expected a folder of scores, found none; check the path"
+                )
         first = ScoreFolder("a", a, key_a, logits in ("a", "both"))
         return cls(first, ScoreFolder("b", b, key_b, logits in ("b", "both")))
 
@@ -125,8 +139,15 @@ class ScorePair:
 
     def options(self) -> list[str]:
         """The same as options of a command line."""
-        found = [word for one in (self.a, self.b) for word in (f"--scores-{one.side}", str(one.folder))]
-        found += [word for one in (self.a, self.b) if one.key is not None for word in (f"--key-{one.side}", one.key)]
+        found = [
+            word for one in (self.a, self.b) for word in (f"--scores-{one.side}", str(one.folder))
+        ]
+        found += [
+            word
+            for one in (self.a, self.b)
+            if one.key is not None
+            for word in (f"--key-{one.side}", one.key)
+        ]
         sides = [one.side for one in (self.a, self.b) if one.logits]
         return found + (["--logits", "both" if len(sides) == 2 else sides[0]] if sides else [])
 
@@ -151,7 +172,9 @@ def check_probabilities(values: np.ndarray, name: str, cure: str) -> None:
 def check_finite(values: np.ndarray, name: str) -> None:
     """Raises InputError where a score is not a finite number."""
     if not np.isfinite(values).all():
-        raise InputError(f"{name}: expected finite scores, found NaN or infinity among them; give probabilities")
+        raise InputError(
+            f"{name}: expected finite scores, found NaN or infinity among them; give probabilities"
+        )
 
 
 @contextmanager
@@ -162,7 +185,9 @@ def _readable(path: Path) -> Iterator[None]:
     except InputError:
         raise
     except (ValueError, EOFError, OSError, BadZipFile, zlib.error):
-        raise InputError(f"{path}: expected NumPy scores, found a broken file; write it again") from None
+        raise InputError(
+            f"{path}: expected NumPy scores, found a broken file; write it again"
+        ) from None
 
 
 def _softmax(values: np.ndarray) -> np.ndarray:

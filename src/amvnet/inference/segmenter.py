@@ -71,7 +71,9 @@ class Segmenter:
         self.weights = weights if isinstance(weights, Weights) else load(weights)
         self.method = _checked_method(method, self.weights)
         if self.weights.model.assertion.name == "loss":
-            raise InputError("expected an assertion that needs no labels, found loss; train the head with another one")
+            raise InputError(
+                "expected an assertion that needs no labels, found loss; train the head with another one"
+            )
         self.engine = "torch"
         self.device, self.precision = _checked_device(device), precision
         check_precision(precision, device)
@@ -84,7 +86,11 @@ class Segmenter:
     @property
     def at_once(self) -> int:
         """How many scans are best segmented side by side, each by its share of torch's threads."""
-        return min(torch.get_num_threads(), MOST_AT_ONCE) if self.device == "cpu" and self.engine == "torch" else 1
+        return (
+            min(torch.get_num_threads(), MOST_AT_ONCE)
+            if self.device == "cpu" and self.engine == "torch"
+            else 1
+        )
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -109,7 +115,10 @@ class Segmenter:
         batch = self._batch(checked)
         labels, found = _fetched(self._scores(batch))
         places = batch.slices()
-        return [_segmentation(one.valid, labels, found, place) for one, place in zip(checked, places, strict=True)]
+        return [
+            _segmentation(one.valid, labels, found, place)
+            for one, place in zip(checked, places, strict=True)
+        ]
 
     def by_ring(self) -> Segmenter:
         """The same for scans whose `ring` is the row of each point, 0 the lowest, whatever rows the weights have."""
@@ -123,7 +132,9 @@ class Segmenter:
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """The (N,) train ids by each method that the weights have the parts for, and which points are uncertain."""
         found, uncertain = self.scores_by_method(scan, methods)
-        labels = {name: labels_in_place(found[name], scan.valid) for name in methods if name in found}
+        labels = {
+            name: labels_in_place(found[name], scan.valid) for name in methods if name in found
+        }
         return labels, None if uncertain is None else in_place(uncertain, scan.valid)
 
     @torch.inference_mode()
@@ -175,13 +186,17 @@ def checked_scan(points: np.ndarray | Scan) -> Scan:
     scan = points if isinstance(points, Scan) else Scan(np.asarray(points, dtype=np.float32))
     if not scan.valid.any():
         found = "none finite" if len(scan) else "none"
-        raise InputError(f"{scan.name or 'scan'}: expected points to segment, found {found}; leave the scan out")
+        raise InputError(
+            f"{scan.name or 'scan'}: expected points to segment, found {found}; leave the scan out"
+        )
     return scan
 
 
 def _checked_method(method: Method, weights: Weights) -> Method:
     if method not in NEEDED:
-        raise InputError(f"expected a method of {', '.join(METHODS)}, found {method!r}; use one of them")
+        raise InputError(
+            f"expected a method of {', '.join(METHODS)}, found {method!r}; use one of them"
+        )
     missing = [part for part in NEEDED[method] if part not in weights.parts]
     if missing:
         raise InputError(
@@ -222,8 +237,14 @@ def _fetched(scores: Scores) -> tuple[Tensor, Scores]:
 
 def _segmentation(valid: np.ndarray, labels: Tensor, scores: Scores, place: slice) -> Segmentation:
     """Of the scan whose valid points stand at this place of a batch."""
-    rv, bev = (None if values is None else in_place(values[place], valid) for values in (scores.rv, scores.bev))
-    uncertain, merged = in_place(scores.uncertain[place], valid), in_place(scores.merged[place], valid)
+    rv, bev = (
+        None if values is None else in_place(values[place], valid)
+        for values in (scores.rv, scores.bev)
+    )
+    uncertain, merged = (
+        in_place(scores.uncertain[place], valid),
+        in_place(scores.merged[place], valid),
+    )
     return Segmentation(in_place(labels[place], valid), uncertain, merged, rv, bev)
 
 
@@ -258,5 +279,7 @@ def labels_in_place(scores: Tensor, valid: np.ndarray) -> np.ndarray:
 def label_ids(scores: Tensor) -> Tensor:
     """(P, K) scores -> (P,) uint8 train ids 1..K, of the largest, or the first of these."""
     # On a CPU by NumPy, in half of torch's time.
-    best = torch.from_numpy(scores.numpy().argmax(axis=1)) if scores.is_cpu else scores.argmax(dim=1)
+    best = (
+        torch.from_numpy(scores.numpy().argmax(axis=1)) if scores.is_cpu else scores.argmax(dim=1)
+    )
     return (best + 1).to(torch.uint8)

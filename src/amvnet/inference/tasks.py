@@ -21,7 +21,9 @@ from amvnet.inference.segmenter import Segmentation
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import MEASURED, Fitting
 
-By = Callable[[Path, bool], Segment]  # for the scan whose scores lie at a place, and whether it is a lone one
+By = Callable[
+    [Path, bool], Segment
+]  # for the scan whose scores lie at a place, and whether it is a lone one
 
 
 @dataclass
@@ -57,7 +59,9 @@ class Lone:
         def write(result: Segmentation) -> Path:
             known = None if result.rv is None or result.bev is None else result.uncertain
             stem = self.out / scan.name
-            return write_scan_labels(stem, self.kind, kept.pop(), result.labels, self.taxonomy, known)
+            return write_scan_labels(
+                stem, self.kind, kept.pop(), result.labels, self.taxonomy, known
+            )
 
         scores = self.out / f"{scan.name}.npz"
         return Task(scan.name, read, self.by(scores, True), write, scores)
@@ -70,11 +74,15 @@ class Lone:
         """
         mistaken = f".{self.kind}" in READERS or (self.scores and path.suffix.lower() == ".npz")
         if mistaken and task.scores.parent.resolve() == path.parent.resolve():
-            raise InputError(f"{path}: expected another folder for the labels, found the scan's own; change --out")
+            raise InputError(
+                f"{path}: expected another folder for the labels, found the scan's own; change --out"
+            )
         return task
 
 
-def tasks_in(inputs: Sequence[str], lone: Lone, sequences: Sequence[str] | None, split: str) -> list[Task]:
+def tasks_in(
+    inputs: Sequence[str], lone: Lone, sequences: Sequence[str] | None, split: str
+) -> list[Task]:
     """The scans of all inputs, data sets as lone ones; raises InputError where two would have the same files."""
     tasks = [task for text in inputs for task in _tasks(text, lone, sequences, split)]
     _check_names(tasks)

@@ -86,7 +86,9 @@ def time_jobs(
                 f"expected the whole of AMVNet to time, found the method {job.segmenter.method}; use amvnet"
             )
         if job.share is not None and not 0 <= job.share <= 1:
-            raise InputError(f"expected a share of uncertain points from 0 to 1, found {job.share}; give another")
+            raise InputError(
+                f"expected a share of uncertain points from 0 to 1, found {job.share}; give another"
+            )
     found: list[list[Run]] = [[] for _ in jobs]
     limits: dict[str, float] = {}
     for number in range(runs + WARM_UP):
@@ -117,7 +119,9 @@ def run_once(job: Job) -> Run:
     with clock(MEAN):
         label_ids(geometric_mean(f, g)).cpu()
     with clock("compare"):
-        uncertain = model.assertion(f, g, batch.points) if job.share is None else _least(f, g, job.share)
+        uncertain = (
+            model.assertion(f, g, batch.points) if job.share is None else _least(f, g, job.share)
+        )
         index = uncertain.nonzero()[:, 0]
     with clock("neighbours"):
         near = nearest_neighbours(batch.points, index, head.config.neighbours)
@@ -156,8 +160,12 @@ class _Clock:
 
 def _report(job: Job, runs: Sequence[Run], limits: dict[str, float]) -> dict[str, Any]:
     stages = {stage: _spread([run.seconds[stage] for run in runs]) for stage in (*STAGES, MEAN)}
-    fusion = _spread([sum(run.seconds[stage] for stage in FUSION) / run.all for run in runs], unit=1)
-    networks = _spread([run.all / sum(run.seconds[stage] for stage in NETWORKS) for run in runs], unit=1)
+    fusion = _spread(
+        [sum(run.seconds[stage] for stage in FUSION) / run.all for run in runs], unit=1
+    )
+    networks = _spread(
+        [run.all / sum(run.seconds[stage] for stage in NETWORKS) for run in runs], unit=1
+    )
     flops = _flops(job)
     return {
         "engine": job.name,
@@ -192,7 +200,10 @@ def _spread(values: Sequence[float], unit: float = 1e3) -> dict[str, float]:
 @torch.inference_mode()
 def _flops(job: Job) -> dict[str, float]:
     """Floating-point operations of each network for the scan; a multiplication and an addition are two."""
-    model, batch = job.segmenter.weights.build().to(job.segmenter.device), PointBatch.of([job.read()])
+    model, batch = (
+        job.segmenter.weights.build().to(job.segmenter.device),
+        PointBatch.of([job.read()]),
+    )
     counted = {}
     for name, score in (("RV", model.score_range_view), ("BEV", model.score_polar_view)):
         with FlopCounterMode(display=False) as counter:
@@ -237,5 +248,7 @@ def untrained(recipe: Recipe) -> Weights:
     """Random weights of a recipe's sizes, to time them."""
     taxonomy = TAXONOMIES[recipe.taxonomy]
     model = build_amvnet(recipe.model, taxonomy.size)
-    tensors = {key: value for part in PARTS for key, value in state_of(part, getattr(model, part)).items()}
+    tensors = {
+        key: value for part in PARTS for key, value in state_of(part, getattr(model, part)).items()
+    }
     return Weights(recipe.model, taxonomy, recipe.sensor, tensors)

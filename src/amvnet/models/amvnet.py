@@ -66,7 +66,10 @@ class AMVNet(nn.Module):
         """h: (U, K) class probabilities of the uncertain points by the point head; None without one."""
         if self.point_head is None:
             return None
-        parts = [refine(self.point_head, batch.points[s], f[s], g[s], uncertain[s]) for s in batch.slices()]
+        parts = [
+            refine(self.point_head, batch.points[s], f[s], g[s], uncertain[s])
+            for s in batch.slices()
+        ]
         return torch.cat(parts)
 
 
@@ -77,7 +80,9 @@ def refine(head: PointHead, points: Tensor, f: Tensor, g: Tensor, uncertain: Ten
     return settle(head, points, f, g, index, near)
 
 
-def settle(head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
+def settle(
+    head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor
+) -> Tensor:
     """h: (U, K) of the points with these indices (U,), whose neighbours are (U, n)."""
     asked, (index, near) = only_asked(len(points), index, near)
     table = point_table(*(values.index_select(0, asked) for values in (points, f, g)))

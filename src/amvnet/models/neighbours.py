@@ -48,7 +48,9 @@ def _nearest_by_scipy(xyz: np.ndarray, asked: np.ndarray, n: int) -> np.ndarray:
 
 def _without_own(found: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     """Drop each point from its own neighbours; the farthest where, among points in one place, it is not found."""
-    if (found[:, 0] == own).all() and found.shape[1] > 1:  # as it is where no two points are in one place
+    if (found[:, 0] == own).all() and found.shape[
+        1
+    ] > 1:  # as it is where no two points are in one place
         found = found[:, 1:]
     elif found.shape[1] > 1:
         is_own = found == own[:, None]

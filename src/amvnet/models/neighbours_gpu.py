@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 BLOCK = 128  # points of a block, at most
-NEAREST = 8  # blocks that are searched for a point's neighbours; 2 hold them for most points of a scan
+NEAREST = (
+    8  # blocks that are searched for a point's neighbours; 2 hold them for most points of a scan
+)
 SPARE = 16  # so many more than are asked for are ranked anew in double precision; points that are repeated take room
 ROUNDING = 1e-6  # relative: a squared distance in float32 is nearer than this to the true one
 UNDERFLOW = 1e-37  # square metres: smaller ones float32 does not know so well
@@ -56,13 +58,18 @@ def split_into_blocks(xyz: Tensor) -> Blocks:
     size = -(-len(xyz) >> levels)  # rounded up
     # Up to the full blocks there are copies of the last point: boxes hold them, and nobody finds them.
     index = torch.arange(size << levels, device=xyz.device)[None]
-    for ways in [2] * (levels % 2) + [4] * (levels // 2):  # in quarters: half as many sorts, and nearly as good boxes
+    for ways in [2] * (levels % 2) + [4] * (
+        levels // 2
+    ):  # in quarters: half as many sorts, and nearly as good boxes
         index = _split(xyz, index, ways)
     points = xyz[index.clamp_max(len(xyz) - 1)]  # (M, B, 3)
     low, high = points.amin(dim=1), points.amax(dim=1)
     copies = (index >= len(xyz))[..., None]
     return Blocks(
-        index.clamp_max(len(xyz)), points.masked_fill(copies, torch.inf).transpose(1, 2).contiguous(), low, high
+        index.clamp_max(len(xyz)),
+        points.masked_fill(copies, torch.inf).transpose(1, 2).contiguous(),
+        low,
+        high,
     )
 
 
@@ -76,7 +83,9 @@ def _split(xyz: Tensor, index: Tensor, ways: int) -> Tensor:
 
 def _nearest(xyz: Tensor, own: Tensor, n: int) -> Tensor:
     """(U, n) of a scan with n other points or more: by the blocks, and where these leave a doubt by all points."""
-    if len(xyz) <= NEAREST * BLOCK or n + SPARE > NEAREST * BLOCK // 2:  # a block is at least half full
+    if (
+        len(xyz) <= NEAREST * BLOCK or n + SPARE > NEAREST * BLOCK // 2
+    ):  # a block is at least half full
         return _among_all(xyz, own, n)
     blocks = split_into_blocks(xyz)
     parts = [_in_blocks(xyz, blocks, some, n) for some in _parts(own, _bytes_in_blocks(blocks))]
@@ -92,7 +101,9 @@ def _in_blocks(xyz: Tensor, blocks: Blocks, own: Tensor, n: int) -> tuple[Tensor
     asked = xyz[own]
     gap, near = _gaps(blocks, asked).topk(NEAREST + 1, dim=1, largest=False)
     index = blocks.index[near[:, :-1]].flatten(1)  # (U, NEAREST * B)
-    squares = (blocks.points[near[:, :-1]] - asked[:, None, :, None]).square_()  # (U, NEAREST, 3, B)
+    squares = (
+        blocks.points[near[:, :-1]] - asked[:, None, :, None]
+    ).square_()  # (U, NEAREST, 3, B)
     distance = (squares[:, :, 0] + squares[:, :, 1] + squares[:, :, 2]).flatten(1)
     distance.masked_fill_(index == own[:, None], torch.inf)
     rough, place = distance.topk(n + SPARE, dim=1, largest=False)
@@ -107,7 +118,9 @@ def _in_blocks(xyz: Tensor, blocks: Blocks, own: Tensor, n: int) -> tuple[Tensor
 def _gaps(blocks: Blocks, asked: Tensor) -> Tensor:
     """(U, M) squared distances of points (U, 3) to the boxes; 0 inside."""
     total = asked.new_zeros(len(asked), len(blocks.low))
-    for axis, low, high in zip(asked.unbind(1), blocks.low.unbind(1), blocks.high.unbind(1), strict=True):
+    for axis, low, high in zip(
+        asked.unbind(1), blocks.low.unbind(1), blocks.high.unbind(1), strict=True
+    ):
         total += torch.maximum(low - axis[:, None], axis[:, None] - high).clamp_min_(0).square_()
     return total
 

@@ -29,14 +29,19 @@ class InPrecision(nn.Module):
 
     def forward(self, view: Any) -> Tensor:
         lower = self.precision != "float32"
-        with _tf32_as_asked(), torch.autocast(self.kind, getattr(torch, self.precision) if lower else None, lower):
+        with (
+            _tf32_as_asked(),
+            torch.autocast(self.kind, getattr(torch, self.precision) if lower else None, lower),
+        ):
             return self.net(view).float()
 
 
 def check_precision(precision: str, device: str) -> None:
     """Raises InputError where there is no such precision, or the device has none."""
     if precision not in PRECISIONS:
-        raise InputError(f"expected a precision of {', '.join(PRECISIONS)}, found {precision!r}; use one of them")
+        raise InputError(
+            f"expected a precision of {', '.join(PRECISIONS)}, found {precision!r}; use one of them"
+        )
     if precision == "float16" and torch.device(device).type == "cpu":
         raise InputError("expected float32 or bfloat16 on a CPU, found float16; use bfloat16")
 

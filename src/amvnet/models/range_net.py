@@ -23,7 +23,9 @@ class RangeNet(nn.Module):
         self.input_norm = nn.BatchNorm2d(CHANNELS)
         self.stem = ConvBlock(CHANNELS, c.stem)
         self.stages = nn.ModuleList(_stages(c))
-        self.recurrent = nn.ModuleList(AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT:] if c.gru)
+        self.recurrent = nn.ModuleList(
+            AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT:] if c.gru
+        )
         decoded = c.widths[FIRST_DECODED:]
         self.lateral = nn.ModuleList(ConvBlock(w, c.decoder, 1) for w in decoded)
         self.decoder = nn.ModuleList(ConvBlock(c.decoder, c.decoder) for _ in decoded)

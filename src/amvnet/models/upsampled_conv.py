@@ -43,12 +43,18 @@ def _convolve_upsampled(x: Tensor, weight: Tensor, scale: tuple[int, int]) -> Te
     they find for a t, in a row, begin one cell before the first.
     """
     rows, columns = scale
-    with torch.autocast(x.device.type, enabled=False):  # sums of weights are exact enough in their own type only
+    with torch.autocast(
+        x.device.type, enabled=False
+    ):  # sums of weights are exact enough in their own type only
         taps = _taps(rows, weight), _taps(columns, weight)
         kernels = torch.einsum("pak,qbl,oikl->pqoiab", *taps, weight).flatten(0, 2)
-    found = F.conv2d(wrap_width(x, 1, 1), kernels, padding=(1, 0)).permute(0, 2, 3, 1)  # (B, h + 1, w + 1, s * s * C')
+    found = F.conv2d(wrap_width(x, 1, 1), kernels, padding=(1, 0)).permute(
+        0, 2, 3, 1
+    )  # (B, h + 1, w + 1, s * s * C')
     b, h, w, _ = found.shape
-    cells = found.view(b, h, w, rows, columns, -1).transpose(2, 3).reshape(b, h * rows, w * columns, -1)
+    cells = (
+        found.view(b, h, w, rows, columns, -1).transpose(2, 3).reshape(b, h * rows, w * columns, -1)
+    )
     top, left = int(rows > 1), int(columns > 1)
     size = x.shape[2] * rows, x.shape[3] * columns
     return cells[:, top : top + size[0], left : left + size[1]].permute(0, 3, 1, 2)
@@ -59,5 +65,7 @@ def _taps(scale: int, like: Tensor) -> Tensor:
     if scale == 1:
         return torch.eye(3, dtype=like.dtype, device=like.device)[None]
     place, k = torch.arange(-1, scale - 1)[:, None], torch.arange(-1, 2)
-    second = (place + k >= 0).to(like)  # (scale, 3): else the fine cell lies in the coarse cell before
+    second = (place + k >= 0).to(
+        like
+    )  # (scale, 3): else the fine cell lies in the coarse cell before
     return torch.stack([1 - second, second], dim=1)

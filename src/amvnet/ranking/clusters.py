@@ -19,5 +19,7 @@ def cluster(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
     cells = np.column_stack([np.floor(xyz / CELL), kind]).astype(np.int64)
     cells, cell_of = np.unique(cells, axis=0, return_inverse=True)
     pairs = cKDTree(cells * [1, 1, 1, APART]).query_pairs(TOUCHING, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cells),) * 2)
+    links = coo_array(
+        (np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(len(cells),) * 2
+    )
     return connected_components(links, directed=False)[1][cell_of.ravel()].astype(np.int64)

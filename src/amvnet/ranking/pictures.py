@@ -16,7 +16,9 @@ REACH = 8.0  # metres from the cluster to each side
 DEEP = 6.0  # metres above and below it: what is farther would hide it
 
 
-def draw(ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, folder: Path) -> list[Path]:
+def draw(
+    ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, folder: Path
+) -> list[Path]:
     """Draw the first clusters, each with its surroundings; returns the files, RANK.png."""
     return [
         _draw(row, ranking, dataset, segmenter, by, folder / f"{place:02d}.png")
@@ -24,14 +26,20 @@ def draw(ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, folde
     ]
 
 
-def _draw(row: np.void, ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, path: Path) -> Path:
+def _draw(
+    row: np.void, ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, path: Path
+) -> Path:
     record = ranking.records[row["scan"]]
     scan = checked_scan(dataset.read(record))
     doubts = doubts_of(scan, segmenter, by)
     _, of = clusters_of(doubts)
     points = scan.points[:, :3] - row["xyz"]
     near = (np.abs(points) <= (REACH, REACH, DEEP)).all(axis=1)
-    panels = {"rv": doubts.rv, "bev": doubts.bev, **({} if scan.labels is None else {"label": doubts.label})}
+    panels = {
+        "rv": doubts.rv,
+        "bev": doubts.bev,
+        **({} if scan.labels is None else {"label": doubts.label}),
+    }
     x, y, z = row["xyz"]
     return draw_scan(
         path,

@@ -103,7 +103,11 @@ def rank(
     check_classes(dataset, segmenter.taxonomy)
     if not {"range_net", "polar_net"} <= set(segmenter.weights.parts):
         raise InputError("expected weights with both networks, found one; train the other, too")
-    found, means, sizes = [np.zeros(0, dtype=ROW)], np.zeros(len(records)), np.zeros(len(records), dtype=np.int64)
+    found, means, sizes = (
+        [np.zeros(0, dtype=ROW)],
+        np.zeros(len(records)),
+        np.zeros(len(records), dtype=np.int64),
+    )
     for place, record in enumerate(records):
         progress(place, len(records))
         doubts = doubts_of(checked_scan(dataset.read(record)), segmenter, by)
@@ -127,7 +131,9 @@ def doubts_of(scan: Scan, segmenter: Segmenter, by: By) -> Doubts:
         InputError: where labels are asked for and the scan has none.
     """
     if by == "labels" and scan.labels is None:
-        raise InputError(f"{scan.name}: expected labels to doubt, found none; name labelled sequences")
+        raise InputError(
+            f"{scan.name}: expected labels to doubt, found none; name labelled sequences"
+        )
     scores, uncertain = segmenter.scores_by_method(scan, ("rv", "bev"))
     assert uncertain is not None
     f, g = scores["rv"], scores["bev"]
@@ -150,7 +156,9 @@ def _sizes_of_things(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> n
     return sizes
 
 
-def _contradicted(f: torch.Tensor, g: torch.Tensor, label: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _contradicted(
+    f: torch.Tensor, g: torch.Tensor, label: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """(P,) by how much the views contradict the labels, and (P,) what they say together.
 
     Both views must: it is what the less sure one gives that class, less what the other one at most gives the label.
@@ -223,7 +231,14 @@ def _cluster_rows(ranking: Ranking, taxonomy: Taxonomy) -> Iterator[list[Any]]:
     for row in ranking.clusters:
         classes = [names[row[column]] for column in ("rv", "bev", "label")]
         place = [f"{value:.2f}" for value in row["xyz"]]
-        yield [ranking.records[row["scan"]].name, f"{row['score']:.4f}", *place, row["points"], row["point"], *classes]
+        yield [
+            ranking.records[row["scan"]].name,
+            f"{row['score']:.4f}",
+            *place,
+            row["points"],
+            row["point"],
+            *classes,
+        ]
 
 
 def _scan_rows(ranking: Ranking) -> Iterator[list[Any]]:

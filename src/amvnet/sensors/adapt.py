@@ -20,7 +20,9 @@ from amvnet.sensors.measure import Measured, elevations, measure
 from amvnet.weights.file import Weights
 
 MEASURED = 5  # scans of a source that are measured; then their median stays
-STEADY = 0.4  # metres: where heights of a source differ by more, each of its scans counts for itself
+STEADY = (
+    0.4  # metres: where heights of a source differ by more, each of its scans counts for itself
+)
 SAME_HEIGHT = 0.15  # metres that do not matter: training moves the sensor by as much
 LOWEST = 0.3  # metres: a lower origin is a place on the ground, not the sensor
 OUTSIDE = 0.16  # share of the points out of the weights' field of view from which on it is widened to the scan's
@@ -53,7 +55,10 @@ class Fitting:
     """
 
     def __init__(
-        self, weights: Weights, given: Sensor | None = None, say: Callable[[str], None] = lambda line: None
+        self,
+        weights: Weights,
+        given: Sensor | None = None,
+        say: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.given, self._say = given or Sensor(), say
         self.trained, self.height = SENSORS.get(weights.sensor), HEIGHTS.get(weights.sensor)
@@ -77,7 +82,9 @@ class Fitting:
         found = self._settled(known, scan, valid)
         sensor = _known(self.given, found)
         moved = _raised(scan, self._rise(sensor))
-        seen = moved if sensor.height is not None and sensor.height < LOWEST else scan  # from where the sensor is
+        seen = (
+            moved if sensor.height is not None and sensor.height < LOWEST else scan
+        )  # from where the sensor is
         wide = self._widened(seen.points[valid], sensor)
         if not known.said:
             known.said = True
@@ -95,7 +102,9 @@ class Fitting:
                 cloud = read()
                 scale = self.given.intensity_scale or cloud.intensity_scale()
                 scan = _level(cloud, self.given).to_scan(scale)
-                self._settled(self._sources.setdefault((source, scale), _Source()), scan, scan.valid)
+                self._settled(
+                    self._sources.setdefault((source, scale), _Source()), scan, scan.valid
+                )
         for (name, _), known in self._sources.items():
             known.learnt |= name == source
 
@@ -114,7 +123,11 @@ class Fitting:
 
     def _rise(self, sensor: Measured) -> float:
         """Metres to move a scan up."""
-        if self.height is None or sensor.height is None or abs(sensor.height - self.height) < SAME_HEIGHT:
+        if (
+            self.height is None
+            or sensor.height is None
+            or abs(sensor.height - self.height) < SAME_HEIGHT
+        ):
             return 0.0
         return sensor.height - self.height
 
@@ -123,16 +136,28 @@ class Fitting:
         view = self._view
         if view.rows == "ring":
             known = self.trained or (sensor if sensor.beams == view.height else None)
-            if known is None or known.fov_up is None or known.fov_down is None or known.fov_up <= known.fov_down:
+            if (
+                known is None
+                or known.fov_up is None
+                or known.fov_down is None
+                or known.fov_up <= known.fov_down
+            ):
                 return None
             view = _by_elevation(view, known.fov_up, known.fov_down, view.height - 1)
         elevation = elevations(points[:, :3].astype(np.float64))
         outside = ((elevation > view.fov_up) | (elevation < view.fov_down)).mean()
-        if outside < OUTSIDE or sensor.fov_up is None or sensor.fov_down is None or sensor.fov_up <= sensor.fov_down:
+        if (
+            outside < OUTSIDE
+            or sensor.fov_up is None
+            or sensor.fov_down is None
+            or sensor.fov_up <= sensor.fov_down
+        ):
             return view
         return _by_elevation(view, sensor.fov_up, sensor.fov_down, view.height)
 
-    def _rows(self, scan: Scan, valid: np.ndarray, view: RangeViewConfig | None) -> np.ndarray | None:
+    def _rows(
+        self, scan: Scan, valid: np.ndarray, view: RangeViewConfig | None
+    ) -> np.ndarray | None:
         """(N,) row of the range image of each point, 0 the lowest; 0 for lost points."""
         own = scan.ring if self._view.rows == "ring" else None
         if view is None or (own is not None and self.trained is None):
@@ -186,7 +211,11 @@ def _by_elevation(view: RangeViewConfig, top: float, bottom: float, steps: int) 
 
 
 def _raised(scan: Scan, rise: float) -> Scan:
-    return dataclasses.replace(scan, points=scan.points + np.array([0, 0, rise, 0], np.float32)) if rise else scan
+    return (
+        dataclasses.replace(scan, points=scan.points + np.array([0, 0, rise, 0], np.float32))
+        if rise
+        else scan
+    )
 
 
 def _median(found: list[Measured]) -> Measured:
@@ -202,7 +231,9 @@ def _median(found: list[Measured]) -> Measured:
 def _known(given: Sensor, found: Measured) -> Measured:
     """What is given, and where it is not, what was measured."""
     stated = {key: getattr(given, key) for key in KEYS}
-    return dataclasses.replace(found, **{key: value for key, value in stated.items() if value is not None})
+    return dataclasses.replace(
+        found, **{key: value for key, value in stated.items() if value is not None}
+    )
 
 
 def _agree(ring: np.ndarray, rows: np.ndarray) -> bool:
@@ -211,7 +242,9 @@ def _agree(ring: np.ndarray, rows: np.ndarray) -> bool:
 
 
 def _intensity_words(cloud: Cloud, scale: float | None) -> str:
-    return "no intensity" if cloud.intensity is None or scale is None else f"intensity 0 to {scale:g}"
+    return (
+        "no intensity" if cloud.intensity is None or scale is None else f"intensity 0 to {scale:g}"
+    )
 
 
 def _lasers_words(sensor: Sensor | Measured) -> str:

@@ -75,12 +75,16 @@ class Sensor:
         }
         for key, (expected, holds) in checks.items():
             if not holds:
-                raise InputError(f"{key}: expected {expected}, found {getattr(self, key)!r}; correct the value")
+                raise InputError(
+                    f"{key}: expected {expected}, found {getattr(self, key)!r}; correct the value"
+                )
 
     @property
     def level(self) -> bool:
         """Whether the scans are in the frame that the package works in: x forward, y left, z up."""
-        return self == dataclasses.replace(self, axes="x-forward", rotate=(0.0, 0.0, 0.0), offset=(0.0, 0.0, 0.0))
+        return self == dataclasses.replace(
+            self, axes="x-forward", rotate=(0.0, 0.0, 0.0), offset=(0.0, 0.0, 0.0)
+        )
 
     def to_level(self, xyz: np.ndarray) -> np.ndarray:
         """(N, 3) points of a file in that frame; float64 where anything has to be done."""
@@ -92,7 +96,10 @@ class Sensor:
 
 def rotation(yaw: float, pitch: float, roll: float) -> np.ndarray:
     """(3, 3) the rotation by roll about x, then pitch about y, then yaw about z, in degrees."""
-    (a, b, c), (d, e, f) = np.cos(np.radians([yaw, pitch, roll])), np.sin(np.radians([yaw, pitch, roll]))
+    (a, b, c), (d, e, f) = (
+        np.cos(np.radians([yaw, pitch, roll])),
+        np.sin(np.radians([yaw, pitch, roll])),
+    )
     about_z = np.array([[a, -d, 0], [d, a, 0], [0, 0, 1]])
     about_y = np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
     about_x = np.array([[1, 0, 0], [0, c, -f], [0, f, c]])
@@ -151,13 +158,19 @@ def _named(text: str) -> Sensor:
     if text in SENSORS:
         return SENSORS[text]
     if path.suffix not in (".yaml", ".yml"):
-        raise InputError(f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {text!r}; give one of them")
+        raise InputError(
+            f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {text!r}; give one of them"
+        )
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError, RecursionError):
-        raise InputError(f"{path}: expected a YAML file that describes a sensor, found none; check it") from None
+        raise InputError(
+            f"{path}: expected a YAML file that describes a sensor, found none; check it"
+        ) from None
     if not isinstance(tree, Mapping):
-        raise InputError(f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md")
+        raise InputError(
+            f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md"
+        )
     try:
         return Sensor(**{"name": path.stem, **_converted(tree, "")})
     except InputError as error:
@@ -175,16 +188,22 @@ def _converted(values: Mapping[Any, Any], mark: str) -> dict[str, Any]:
             found[key] = kinds[key](value)
         except (ValueError, TypeError, OverflowError):
             shown = f"{mark}{key}".replace("_", "-") if mark else key
-            raise InputError(f"{shown}: expected {_example(key)}, found {value!r}; correct the value") from None
+            raise InputError(
+                f"{shown}: expected {_example(key)}, found {value!r}; correct the value"
+            ) from None
     return found
 
 
 def _kind(key: str) -> Any:
-    return {"name": str, "axes": str, "beams": _whole, "rotate": _triple, "offset": _triple}.get(key, float)
+    return {"name": str, "axes": str, "beams": _whole, "rotate": _triple, "offset": _triple}.get(
+        key, float
+    )
 
 
 def _example(key: str) -> str:
-    return {"rotate": "yaw,pitch,roll such as 90,0,0", "offset": "x,y,z such as 0,0,1.2"}.get(key, "a number")
+    return {"rotate": "yaw,pitch,roll such as 90,0,0", "offset": "x,y,z such as 0,0,1.2"}.get(
+        key, "a number"
+    )
 
 
 def _whole(value: Any) -> int:

@@ -60,7 +60,11 @@ def measure(points: np.ndarray, ring: np.ndarray | None = None) -> Measured:
         return Measured()
     elevation = elevations(xyz[distant])
     down, up = np.percentile(elevation, ENDS)
-    beams = len(np.unique(ring)) if ring is not None else beams_by_order(xyz) or beams_by_peaks(xyz[distant])
+    beams = (
+        len(np.unique(ring))
+        if ring is not None
+        else beams_by_order(xyz) or beams_by_peaks(xyz[distant])
+    )
     return Measured(beams, float(up), float(down), ground_height(xyz[distant]))
 
 
@@ -92,7 +96,9 @@ def beams_by_peaks(xyz: np.ndarray) -> int | None:
     elevation = elevations(xyz)
     sector = ((np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(int)
     beams, covered = _peaks(elevation)
-    in_sector = [_peaks(elevation[sector == k])[0] for k in range(SECTORS) if (sector == k).sum() >= FEWEST]
+    in_sector = [
+        _peaks(elevation[sector == k])[0] for k in range(SECTORS) if (sector == k).sum() >= FEWEST
+    ]
     parts = np.percentile(in_sector or [0], 75)
     crisp = covered < CRISP and parts >= UNSPLIT * beams
     return beams if crisp and FEWEST_BEAMS <= beams <= MOST_BEAMS else None
@@ -105,7 +111,9 @@ def _peaks(elevation: np.ndarray) -> tuple[int, float]:
     peak = counts > np.maximum(PEAK * maximum_filter1d(counts, int(2 * AROUND / BIN)), 1)
     if counts[peak].sum() < INSIDE * len(elevation):
         return 0, 1.0
-    return int((np.diff(peak.astype(int), prepend=0) == 1).sum()), peak.sum() * BIN / max(high - low, BIN)
+    return int((np.diff(peak.astype(int), prepend=0) == 1).sum()), peak.sum() * BIN / max(
+        high - low, BIN
+    )
 
 
 def ground_height(xyz: np.ndarray) -> float | None:

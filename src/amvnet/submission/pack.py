@@ -34,7 +34,9 @@ class Submission:
         """What a user should know of an archive that keeps to the rules all the same."""
         notes = []
         if self.unmatched:
-            notes.append(f"{self.unmatched} predictions are of scans that are not on disk; their length is not checked")
+            notes.append(
+                f"{self.unmatched} predictions are of scans that are not on disk; their length is not checked"
+            )
         if self.official is not None and self.predictions < self.official:
             notes.append(
                 f"the benchmark has {self.official} scans in this split; its server refuses an archive of fewer"
@@ -93,7 +95,9 @@ def check(rules: Rules, path: Path, progress: Progress = lambda done, total: Non
         _check_tree(rules, archive)
         for name, size in archive.sizes.items():
             rules.check_size(name, size, f"{path}: {name}")
-        for done, name in enumerate(sorted(archive.sizes, key=lambda name: name in rules.points)):  # short ones first
+        for done, name in enumerate(
+            sorted(archive.sizes, key=lambda name: name in rules.points)
+        ):  # short ones first
             progress(done, len(archive.sizes))
             rules.check_content(name, archive.read(name), f"{path}: {name}")
         progress(len(archive.sizes), len(archive.sizes))
@@ -117,7 +121,9 @@ def _check_tree(rules: Rules, archive: Archive) -> None:
     names, path = set(archive.sizes), archive.path
     top = {name.partition("/")[0] for name in (*names, *archive.folders)}
     _check_top(rules, names, top, path)
-    if rules.needs_folders and (lacking := [entry for entry in rules.folders if entry not in archive.folders]):
+    if rules.needs_folders and (
+        lacking := [entry for entry in rules.folders if entry not in archive.folders]
+    ):
         raise InputError(
             f"{path}: expected an entry for every folder, found none for {_one_of(lacking)}; pack folders as entries "
             "of their own, as zip -r does"
@@ -129,7 +135,9 @@ def _check_tree(rules: Rules, archive: Archive) -> None:
         )
     _check_missing(rules.required, names, str(path))
     if other := sorted(names - {*rules.points, *rules.others}):
-        raise InputError(f"{path}: expected predictions alone, found {_one_of(other)}; pack it without")
+        raise InputError(
+            f"{path}: expected predictions alone, found {_one_of(other)}; pack it without"
+        )
 
 
 def _check_top(rules: Rules, names: set[str], top: set[str], path: Path) -> None:

@@ -23,7 +23,9 @@ from amvnet.errors import InputError
 # Scans of SemanticKITTI's test sequences (KITTI odometry 11 to 21); its server wants every one.
 TEST_SCANS = {"11": 921, "12": 1061, "13": 3281, "14": 631, "15": 1901, "16": 1731, "17": 491, "18": 1801, "19": 4981,
               "20": 831, "21": 2721}  # fmt: skip
-MOST_POINTS = 1_000_000  # of a scan that is not on disk; a full turn of these sensors has 130,000 at most
+MOST_POINTS = (
+    1_000_000  # of a scan that is not on disk; a full turn of these sensors has 130,000 at most
+)
 MOST_TEXT = 1_000_000  # bytes of a description or of submission.json
 
 
@@ -89,7 +91,9 @@ class Rules:
         """
         if name in self.others:
             if size > MOST_TEXT:
-                raise InputError(f"{shown}: expected at most {MOST_TEXT} bytes of text, found {size}; shorten it")
+                raise InputError(
+                    f"{shown}: expected at most {MOST_TEXT} bytes of text, found {size}; shorten it"
+                )
             return
         count, width = self.points[name], np.dtype(self.dtype).itemsize
         if count is not None:
@@ -148,9 +152,15 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
     away = [s for s in wanted if s in TEST_SCANS and s not in present] if sequences is None else []
     records = dataset.records([s for s in wanted if s not in away])
     points = {r.prediction: _points(r, files.KITTI_COLUMNS) for r in records}
-    official = {s: [f"sequences/{s}/predictions/{i:06d}.label" for i in range(TEST_SCANS.get(s, 0))] for s in wanted}
+    official = {
+        s: [f"sequences/{s}/predictions/{i:06d}.label" for i in range(TEST_SCANS.get(s, 0))]
+        for s in wanted
+    }
     required = {*points, *(name for s in away for name in official[s])}
-    folders = ("sequences/", *(f"sequences/{s}/{inner}" for s in wanted for inner in ("", "predictions/")))
+    folders = (
+        "sequences/",
+        *(f"sequences/{s}/{inner}" for s in wanted for inner in ("", "predictions/")),
+    )
     return Rules(
         taxonomy=dataset.taxonomy,
         what=_what(split, sequences),
@@ -181,7 +191,9 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     points = {r.prediction: _points(r, files.NUSCENES_COLUMNS) for r in dataset.records(scenes)}
     splits = sorted({name.split("/")[1] for name in points})
     if len(splits) != 1:
-        raise InputError(f"{dataset.root}: expected scenes of one split, found {', '.join(splits)}; name those of one")
+        raise InputError(
+            f"{dataset.root}: expected scenes of one split, found {', '.join(splits)}; name those of one"
+        )
     return Rules(
         taxonomy=dataset.taxonomy,
         what=_what(split, sequences),
@@ -212,13 +224,19 @@ def check_sources(data: bytes, shown: str) -> None:
     meta = found.get("meta") if isinstance(found, dict) else None
     wanted = asdict(Sources())
     if not isinstance(meta, dict) or set(meta) != set(wanted):
-        keys = "no such object" if not isinstance(meta, dict) else ", ".join(map(repr, meta)) or "nothing"
+        keys = (
+            "no such object"
+            if not isinstance(meta, dict)
+            else ", ".join(map(repr, meta)) or "nothing"
+        )
         raise InputError(
             f'{shown}: expected {", ".join(wanted)} in the object "meta", found {keys[:200]}; write these five'
         )
     if wrong := [key for key in wanted if not isinstance(meta[key], bool)]:
         kind = type(meta[wrong[0]]).__name__
-        raise InputError(f"{shown}: expected true or false for {wrong[0]}, found a value of type {kind}; write a flag")
+        raise InputError(
+            f"{shown}: expected true or false for {wrong[0]}, found a value of type {kind}; write a flag"
+        )
 
 
 def _points(record: ScanRecord, columns: int) -> int | None:

@@ -18,11 +18,27 @@ from amvnet.files import whole_file
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what every unpacker knows
 ENCRYPTED = 0x1  # bit of an entry's flags
 LEVEL = 6  # of deflate: 9 takes five to eight times as long for a sixth less
-LONG_AGO = (1980, 1, 1, 0, 0, 0)  # the time of every entry, so that the same content gives the same bytes
+LONG_AGO = (
+    1980,
+    1,
+    1,
+    0,
+    0,
+    0,
+)  # the time of every entry, so that the same content gives the same bytes
 UNIX = 3  # the system that wrote an entry
 FOLDER_BIT = 0x10  # of MS-DOS
 # What zipfile raises for broken data; an offset before the beginning is an OSError or an OverflowError.
-BROKEN = (zipfile.BadZipFile, OSError, EOFError, OverflowError, RuntimeError, ValueError, zlib.error, struct.error)
+BROKEN = (
+    zipfile.BadZipFile,
+    OSError,
+    EOFError,
+    OverflowError,
+    RuntimeError,
+    ValueError,
+    zlib.error,
+    struct.error,
+)
 
 
 @dataclass(frozen=True)
@@ -115,7 +131,9 @@ def _entry(name: str) -> zipfile.ZipInfo:
 def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
     for entry in entries:
         if entry.flag_bits & ENCRYPTED:
-            raise InputError(f"{path}: expected no password, found {entry.filename!r} encrypted; pack without one")
+            raise InputError(
+                f"{path}: expected no password, found {entry.filename!r} encrypted; pack without one"
+            )
         if not _is_inside(entry.orig_filename):
             raise InputError(
                 f"{path}: expected paths below the archive's own folder, found {entry.orig_filename!r}; "
@@ -128,7 +146,9 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
             )
     names = Counter(entry.filename.rstrip("/") for entry in entries)
     if twice := [name for name, times in names.items() if times > 1]:
-        raise InputError(f"{path}: expected every name once, found {twice[0]!r} {names[twice[0]]} times; pack it again")
+        raise InputError(
+            f"{path}: expected every name once, found {twice[0]!r} {names[twice[0]]} times; pack it again"
+        )
 
 
 def _is_inside(name: str) -> bool:

@@ -25,7 +25,11 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
         xyz += rng.standard_normal(xyz.shape, dtype=np.float32) * config.jitter
     xyz[:, :2] = xyz[:, :2] @ rotation(np.radians(rng.uniform(-config.yaw, config.yaw))).T
     xyz[:, 2] += rng.uniform(-config.height, config.height)
-    gain = 0.0 if rng.random() < config.no_intensity else 1 + rng.uniform(-config.intensity, config.intensity)
+    gain = (
+        0.0
+        if rng.random() < config.no_intensity
+        else 1 + rng.uniform(-config.intensity, config.intensity)
+    )
     intensity = np.minimum(scan.points[:, 3:] * gain, 1)
     return dataclasses.replace(scan, points=np.column_stack([xyz, intensity]).astype(np.float32))
 
@@ -34,9 +38,13 @@ def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
     """A scan with a sector of a quarter to three quarters of the circle from another one (Xiao et al., 2022)."""
     start, width = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 1.5) * np.pi
     parts = [_only(s, _in_sector(s, start, width) == (s is other)) for s in (scan, other)]
-    points, labels, ring = (_joined([getattr(p, name) for p in parts]) for name in ("points", "labels", "ring"))
+    points, labels, ring = (
+        _joined([getattr(p, name) for p in parts]) for name in ("points", "labels", "ring")
+    )
     assert points is not None
-    return dataclasses.replace(scan, points=points, labels=labels, ring=ring) if len(points) else scan
+    return (
+        dataclasses.replace(scan, points=points, labels=labels, ring=ring) if len(points) else scan
+    )
 
 
 def _in_sector(scan: Scan, start: float, width: float) -> np.ndarray:

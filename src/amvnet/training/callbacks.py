@@ -41,7 +41,9 @@ class KeepWeights(Callback):
     Where nothing is validated the last is the best.
     """
 
-    def __init__(self, write: Callable[[nn.Module, Path, dict[str, float]], None], folder: Path) -> None:
+    def __init__(
+        self, write: Callable[[nn.Module, Path, dict[str, float]], None], folder: Path
+    ) -> None:
         self.write, self.highest = write, -1.0
         self.kept = Kept(folder / "best.safetensors", folder / "last.safetensors")
 
@@ -70,7 +72,10 @@ class Curves(Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if not trainer.is_global_zero:
             return
-        now = {"epoch": trainer.current_epoch, **{k: float(v) for k, v in trainer.callback_metrics.items()}}
+        now = {
+            "epoch": trainer.current_epoch,
+            **{k: float(v) for k, v in trainer.callback_metrics.items()},
+        }
         rows = [row for row in self._kept() if int(row["epoch"]) < now["epoch"]] + [now]
         with whole_file(self.path) as part, part.open("w", newline="") as file:
             table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
@@ -90,7 +95,9 @@ class SeedBatches(Callback):
     def __init__(self, seed: int, rank: int = 0) -> None:
         self.seed, self.rank = seed, rank
 
-    def on_train_batch_start(self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, index: int) -> None:
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, index: int
+    ) -> None:
         place = [self.seed, trainer.current_epoch, index, *([self.rank] if self.rank else [])]
         torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1)[0]))
 
@@ -113,7 +120,9 @@ class Speed(Callback):
         self.seconds, self._units, self._steps = [], 0, trainer.global_step
         self._begun = self._last = time.perf_counter()
 
-    def on_train_batch_end(self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
         now = time.perf_counter()
         self._units += pl_module.size_of(batch) * trainer.world_size
         self.rate = self._units / (now - self._begun)
@@ -126,7 +135,9 @@ class Speed(Callback):
     def left(self, trainer: L.Trainer) -> str:
         """The time that the rest of the training takes at this rate, as h:mm:ss."""
         elapsed, epoch = time.perf_counter() - self._begun, trainer.current_epoch
-        done = trainer.fit_loop.epoch_loop.batch_progress.current.completed / max(trainer.num_training_batches, 1)
+        done = trainer.fit_loop.epoch_loop.batch_progress.current.completed / max(
+            trainer.num_training_batches, 1
+        )
         ahead = (trainer.max_epochs or epoch) - epoch - done
         return str(timedelta(seconds=round(ahead * elapsed / done))) if done else "?"
 
@@ -160,7 +171,9 @@ class EpochLines(Callback):
             reached += f", val mIoU {values['val/miou']:.4f} (classes present {values['val/miou_present']:.4f})"
         speed = speed_of(trainer)
         pace = f"{speed.rate:.3g} {pl_module.unit}/s, {speed.left(trainer)} left"
-        self.say(f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: {reached}; {pace}")
+        self.say(
+            f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: {reached}; {pace}"
+        )
 
 
 class Pictures(Callback):
@@ -171,7 +184,9 @@ class Pictures(Callback):
         label: the (P,) train ids of a batch of one scan.
     """
 
-    def __init__(self, scans: Sequence[Scan], taxonomy: Taxonomy, label: Callable[[PointBatch], Tensor]) -> None:
+    def __init__(
+        self, scans: Sequence[Scan], taxonomy: Taxonomy, label: Callable[[PointBatch], Tensor]
+    ) -> None:
         self.scans, self.taxonomy, self.label = scans, taxonomy, label
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -187,8 +202,12 @@ class Pictures(Callback):
     @torch.no_grad()
     def _draw(self, trainer: L.Trainer, scan: Scan, like: Tensor) -> None:
         ids = np.zeros(len(scan), dtype=np.uint8)
-        ids[scan.valid] = self.label(PointBatch.of([scan]).to(like.device).to(like.dtype)).cpu().numpy()
-        figure = scan_figure(scan.points, self.taxonomy, {"prediction": ids}, scan.labels, title=scan.name)
+        ids[scan.valid] = (
+            self.label(PointBatch.of([scan]).to(like.device).to(like.dtype)).cpu().numpy()
+        )
+        figure = scan_figure(
+            scan.points, self.taxonomy, {"prediction": ids}, scan.labels, title=scan.name
+        )
         figure.set_dpi(PICTURE_DOTS)
         assert trainer.logger is not None
         trainer.logger.experiment.add_figure(scan.name, figure, trainer.current_epoch)  # type: ignore[attr-defined]

@@ -91,12 +91,21 @@ def fit(
         trainer = _trainer(course, len(train), [speed, *kept], val is not None)
         trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
     except InputError as error:  # from a reading process it comes with that process's traceback
-        raise InputError(str(error).splitlines()[-1].removeprefix(f"{InputError.__module__}.InputError: ")) from None
+        raise InputError(
+            str(error).splitlines()[-1].removeprefix(f"{InputError.__module__}.InputError: ")
+        ) from None
     return speed
 
 
-def _trainer(course: Course, batches: int, callbacks: Sequence[Callback], validates: bool) -> L.Trainer:
-    training, processes, folder, trial = course.training, course.processes, course.folder, course.steps is not None
+def _trainer(
+    course: Course, batches: int, callbacks: Sequence[Callback], validates: bool
+) -> L.Trainer:
+    training, processes, folder, trial = (
+        course.training,
+        course.processes,
+        course.folder,
+        course.steps is not None,
+    )
     kept = [] if trial else [
         Curves(folder / "metrics.csv"),
         ModelCheckpoint(folder, filename="last", enable_version_counter=False, save_on_train_epoch_end=True),
@@ -140,4 +149,6 @@ def _epochs_done(checkpoint: Path) -> int:
     try:
         return torch.load(checkpoint, map_location="cpu", weights_only=True)["epoch"] + 1
     except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError):
-        raise InputError(f"{checkpoint}: expected a checkpoint, found a broken file; delete it to train anew") from None
+        raise InputError(
+            f"{checkpoint}: expected a checkpoint, found a broken file; delete it to train anew"
+        ) from None

@@ -68,7 +68,9 @@ class HeadPoints:
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
         """The points of some indices, in this order."""
         found = np.memmap(self.path, self.row, "r", shape=(self.size,))[index]
-        point, rows, labels, stands_for = (torch.from_numpy(found[name].copy()) for name in self.row.names or ())
+        point, rows, labels, stands_for = (
+            torch.from_numpy(found[name].copy()) for name in self.row.names or ()
+        )
         return point.float(), rows.float(), labels.long(), stands_for
 
 
@@ -78,7 +80,9 @@ class PointSampler(data.Sampler[np.ndarray]):
     Of several processes each takes its part of every batch.
     """
 
-    def __init__(self, size: int, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
+    def __init__(
+        self, size: int, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
+    ) -> None:
         self.size, self.batch, self.seed, self.shuffle, self.epoch = size, batch, seed, shuffle, 0
         self.processes = processes
 
@@ -93,7 +97,9 @@ class PointSampler(data.Sampler[np.ndarray]):
         rng = np.random.default_rng([self.seed, self.epoch])
         order = rng.permutation(self.size) if self.shuffle else np.arange(self.size)
         for i in range(len(self)):
-            yield order[i * self.batch : (i + 1) * self.batch][self.processes.rank :: self.processes.size]
+            yield order[i * self.batch : (i + 1) * self.batch][
+                self.processes.rank :: self.processes.size
+            ]
 
 
 def head_loader(
@@ -130,13 +136,20 @@ def gather_points(
         InputError: where the scans have no labelled points.
     """
     views = views if all(source.augmented for source in sources) else 0
-    gather = functools.partial(_gather, sources, dataset, model.point_head, training, views, folder, say, processes)
-    found, least = gather(build_assertion(model.assertion)), max(2, processes.size)  # batch norm needs two
+    gather = functools.partial(
+        _gather, sources, dataset, model.point_head, training, views, folder, say, processes
+    )
+    found, least = (
+        gather(build_assertion(model.assertion)),
+        max(2, processes.size),
+    )  # batch norm needs two
     if len(found) < least:
         say("head: the networks agree everywhere; it learns from points drawn from all")
         found = gather(_everywhere)
     if len(found) < least:
-        raise InputError(f"{folder}: expected labelled points to train the head with, found none; name other scans")
+        raise InputError(
+            f"{folder}: expected labelled points to train the head with, found none; name other scans"
+        )
     return found
 
 
@@ -159,14 +172,27 @@ def _gather(
     """As `gather_points`, of the points that an assertion doubts."""
     _empty(folder, processes)
     classes, device = dataset.taxonomy.size, device_of(training.accelerator)
-    row, matrices = row_of(classes, config.neighbours), np.zeros((2, classes + 1, classes + 1), dtype=np.int64)
-    jobs = [(s, *job) for s, one in enumerate(sources) for job in np.ndindex(max(views, 1), len(one.records))]
-    sets = [ScanSet(dataset, one.records, training.augment if views else None, training.seed) for one in sources]
+    row, matrices = (
+        row_of(classes, config.neighbours),
+        np.zeros((2, classes + 1, classes + 1), dtype=np.int64),
+    )
+    jobs = [
+        (s, *job)
+        for s, one in enumerate(sources)
+        for job in np.ndindex(max(views, 1), len(one.records))
+    ]
+    sets = [
+        ScanSet(dataset, one.records, training.augment if views else None, training.seed)
+        for one in sources
+    ]
     scorer_of = functools.lru_cache(1)(lambda s: sources[s].scorer(device))
     most, counts, mine = -(-training.head.points // len(jobs)), [], processes.share(jobs)
     with (folder / str(processes.rank)).open("wb") as file:
         for done, (source, epoch, place) in enumerate(mine, start=1):
-            rng, scan = np.random.default_rng([training.seed, epoch, place]), sets[source][epoch, place]
+            rng, scan = (
+                np.random.default_rng([training.seed, epoch, place]),
+                sets[source][epoch, place],
+            )
             score = functools.partial(scorer_of(source), sources[source].records[place], scan)
             rows, matrix = _gather_scan(score, config, assertion, scan, most, row, rng, device)
             rows.tofile(file)
@@ -188,12 +214,16 @@ def _empty(folder: Path, processes: Processes) -> None:
     processes.wait()
 
 
-def _join(folder: Path, counts: Sequence[Sequence[int]], row: np.dtype, processes: Processes) -> Path:
+def _join(
+    folder: Path, counts: Sequence[Sequence[int]], row: np.dtype, processes: Processes
+) -> Path:
     """One file of the rows of all processes, in the order of the scans, which they took in turns."""
     path = folder / "points"
     if processes.first:
         with ExitStack() as stack, path.open("wb") as joined:
-            parts = [stack.enter_context((folder / str(rank)).open("rb")) for rank in range(len(counts))]
+            parts = [
+                stack.enter_context((folder / str(rank)).open("rb")) for rank in range(len(counts))
+            ]
             for place in range(sum(map(len, counts))):
                 turn, rank = divmod(place, len(counts))
                 joined.write(parts[rank].read(counts[rank][turn] * row.itemsize))
@@ -221,7 +251,9 @@ def _gather_scan(
     uncertain = assertion(f, g, batch.points, labels) & (labels > 0)
     agreed = (geometric_mean(f, g).argmax(dim=1) + 1).cpu().numpy()
     truth, doubted = labels.cpu().numpy(), uncertain.cpu().numpy()
-    matrices = np.stack([confusion(truth[kept], agreed[kept], f.shape[1]) for kept in (~doubted, doubted)])
+    matrices = np.stack(
+        [confusion(truth[kept], agreed[kept], f.shape[1]) for kept in (~doubted, doubted)]
+    )
     index = uncertain.nonzero()[:, 0]
     chosen = rng.permutation(len(index))[:most]
     stands_for = len(index) / max(len(chosen), 1)

@@ -19,7 +19,9 @@ from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights
 
-Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]  # f and g of a scan's valid points, (P, K)
+Scorer = Callable[
+    [ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]
+]  # f and g of a scan's valid points, (P, K)
 
 
 class Source(Protocol):
@@ -50,7 +52,10 @@ class Networks:
 
     def scorer(self, device: str) -> Scorer:
         model = self.weights.build().to(device)
-        return lambda record, scan, batch: (model.score_range_view(batch), model.score_polar_view(batch))
+        return lambda record, scan, batch: (
+            model.score_range_view(batch),
+            model.score_polar_view(batch),
+        )
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,9 @@ def source_of(networks: Weights, scores: ScorePair | None, records: Sequence[Sca
     if scores is not None:
         return Files(scores, records, networks.taxonomy.size)
     if missing := [part for part in ("range_net", "polar_net") if part not in networks.parts]:
-        raise InputError(f"expected trained networks for the head, found no {missing[0]}; train it, or give --init")
+        raise InputError(
+            f"expected trained networks for the head, found no {missing[0]}; train it, or give --init"
+        )
     return Networks(networks, records)
 
 
@@ -88,6 +95,8 @@ def scored_with(networks: Weights, head: PointHead) -> Callable[[PointBatch], Te
     """The (P, K) scores of a batch by AMVNet whose head is being trained."""
     model = networks.build()
     model.point_head = head
-    if networks.model.assertion.name == "loss":  # which needs labels, that a picture of a prediction must not know
+    if (
+        networks.model.assertion.name == "loss"
+    ):  # which needs labels, that a picture of a prediction must not know
         model.assertion = Disagreement()
     return lambda batch: model.to(batch.points.device)(batch).merged

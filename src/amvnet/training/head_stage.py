@@ -22,7 +22,9 @@ class HeadStage(Stage):
     unit = "points"
     config: HeadTraining
 
-    def __init__(self, head: PointHead, train: HeadPoints, val: HeadPoints | None, *args: Any) -> None:
+    def __init__(
+        self, head: PointHead, train: HeadPoints, val: HeadPoints | None, *args: Any
+    ) -> None:
         super().__init__(*args)
         self.trained, self.learnt, self.val = head, train, val
 
@@ -31,8 +33,14 @@ class HeadStage(Stage):
 
     def training_step(self, batch: HeadBatch, index: int) -> Tensor:
         point, rows, labels, _ = batch
-        loss = F.cross_entropy(self.trained(point, rows), labels - 1, self.class_weights, reduction="sum")
-        own = labels.new_tensor(len(labels)) if self.class_weights is None else self.class_weights[labels - 1].sum()
+        loss = F.cross_entropy(
+            self.trained(point, rows), labels - 1, self.class_weights, reduction="sum"
+        )
+        own = (
+            labels.new_tensor(len(labels))
+            if self.class_weights is None
+            else self.class_weights[labels - 1].sum()
+        )
         # The mean over the batch of all processes, of which Lightning averages the gradients.
         whole = self.trainer.strategy.reduce(own.float(), reduce_op="sum")
         loss = loss * self.processes.size / whole
@@ -55,9 +63,13 @@ class HeadStage(Stage):
     def on_validation_epoch_end(self) -> None:
         super().on_validation_epoch_end()
         assert self.val is not None
-        self.log_dict({"train/uncertain": self.learnt.uncertain, "val/uncertain": self.val.uncertain})
+        self.log_dict(
+            {"train/uncertain": self.learnt.uncertain, "val/uncertain": self.val.uncertain}
+        )
 
     def configure_optimizers(self) -> Any:
         c = self.config
         parameters = self.trained.parameters()
-        return self.one_cycle(torch.optim.SGD(parameters, c.lr, c.momentum, weight_decay=c.weight_decay), c.momentum)
+        return self.one_cycle(
+            torch.optim.SGD(parameters, c.lr, c.momentum, weight_decay=c.weight_decay), c.momentum
+        )

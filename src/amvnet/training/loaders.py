@@ -28,7 +28,11 @@ class ScanSet(data.Dataset[Scan]):
     """Labelled scans, each augmented by (seed, epoch, place): the same on any number of processes."""
 
     def __init__(
-        self, dataset: Dataset, records: Sequence[ScanRecord], augment: AugmentConfig | None = None, seed: int = 0
+        self,
+        dataset: Dataset,
+        records: Sequence[ScanRecord],
+        augment: AugmentConfig | None = None,
+        seed: int = 0,
     ) -> None:
         self.dataset, self.records, self.augment, self.seed = dataset, list(records), augment, seed
 
@@ -50,9 +54,13 @@ class ScanSet(data.Dataset[Scan]):
     def _read(self, place: int) -> Scan:
         scan = self.dataset.read(self.records[place])
         if scan.labels is None:
-            raise InputError(f"{scan.name}: expected labels to train with, found none; name labelled sequences")
+            raise InputError(
+                f"{scan.name}: expected labels to train with, found none; name labelled sequences"
+            )
         if scan.valid.sum() < 2:  # of one point batch norm has no variance
-            raise InputError(f"{scan.name}: expected points to train with, found fewer than two; leave the scan out")
+            raise InputError(
+                f"{scan.name}: expected points to train with, found fewer than two; leave the scan out"
+            )
         return scan
 
 
@@ -64,7 +72,13 @@ class EpochSampler(data.Sampler[Key]):
     """
 
     def __init__(self, size: int, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
-        self.size, self.seed, self.shuffle, self.processes, self.epoch = size, seed, shuffle, processes, 0
+        self.size, self.seed, self.shuffle, self.processes, self.epoch = (
+            size,
+            seed,
+            shuffle,
+            processes,
+            0,
+        )
 
     def set_epoch(self, epoch: int) -> None:
         self.epoch = epoch
@@ -79,7 +93,9 @@ class EpochSampler(data.Sampler[Key]):
         order = np.arange(self.size)
         if self.shuffle:
             even = -(-self.size // self.processes.size) * self.processes.size
-            order = np.resize(np.random.default_rng([self.seed, self.epoch]).permutation(self.size), even)
+            order = np.resize(
+                np.random.default_rng([self.seed, self.epoch]).permutation(self.size), even
+            )
         return list(self.processes.share(order.tolist()))
 
 
@@ -120,13 +136,21 @@ def count_classes(
     counts = np.sum(processes.gather(mine), axis=0)[1:]
     if processes.first:
         with whole_file(kept) as part:
-            np.savez(part, counts=counts, scans=np.array(made["scans"]), classes=np.array(made["classes"]))
+            np.savez(
+                part,
+                counts=counts,
+                scans=np.array(made["scans"]),
+                classes=np.array(made["classes"]),
+            )
     return counts
 
 
 def _counted(kept: Path, made: dict[str, list[str]]) -> np.ndarray | None:
     """The counts in a file, where they are of these scans and classes."""
-    with suppress(OSError, ValueError, KeyError, BadZipFile), np.load(kept, allow_pickle=False) as file:
+    with (
+        suppress(OSError, ValueError, KeyError, BadZipFile),
+        np.load(kept, allow_pickle=False) as file,
+    ):
         if all(file[key].tolist() == value for key, value in made.items()):
             return file["counts"]
     return None

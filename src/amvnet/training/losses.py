@@ -33,7 +33,9 @@ def class_weights(counts: np.ndarray) -> np.ndarray:
     return (weights / weights.mean()).astype(np.float32)
 
 
-def range_view_loss(logits: Tensor, labels: Tensor, weights: Tensor | None, region: float) -> Tensor:
+def range_view_loss(
+    logits: Tensor, labels: Tensor, weights: Tensor | None, region: float
+) -> Tensor:
     """Cross-entropy + Dice, the loss of the range-view network (section 3.1 of the paper).
 
     Args:
@@ -45,7 +47,9 @@ def range_view_loss(logits: Tensor, labels: Tensor, weights: Tensor | None, regi
     return _loss(logits, labels, weights, region, dice)
 
 
-def polar_view_loss(logits: Tensor, labels: Tensor, weights: Tensor | None, region: float) -> Tensor:
+def polar_view_loss(
+    logits: Tensor, labels: Tensor, weights: Tensor | None, region: float
+) -> Tensor:
     """Cross-entropy + Lovász-softmax, the loss of PolarNet; arguments as of `range_view_loss`."""
     return _loss(logits, labels, weights, region, lovasz_softmax)
 
@@ -101,4 +105,6 @@ def _loss(
     if not kept.any():
         return logits.sum() * 0
     logits, target = at_least_float(logits[kept]), labels[kept].long() - 1
-    return F.cross_entropy(logits, target, weights) + region * region_loss(logits.softmax(dim=1), target)
+    return F.cross_entropy(logits, target, weights) + region * region_loss(
+        logits.softmax(dim=1), target
+    )

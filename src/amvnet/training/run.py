@@ -75,7 +75,9 @@ class Run:
         self.out = Path(self.out)
         common = {r.name for r in self.train} & {r.name for r in self.val}
         if common:
-            raise InputError(f"expected validation scans apart from training, found {min(common)} in both; name others")
+            raise InputError(
+                f"expected validation scans apart from training, found {min(common)} in both; name others"
+            )
         size = self.processes.size
         if 0 < len(self.val) < size:  # each must have one, or they would wait for each other
             raise InputError(
@@ -95,7 +97,9 @@ class Run:
                 "use the recipe of that benchmark"
             )
 
-    def stages(self, stage: StageName | Literal["all"] = "all", init: Weights | None = None) -> Path:
+    def stages(
+        self, stage: StageName | Literal["all"] = "all", init: Weights | None = None
+    ) -> Path:
         """Train one stage, or all three; returns the weights file with what is trained so far.
 
         Raises:
@@ -104,17 +108,23 @@ class Run:
         """
         names = self.recipe.stages if stage == "all" else (stage,)
         if self.scores is not None and names != ("head",):
-            raise InputError(f"expected --stage head for scores of other models, found {stage}; add it")
+            raise InputError(
+                f"expected --stage head for scores of other models, found {stage}; add it"
+            )
         current, path = self._start(init), self.out / "weights.safetensors"
         for name in names:  # before anything is written, and hours are spent on the first
             check_begun(self._folder(name), self._settings(name, current), self.resume)
         self.processes.wait()
         if self.processes.first:
-            describe(self.out, self.recipe, self.dataset, self.train, self.val, stage, init, self.scores)
+            describe(
+                self.out, self.recipe, self.dataset, self.train, self.val, stage, init, self.scores
+            )
         for name in names:
             current = self._stage(name, current)
             if self.processes.first:
-                weights_file.save(current, path)  # after each stage, so that one that fails takes nothing with it
+                weights_file.save(
+                    current, path
+                )  # after each stage, so that one that fails takes nothing with it
             self.processes.wait()
         return path
 
@@ -177,11 +187,18 @@ class Run:
             config = self._config(name)
             with TemporaryDirectory() as folder:
                 # Whole steps, where there are fewer scans, too.
-                scans = [self.train[place % len(self.train)] for place in range(TRIAL_STEPS * config.batch)]
-                trial = dataclasses.replace(self, train=scans, val=(), out=Path(folder), resume=False)
+                scans = [
+                    self.train[place % len(self.train)]
+                    for place in range(TRIAL_STEPS * config.batch)
+                ]
+                trial = dataclasses.replace(
+                    self, train=scans, val=(), out=Path(folder), resume=False
+                )
                 trial.say = lambda line: None
                 # The classes' weights cost a look at every scan, and nothing else.
-                speed = trial._fit_network(name, fresh, np.ones(self.dataset.taxonomy.size), TRIAL_STEPS)
+                speed = trial._fit_network(
+                    name, fresh, np.ones(self.dataset.taxonomy.size), TRIAL_STEPS
+                )
             step = speed.seconds[-1]
             hours = -(-len(self.train) // config.batch) * config.epochs * step / 3600
             yield (
@@ -194,11 +211,19 @@ class Run:
         return self.recipe.training.rv if name == "rv" else self.recipe.training.bev
 
     def _fit_network(
-        self, name: str, current: Weights, counts: np.ndarray | None = None, steps: int | None = None
+        self,
+        name: str,
+        current: Weights,
+        counts: np.ndarray | None = None,
+        steps: int | None = None,
     ) -> Speed:
         training, config = self.recipe.training, self._config(name)
         model = self._module(PART[name], current)
-        weights = class_weights(self._counts() if counts is None else counts) if config.class_weights else None
+        weights = (
+            class_weights(self._counts() if counts is None else counts)
+            if config.class_weights
+            else None
+        )
         shared = (config, self.dataset.taxonomy, weights, self.processes)
         stage: Stage = (
             RangeStage(model.range_view, model.range_net, *shared)
@@ -212,9 +237,15 @@ class Run:
         return fit(
             stage,
             dataclasses.replace(course, steps=steps),
-            load(ScanSet(self.dataset, self.train, training.augment, training.seed), part, shuffle=True),
+            load(
+                ScanSet(self.dataset, self.train, training.augment, training.seed),
+                part,
+                shuffle=True,
+            ),
             load(ScanSet(self.dataset, self.val), 1, shuffle=False) if self.val else None,
-            [] if steps else [self._keep(name, current), self._pictures(lambda batch: scored(batch))],
+            []
+            if steps
+            else [self._keep(name, current), self._pictures(lambda batch: scored(batch))],
         )
 
     def _fit_head(self, current: Weights) -> None:
@@ -222,7 +253,9 @@ class Run:
         folder, validated = self._folder("head"), source_of(current, self.scores, self.val)
         gather = functools.partial(gather_points, dataset=self.dataset, model=current.model, training=training,
                                    processes=self.processes)  # fmt: skip
-        train = gather(self._sources(current), views=config.views, folder=folder / "train", say=self.say)
+        train = gather(
+            self._sources(current), views=config.views, folder=folder / "train", say=self.say
+        )
         val = gather([validated], views=0, folder=folder / "val") if self.val else None
         head = self._module(PART["head"], current).point_head
         assert head is not None
@@ -234,7 +267,10 @@ class Run:
             load(train, config.batch, shuffle=True),
             load(val, 64 * config.batch, shuffle=False) if val is not None else None,
             # The pictures' scans are scored as they come, and of files nobody knows which scan that is.
-            [self._keep("head", current), *([] if self.scores else [self._pictures(scored_with(current, head))])],
+            [
+                self._keep("head", current),
+                *([] if self.scores else [self._pictures(scored_with(current, head))]),
+            ],
         )
         self.processes.wait()
         if self.processes.first:
@@ -246,13 +282,23 @@ class Run:
         if name == "head":  # of so few multiplications bfloat16 would save nothing
             training = dataclasses.replace(training, precision="32-true")
         return Course(
-            training, self._folder(name), epochs, parts, clip, self.resume, self.say, self.bars, self.processes
+            training,
+            self._folder(name),
+            epochs,
+            parts,
+            clip,
+            self.resume,
+            self.say,
+            self.bars,
+            self.processes,
         )
 
     def _pictures(self, score: Callable[[PointBatch], Tensor]) -> Pictures:
         """Of the first and the last validation scan, say, by the (P, K) scores of a batch of one scan."""
         places = np.linspace(0, len(self.val) - 1, min(PICTURED_SCANS, len(self.val))).astype(int)
-        scans = [self.dataset.read(self.val[place]) for place in places] if self.processes.first else []
+        scans = (
+            [self.dataset.read(self.val[place]) for place in places] if self.processes.first else []
+        )
         return Pictures(scans, self.dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
 
     def _sources(self, current: Weights) -> list[Source]:
@@ -262,7 +308,9 @@ class Run:
             return [source_of(current, self.scores, self.train)]
         names = names_of(self.train)
         if len(names) < folds:
-            raise InputError(f"expected at least {folds} training sequences for {folds} folds, found {len(names)}")
+            raise InputError(
+                f"expected at least {folds} training sequences for {folds} folds, found {len(names)}"
+            )
         return [self._fold(index, set(names[index::folds])) for index in range(folds)]
 
     def _fold(self, index: int, left_out: set[str]) -> Networks:
@@ -270,12 +318,16 @@ class Run:
         seen = [r for r in self.train if r.sequence not in left_out]
         unseen = [r for r in self.train if r.sequence in left_out]
         out = self.out / "folds" / str(index)
-        fold = Run(self.recipe, self.dataset, seen, unseen, out, True, self.say, self.bars, self.processes)
+        fold = Run(
+            self.recipe, self.dataset, seen, unseen, out, True, self.say, self.bars, self.processes
+        )
         fold.stages("rv")
         return Networks(weights_file.load(fold.stages("bev")), unseen)
 
     def _counts(self) -> Any:
-        return count_classes(self.dataset, self.train, self.out / "class_counts.npz", self.processes)
+        return count_classes(
+            self.dataset, self.train, self.out / "class_counts.npz", self.processes
+        )
 
     def _keep(self, name: str, current: Weights) -> KeepWeights:
         """How the part of a stage is written: with the description of what made it."""

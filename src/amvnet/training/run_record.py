@@ -39,7 +39,9 @@ def describe(
     earlier = {key: value for key, value in _calls(out / "run.yaml").items() if key != stage}
     said = {
         "repeat": shlex.join(map(str, _repeat(out, dataset, train, val, stage, init, scores))),
-        "versions": {name: metadata.version(name) for name in ("amvnet", "torch", "lightning", "numpy")},
+        "versions": {
+            name: metadata.version(name) for name in ("amvnet", "torch", "lightning", "numpy")
+        },
         "python": platform.python_version(),
         "data": str(dataset.root),
         "classes": dataset.taxonomy.name,
@@ -48,7 +50,10 @@ def describe(
         "init": None if init is None else {part: init.digest(part) for part in init.parts},
         **({} if scores is None else {"scores": scores.said()}),
     }
-    for name, tree in {"recipe.yaml": to_dict(recipe), "run.yaml": {**earlier, stage: said}}.items():
+    for name, tree in {
+        "recipe.yaml": to_dict(recipe),
+        "run.yaml": {**earlier, stage: said},
+    }.items():
         with whole_file(out / name) as part:
             part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
 
@@ -100,7 +105,9 @@ def settings(
     if scores is not None:
         found["scores"] = scores.digests([*train, *val])
     elif name == "head":
-        found["networks"] = {network: current.digest(network) for network in ("range_net", "polar_net")}
+        found["networks"] = {
+            network: current.digest(network) for network in ("range_net", "polar_net")
+        }
     return found
 
 
@@ -109,7 +116,9 @@ def check_begun(folder: Path, now: dict[str, Any], resume: bool) -> None:
     if not (folder / LAST).is_file():
         return
     if not resume:
-        raise InputError(f"{folder}: expected no earlier run, found one; add --resume or give another")
+        raise InputError(
+            f"{folder}: expected no earlier run, found one; add --resume or give another"
+        )
     begun = yaml.safe_load((folder / SETTINGS).read_text()) if (folder / SETTINGS).is_file() else {}
     if begun != now:
         other = ", ".join(key for key in now if begun.get(key) != now[key])

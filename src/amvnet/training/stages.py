@@ -41,7 +41,11 @@ class Stage(L.LightningModule):
         super().__init__()
         self.config, self.taxonomy, self.processes = config, taxonomy, processes
         self.class_weights: Tensor | None
-        self.register_buffer("class_weights", None if weights is None else torch.from_numpy(weights), persistent=False)
+        self.register_buffer(
+            "class_weights",
+            None if weights is None else torch.from_numpy(weights),
+            persistent=False,
+        )
         self.matrix = self._empty_matrix()
 
     def _empty_matrix(self) -> np.ndarray:
@@ -53,7 +57,10 @@ class Stage(L.LightningModule):
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
         """In the precision of the weights."""
-        return tuple(x.to(self.dtype) if isinstance(x, PointBatch) or x.is_floating_point() else x for x in batch)
+        return tuple(
+            x.to(self.dtype) if isinstance(x, PointBatch) or x.is_floating_point() else x
+            for x in batch
+        )
 
     def on_validation_epoch_start(self) -> None:
         self.matrix = self._empty_matrix()
@@ -62,7 +69,9 @@ class Stage(L.LightningModule):
         """Raises InputError where a loss is not finite, before it has spoiled the weights."""
         if not torch.isfinite(loss):
             rate = f"--training.{self.name}.lr"
-            raise InputError(f"expected a finite loss, found {loss:g} {where}; lower {rate}, or leave them out")
+            raise InputError(
+                f"expected a finite loss, found {loss:g} {where}; lower {rate}, or leave them out"
+            )
 
     def count(self, labels: Tensor, prediction: Tensor) -> None:
         """Add points to the validation's confusion matrix."""
@@ -75,8 +84,12 @@ class Stage(L.LightningModule):
     def on_validation_epoch_end(self) -> None:
         found = metrics(self.whole_matrix(), self.taxonomy)
         self.log("val/miou", found["miou"] or 0.0, prog_bar=True)
-        self.log_dict({"val/miou_present": found["miou_present"] or 0.0, "val/acc": found["accuracy"] or 0.0})
-        self.log_dict({f"iou/{name}": value for name, value in found["iou"].items() if value is not None})
+        self.log_dict(
+            {"val/miou_present": found["miou_present"] or 0.0, "val/acc": found["accuracy"] or 0.0}
+        )
+        self.log_dict(
+            {f"iou/{name}": value for name, value in found["iou"].items() if value is not None}
+        )
 
     def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
         """The schedule of the learning rate and, the other way round, of SGD's momentum or AdamW's first beta."""
@@ -102,7 +115,9 @@ class NetworkStage(Stage):
     def size_of(self, batch: Batch) -> int:
         return batch[0].count
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    def logits(
+        self, batch: PointBatch, labels: Tensor
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         """Of each scan the scores and labels (M, K), (M,) that the loss is over, and scores (P, K) of all points."""
         raise NotImplementedError
 
@@ -123,7 +138,9 @@ class NetworkStage(Stage):
 
     def configure_optimizers(self) -> Any:
         c = self.config
-        return self.one_cycle(torch.optim.AdamW(self.trained.parameters(), lr=c.lr, weight_decay=c.weight_decay))
+        return self.one_cycle(
+            torch.optim.AdamW(self.trained.parameters(), lr=c.lr, weight_decay=c.weight_decay)
+        )
 
 
 class RangeStage(NetworkStage):
@@ -135,7 +152,9 @@ class RangeStage(NetworkStage):
         super().__init__(*args)
         self.view, self.trained = view, net
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    def logits(
+        self, batch: PointBatch, labels: Tensor
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         view = self.view.project(batch)
         scores = self.trained(view.image)  # (B, K, H, W)
         seen = view.nearest >= 0
@@ -157,7 +176,9 @@ class PolarStage(NetworkStage):
         super().__init__(*args)
         self.view, self.trained = view, net
 
-    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    def logits(
+        self, batch: PointBatch, labels: Tensor
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         view = self.view.project(batch)
         points = view.to_points(self.trained(view))  # (P, K)
         return [points[s] for s in batch.slices()], [labels[s] for s in batch.slices()], points

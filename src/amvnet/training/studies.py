@@ -37,7 +37,9 @@ def sweep_neighbours(
         InputError: where OUT holds heads for other networks, other scans or another recipe.
     """
     # Folds would train networks of their own.
-    training = dataclasses.replace(recipe.training, head=dataclasses.replace(recipe.training.head, folds=1))
+    training = dataclasses.replace(
+        recipe.training, head=dataclasses.replace(recipe.training.head, folds=1)
+    )
     for n in values:
         head = dataclasses.replace(weights.model.point_head, neighbours=n)
         model = dataclasses.replace(weights.model, point_head=head)
@@ -48,7 +50,9 @@ def sweep_neighbours(
         run = Run(changed, dataset, train, val, out / "neighbours" / str(n), True, say)
         segmenter = Segmenter(run.stages("head", networks), device)
         found = jobs.evaluate(dataset, val, jobs.by_weights(dataset, segmenter))
-        yield Swept.of(n, found.uncertain / max(found.asked, 1), found.matrices["amvnet"][0], dataset.taxonomy)
+        yield Swept.of(
+            n, found.uncertain / max(found.asked, 1), found.matrices["amvnet"][0], dataset.taxonomy
+        )
 
 
 def ablate(
@@ -73,12 +77,20 @@ def ablate(
         InputError: where OUT holds runs on other scans or of another recipe.
     """
     for gru, weighted in ((False, False), (True, False), (False, True), (True, True)):
-        model = dataclasses.replace(recipe.model, range_net=dataclasses.replace(recipe.model.range_net, gru=gru))
+        model = dataclasses.replace(
+            recipe.model, range_net=dataclasses.replace(recipe.model.range_net, gru=gru)
+        )
         rv = dataclasses.replace(recipe.training.rv, class_weights=weighted)
-        changed = dataclasses.replace(recipe, model=model, training=dataclasses.replace(recipe.training, rv=rv))
+        changed = dataclasses.replace(
+            recipe, model=model, training=dataclasses.replace(recipe.training, rv=rv)
+        )
         name = "-".join(["rv", *(["gru"] if gru else []), *(["weights"] if weighted else [])])
         say(f"{name}:")
-        path = Run(changed, dataset, train, val, out / name, True, say, bars, processes).stages("rv")
+        path = Run(changed, dataset, train, val, out / name, True, say, bars, processes).stages(
+            "rv"
+        )
         segmenter = Segmenter(path, processes.device(device), "rv")
-        scored = jobs.evaluate(dataset, val, jobs.by_weights(dataset, segmenter), processes=processes)
+        scored = jobs.evaluate(
+            dataset, val, jobs.by_weights(dataset, segmenter), processes=processes
+        )
         yield gru, weighted, metrics(scored.matrices["rv"][0], dataset.taxonomy)

@@ -18,7 +18,11 @@ def synced(net: nn.Module, cuda: bool) -> nn.Module:
     if cuda:
         return nn.SyncBatchNorm.convert_sync_batchnorm(net)
     for name, child in net.named_children():
-        setattr(net, name, SyncedBatchNorm.of(child) if isinstance(child, _BatchNorm) else synced(child, cuda))
+        setattr(
+            net,
+            name,
+            SyncedBatchNorm.of(child) if isinstance(child, _BatchNorm) else synced(child, cuda),
+        )
     return net
 
 
@@ -47,7 +51,9 @@ class SyncedBatchNorm(_BatchNorm):
     def of(cls, norm: _BatchNorm) -> SyncedBatchNorm:
         """One with the parameters of another."""
         like = norm.weight
-        found = cls(norm.num_features, norm.eps, norm.momentum, device=like.device, dtype=like.dtype)
+        found = cls(
+            norm.num_features, norm.eps, norm.momentum, device=like.device, dtype=like.dtype
+        )
         found.load_state_dict(norm.state_dict())
         return found
 

@@ -51,7 +51,9 @@ class Frame:
 
     def errors(self, method: str) -> np.ndarray | None:
         """(N,) bool: the points that truth names and the method takes for something else; None without truth."""
-        return None if self.truth is None else (self.truth > 0) & (self.labels[method] != self.truth)
+        return (
+            None if self.truth is None else (self.truth > 0) & (self.labels[method] != self.truth)
+        )
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,9 @@ class Frames:
 
     def _frame(self, source: Source) -> Frame:
         scan = checked_scan(source.read())
-        given = {} if self.labels is None else {"labels": source.read_labels(self.labels, len(scan))}
+        given = (
+            {} if self.labels is None else {"labels": source.read_labels(self.labels, len(scan))}
+        )
         frame = Frame(source.name, scan.points, scan.valid, scan.labels, given)
         return frame if source.segmenter is None else _segmented(frame, scan, source.segmenter)
 
@@ -113,14 +117,20 @@ def choose_frames(
     if count < 1:
         raise InputError(f"expected a number of scans from 1, found {count}; say --scans 5")
     if labels is not None and not labels.exists():
-        raise InputError(f"{labels}: expected a file or a folder of labels, found none; check the path")
+        raise InputError(
+            f"{labels}: expected a file or a folder of labels, found none; check the path"
+        )
     given = _given_taxonomy(taxonomy, segmenter)
     found = [_sources(text, given, segmenter, sequences) for text in inputs]
     if len({classes.classes for classes, _ in found}) > 1:
-        raise InputError("expected inputs with the same classes, found several; look at them one after the other")
+        raise InputError(
+            "expected inputs with the same classes, found several; look at them one after the other"
+        )
     sources = [source for _, some in found for source in some]
     if labels is not None and labels.is_file() and len(sources) > 1:
-        raise InputError(f"{labels}: expected a folder of labels for {len(sources)} scans, found a file; give a folder")
+        raise InputError(
+            f"{labels}: expected a folder of labels for {len(sources)} scans, found a file; give a folder"
+        )
     places = np.linspace(0, len(sources) - 1, min(count, len(sources))).round().astype(int)
     return Frames(found[0][0], [sources[place] for place in places], labels)
 
@@ -130,8 +140,12 @@ def _segmented(frame: Frame, scan: Scan, segmenter: Segmenter) -> Frame:
     labels = {name: labels_in_place(values, scan.valid) for name, values in scores.items()}
     if uncertain is None:
         return replace(frame, labels=labels)
-    disagreement = in_place((1 - cosine_similarity(scores["rv"], scores["bev"])).clamp(0, 1), scan.valid)
-    return replace(frame, labels=labels, uncertain=in_place(uncertain, scan.valid), disagreement=disagreement)
+    disagreement = in_place(
+        (1 - cosine_similarity(scores["rv"], scores["bev"])).clamp(0, 1), scan.valid
+    )
+    return replace(
+        frame, labels=labels, uncertain=in_place(uncertain, scan.valid), disagreement=disagreement
+    )
 
 
 def _given_taxonomy(text: str | None, segmenter: Segmenter | None) -> Taxonomy | None:
@@ -139,7 +153,9 @@ def _given_taxonomy(text: str | None, segmenter: Segmenter | None) -> Taxonomy |
     if text is None:
         return None if segmenter is None else own_classes(segmenter.taxonomy)
     if segmenter is not None:
-        raise InputError("expected no --taxonomy beside --weights, which say their classes; leave it out")
+        raise InputError(
+            "expected no --taxonomy beside --weights, which say their classes; leave it out"
+        )
     return TAXONOMIES[text] if text in TAXONOMIES else taxonomy_from_yaml(text)
 
 
@@ -157,12 +173,18 @@ def _sources(
     taxonomy = given or (ours if segmenter is None else segmenter.taxonomy)
     fit = None if segmenter is None else Fitting(segmenter.weights)
     by_ring = None if segmenter is None else segmenter.by_ring()
-    return taxonomy, [_lone_source(scan, taxonomy, by_ring, fit) for path in paths for scan in named_scans(path)]
+    return taxonomy, [
+        _lone_source(scan, taxonomy, by_ring, fit) for path in paths for scan in named_scans(path)
+    ]
 
 
 def _record_source(dataset: Dataset, record: ScanRecord, segmenter: Segmenter | None) -> Source:
     # A token says nothing to people; the last part of nuScenes' names of files is the time.
-    name = record.name if "/" in record.name else f"{record.sequence}/{stem(record.points_path).split('__')[-1]}"
+    name = (
+        record.name
+        if "/" in record.name
+        else f"{record.sequence}/{stem(record.points_path).split('__')[-1]}"
+    )
 
     def labels(folder: Path, count: int) -> np.ndarray:
         return dataset.read_prediction(record, folder)
@@ -170,7 +192,9 @@ def _record_source(dataset: Dataset, record: ScanRecord, segmenter: Segmenter | 
     return Source(name, lambda: dataset.read(record), labels, segmenter)
 
 
-def _lone_source(scan: NamedScan, taxonomy: Taxonomy, segmenter: Segmenter | None, fit: Fitting | None) -> Source:
+def _lone_source(
+    scan: NamedScan, taxonomy: Taxonomy, segmenter: Segmenter | None, fit: Fitting | None
+) -> Source:
     def read() -> Scan:
         return scan.read().to_scan() if fit is None else fit(scan.read(), scan.source)
 

@@ -21,11 +21,16 @@ from amvnet.files import whole_file
 from amvnet.inference.methods import TITLES
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
-MOST_POINTS = 400_000  # of one scan; of more, every second or third is drawn, so that a telephone can
+MOST_POINTS = (
+    400_000  # of one scan; of more, every second or third is drawn, so that a telephone can
+)
 REACH = 500.0  # metres along each axis; farther points are left out, so that positions stay within 1.6 cm of the truth
 LEVELS = 32_767  # int16
 STOPS = 17  # colours from which the page makes a ramp
-RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}  # colour map, and the part that is used
+RAMPS = {
+    "height": ("turbo", 0.06, 0.94),
+    "intensity": ("inferno", 0.16, 1.0),
+}  # colour map, and the part that is used
 DOUBT = (RIGHT, (128, 104, 92), (190, 110, 50), UNCERTAIN, (255, 190, 60))
 SCRIPTS = ("scans", "camera", "shaders", "draw", "look", "panel", "point", "hands", "page")
 
@@ -74,7 +79,9 @@ def pack(frame: Frame) -> Packed:
     center, step = _extent(xyz)
     steps = np.round((xyz - center) / step).astype(np.int16)
     values = {name: values[chosen] for name, values in _values(frame).items()}
-    data = b"".join([*(_differences(axis) for axis in steps.T), *(plane.tobytes() for plane in values.values())])
+    data = b"".join(
+        [*(_differences(axis) for axis in steps.T), *(plane.tobytes() for plane in values.values())]
+    )
     low, high = (float(v) for v in np.percentile(xyz[:, 2], (1, 99))) if len(xyz) else (0.0, 1.0)
     about = {
         "name": frame.name,
@@ -98,7 +105,10 @@ def pack(frame: Frame) -> Packed:
 def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
     """The text of the page. What the user's files are called goes in as JSON, or escaped."""
     style, script = _source("page.css"), "\n".join(_source(f"{name}.js") for name in SCRIPTS)
-    scans = [f'<script type="text/plain" id="scan-{place}">{scan.planes}</script>' for place, scan in enumerate(packed)]
+    scans = [
+        f'<script type="text/plain" id="scan-{place}">{scan.planes}</script>'
+        for place, scan in enumerate(packed)
+    ]
     return _fill(
         _source("page.html"),
         {
@@ -126,7 +136,10 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
         "scans": [scan.about for scan in packed],
         "ranges": {
             "uncertainty": (0, 1),
-            "height": (min(scan.height[0] for scan in packed), max(scan.height[1] for scan in packed)),
+            "height": (
+                min(scan.height[0] for scan in packed),
+                max(scan.height[1] for scan in packed),
+            ),
             "intensity": (0, max(scan.intensity for scan in packed)),
         },
         "ramps": {"uncertainty": DOUBT, **{name: _ramp(*part) for name, part in RAMPS.items()}},
@@ -142,7 +155,10 @@ def _values(frame: Frame) -> dict[str, np.ndarray]:
         planes["truth"] = frame.truth.astype(np.uint8)
     planes |= {name: ids.astype(np.uint8) for name, ids in frame.labels.items()}
     if frame.uncertain is not None and frame.disagreement is not None:
-        planes |= {"uncertain": frame.uncertain.astype(np.uint8), "disagreement": _byte(frame.disagreement)}
+        planes |= {
+            "uncertain": frame.uncertain.astype(np.uint8),
+            "disagreement": _byte(frame.disagreement),
+        }
     return planes
 
 
@@ -178,7 +194,9 @@ def _note(left_out: int, every: int) -> str:
 def _ramp(name: str, start: float, end: float) -> list[list[int]]:
     from matplotlib import colormaps
 
-    return (colormaps[name](np.linspace(start, end, STOPS))[:, :3] * 255).round().astype(int).tolist()
+    return (
+        (colormaps[name](np.linspace(start, end, STOPS))[:, :3] * 255).round().astype(int).tolist()
+    )
 
 
 def _source(name: str) -> str:

@@ -41,8 +41,12 @@ def check_rerun() -> Any:
 def check_window() -> None:
     """Raises InputError where there is no Rerun, or no screen to open a window on."""
     check_rerun()
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise InputError("expected a screen for a window, found none; write a file with --html or --save")
+    if sys.platform == "linux" and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise InputError(
+            "expected a screen for a window, found none; write a file with --html or --save"
+        )
 
 
 def save_recording(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy) -> Path:
@@ -74,12 +78,16 @@ def open_window(frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
     """
     stream, first, frames = _stream(), *_first(frames)
     # Without an activated environment, the viewer beside this Python is not on the path.
-    os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", ""), str(Path(sys.executable).parent)])
+    os.environ["PATH"] = os.pathsep.join(
+        [os.environ.get("PATH", ""), str(Path(sys.executable).parent)]
+    )
     try:
         stream.spawn(default_blueprint=blueprint(first))
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"expected a window of Rerun, found: {reason}; write a file with --save or --html") from None
+        raise InputError(
+            f"expected a window of Rerun, found: {reason}; write a file with --save or --html"
+        ) from None
     log(stream, frames, taxonomy)
     stream.disconnect()
 
@@ -89,8 +97,13 @@ def log(stream: Any, frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
     rerun = check_rerun()
     colors = (UNLABELLED, *taxonomy.colors[1:])
     classes = zip(("unlabelled", *taxonomy.classes), colors, strict=True)
-    context = [rerun.AnnotationInfo(id=i, label=name, color=color) for i, (name, color) in enumerate(classes)]
-    stream.log("/", rerun.AnnotationContext(context), rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    context = [
+        rerun.AnnotationInfo(id=i, label=name, color=color)
+        for i, (name, color) in enumerate(classes)
+    ]
+    stream.log(
+        "/", rerun.AnnotationContext(context), rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True
+    )
     for step, frame in enumerate(frames):
         stream.set_time(TIMELINE, sequence=step)
         stream.log("name", rerun.TextLog(frame.name))
@@ -114,7 +127,9 @@ def blueprint(frame: Frame) -> Any:
     if titles:
         views.append(tabs([space(title, f"/labels/{m}") for m, title in titles.items()]))
     if titles and truth:
-        views.append(tabs([space(f"errors of {t}", "/points", f"/errors/{m}") for m, t in titles.items()]))
+        views.append(
+            tabs([space(f"errors of {t}", "/points", f"/errors/{m}") for m, t in titles.items()])
+        )
     if doubts:
         views.append(space("uncertain", "/points", "/uncertain"))
     grid = parts.Grid(*(views or [space("points", "/points")]))
@@ -157,7 +172,10 @@ def _log_shares(stream: Any, rerun: Any, frame: Frame) -> None:
     """Shares in percent: of the points that truth names, those taken for something else; of all, the uncertain."""
     for method in frame.labels:
         if (errors := frame.errors(method)) is not None and frame.truth is not None:
-            stream.log(f"percent/wrong/{method}", rerun.Scalars(100 * errors.sum() / max((frame.truth > 0).sum(), 1)))
+            stream.log(
+                f"percent/wrong/{method}",
+                rerun.Scalars(100 * errors.sum() / max((frame.truth > 0).sum(), 1)),
+            )
     if frame.uncertain is not None:
         stream.log("percent/uncertain", rerun.Scalars(100 * frame.uncertain.mean()))
 

@@ -9,7 +9,11 @@ import yaml
 
 from amvnet.weights.file import Weights
 
-TITLES = {"range_net": "Range-view network", "polar_net": "Bird's-eye-view network", "point_head": "Point head"}
+TITLES = {
+    "range_net": "Range-view network",
+    "polar_net": "Bird's-eye-view network",
+    "point_head": "Point head",
+}
 LISTED = 12  # names that are listed in full
 METRICS = {"val/miou": "mIoU", "val/miou_present": "mIoU, classes present", "val/acc": "accuracy"}
 DATA = {"scans": "scans", "sequences": "sequences", "validated_on": "validated on"}
@@ -63,7 +67,9 @@ def _use(weights: Weights, name: str) -> str:
         method = "" if "point_head" in weights.parts else f', method="{_method(weights.parts)}"'
         call = f'segmenter = amvnet.load("{name}"{method})\nresult = segmenter(points)'
     lines = "import amvnet\n\n" + call
-    return f"```python\n{lines}\n```\n\n`points` is (N, 4): x, y, z in metres and intensity in [0, 1]."
+    return (
+        f"```python\n{lines}\n```\n\n`points` is (N, 4): x, y, z in metres and intensity in [0, 1]."
+    )
 
 
 def _method(parts: Sequence[str]) -> str:
@@ -75,7 +81,9 @@ def _sizes(weights: Weights) -> Iterator[tuple[str, str]]:
     model, parts = weights.model, weights.parts
     if "range_net" in parts:
         view = model.range_view
-        field = "by ring" if view.rows == "ring" else f"{view.fov_up:+g} to {view.fov_down:+g} degrees"
+        field = (
+            "by ring" if view.rows == "ring" else f"{view.fov_up:+g} to {view.fov_down:+g} degrees"
+        )
         yield "range view", f"{view.height} x {view.width}, {field}"
     if "polar_net" in parts:
         grid = model.polar_view
@@ -92,17 +100,25 @@ def _metrics(weights: Weights) -> str:
     rows = ["| | " + " | ".join(METRICS.values()) + " |", "|---" * (len(METRICS) + 1) + "|"]
     for part in weights.parts:
         reached = weights.metrics.get(part, {})
-        shown = [f"{100 * reached[key]:.1f}" if isinstance(reached.get(key), float) else "–" for key in METRICS]
+        shown = [
+            f"{100 * reached[key]:.1f}" if isinstance(reached.get(key), float) else "–"
+            for key in METRICS
+        ]
         rows.append(f"| {TITLES[part]} | {' | '.join(shown)} |")
     return "On the scans named below as validated on, %:\n\n" + "\n".join(rows)
 
 
 def _training(weights: Weights, part: str) -> str:
     """What a part learnt from, and how."""
-    known, count = weights.training.get(part, {}), sum(v.numel() for v in weights.part(part).values())
+    known, count = (
+        weights.training.get(part, {}),
+        sum(v.numel() for v in weights.part(part).values()),
+    )
     data = [(title, known[key]) for key, title in DATA.items() if key in known]
     rest = [(key, value) for key, value in known.items() if key not in DATA]
-    return _list([("values", f"{count:,}"), *((key, _plain(value)) for key, value in (*data, *rest))])
+    return _list(
+        [("values", f"{count:,}"), *((key, _plain(value)) for key, value in (*data, *rest))]
+    )
 
 
 def _list(rows: Iterator[tuple[str, str]] | Sequence[tuple[str, str]]) -> str:
@@ -114,5 +130,9 @@ def _plain(value: Any) -> str:
         return ", ".join(f"{k} {_plain(v)}" for k, v in value.items())
     if isinstance(value, list):
         names = [str(one) for one in value]
-        return ", ".join(names) if len(names) <= LISTED else f"{len(names)}, from {names[0]} to {names[-1]}"
+        return (
+            ", ".join(names)
+            if len(names) <= LISTED
+            else f"{len(names)}, from {names[0]} to {names[-1]}"
+        )
     return f"{value:.4g}" if isinstance(value, float) else str(value)

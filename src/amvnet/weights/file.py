@@ -64,7 +64,11 @@ class Weights:
 
     def part(self, name: str) -> dict[str, Tensor]:
         """The parameters of one part, named as the part's own module names them."""
-        return {k.removeprefix(f"{name}."): v for k, v in self.tensors.items() if k.startswith(f"{name}.")}
+        return {
+            k.removeprefix(f"{name}."): v
+            for k, v in self.tensors.items()
+            if k.startswith(f"{name}.")
+        }
 
     def digest(self, name: str) -> str:
         """Tells the parameters of one part from other ones."""
@@ -80,7 +84,9 @@ class Weights:
             InputError: where the other has no such part, other classes, or other sizes of it.
         """
         if name not in other.parts:
-            raise InputError(f"expected weights with the part {name}, found {', '.join(other.parts) or 'none'}")
+            raise InputError(
+                f"expected weights with the part {name}, found {', '.join(other.parts) or 'none'}"
+            )
         if self.taxonomy.classes != other.taxonomy.classes:
             raise InputError(
                 f"expected weights for the classes of {self.taxonomy.name}, found those of {other.taxonomy.name}; "
@@ -119,7 +125,9 @@ class Weights:
             InputError: where there is none, or its parameters do not fit its sizes.
         """
         if "point_head" not in self.parts:
-            raise InputError("expected weights with a point head, found none; train one with --stage head")
+            raise InputError(
+                "expected weights with a point head, found none; train one with --stage head"
+            )
         head = PointHead(self.model.point_head, self.taxonomy.size)
         self._fill("point_head", head)
         return head.eval()
@@ -128,7 +136,9 @@ class Weights:
         try:
             module.load_state_dict({k: v.float() for k, v in self.part(part).items()})
         except RuntimeError:
-            raise InputError(f"the parameters of {part} do not fit its description; train it anew") from None
+            raise InputError(
+                f"the parameters of {part} do not fit its description; train it anew"
+            ) from None
 
 
 def _only(values: Mapping[str, Any], name: str) -> dict[str, Any]:
@@ -137,7 +147,9 @@ def _only(values: Mapping[str, Any], name: str) -> dict[str, Any]:
 
 def state_of(part: str, module: torch.nn.Module) -> dict[str, Tensor]:
     """A module's parameters under its part's name, on the CPU and apart from the module."""
-    return {f"{part}.{k}": v.detach().cpu().clone().contiguous() for k, v in module.state_dict().items()}
+    return {
+        f"{part}.{k}": v.detach().cpu().clone().contiguous() for k, v in module.state_dict().items()
+    }
 
 
 def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
@@ -180,12 +192,24 @@ def load(name_or_path: str | Path) -> Weights:
             description = json.loads((file.metadata() or {}).get(KEY, "null"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118  not a dictionary
     except (SafetensorError, OSError, ValueError):
-        raise InputError(f"{path}: expected a safetensors file, found something else; give AMVNet weights") from None
+        raise InputError(
+            f"{path}: expected a safetensors file, found something else; give AMVNet weights"
+        ) from None
     if not isinstance(description, dict) or description.get("format") != FORMAT:
-        raise InputError(f"{path}: expected weights with AMVNet's description inside, found none; give AMVNet weights")
-    for key, kind in (("model", dict), ("taxonomy", dict), ("sensor", str), ("training", dict), ("metrics", dict)):
+        raise InputError(
+            f"{path}: expected weights with AMVNet's description inside, found none; give AMVNet weights"
+        )
+    for key, kind in (
+        ("model", dict),
+        ("taxonomy", dict),
+        ("sensor", str),
+        ("training", dict),
+        ("metrics", dict),
+    ):
         if not isinstance(description.get(key), kind):
-            raise InputError(f"{path}: expected a description with {key}, found {description.get(key)!r}; train anew")
+            raise InputError(
+                f"{path}: expected a description with {key}, found {description.get(key)!r}; train anew"
+            )
     return Weights(
         model=from_dict(ModelConfig, description["model"], f"{path}: model"),
         taxonomy=Taxonomy.from_dict(description["taxonomy"]),
@@ -210,5 +234,7 @@ def _find(name_or_path: str) -> Path:
         return path / "weights.safetensors"  # the folder of a training run
     if not path.is_file():
         names = ", ".join(built_in()) or "none"
-        raise InputError(f"expected a weights file, found no {name_or_path}; check the path (built in: {names})")
+        raise InputError(
+            f"expected a weights file, found no {name_or_path}; check the path (built in: {names})"
+        )
     return path

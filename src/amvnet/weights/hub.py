@@ -37,7 +37,9 @@ def client() -> Any:
     try:
         import huggingface_hub
     except ImportError:
-        raise InputError("expected huggingface_hub for the hub, found none; pip install 'amvnet[hub]'") from None
+        raise InputError(
+            "expected huggingface_hub for the hub, found none; pip install 'amvnet[hub]'"
+        ) from None
     return huggingface_hub
 
 
@@ -46,7 +48,9 @@ def one_line(name: str, cure: str) -> Iterator[None]:
     """What the hub's client complains of as one line, with what to do."""
     try:
         yield
-    except Exception as error:  # which kinds there are depends on its version, and that of its HTTP library
+    except (
+        Exception
+    ) as error:  # which kinds there are depends on its version, and that of its HTTP library
         said = next((line.strip() for line in str(error).splitlines() if line.strip()), "no more")
         raise InputError(
             f"{name}: expected an answer of the hub, found {type(error).__name__}: {said}; {cure}"

@@ -12,7 +12,9 @@ from amvnet.weights.hub import FILE, PREFIX, check_name, client, one_line
 CARD = "README.md"
 
 
-def push(weights: Weights | Path | str, name: str, licence: str | None = None, private: bool = False) -> str:
+def push(
+    weights: Weights | Path | str, name: str, licence: str | None = None, private: bool = False
+) -> str:
     """Share weights as OWNER/NAME on the hub, as who is logged in there; with their card as README.md.
 
     Args:
@@ -38,6 +40,9 @@ def push(weights: Weights | Path | str, name: str, licence: str | None = None, p
         with one_line(name, "check the name and the network, and log in by hf auth login"):
             hub.create_repo(repo_id=name, private=private, exist_ok=True)
             made = hub.upload_folder(
-                repo_id=name, folder_path=folder, allow_patterns=[FILE, CARD], commit_message="AMVNet weights"
+                repo_id=name,
+                folder_path=folder,
+                allow_patterns=[FILE, CARD],
+                commit_message="AMVNet weights",
             )
     return str(getattr(made, "commit_url", made))

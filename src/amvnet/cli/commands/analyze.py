@@ -50,7 +50,9 @@ def analyze(
     from amvnet.weights.file import load
 
     if (neighbours is None) != (recipe is None):
-        raise InputError("expected --neighbours and --recipe together, found one of them; give both or neither")
+        raise InputError(
+            "expected --neighbours and --recipe together, found one of them; give both or neither"
+        )
     given = load(weights)
     dataset = open_data(data, None, own_classes(given.taxonomy))
     segmenter = Segmenter(given, device)

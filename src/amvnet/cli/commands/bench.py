@@ -51,13 +51,24 @@ def bench(
     with TemporaryDirectory() as folder:
         if scan is None:
             write(Path(folder), scans=1)
-        path, labels = scan or Path(folder) / "sequences/00/velodyne/000000.bin", Path(folder) / "labels.label"
+        path, labels = (
+            scan or Path(folder) / "sequences/00/velodyne/000000.bin",
+            Path(folder) / "labels.label",
+        )
         jobs = []
         for engine in names_in(engines) or []:
             segmenter = Segmenter(given, device, precision=precision)
             name = engage(segmenter, engine)
             name = name if precision == "float32" else f"{name}, {precision}"
-            jobs.append(Job(segmenter, lambda: read_scan(path), lambda ids: write_labels(labels, ids), name, share))
+            jobs.append(
+                Job(
+                    segmenter,
+                    lambda: read_scan(path),
+                    lambda ids: write_labels(labels, ids),
+                    name,
+                    share,
+                )
+            )
         with progress("timing") as step:
             reports = time_jobs(jobs, runs, step)
     console.print(*(timing_table(report) for report in reports), sep="\n")

@@ -39,5 +39,9 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
     with progress("scoring") as step:
         label = jobs.by_weights(dataset, segmenter)
         found = jobs.evaluate(dataset, records, label, out / "pictures", step)
-    show_evaluation(found, f"simulated streets, seed {seed}", dataset.taxonomy, out / "metrics.json")
-    say(f"labels in {out / 'predictions'}, pictures in {out / 'pictures'}, figures in {out / 'metrics.json'}")
+    show_evaluation(
+        found, f"simulated streets, seed {seed}", dataset.taxonomy, out / "metrics.json"
+    )
+    say(
+        f"labels in {out / 'predictions'}, pictures in {out / 'pictures'}, figures in {out / 'metrics.json'}"
+    )

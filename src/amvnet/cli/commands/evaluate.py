@@ -52,7 +52,9 @@ def evaluate(
     from amvnet.weights.file import load
 
     if (weights is None) == (predictions is None):
-        raise InputError("expected either --weights or --predictions, found both or neither; give one of them")
+        raise InputError(
+            "expected either --weights or --predictions, found both or neither; give one of them"
+        )
     processes = meet()
     given = None if weights is None else load(weights)
     dataset = open_data(data, taxonomy, None if given is None else own_classes(given.taxonomy))
@@ -71,7 +73,9 @@ def evaluate(
         show_evaluation(found, data, dataset.taxonomy, json)
 
 
-def show_evaluation(evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None) -> None:
+def show_evaluation(
+    evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None
+) -> None:
     """Print the table, and write the same figures as JSON."""
     from amvnet.cli.tables import evaluation_table
     from amvnet.files import whole_file

@@ -21,6 +21,10 @@ def export(weights: str, out: Path, int8: str | None = None) -> None:
     with progress("exporting") as step:
         measured = run(weights, out, step, int8)
     largest = max(measured.differences.values())
-    say(f"{len(measured.differences)} graphs and amvnet.json in {out}; they differ from torch by at most {largest:.1e}")
+    say(
+        f"{len(measured.differences)} graphs and amvnet.json in {out}; they differ from torch by at most {largest:.1e}"
+    )
     for name, share in measured.agreement.items():
-        say(f"{name} is in int8 now; on scans it was not calibrated with, {share:.1%} of its labels are as before")
+        say(
+            f"{name} is in int8 now; on scans it was not calibrated with, {share:.1%} of its labels are as before"
+        )

@@ -55,7 +55,9 @@ def fuse(
     given = None if head is None else load(head)
     classes = _classes(inputs, taxonomy, given)
     with progress("fusing") as step:
-        written, uncertain = run(inputs, pair, given, classes, out, names_in(sequences), step, split, tau, topic)
+        written, uncertain = run(
+            inputs, pair, given, classes, out, names_in(sequences), step, split, tau, topic
+        )
     say(f"{written} label files in {out}; the two models disagree on {uncertain:.1%} of the points")
 
 
@@ -66,7 +68,9 @@ def _classes(inputs: list[str], text: str | None, head: Weights | None) -> Taxon
     from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, taxonomy_from_yaml
 
     if head is not None and text is not None:
-        raise InputError("expected no --taxonomy beside --head, which says its classes; leave it out")
+        raise InputError(
+            "expected no --taxonomy beside --head, which says its classes; leave it out"
+        )
     if head is not None:
         return head.taxonomy
     if text is not None:

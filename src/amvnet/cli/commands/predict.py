@@ -72,7 +72,13 @@ def predict(
     from amvnet.sensors.lidars import describe
 
     processes = meet()
-    options = {"height": height, "intensity_scale": intensity_scale, "axes": axes, "rotate": rotate, "offset": offset}
+    options = {
+        "height": height,
+        "intensity_scale": intensity_scale,
+        "axes": axes,
+        "rotate": rotate,
+        "offset": offset,
+    }
     given = describe(sensor, **options)
     segmenter = Segmenter(weights, processes.device(device), method, precision)
     engage(segmenter, engine)

@@ -43,7 +43,10 @@ def rank(
     dataset = open_data(data, None, own_classes(given.taxonomy))
     records = choose_records(dataset, names_in(sequences), split)
     segmenter = Segmenter(given, device, widest_method(given))
-    for folder in (out.parent, *([] if pictures is None else [pictures])):  # so that nothing is scored in vain
+    for folder in (
+        out.parent,
+        *([] if pictures is None else [pictures]),
+    ):  # so that nothing is scored in vain
         make_folder(folder)
     with progress("scoring") as step:
         found = ranking.rank(dataset, records, segmenter, by, step)

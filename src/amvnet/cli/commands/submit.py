@@ -44,7 +44,9 @@ def submit(
     sources = Sources(use_camera, use_lidar, use_radar, use_map, use_external)
     rules = rules_for(open_data(data, None), split, names_in(sequences))
     if sources != Sources() and (check is not None or rules.meta is None):
-        raise InputError("expected no --use-... but to write an archive for nuScenes, found one; leave it out")
+        raise InputError(
+            "expected no --use-... but to write an archive for nuScenes, found one; leave it out"
+        )
     if check is not None and predictions is None and out is None:
         with progress("checking") as step:
             found = submission.check(rules, check, step)
@@ -52,7 +54,11 @@ def submit(
         with progress("packing") as step:
             found = submission.write(rules, predictions, out, sources, step)
     else:
-        raise InputError("expected either --predictions and --out, or --check, found others; give one or the other")
-    say(f"{check or out}: {found.predictions} predictions of {rules.what} keep to the rules of {rules.taxonomy.name}")
+        raise InputError(
+            "expected either --predictions and --out, or --check, found others; give one or the other"
+        )
+    say(
+        f"{check or out}: {found.predictions} predictions of {rules.what} keep to the rules of {rules.taxonomy.name}"
+    )
     for note in found.notes:
         say(f"note: {note}")

@@ -56,7 +56,9 @@ def train(
     _calm_lightning()
     processes = meet(device_of(recipe.training.accelerator) == "cuda")
     dataset = open_data(data, taxonomy)
-    learnt, val = split_records(dataset, names_in(train_sequences), names_in(val_sequences), with_val)
+    learnt, val = split_records(
+        dataset, names_in(train_sequences), names_in(val_sequences), with_val
+    )
     say(f"training on {listed(learnt)}; validating on {listed(val)}")
     given = None if init is None else weights.load(init)
     pair = scores_in(scores_a, scores_b, key_a, key_b, logits)
@@ -69,5 +71,8 @@ def train(
 
 
 def _calm_lightning() -> None:
-    for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when they are imported
+    for name in (
+        "lightning.pytorch",
+        "lightning.fabric",
+    ):  # which set their levels when they are imported
         logging.getLogger(name).setLevel(logging.ERROR)

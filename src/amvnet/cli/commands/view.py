@@ -84,4 +84,8 @@ def _show(chosen: Frames, title: str, html: Path | None, save: Path | None) -> N
 def _title(inputs: list[str], weights: str | None) -> str:
     """Of a page: the first input, and what labelled it."""
     more = f" and {len(inputs) - 1} more" if len(inputs) > 1 else ""
-    return Path(inputs[0]).resolve().name + more + ("" if weights is None else f" · {Path(weights).name}")
+    return (
+        Path(inputs[0]).resolve().name
+        + more
+        + ("" if weights is None else f" · {Path(weights).name}")
+    )

@@ -52,11 +52,16 @@ class NuScenes:
         InputError: where `root` has no such layout, the version is not clear or a table is missing.
     """
 
-    def __init__(self, root: Path | str, version: str | None = None, taxonomy: Taxonomy = NUSCENES) -> None:
+    def __init__(
+        self, root: Path | str, version: str | None = None, taxonomy: Taxonomy = NUSCENES
+    ) -> None:
         self.root = Path(root)
         self.version = self._find_version(version)
         self.taxonomy = taxonomy
-        self._labels = {row["sample_data_token"]: row["filename"] for row in self._table("lidarseg", required=False)}
+        self._labels = {
+            row["sample_data_token"]: row["filename"]
+            for row in self._table("lidarseg", required=False)
+        }
         self._to_train = self._category_lookup() if self._labels else None
         try:
             self._by_scene = self._index()
@@ -75,7 +80,9 @@ class NuScenes:
         scenes = self.scenes(split)
         folder = self.root / "samples" / CHANNEL
         present = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        if found := tuple(s for s in scenes if any(r.points_path.name in present for r in self._by_scene[s])):
+        if found := tuple(
+            s for s in scenes if any(r.points_path.name in present for r in self._by_scene[s])
+        ):
             return found
         raise InputError(
             f"{folder}: expected scans of {split} scenes ({len(scenes)} in the tables of {self.version}), "
@@ -89,8 +96,14 @@ class NuScenes:
             InputError: where the split is unknown.
         """
         if split not in SPLITS:
-            raise InputError(f"{self.root}: expected a split of {', '.join(SPLITS)}, found {split!r}; give one of them")
-        return tuple(s for s in sorted(self._by_scene) if split in ("all", self._split(s).removeprefix("mini_")))
+            raise InputError(
+                f"{self.root}: expected a split of {', '.join(SPLITS)}, found {split!r}; give one of them"
+            )
+        return tuple(
+            s
+            for s in sorted(self._by_scene)
+            if split in ("all", self._split(s).removeprefix("mini_"))
+        )
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """The scans of these scenes in order; raises as `records.Dataset`."""
@@ -113,20 +126,30 @@ class NuScenes:
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
         """Read (N,) uint8 train ids; raises as `records.Dataset`."""
-        return read_prediction(Path(folder) / record.prediction, np.uint8, self._count(record), self.taxonomy)
+        return read_prediction(
+            Path(folder) / record.prediction, np.uint8, self._count(record), self.taxonomy
+        )
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) train ids (uint8); raises as `records.Dataset`."""
         ids = files.check_count(ids, record.points_path, self._count(record))
-        return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids), np.uint8)
+        return files.write_labels(
+            Path(folder) / record.prediction, self.taxonomy.to_raw(ids), np.uint8
+        )
 
     def _find_version(self, version: str | None) -> str:
         present = sorted(path.name for path in self.root.glob("v1.0-*") if path.is_dir())
         if version in present or (version is None and len(present) == 1):
             return version or present[0]
         wanted = version or ("one folder v1.0-*" if present else "a folder v1.0-*")
-        advice = f"give one of them as {self.root}@{present[0]}" if present else "give the folder that holds it"
-        raise InputError(f"{self.root}: expected {wanted}, found {', '.join(present) or 'none'}; {advice}")
+        advice = (
+            f"give one of them as {self.root}@{present[0]}"
+            if present
+            else "give the folder that holds it"
+        )
+        raise InputError(
+            f"{self.root}: expected {wanted}, found {', '.join(present) or 'none'}; {advice}"
+        )
 
     def _table(self, name: str, required: bool = True) -> list[Row]:
         path = self.root / self.version / f"{name}.json"
@@ -139,7 +162,9 @@ class NuScenes:
         try:
             rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
-            raise InputError(f"{path}: expected a table in JSON, found {error}; unpack the file again") from None
+            raise InputError(
+                f"{path}: expected a table in JSON, found {error}; unpack the file again"
+            ) from None
         return rows
 
     def _category_lookup(self) -> np.ndarray:
@@ -189,7 +214,9 @@ class NuScenes:
     @staticmethod
     def _is_scan(row: Row, lidars: dict[str, bool]) -> bool:
         under = str(row["filename"]).startswith(f"samples/{CHANNEL}/")
-        return bool(row["is_key_frame"]) and under and lidars.get(row["calibrated_sensor_token"], True)
+        return (
+            bool(row["is_key_frame"]) and under and lidars.get(row["calibrated_sensor_token"], True)
+        )
 
     def _record(self, row: Row, scene: str) -> ScanRecord:
         token = row["token"]

@@ -12,7 +12,10 @@ from amvnet.errors import InputError
 
 __all__ = ["Dataset", "ScanRecord", "is_dataset", "open_dataset"]
 
-KINDS: dict[str, type[SemanticKitti] | type[NuScenes]] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
+KINDS: dict[str, type[SemanticKitti] | type[NuScenes]] = {
+    "semantickitti": SemanticKitti,
+    "nuscenes": NuScenes,
+}
 
 
 def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
@@ -61,11 +64,16 @@ def _guess(path: Path) -> type[SemanticKitti] | type[NuScenes]:
 
 
 def _open(
-    opener: type[SemanticKitti] | type[NuScenes], path: Path, version: str | None, taxonomy: Taxonomy | None
+    opener: type[SemanticKitti] | type[NuScenes],
+    path: Path,
+    version: str | None,
+    taxonomy: Taxonomy | None,
 ) -> Dataset:
     options = {} if taxonomy is None else {"taxonomy": taxonomy}
     if issubclass(opener, NuScenes):
         return opener(path, version=version, **options)
     if version is not None:
-        raise InputError(f"{path}: expected no version after @, found {version}; only nuScenes has versions")
+        raise InputError(
+            f"{path}: expected no version after @, found {version}; only nuScenes has versions"
+        )
     return opener(path, **options)

@@ -21,7 +21,9 @@ def read_prediction(path: Path, dtype: DTypeLike, count: int, taxonomy: Taxonomy
         InputError: where the file is missing, and as `check_size` and `train_ids`.
     """
     if not path.is_file():
-        raise InputError(f"{path}: expected the prediction of a scan, found no file; predict this scan, too")
+        raise InputError(
+            f"{path}: expected the prediction of a scan, found no file; predict this scan, too"
+        )
     check_size(path, path.stat().st_size, count, dtype)
     return train_ids(path, np.fromfile(path, dtype=dtype, count=count), taxonomy)
 
@@ -57,7 +59,9 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
         InputError: where an id is none of the benchmark's raw ids, or all look like another number type.
     """
     classes = raw.astype(np.uint32) & np.uint32(INSTANCE_MASK)
-    if raw.any() and not classes.any():  # 40.0 and a big-endian 40 have all of their bits in the upper half
+    if (
+        raw.any() and not classes.any()
+    ):  # 40.0 and a big-endian 40 have all of their bits in the upper half
         raise InputError(
             f"{name}: expected little-endian {raw.dtype} ids, found the class 0 with other bits, as float32 and "
             f"big-endian ids read; write the ids as little-endian {raw.dtype}"
@@ -70,9 +74,14 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
 
 def _unknown(classes: np.ndarray, taxonomy: Taxonomy) -> str:
     """What to say of ids that are not all in the table."""
-    table = {*taxonomy.train_to_raw, *(raw for raw in taxonomy.raw_to_train if isinstance(raw, int))}
+    table = {
+        *taxonomy.train_to_raw,
+        *(raw for raw in taxonomy.raw_to_train if isinstance(raw, int)),
+    }
     found = sorted(set(np.unique(classes).tolist()) - table)
-    shown = ", ".join(map(str, found[:SHOWN])) + (f" and {len(found) - SHOWN} more" if len(found) > SHOWN else "")
+    shown = ", ".join(map(str, found[:SHOWN])) + (
+        f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+    )
     train = " (train ids, it seems)" if classes.max() <= taxonomy.size else ""
     wanted = ", ".join(map(str, taxonomy.train_to_raw[1:]))
     return f"expected the raw ids of {taxonomy.name} ({wanted}), found {shown}{train}; write its raw ids"

@@ -23,7 +23,9 @@ def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
         )
 
 
-def choose_records(dataset: Dataset, sequences: Sequence[str] | None, split: str) -> list[ScanRecord]:
+def choose_records(
+    dataset: Dataset, sequences: Sequence[str] | None, split: str
+) -> list[ScanRecord]:
     """The scans of the named sequences, or else of a split."""
     return dataset.records(dataset.sequences(split) if sequences is None else sequences)
 

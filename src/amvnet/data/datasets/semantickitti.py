@@ -49,7 +49,9 @@ class SemanticKitti:
         present = self._present()
         splits = {**self.taxonomy.splits, "all": present}
         if split not in splits:
-            raise InputError(f"{self.root}: expected a split of {', '.join(splits)}, found {split!r}; give one of them")
+            raise InputError(
+                f"{self.root}: expected a split of {', '.join(splits)}, found {split!r}; give one of them"
+            )
         if found := tuple(sequence for sequence in splits[split] if sequence in present):
             return found
         raise InputError(
@@ -66,12 +68,16 @@ class SemanticKitti:
         points = files.read_kitti(record.points_path)
         ids = None
         if labels and record.labels_path is not None:
-            ids = files.read_labels(record.labels_path, np.uint32, len(points), self.taxonomy.to_train)
+            ids = files.read_labels(
+                record.labels_path, np.uint32, len(points), self.taxonomy.to_train
+            )
         return Scan(points, labels=ids, name=record.name)
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
         """Read (N,) uint8 train ids; raises as `records.Dataset`."""
-        return read_prediction(Path(folder) / record.prediction, np.uint32, self._count(record), self.taxonomy)
+        return read_prediction(
+            Path(folder) / record.prediction, np.uint32, self._count(record), self.taxonomy
+        )
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) train ids as raw ids (uint32); raises as `records.Dataset`."""
@@ -92,7 +98,9 @@ class SemanticKitti:
     def _records(self, sequence: str) -> list[ScanRecord]:
         folder = self._folder / sequence
         # What a killed program had begun to write has a name that begins with a dot.
-        scans = sorted(path for path in (folder / "velodyne").glob("*.bin") if not path.name.startswith("."))
+        scans = sorted(
+            path for path in (folder / "velodyne").glob("*.bin") if not path.name.startswith(".")
+        )
         if not scans:
             raise InputError(
                 f"{folder / 'velodyne'}: expected the scans *.bin of sequence {sequence}, found none; "

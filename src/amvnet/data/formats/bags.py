@@ -15,7 +15,10 @@ from amvnet.errors import InputError
 TYPE = "sensor_msgs/msg/PointCloud2"
 METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
 SMALLEST = 16  # bytes of a bag for each message that it claims, compressed ones too
-EXPECTED, ADVICE = "a ROS bag", "mend it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
+EXPECTED, ADVICE = (
+    "a ROS bag",
+    "mend it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again",
+)
 
 
 class Bag:
@@ -36,7 +39,9 @@ class Bag:
             self.topic = _choose(_topics(reader), topic, path)
             self._count = sum(c.msgcount for c in _connections(reader, self.topic))
         if not 0 < self._count <= _size(path) // SMALLEST:
-            raise InputError(f"{path}: expected scans under {self.topic}, found {self._count} messages; {ADVICE}")
+            raise InputError(
+                f"{path}: expected scans under {self.topic}, found {self._count} messages; {ADVICE}"
+            )
         self._next, self._messages = 0, iter(())  # type: tuple[int, Iterator[Any]]
 
     def __len__(self) -> int:
@@ -77,7 +82,9 @@ def _opened(path: Path, ending: str) -> Iterator[Any]:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
     except ImportError:
-        raise InputError(f'{path}: expected rosbags to read it, found none; do pip install "amvnet[formats]"') from None
+        raise InputError(
+            f'{path}: expected rosbags to read it, found none; do pip install "amvnet[formats]"'
+        ) from None
     with ExitStack() as stack:
         if ending in (".mcap", ".db3") and path.suffix != ending:
             folder = Path(stack.enter_context(TemporaryDirectory()))
@@ -112,13 +119,23 @@ def _choose(counts: dict[str, int], topic: str | None, path: Path) -> str:
     if topic is not None:
         if topic in counts:
             return topic
-        raise InputError(f"{path}: expected PointCloud2 under {topic}, found {shown or 'none'}; give another --topic")
+        raise InputError(
+            f"{path}: expected PointCloud2 under {topic}, found {shown or 'none'}; give another --topic"
+        )
     if not counts:
-        raise InputError(f"{path}: expected a topic with PointCloud2, found none; convert the driver's packets first")
+        raise InputError(
+            f"{path}: expected a topic with PointCloud2, found none; convert the driver's packets first"
+        )
     if len(counts) > 1:
-        raise InputError(f"{path}: expected one topic with PointCloud2, found {shown}; give one with --topic")
+        raise InputError(
+            f"{path}: expected one topic with PointCloud2, found {shown}; give one with --topic"
+        )
     return next(iter(counts))
 
 
 def _size(path: Path) -> int:
-    return sum(f.stat().st_size for f in path.iterdir() if f.is_file()) if path.is_dir() else path.stat().st_size
+    return (
+        sum(f.stat().st_size for f in path.iterdir() if f.is_file())
+        if path.is_dir()
+        else path.stat().st_size
+    )

@@ -20,7 +20,15 @@ NAMES = {
     "x": ("x",),
     "y": ("y",),
     "z": ("z",),
-    "intensity": ("intensity", "intensities", "i", "reflectivity", "reflectance", "remission", "scalar_intensity"),
+    "intensity": (
+        "intensity",
+        "intensities",
+        "i",
+        "reflectivity",
+        "reflectance",
+        "remission",
+        "scalar_intensity",
+    ),
     "ring": ("ring", "rings", "channel", "laser_id", "laser", "scalar_ring"),
 }  # of columns, in small letters; the first that a file has counts
 
@@ -69,7 +77,9 @@ class Cloud:
             InputError: where no point is usable.
         """
         points = np.zeros((len(self.xyz), 4), dtype=np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):  # what does not fit is infinite, and so not valid
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # what does not fit is infinite, and so not valid
             points[:, :3] = self.xyz
             scale = scale or self.intensity_scale()
             if self.intensity is not None and scale is not None:
@@ -106,7 +116,9 @@ def check_number(count: int, path: Path | str, least: int = 0) -> int:
         InputError: where a scan cannot, or the file is too short for it.
     """
     if not 0 <= count <= MAX_POINTS:
-        raise InputError(f"{path}: expected a scan of at most {MAX_POINTS:,} points, found {count}; cut it into scans")
+        raise InputError(
+            f"{path}: expected a scan of at most {MAX_POINTS:,} points, found {count}; cut it into scans"
+        )
     if least and least > (size := Path(path).stat().st_size):
         raise InputError(
             f"{path}: expected {least} bytes or more for {count} points, found {size}; "
@@ -128,13 +140,18 @@ def refusing(path: Path | str, expected: str, advice: str) -> Iterator[None]:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         found = " ".join(str(error).split())[:160] or type(error).__name__
-        raise InputError(f"{path}: expected {expected}, found a broken one ({found}); {advice}") from None
+        raise InputError(
+            f"{path}: expected {expected}, found a broken one ({found}); {advice}"
+        ) from None
 
 
 def picked(names: Sequence[str]) -> dict[str, int]:
     """Which of a file's columns are x, y, z, intensity and ring, by their names; the last two can be missing."""
     lower = [name.lower() for name in names]
-    found = {key: [lower.index(alias) for alias in aliases if alias in lower] for key, aliases in NAMES.items()}
+    found = {
+        key: [lower.index(alias) for alias in aliases if alias in lower]
+        for key, aliases in NAMES.items()
+    }
     return {key: places[0] for key, places in found.items() if places}
 
 
@@ -143,14 +160,20 @@ def picked_or_refused(names: Sequence[str], path: Path | str) -> dict[str, int]:
     found = picked(names)
     if not {"x", "y", "z"} <= set(found):
         shown = ", ".join(names[:20]) or "none"
-        raise InputError(f"{path}: expected columns x, y, z, found {shown[:200]!a}; name the columns so")
+        raise InputError(
+            f"{path}: expected columns x, y, z, found {shown[:200]!a}; name the columns so"
+        )
     return found
 
 
 def cloud_of(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     """A cloud of the columns x, y, z and, where there are any, intensity and ring."""
-    wide = any(columns[axis].dtype.itemsize > 4 or columns[axis].dtype.kind in "iu" for axis in "xyz")
-    xyz = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(np.float64 if wide else np.float32)
+    wide = any(
+        columns[axis].dtype.itemsize > 4 or columns[axis].dtype.kind in "iu" for axis in "xyz"
+    )
+    xyz = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(
+        np.float64 if wide else np.float32
+    )
     return Cloud(xyz, columns.get("intensity"), rings(columns.get("ring")), name)
 
 
@@ -160,5 +183,7 @@ def rings(values: np.ndarray | None) -> np.ndarray | None:
     if values is None or not len(values):
         return None
     finite = np.where(np.isfinite(values), values, 0)
-    whole = np.array_equal(finite, np.round(finite)) and finite.min() >= 0 and finite.max() < MOST_RINGS
+    whole = (
+        np.array_equal(finite, np.round(finite)) and finite.min() >= 0 and finite.max() < MOST_RINGS
+    )
     return finite.astype(np.int64) if whole else None

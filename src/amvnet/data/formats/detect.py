@@ -61,7 +61,9 @@ class NamedScan:
 
 def is_bag_folder(path: Path) -> bool:
     """Whether a folder is a ROS 2 bag."""
-    return (path / METADATA).is_file() and any(any(path.glob(f"*{ending}*")) for ending in (".db3", ".mcap"))
+    return (path / METADATA).is_file() and any(
+        any(path.glob(f"*{ending}*")) for ending in (".db3", ".mcap")
+    )
 
 
 def is_scan(path: Path) -> bool:
@@ -110,7 +112,9 @@ def read_cloud(path: Path | str) -> Cloud:
         return READERS[ending](path)
     bag = Bag(path, ending)
     if len(bag) > 1:
-        raise InputError(f"{path}: expected one scan, found a bag of {len(bag)}; segment it with amvnet predict")
+        raise InputError(
+            f"{path}: expected one scan, found a bag of {len(bag)}; segment it with amvnet predict"
+        )
     return bag.read(0)
 
 

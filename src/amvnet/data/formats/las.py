@@ -52,7 +52,9 @@ def _check_header(path: Path) -> tuple[int, bool]:
         (count,) = struct.unpack_from("<Q", header, 247)
     end = path.stat().st_size
     if size < OLDEST or size + RECORD * records > begin or begin > end:
-        raise InputError(f"{path}: expected points after {records} records, found {end} bytes in all; {ADVICE}")
+        raise InputError(
+            f"{path}: expected points after {records} records, found {end} bytes in all; {ADVICE}"
+        )
     compressed = bool(kind & COMPRESSED)
     return check_number(count, path, 0 if compressed else begin + row * count), compressed
 
@@ -81,8 +83,12 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
 
 def _read_apart(path: Path, count: int) -> dict[str, np.ndarray]:
     """The same in another process: on broken bytes lazrs (0.8) takes any amount of memory, or ends its process."""
-    code = "import sys; from amvnet.data.formats.las import write_columns; write_columns(sys.argv[1])"
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")  # each takes of the memory allowed
+    code = (
+        "import sys; from amvnet.data.formats.las import write_columns; write_columns(sys.argv[1])"
+    )
+    threads = dict.fromkeys(
+        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
+    )  # each takes of the memory allowed
     found = subprocess.run(
         [sys.executable, "-c", code, str(path.absolute())],
         env={**os.environ, **threads, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
@@ -92,7 +98,9 @@ def _read_apart(path: Path, count: int) -> dict[str, np.ndarray]:
     )
     if found.returncode:
         raise ValueError("its points cannot be unpacked")
-    points = np.frombuffer(found.stdout, np.dtype([(name, "f8") for name in "xyz"] + [("intensity", "u2")]))
+    points = np.frombuffer(
+        found.stdout, np.dtype([(name, "f8") for name in "xyz"] + [("intensity", "u2")])
+    )
     return {name: points[name] for name in ("x", "y", "z", "intensity")}
 
 

@@ -9,7 +9,14 @@ from typing import BinaryIO
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused, refusing, rings
+from amvnet.data.formats.cloud import (
+    Cloud,
+    check_number,
+    cloud_of,
+    picked_or_refused,
+    refusing,
+    rings,
+)
 from amvnet.data.formats.raw import ring_column
 from amvnet.errors import InputError
 
@@ -31,8 +38,13 @@ def read_npy(path: Path) -> Cloud:
 
 def read_npz(path: Path) -> Cloud:
     """Read the one array of an archive, or the one named `points`, `xyz`, `scan` or `arr_0`; raises as `read_npy`."""
-    with refusing(path, "a NumPy archive", "save it again with np.savez"), zipfile.ZipFile(path) as archive:
-        names = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+    with (
+        refusing(path, "a NumPy archive", "save it again with np.savez"),
+        zipfile.ZipFile(path) as archive,
+    ):
+        names = {
+            name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")
+        }
         found = list(names) if len(names) == 1 else [key for key in KEYS if key in names]
         if not found:
             shown = ", ".join(list(names)[:10])[:200] or "none"
@@ -47,14 +59,22 @@ def read_npz(path: Path) -> Cloud:
 def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
     """The array that begins here, if the `size` bytes can hold what its header claims."""
     version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, fortran, dtype = read(file)
     numbers = dtype.names is not None or dtype.kind in "fiu"
     if dtype.hasobject or not numbers or not shape:
-        raise InputError(f"{path}: expected an array of numbers, found {dtype} of shape {shape}; {ADVICE} as float32")
+        raise InputError(
+            f"{path}: expected an array of numbers, found {dtype} of shape {shape}; {ADVICE} as float32"
+        )
     length = math.prod(shape) * dtype.itemsize
     if length > size:
-        raise InputError(f"{path}: expected {length} bytes for its shape {shape}, found {size}; {ADVICE}")
+        raise InputError(
+            f"{path}: expected {length} bytes for its shape {shape}, found {size}; {ADVICE}"
+        )
     check_number(math.prod(shape[:1] if len(shape) < 3 else shape[:-1]), path)
     flat = np.frombuffer(file.read(length), dtype)
     return flat.reshape(shape, order="F" if fortran else "C")
@@ -63,7 +83,9 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
 def _cloud(array: np.ndarray, path: Path) -> Cloud:
     if array.dtype.names is not None:
         flat, names = array.ravel(), array.dtype.names
-        return cloud_of({key: flat[names[i]] for key, i in picked_or_refused(names, path).items()}, str(path))
+        return cloud_of(
+            {key: flat[names[i]] for key, i in picked_or_refused(names, path).items()}, str(path)
+        )
     if array.ndim not in (2, 3) or array.shape[-1] < 3:
         raise InputError(
             f"{path}: expected numbers of shape (N, 3), (N, 4), (N, 5) or (H, W, C), found shape {array.shape}; "

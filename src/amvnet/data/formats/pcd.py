@@ -70,20 +70,30 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
     while "DATA" not in words:
         line = file.readline(HEADER)
         if not line or file.tell() > HEADER:
-            raise InputError(f"{path}: expected the header of a PCD file, found no line DATA; {ADVICE}")
+            raise InputError(
+                f"{path}: expected the header of a PCD file, found no line DATA; {ADVICE}"
+            )
         parts = line.decode("ascii").split()
         if parts and not parts[0].startswith("#"):
             words[parts[0].upper()] = parts[1:]
     names = words.get("FIELDS") or words["COLUMNS"]
     columns = _columns(names, words["SIZE"], words["TYPE"], words.get("COUNT", ["1"] * len(names)))
-    points = int(words["POINTS"][0]) if "POINTS" in words else int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
+    points = (
+        int(words["POINTS"][0])
+        if "POINTS" in words
+        else int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
+    )
     encoding = words["DATA"][0].lower()
     if encoding not in READERS:
-        raise InputError(f"{path}: expected DATA {', '.join(READERS)}, found {encoding[:20]!a}; {ADVICE}")
+        raise InputError(
+            f"{path}: expected DATA {', '.join(READERS)}, found {encoding[:20]!a}; {ADVICE}"
+        )
     return Header(columns, points, encoding)
 
 
-def _columns(names: list[str], sizes: list[str], types: list[str], counts: list[str]) -> tuple[Column, ...]:
+def _columns(
+    names: list[str], sizes: list[str], types: list[str], counts: list[str]
+) -> tuple[Column, ...]:
     found, offset, place = [], 0, 0
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
         column = Column(name, TYPES[kind.upper()][int(size)], int(count), offset, place)
@@ -94,13 +104,19 @@ def _columns(names: list[str], sizes: list[str], types: list[str], counts: list[
     return tuple(found)
 
 
-def _read_ascii(file: BinaryIO, header: Header, columns: dict[str, Column], path: Path) -> dict[str, np.ndarray]:
+def _read_ascii(
+    file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
+) -> dict[str, np.ndarray]:
     values = sum(column.count for column in header.columns)
     count = check_number(header.points, path, 2 * values * header.points - 1)
-    return read_text(file, count, {key: (column.place, column.dtype) for key, column in columns.items()}, path)
+    return read_text(
+        file, count, {key: (column.place, column.dtype) for key, column in columns.items()}, path
+    )
 
 
-def read_text(file: BinaryIO, count: int, columns: dict[str, tuple[int, str]], path: Path) -> dict[str, np.ndarray]:
+def read_text(
+    file: BinaryIO, count: int, columns: dict[str, tuple[int, str]], path: Path
+) -> dict[str, np.ndarray]:
     """Columns of the next `count` lines of numbers; each is given as its place and its type.
 
     Raises:
@@ -111,36 +127,56 @@ def read_text(file: BinaryIO, count: int, columns: dict[str, tuple[int, str]], p
     places = [place for place, _ in columns.values()]
     table = np.loadtxt(file, usecols=places, max_rows=count, comments=None, ndmin=2)
     if len(table) < count:
-        raise InputError(f"{path}: expected {count} lines of points, found {len(table)}; copy the file again")
+        raise InputError(
+            f"{path}: expected {count} lines of points, found {len(table)}; copy the file again"
+        )
     with np.errstate(invalid="ignore"):
-        return {key: _typed(table[:, i], dtype) for i, (key, (_, dtype)) in enumerate(columns.items())}
+        return {
+            key: _typed(table[:, i], dtype) for i, (key, (_, dtype)) in enumerate(columns.items())
+        }
 
 
 def _typed(values: np.ndarray, dtype: str) -> np.ndarray:
     return values.astype(dtype) if np.isfinite(values).all() else values
 
 
-def _read_binary(file: BinaryIO, header: Header, columns: dict[str, Column], path: Path) -> dict[str, np.ndarray]:
+def _read_binary(
+    file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
+) -> dict[str, np.ndarray]:
     count = check_number(header.points, path, file.tell() + header.points * header.row)
-    return read_rows(file, count, header.row, {key: (c.dtype, c.offset) for key, c in columns.items()})
+    return read_rows(
+        file, count, header.row, {key: (c.dtype, c.offset) for key, c in columns.items()}
+    )
 
 
-def read_rows(file: BinaryIO, count: int, row: int, columns: dict[str, tuple[str, int]]) -> dict[str, np.ndarray]:
+def read_rows(
+    file: BinaryIO, count: int, row: int, columns: dict[str, tuple[str, int]]
+) -> dict[str, np.ndarray]:
     """Columns of the next `count` points of `row` bytes; each is given as its type and where it begins in a point."""
-    formats, offsets = [dtype for dtype, _ in columns.values()], [offset for _, offset in columns.values()]
-    point = np.dtype({"names": list(columns), "formats": formats, "offsets": offsets, "itemsize": row})
+    formats, offsets = (
+        [dtype for dtype, _ in columns.values()],
+        [offset for _, offset in columns.values()],
+    )
+    point = np.dtype(
+        {"names": list(columns), "formats": formats, "offsets": offsets, "itemsize": row}
+    )
     table = np.fromfile(file, dtype=point, count=count)
     return {key: table[key] for key in columns}
 
 
-def _read_compressed(file: BinaryIO, header: Header, columns: dict[str, Column], path: Path) -> dict[str, np.ndarray]:
+def _read_compressed(
+    file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
+) -> dict[str, np.ndarray]:
     packed, unpacked = struct.unpack("<II", file.read(8))
     count = check_number(header.points, path, file.tell() + packed)
     if unpacked != count * header.row or unpacked * SHORTEST > packed * LONGEST:
-        raise InputError(f"{path}: expected {count * header.row} bytes of points, found {unpacked}; {ADVICE}")
+        raise InputError(
+            f"{path}: expected {count * header.row} bytes of points, found {unpacked}; {ADVICE}"
+        )
     data = unpack_lzf(file.read(packed), unpacked)
     return {  # one column after the other
-        key: np.frombuffer(data, c.dtype, count * c.count, count * c.offset)[:: c.count] for key, c in columns.items()
+        key: np.frombuffer(data, c.dtype, count * c.count, count * c.offset)[:: c.count]
+        for key, c in columns.items()
     }
 
 

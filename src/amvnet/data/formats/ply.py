@@ -49,10 +49,14 @@ def read_ply(path: Path) -> Cloud:
         before = [element.name for element in elements].index("vertex")
         vertex = elements[before]
         if any(not dtype for element in elements[: before + 1] for _, dtype in element.properties):
-            raise InputError(f"{path}: expected vertices without lists, found a list; write the points alone")
+            raise InputError(
+                f"{path}: expected vertices without lists, found a list; write the points alone"
+            )
         wanted = picked_or_refused([name for name, _ in vertex.properties], path)
         read = _read_text if encoding == "ascii" else _read_binary
-        return cloud_of(read(file, elements[:before], vertex, wanted, ORDERS[encoding], path), str(path))
+        return cloud_of(
+            read(file, elements[:before], vertex, wanted, ORDERS[encoding], path), str(path)
+        )
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
@@ -63,21 +67,32 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
         elif words[:1] == ["element"]:
             elements.append(Element(words[1], int(words[2]), []))
         elif words[:1] == ["property"]:
-            elements[-1].properties.append((words[-1], "" if words[1] == "list" else TYPES[words[1]]))
+            elements[-1].properties.append(
+                (words[-1], "" if words[1] == "list" else TYPES[words[1]])
+            )
     if encoding not in ORDERS or any(element.count < 0 for element in elements):
-        raise InputError(f"{path}: expected the format {', '.join(ORDERS)}, found {encoding[:30]!a}; {ADVICE}")
+        raise InputError(
+            f"{path}: expected the format {', '.join(ORDERS)}, found {encoding[:30]!a}; {ADVICE}"
+        )
     return encoding, elements
 
 
 def _line(file: BinaryIO, path: Path) -> list[str]:
     line = file.readline(HEADER)
     if not line or file.tell() > HEADER:
-        raise InputError(f"{path}: expected the header of a PLY file, found no end_header; {ADVICE}")
+        raise InputError(
+            f"{path}: expected the header of a PLY file, found no end_header; {ADVICE}"
+        )
     return line.decode("latin-1").split()  # comments may be in any language
 
 
 def _read_text(
-    file: BinaryIO, before: list[Element], vertex: Element, wanted: dict[str, int], order: str, path: Path
+    file: BinaryIO,
+    before: list[Element],
+    vertex: Element,
+    wanted: dict[str, int],
+    order: str,
+    path: Path,
 ) -> dict[str, np.ndarray]:
     skipped = sum(element.count for element in before)
     least = 2 * (skipped + vertex.count * len(vertex.properties)) - 1
@@ -89,11 +104,18 @@ def _read_text(
 
 
 def _read_binary(
-    file: BinaryIO, before: list[Element], vertex: Element, wanted: dict[str, int], order: str, path: Path
+    file: BinaryIO,
+    before: list[Element],
+    vertex: Element,
+    wanted: dict[str, int],
+    order: str,
+    path: Path,
 ) -> dict[str, np.ndarray]:
     skipped = sum(element.count * element.row for element in before)
     check_number(vertex.count, path, file.tell() + skipped + vertex.count * vertex.row)
     file.seek(skipped, 1)
     ends = np.cumsum([0, *(int(dtype[1:]) for _, dtype in vertex.properties)]).tolist()
-    columns = {key: (order + vertex.properties[place][1], ends[place]) for key, place in wanted.items()}
+    columns = {
+        key: (order + vertex.properties[place][1], ends[place]) for key, place in wanted.items()
+    }
     return read_rows(file, vertex.count, vertex.row, columns)

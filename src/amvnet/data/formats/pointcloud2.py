@@ -9,7 +9,16 @@ import numpy as np
 from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused
 from amvnet.errors import InputError
 
-TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # by the message's numbers
+TYPES = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    8: "f8",
+}  # by the message's numbers
 
 
 def read_message(message: Any, name: str) -> Cloud:
@@ -21,7 +30,10 @@ def read_message(message: Any, name: str) -> Cloud:
     height, width, step = message.height, message.width, message.point_step
     count = check_number(height * width, name)
     fields = list(message.fields)
-    wanted = {key: fields[i] for key, i in picked_or_refused([field.name for field in fields], name).items()}
+    wanted = {
+        key: fields[i]
+        for key, i in picked_or_refused([field.name for field in fields], name).items()
+    }
     order = ">" if message.is_bigendian else "<"
     point = np.dtype(
         {
@@ -33,7 +45,9 @@ def read_message(message: Any, name: str) -> Cloud:
     )
     row = message.row_step or width * step  # some drivers leave it out
     if count and (row < width * step or len(message.data) < (height - 1) * row + width * step):
-        raise InputError(f"{name}: expected {count} points of {step} bytes, found {len(message.data)} bytes")
+        raise InputError(
+            f"{name}: expected {count} points of {step} bytes, found {len(message.data)} bytes"
+        )
     data = np.ascontiguousarray(message.data) if count else b""
     table = np.ndarray((height, width), point, data, strides=(row, step)).ravel()
     return cloud_of({key: table[key] for key in wanted}, name)

@@ -45,7 +45,9 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
 def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
     """The number of rows in such a file, by its size alone; raises as `read_table` does."""
     if not path.is_file():
-        raise InputError(f"{path}: expected a file, found none; check the path or complete the data set")
+        raise InputError(
+            f"{path}: expected a file, found none; check the path or complete the data set"
+        )
     size, row = path.stat().st_size, np.dtype(dtype).itemsize * columns
     if size % row:
         raise InputError(
@@ -82,7 +84,9 @@ def _is_nuscenes(table: np.ndarray) -> bool:
 def _is_kitti(table: np.ndarray) -> bool:
     """Only a column of intensities has no negative value, and coordinates have some."""
     near, negative = np.abs(table[:, :3]) < NEAR, (table[:, :3] < 0).any()
-    return bool(near.all() and negative and (table[:, 3] >= 0).all() and (table[:, 3] <= 65535).all())
+    return bool(
+        near.all() and negative and (table[:, 3] >= 0).all() and (table[:, 3] <= 65535).all()
+    )
 
 
 @np.errstate(invalid="ignore")
@@ -93,6 +97,12 @@ def ring_column(values: np.ndarray, path: Path) -> np.ndarray:
         InputError: where they are none.
     """
     finite = np.isfinite(values).all()
-    if not finite or (len(values) and values.min() < 0) or not np.array_equal(values, np.round(values)):
-        raise InputError(f"{path}: expected ring indices 0, 1, ... in column 5, found other values; correct the column")
+    if (
+        not finite
+        or (len(values) and values.min() < 0)
+        or not np.array_equal(values, np.round(values))
+    ):
+        raise InputError(
+            f"{path}: expected ring indices 0, 1, ... in column 5, found other values; correct the column"
+        )
     return values.astype(np.int64)

@@ -49,7 +49,9 @@ class PointBatch:
         """On a device, or with points of a floating-point type; from pinned memory to a GPU without waiting."""
         if isinstance(where, torch.dtype):
             return replace(self, points=self.points.to(where))
-        to_gpu = torch.device(where).type == "cuda"  # the other way, what comes could be read before it is there
+        to_gpu = (
+            torch.device(where).type == "cuda"
+        )  # the other way, what comes could be read before it is there
         return self._each(lambda values: values.to(where, non_blocking=to_gpu))
 
     def pin_memory(self) -> PointBatch:
@@ -70,10 +72,18 @@ class PointBatch:
     def of(cls, scans: Sequence[Scan]) -> PointBatch:
         """The valid points of some scans (`Scan.valid`), in order."""
         kept = [scan.valid for scan in scans]
-        points = np.concatenate([s.points[k] for s, k in zip(scans, kept, strict=True)]).astype(np.float32, copy=False)
+        points = np.concatenate([s.points[k] for s, k in zip(scans, kept, strict=True)]).astype(
+            np.float32, copy=False
+        )
         sizes = tuple(int(k.sum()) for k in kept)
         index = np.repeat(np.arange(len(scans)), sizes)
         rings = [s.ring[k] for s, k in zip(scans, kept, strict=True) if s.ring is not None]
-        ring = torch.from_numpy(np.concatenate(rings).astype(np.int64)) if len(rings) == len(scans) else None
+        ring = (
+            torch.from_numpy(np.concatenate(rings).astype(np.int64))
+            if len(rings) == len(scans)
+            else None
+        )
         names = tuple(scan.name for scan in scans)
-        return cls(torch.from_numpy(points), torch.from_numpy(index), len(scans), ring, names, sizes)
+        return cls(
+            torch.from_numpy(points), torch.from_numpy(index), len(scans), ring, names, sizes
+        )

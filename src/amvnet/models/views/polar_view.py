@@ -84,9 +84,13 @@ class PolarView:
         x, y, z = batch.points[:, :3].double().unbind(1)
         # In double precision, so that a point at a cell's border falls the same way on every device.
         polar = (torch.sqrt(x * x + y * y), torch.atan2(y, x), z)
-        placed = [_place(*axis) for axis in zip(polar, self._low, self._high, self._cells, strict=True)]
+        placed = [
+            _place(*axis) for axis in zip(polar, self._low, self._high, self._cells, strict=True)
+        ]
         radius, angle, voxel = (cell for cell, _ in placed)
-        features = torch.stack([*(offset for _, offset in placed), *polar], dim=1).to(batch.points.dtype)
+        features = torch.stack([*(offset for _, offset in placed), *polar], dim=1).to(
+            batch.points.dtype
+        )
         c = self.config
         pillar = (batch.scan * c.radial + radius) * c.angular + angle
         shape = (batch.count, c.radial, c.angular, c.vertical)

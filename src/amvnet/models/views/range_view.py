@@ -54,10 +54,14 @@ class RangeView:
         distance = batch.points[:, :3].norm(dim=1)
         pixel = (batch.scan * c.height + self.rows(batch)) * c.width + self.columns(batch)
         nearest = _nearest(distance, pixel, batch.count * c.height * c.width)
-        values = torch.cat([batch.points, distance[:, None], torch.ones_like(distance)[:, None]], dim=1)
+        values = torch.cat(
+            [batch.points, distance[:, None], torch.ones_like(distance)[:, None]], dim=1
+        )
         padded = torch.cat([values, values.new_zeros(1, CHANNELS)])
         image = padded.index_select(0, nearest % len(padded))  # -1, no point, is the last row
-        return RangeImage(image.view(batch.count, c.height, c.width, CHANNELS).permute(0, 3, 1, 2), pixel, nearest)
+        return RangeImage(
+            image.view(batch.count, c.height, c.width, CHANNELS).permute(0, 3, 1, 2), pixel, nearest
+        )
 
     def columns(self, batch: PointBatch) -> Tensor:
         """(P,) column by azimuth: forward (+x) is the middle, left (+y) is left of it."""
@@ -77,8 +81,12 @@ class RangeView:
     def _rows_by_ring(self, ring: Tensor | None) -> Tensor:
         height = self.config.height
         if ring is None:
-            raise InputError("expected a scan with a ring index, found none; use a model with rows by elevation")
-        low, high = torch.stack(ring.aminmax()).tolist() if len(ring) else (0, 0)  # a GPU is asked once
+            raise InputError(
+                "expected a scan with a ring index, found none; use a model with rows by elevation"
+            )
+        low, high = (
+            torch.stack(ring.aminmax()).tolist() if len(ring) else (0, 0)
+        )  # a GPU is asked once
         if not 0 <= low <= high < height:
             raise InputError(
                 f"expected ring indices from 0 to {height - 1}, found {low} to {high}; use a model for this sensor"
