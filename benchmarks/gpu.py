@@ -39,7 +39,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.simulation import simulate
 from amvnet.training.stages import NetworkStage, PolarStage, RangeStage
-from amvnet.weights.file import Weights, state_of
+from amvnet.weights.file import Weights, part_state
 
 CLASSES = SEMANTICKITTI.size
 TINY = ModelConfig(
@@ -92,7 +92,7 @@ def fresh(model: ModelConfig) -> Weights:
     built = build_amvnet(model, CLASSES)
     parts = {name: getattr(built, name) for name in ("range_net", "polar_net", "point_head")}
     tensors = {
-        key: value for name, part in parts.items() for key, value in state_of(name, part).items()
+        key: value for name, part in parts.items() for key, value in part_state(name, part).items()
     }
     return Weights(model, SEMANTICKITTI, "hdl64e", tensors)
 

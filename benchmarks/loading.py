@@ -10,7 +10,7 @@ import time
 
 from amvnet.config.recipes import load_recipe
 from amvnet.data.datasets.open import open_dataset
-from amvnet.training.loaders import ScanSet, loader
+from amvnet.training.loaders import ScanSet, make_loader
 
 ROUNDS = 2  # the first one starts the processes and fills the disk's cache
 
@@ -19,7 +19,7 @@ def main(data: str, recipe: str = "semantickitti", processes: str = "2") -> None
     dataset, training = open_dataset(data), load_recipe(recipe).training
     scans = ScanSet(dataset, dataset.records(dataset.sequences("all")), training.augment)
     for workers in range(int(processes) + 1):
-        batches = loader(scans, training.bev.batch, workers, shuffle=True)
+        batches = make_loader(scans, training.bev.batch, workers, shuffle=True)
         for _ in range(ROUNDS):
             started, points = time.perf_counter(), 0
             for batch, _labels in batches:

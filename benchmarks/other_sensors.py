@@ -17,7 +17,7 @@ from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.segmenter import Segmenter
-from amvnet.sensors.adapt import Fitting
+from amvnet.sensors.adapt import ScanAdapter
 from amvnet.simulation import simulate
 from amvnet.simulation.sensors import HDL64E, SENSORS, Sensor
 
@@ -53,7 +53,7 @@ OTHERS = {
 def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
     """Print mIoU over the classes present and accuracy of AMVNet, both ways."""
     dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
-    fit, by_row = Fitting(segmenter.weights), segmenter.by_ring()
+    fit, by_row = ScanAdapter(segmenter.weights), segmenter.by_ring()
     found = {way: Evaluation(dataset.taxonomy) for way in ("as it is", "measured")}
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record)

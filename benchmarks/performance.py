@@ -26,7 +26,7 @@ import amvnet.models.polar_net
 import amvnet.models.range_net
 from amvnet.config.recipes import load_recipe
 from amvnet.data.scan_files import read_scan, write_labels
-from amvnet.export.engines import OnnxGraph, cache_folder, engage
+from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
 from amvnet.models.layers import upsample
@@ -38,7 +38,7 @@ WARM_UP = 2
 
 
 def without_memory() -> None:
-    amvnet.inference.segmenter.keep_memory = lambda: False
+    amvnet.inference.segmenter.keep_freed_memory = lambda: False
 
 
 def without_folding() -> None:
@@ -110,7 +110,7 @@ def measure(
     for take_away in TAKEN_AWAY[variant]:
         take_away()
     segmenter = Segmenter(untrained(load_recipe(recipe)) if recipe else "sim-hdl64e")
-    engage(segmenter, engine)
+    use_engine(segmenter, engine)
     salsanext, image = yardstick(engine)
     with TemporaryDirectory() as folder:
         target = Path(folder) / "labels.label"

@@ -36,8 +36,8 @@ from amvnet.models.point_head import (
     PointHead,
     head_features,
     nearest_neighbours,
-    only_asked,
     point_table,
+    select_used_points,
 )
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid
@@ -319,7 +319,7 @@ def test_scoring_points_from_the_table_equals_scoring_their_features(
 
 def test_only_the_points_that_are_asked_for_are_taken() -> None:
     a, b = torch.tensor([7, 3]), torch.tensor([[3, 9, 9], [0, 7, 3]])
-    asked, (of_a, of_b) = only_asked(12, a, b)
+    asked, (of_a, of_b) = select_used_points(12, a, b)
     assert asked.tolist() == [0, 3, 7, 9]
     assert torch.equal(asked[of_a], a)
     assert torch.equal(asked[of_b], b)

@@ -93,7 +93,7 @@ def test_points_that_no_network_sees_count_as_evaluate_counts_them(
     dataset = open_dataset(f"semantickitti:{tmp_path}")
     segmenter, records = Segmenter(weights), dataset.records(["08"])
     found = analyze(dataset, records, segmenter)
-    expected = jobs.evaluate(dataset, records, jobs.by_weights(dataset, segmenter))
+    expected = jobs.evaluate(dataset, records, jobs.label_by_weights(dataset, segmenter))
     for name, stack in expected.matrices.items():
         np.testing.assert_array_equal(found.evaluation.matrices[name], stack)
     assert (found.evaluation.points, found.evaluation.uncertain) == (

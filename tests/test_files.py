@@ -13,7 +13,7 @@ from worlds import fails, label_map
 
 from amvnet.data.scan_files import find_scans, read_scan, write_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 
 # --- lone files ---
 
@@ -87,7 +87,7 @@ def test_files_appear_whole_or_not_at_all(tmp_path: Path) -> None:
     target = tmp_path / "deep" / "a.label"
 
     def stop_halfway() -> None:
-        with whole_file(target) as part:
+        with atomic_write(target) as part:
             part.write_bytes(b"half")
             raise RuntimeError
 

@@ -27,7 +27,7 @@ from scan_files import (
 from worlds import fails
 
 from amvnet.data.formats.cloud import MAX_POINTS
-from amvnet.data.formats.detect import named_scans, read_cloud, stem
+from amvnet.data.formats.detect import read_cloud, scan_stem, scans_in_file
 from amvnet.data.formats.pcd import unpack_lzf
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.data.scan_files import find_scans, read_scan
@@ -72,7 +72,7 @@ def test_the_content_counts_where_the_name_lies(
 
 def test_a_folder_lists_all_of_them(folder: Path) -> None:
     assert [path.name for path in find_scans(folder)] == sorted(WRITERS)
-    names = [scan.name for path in find_scans(folder) for scan in named_scans(path)]
+    names = [scan.name for path in find_scans(folder) for scan in scans_in_file(path)]
     assert "nuscenes" in names
     assert "plain/000000" in names
     assert "lone/000000" in names
@@ -314,7 +314,7 @@ def test_a_bag_is_its_scans_in_order(
     write_bag2(tmp_path / "drive", {"/lidar": clouds}, STORAGES[storage], compressed)
     assert find_scans(tmp_path / "drive") == [tmp_path / "drive"]
     assert find_scans(tmp_path) == [tmp_path / "drive"]
-    scans = list(named_scans(tmp_path / "drive"))
+    scans = list(scans_in_file(tmp_path / "drive"))
     assert [scan.name for scan in scans] == [f"drive/{i:06d}" for i in range(5)]
     for i in (0, 1, 2, 3, 4, 2, 0, 4):  # in order, and not
         np.testing.assert_array_equal(scans[i].read().to_scan().points, clouds[i])
@@ -324,12 +324,12 @@ def test_a_bag_is_its_scans_in_order(
 def test_the_topic_is_found_or_asked_for(tmp_path: Path) -> None:
     front, rear = [some_points(60, 1)], [some_points(60, 2), some_points(60, 3)]
     path = write_bag1(tmp_path / "two.bag", {"/front": front, "/rear": rear})
-    fails(lambda: list(named_scans(path)), "/front", "/rear", "--topic")
-    fails(lambda: list(named_scans(path, "/top")), "/front", "/rear", "/top")
-    found = list(named_scans(path, "/rear"))
+    fails(lambda: list(scans_in_file(path)), "/front", "/rear", "--topic")
+    fails(lambda: list(scans_in_file(path, "/top")), "/front", "/rear", "/top")
+    found = list(scans_in_file(path, "/rear"))
     assert len(found) == 2
     np.testing.assert_array_equal(found[1].read().to_scan().points, rear[1])
-    fails(lambda: list(named_scans(write_bag1(tmp_path / "none.bag", {}))), "none.bag")
+    fails(lambda: list(scans_in_file(write_bag1(tmp_path / "none.bag", {}))), "none.bag")
 
 
 def test_a_bag_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
@@ -337,9 +337,9 @@ def test_a_bag_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
     metadata = tmp_path / "drive" / "metadata.yaml"
     said = metadata.read_text()
     metadata.write_text(said.replace("message_count: 3", "message_count: 3000000000"))
-    fails(lambda: list(named_scans(tmp_path / "drive")), "3000000000")
+    fails(lambda: list(scans_in_file(tmp_path / "drive")), "3000000000")
     metadata.write_text(said.replace("message_count: 3", "message_count: 4"))
-    scans = list(named_scans(tmp_path / "drive"))
+    scans = list(scans_in_file(tmp_path / "drive"))
     assert len(scans) == 4
     fails(lambda: scans[3].read(), "drive", "3")
 
@@ -348,7 +348,7 @@ def test_a_bag_is_read_in_constant_memory(tmp_path: Path) -> None:
     points = some_points(50_000)  # 0.8 MB
     path = write_bag1(tmp_path / "long.bag", {"/lidar": [points] * 30})
     tracemalloc.start()
-    for scan in named_scans(path):
+    for scan in scans_in_file(path):
         scan.read()
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -445,7 +445,7 @@ def test_names_without_their_endings() -> None:
         "e": "e",
         "f.txt": "f",
     }.items():
-        assert stem(Path(name)) == expected
+        assert scan_stem(Path(name)) == expected
 
 
 # --- real scans

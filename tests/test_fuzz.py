@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin
 from scan_files import WRITERS, some_points, write_bag2
 
-from amvnet.data.formats.detect import named_scans
+from amvnet.data.formats.detect import scans_in_file
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -98,7 +98,7 @@ def ends_well(path: Path) -> None:
 def refusal(path: Path) -> str:
     """What is said of a file that is refused; nothing where all of its scans are read."""
     try:
-        for scan in named_scans(path):
+        for scan in scans_in_file(path):
             assert isinstance(scan.read().to_scan(), Scan)
     except InputError as error:
         return str(error)

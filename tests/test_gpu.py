@@ -359,13 +359,13 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
     assert amvnet(*arguments) == (0, "")
     whole = {name: (tmp_path / name).read_bytes() for name in files(tmp_path)}
     from amvnet.inference.journal import Journal
-    from amvnet.inference.predict import Fitting
+    from amvnet.inference.predict import ScanAdapter
 
     weights = Segmenter(world / "w.safetensors").weights
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(Fitting(weights).given),
+        "sensor": repr(ScanAdapter(weights).given),
         "scores": False,
         "uncertain": False,
         "format": "label",

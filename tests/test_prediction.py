@@ -14,7 +14,7 @@ import pytest
 import torch
 from worlds import amvnet, files, fresh_weights, make_streets, street
 
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.inference import predict as prediction
 from amvnet.inference.journal import Journal
 from amvnet.inference.pipeline import AHEAD, Task, stream
@@ -201,7 +201,7 @@ def test_a_part_of_a_folder_is_labelled_as_in_the_whole(
 def settings_of(world: Path) -> dict[str, object]:
     weights = Segmenter(str(world / WEIGHTS)).weights
     parts = {part: weights.digest(part) for part in weights.parts}
-    sensor = repr(prediction.Fitting(weights).given)
+    sensor = repr(prediction.ScanAdapter(weights).given)
     kept = {"scores": False, "uncertain": False, "format": "label"}
     return {"weights": parts, "method": "amvnet", "sensor": sensor, **kept}
 
@@ -236,7 +236,7 @@ def test_what_a_killed_run_left_half_written_is_taken_away(
     world: Path, whole: Path, tmp_path: Path
 ) -> None:
     (tmp_path / ".notes.part").write_text("of somebody else")
-    with whole_file(tmp_path / "000000.label") as part:
+    with atomic_write(tmp_path / "000000.label") as part:
         part.write_bytes(b"whole")
     part.write_bytes(b"half")  # under the name that it has until it is whole
     arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path)

@@ -16,7 +16,7 @@ from worlds import amvnet, files, make_streets, without, write_recipe
 
 from amvnet.distributed import Processes
 from amvnet.training.loaders import EpochSampler
-from amvnet.training.sync_batch_norm import SyncedBatchNorm, synced
+from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.weights.file import Weights, load, save
 
 # DropBlock draws for each process anew, and so as no single process does. In double precision, as AdamW divides each
@@ -193,7 +193,7 @@ def _norms_of_a_process(rank: int, port: int, folder: str) -> None:
     torch.distributed.init_process_group("gloo", f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
     x = torch.load(f"{folder}/x.pt", weights_only=True)
     mine = (x[:3] if rank == 0 else x[3:]).clone().requires_grad_()
-    norm = synced(_norm(), cuda=False)
+    norm = synchronise_batch_norms(_norm(), cuda=False)
     (norm(mine) ** 3).sum().backward()
     torch.save({"x": mine.grad, **norm.state_dict()}, f"{folder}/{rank}.pt")
     torch.distributed.destroy_process_group()
@@ -231,7 +231,7 @@ def test_a_synced_batch_norm_is_used_as_the_one_it_stands_for() -> None:
     net, x = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4)), torch.randn(8, 3)
     net(x)
     expected = net.eval()(x)
-    copied = synced(net, cuda=False)
+    copied = synchronise_batch_norms(net, cuda=False)
     assert isinstance(copied[1], SyncedBatchNorm)
     assert torch.equal(copied.eval()(x), expected)
     assert np.all([k in copied.state_dict() for k in ("1.weight", "1.running_mean")])

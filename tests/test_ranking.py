@@ -20,7 +20,7 @@ from amvnet import Scan, Segmenter
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking.clusters import CELL, cluster
-from amvnet.ranking.rank import clusters_of, doubts_of, rank
+from amvnet.ranking.rank import find_clusters, find_doubts, rank
 from amvnet.weights.file import save
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -104,14 +104,14 @@ def test_the_vehicle_that_carries_the_sensor_is_not_doubted() -> None:
     points, thing = things()
     points[thing == 0, :3] *= (1, 0.1, 1)  # to half a metre from the sensor
     f, g = (sure(np.full(301, kind)) for kind in (CAR, PERSON))
-    _, of = clusters_of(doubts_of(Scan(points), Said(f, g), "disagreement"))
+    _, of = find_clusters(find_doubts(Scan(points), Said(f, g), "disagreement"))
     assert np.array_equal(of >= 0, (thing == 1) | (thing == 2))
 
 
 def test_a_disagreement_is_one_cluster_where_it_is() -> None:
     points, thing = things()
     f, g = (sure(np.where(thing == 1, kind, ROAD)) for kind in (CAR, PERSON))
-    rows, of = clusters_of(doubts_of(Scan(points), Said(f, g), "disagreement"))
+    rows, of = find_clusters(find_doubts(Scan(points), Said(f, g), "disagreement"))
     assert len(rows) == 1
     assert np.array_equal(of >= 0, thing == 1)
     assert (rows["rv"], rows["bev"], rows["label"], rows["points"]) == (CAR, PERSON, 0, 100)
@@ -125,8 +125,8 @@ def test_a_label_is_doubted_only_where_both_views_contradict_it() -> None:
         np.uint8
     )  # wrong, half wrong, none
     f, g = sure(np.full(301, CAR)), sure(np.where(thing == 1, ROAD, CAR))
-    doubts = doubts_of(Scan(points, labels), Said(f, g), "labels")
-    rows, of = clusters_of(doubts)
+    doubts = find_doubts(Scan(points, labels), Said(f, g), "labels")
+    rows, of = find_clusters(doubts)
     assert np.array_equal(of >= 0, thing == 0)
     assert (rows["rv"], rows["bev"], rows["label"]) == (CAR, CAR, WALL)
     assert np.allclose(doubts.doubt[thing == 0], 0.9, atol=1e-5)
@@ -137,7 +137,9 @@ def test_a_whole_thing_is_more_doubtful_than_the_edge_of_one_and_many_points_tha
     labels = np.full(301, WALL, np.uint8)
     said = np.where((thing == 0) | ((thing == 1) & (points[:, 0] > 10.3)), CAR, WALL)
     said[np.flatnonzero(thing == 2)[:1]] = CAR
-    rows, _ = clusters_of(doubts_of(Scan(points, labels), Said(sure(said), sure(said)), "labels"))
+    rows, _ = find_clusters(
+        find_doubts(Scan(points, labels), Said(sure(said), sure(said)), "labels")
+    )
     order = np.argsort(-rows["score"])
     assert rows["points"][order][0] == 100
     assert rows["points"][order][-1] == 1

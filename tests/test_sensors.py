@@ -21,8 +21,8 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import MEASURED, Fitting
-from amvnet.sensors.lidars import AXES, HEIGHTS, SENSORS, Sensor, describe, rotation
+from amvnet.sensors.adapt import MEASURED, ScanAdapter
+from amvnet.sensors.lidars import AXES, HEIGHTS, SENSORS, Sensor, make_sensor, rotation
 from amvnet.sensors.measure import ground_height, measure
 from amvnet.simulation.sensors import HDL32E, HDL64E
 from amvnet.weights.file import save
@@ -137,10 +137,10 @@ def test_real_sensors_stand_where_they_do(name: str, beams: int) -> None:
 
 def _fitting(
     given: Sensor | None = None, sensor: str = "hdl64e", nuscenes: bool = False
-) -> tuple[Fitting, list[str]]:
+) -> tuple[ScanAdapter, list[str]]:
     said: list[str] = []
     weights = replace(fresh_weights(NUSCENES if nuscenes else SEMANTICKITTI), sensor=sensor)
-    return Fitting(weights, given, said.append), said
+    return ScanAdapter(weights, given, said.append), said
 
 
 def _cloud(points: np.ndarray, ring: np.ndarray | None = None) -> Cloud:
@@ -207,7 +207,7 @@ def test_rows_are_those_of_the_weights_where_the_sensor_is_theirs() -> None:
     points, _ = place(HDL64E.elevations, 1.73)
     weights = replace(fresh_weights(), sensor="hdl64e")
     segmenter = Segmenter(weights)
-    fitted = Fitting(weights)(_cloud(points), "a")
+    fitted = ScanAdapter(weights)(_cloud(points), "a")
     np.testing.assert_array_equal(fitted.points, points)
     np.testing.assert_array_equal(segmenter.by_ring()(fitted).labels, segmenter(points).labels)
     np.testing.assert_array_equal(segmenter.by_ring()(fitted).rv, segmenter(points).rv)
@@ -216,7 +216,7 @@ def test_rows_are_those_of_the_weights_where_the_sensor_is_theirs() -> None:
 def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None:
     points, laser = place(LASERS["os1-64"], 0.8)
     weights = replace(fresh_weights(), sensor="hdl64e")
-    ring = Fitting(weights)(_cloud(points), "a").ring
+    ring = ScanAdapter(weights)(_cloud(points), "a").ring
     assert ring is not None
     of_laser = [np.unique(ring[laser == k]) for k in range(64)]
     assert all(len(rows) == 1 for rows in of_laser)
@@ -341,11 +341,13 @@ def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
     path.write_text(
         "beams: 16\nfov_up: 15\nfov_down: -15\nheight: 0.4\naxes: z-forward\nrotate: [0, -5, 0]\n"
     )
-    assert describe(str(path)) == Sensor("robot", 16, 15, -15, 0.4, None, "z-forward", (0, -5, 0))
-    assert describe(str(path), height=0.5, offset="0,0,1e-1").height == 0.5
-    assert describe(None, rotate="90, 0,0").rotate == (90, 0, 0)
-    assert describe("vlp16") is not None
-    assert describe() == Sensor()
+    assert make_sensor(str(path)) == Sensor(
+        "robot", 16, 15, -15, 0.4, None, "z-forward", (0, -5, 0)
+    )
+    assert make_sensor(str(path), height=0.5, offset="0,0,1e-1").height == 0.5
+    assert make_sensor(None, rotate="90, 0,0").rotate == (90, 0, 0)
+    assert make_sensor("vlp16") is not None
+    assert make_sensor() == Sensor()
 
 
 @pytest.mark.parametrize(
@@ -369,14 +371,14 @@ def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
 def test_a_wrong_description_is_named(tmp_path: Path, text: str, words: list[str]) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text(text)
-    fails(lambda: describe(str(path)), path, *words)
+    fails(lambda: make_sensor(str(path)), path, *words)
 
 
 def test_wrong_options_are_named(tmp_path: Path) -> None:
-    fails(lambda: describe("eye"), "eye", "vlp16")
-    fails(lambda: describe(str(tmp_path / "no.yaml")), "no.yaml")
-    fails(lambda: describe(rotate="1,2"), "--rotate", "90,0,0")
-    fails(lambda: describe(intensity_scale="much"), "--intensity-scale")
+    fails(lambda: make_sensor("eye"), "eye", "vlp16")
+    fails(lambda: make_sensor(str(tmp_path / "no.yaml")), "no.yaml")
+    fails(lambda: make_sensor(rotate="1,2"), "--rotate", "90,0,0")
+    fails(lambda: make_sensor(intensity_scale="much"), "--intensity-scale")
 
 
 def test_known_sensors_are_those_that_are_simulated() -> None:

@@ -22,7 +22,7 @@ from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
-from amvnet.weights.file import Weights, state_of
+from amvnet.weights.file import Weights, part_state
 
 GOLDEN = Path(__file__).parent / "golden"
 CAR, ROAD, SIDEWALK, BUILDING, UNLABELLED = 10, 40, 48, 50, 0  # raw ids of SemanticKITTI
@@ -127,7 +127,7 @@ def fresh_weights(taxonomy: Taxonomy = SEMANTICKITTI, seed: int = 0) -> Weights:
         "point_head": model.point_head,
     }
     tensors = {
-        key: value for name, part in parts.items() for key, value in state_of(name, part).items()
+        key: value for name, part in parts.items() for key, value in part_state(name, part).items()
     }
     said = {name: {"seed": seed} for name in parts}
     return Weights(

@@ -50,7 +50,7 @@ def load(
         weights, device, method, precision
     )
     if engine != "torch":
-        import_module("amvnet.export.engines").engage(segmenter, engine)
+        import_module("amvnet.export.engines").use_engine(segmenter, engine)
     return segmenter
 
 

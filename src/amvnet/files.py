@@ -15,7 +15,7 @@ PARTS = f".{'[0-9a-f]' * 32}.part*"  # the names of files that `whole_file` has 
 
 
 @contextmanager
-def whole_file(path: Path | str) -> Iterator[Path]:
+def atomic_write(path: Path | str) -> Iterator[Path]:
     """Let a file appear whole or not at all: write to the path this yields, a rename does the rest.
 
     The temporary file lies in the same folder (made where it is missing) and keeps the ending of

@@ -10,7 +10,7 @@ import sys
 M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
 
 
-def keep_memory() -> bool:
+def keep_freed_memory() -> bool:
     """Let this process keep what it frees; returns whether the C library could be told so (glibc's can).
 
     By default glibc fetches each map of more than 32 MiB anew from the system, which fills it with zeros page by page:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SHOWN = 20  # names of sequences in a line
 
 
-def meet(cuda: bool = False) -> Processes:
+def join_processes(cuda: bool = False) -> Processes:
     """The processes of this job, where torchrun or SLURM has started several; only the first one prints."""
     from amvnet.distributed import join
 
@@ -36,7 +36,7 @@ def open_data(data: str, taxonomy: Path | None, otherwise: Taxonomy | None = Non
     return open_dataset(data, otherwise if taxonomy is None else taxonomy_from_yaml(taxonomy))
 
 
-def listed(records: Sequence[ScanRecord]) -> str:
+def describe_records(records: Sequence[ScanRecord]) -> str:
     """How many scans there are, of which sequences."""
     names = sorted({record.sequence for record in records})
     shown = ", ".join(names[:SHOWN]) + (
@@ -45,7 +45,7 @@ def listed(records: Sequence[ScanRecord]) -> str:
     return f"{len(records)} scans of {shown}" if records else "none"
 
 
-def names_in(text: str | None) -> list[str] | None:
+def parse_names(text: str | None) -> list[str] | None:
     """Names with commas; None where the option was left out. Raises InputError where there is none in it."""
     names = None if text is None else [name.strip() for name in text.split(",") if name.strip()]
     if names == []:
@@ -55,11 +55,11 @@ def names_in(text: str | None) -> list[str] | None:
     return names
 
 
-def methods_in(text: str) -> list[str]:
+def parse_methods(text: str) -> list[str]:
     """Methods with commas. Raises InputError where one is none."""
     from amvnet.inference.methods import METHODS
 
-    names = names_in(text) or []
+    names = parse_names(text) or []
     if wrong := [name for name in names if name not in METHODS]:
         raise InputError(
             f"expected methods of {', '.join(METHODS)}, found {wrong[0]!r}; use some of them"
@@ -67,15 +67,15 @@ def methods_in(text: str) -> list[str]:
     return names
 
 
-def numbers_in(text: str) -> list[int]:
+def parse_numbers(text: str) -> list[int]:
     """Numbers from 1 with commas, ascending, each once. Raises InputError where one is none."""
-    names = names_in(text) or []
+    names = parse_names(text) or []
     if not all(name.isdecimal() and int(name) for name in names):
         raise InputError(f"expected numbers of neighbours with commas, found {text!r}; say 5,10,15")
     return sorted({int(name) for name in names})
 
 
-def scores_in(
+def parse_scores(
     a: Path | None, b: Path | None, key_a: str | None, key_b: str | None, logits: Which | None
 ) -> ScorePair | None:
     """Two models' scores; None where no option names any. Raises InputError where a folder is missing."""

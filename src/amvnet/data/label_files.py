@@ -11,7 +11,7 @@ import numpy as np
 from amvnet.data.scan_files import check_count, write_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 
 Kind = Literal["label", "npy", "ply", "pcd", "las"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -88,7 +88,7 @@ def write_scan_labels(
     raw = taxonomy.to_raw(ids)
     if kind == "label":
         return write_labels(path, raw)
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         if kind == "npy":
             np.save(part, raw)
         else:
@@ -100,7 +100,7 @@ def write_scan_labels(
 
 def write_uncertain(path: Path, uncertain: np.ndarray) -> Path:
     """Write which points are uncertain, (N,) bool, as `.npy`; whole or not at all."""
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         np.save(part, np.asarray(uncertain, dtype=bool))
     return path
 

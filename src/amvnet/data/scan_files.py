@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.formats.detect import ENDINGS, is_bag_folder, is_scan, read_cloud
+from amvnet.data.formats.detect import ENDINGS, is_bag_folder, is_scan_file, read_cloud
 from amvnet.data.formats.raw import (
     FULL_INTENSITY,
     KITTI_COLUMNS,
@@ -18,7 +18,7 @@ from amvnet.data.formats.raw import (
 )
 from amvnet.data.formats.raw import count_rows as count_rows
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.scan import Scan
 
 
@@ -53,7 +53,7 @@ def find_scans(path: Path | str) -> list[Path]:
         raise InputError(
             f"{path}: expected a scan file or a folder of scans, found nothing; check the path"
         )
-    if found := sorted(entry for entry in path.iterdir() if is_scan(entry)):
+    if found := sorted(entry for entry in path.iterdir() if is_scan_file(entry)):
         return found
     raise InputError(
         f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; give the folder of scans"
@@ -109,7 +109,7 @@ def read_labels(
 
 def write_labels(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint32) -> Path:
     """Write (N,) raw ids as `dtype` (uint32 is the official `.label`), whole or not at all."""
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         np.asarray(raw_ids).astype(dtype).tofile(part)
     return Path(path)
 

@@ -13,7 +13,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation import scoring as jobs
 from amvnet.evaluation.metrics import Evaluation, metrics
-from amvnet.inference.segmenter import Segmenter, checked_scan, in_place, labels_in_place
+from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
 from amvnet.models.amvnet import ENSEMBLES, merge, refine
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.views.points import PointBatch
@@ -95,8 +95,8 @@ def analyze(
         np.zeros((BINS, size, size), dtype=np.int64),
         np.zeros((SWEPT, size, size), dtype=np.int64),
     )
-    for _, scan in jobs.labelled(dataset, records, progress):
-        _add(found, checked_scan(scan), segmenter)
+    for _, scan in jobs.read_labelled(dataset, records, progress):
+        _add(found, check_scan(scan), segmenter)
     return found
 
 
@@ -114,13 +114,13 @@ def _add(found: Analysis, scan: Scan, segmenter: Segmenter) -> None:
     scores = {"rv": f, "bev": g, **{name: mean(f, g) for name, mean in ENSEMBLES.items()}}
     scores["amvnet"] = merge(f, g, uncertain, h[uncertain[asked]])
     scores["head"] = merge(f, g, asked, h)
-    ids = {name: labels_in_place(values, scan.valid) for name, values in scores.items()}
+    ids = {name: expand_labels(values, scan.valid) for name, values in scores.items()}
     head = ids.pop("head")
     assert scan.labels is not None
     truth, size = scan.labels, len(found.ensemble[0])
-    found.evaluation.add(scan.points, truth, ids, in_place(uncertain, scan.valid))
+    found.evaluation.add(scan.points, truth, ids, expand_to_scan(uncertain, scan.valid))
     # Points that no network has seen count as agreed on, with id 0, whatever tau is.
-    bins = np.where(scan.valid, in_place(place, scan.valid), BINS - 1)
+    bins = np.where(scan.valid, expand_to_scan(place, scan.valid), BINS - 1)
     found.points += np.bincount(bins, minlength=BINS)
     found.ensemble += _by_bin(bins, truth, ids["ensemble"], BINS, size)
     swept = bins < SWEPT

@@ -11,7 +11,7 @@ import numpy as np
 
 from amvnet.evaluation.analysis import BINS, Analysis, Swept
 from amvnet.evaluation.metrics import metrics
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 
 SIZE = (6.0, 3.6)  # inches
 DOTS_PER_INCH = 160
@@ -164,14 +164,14 @@ def _figure(title: str) -> tuple[Any, Any]:
 def _write(path: Path, heads: Sequence[str], rows: Sequence[Row], figure: Any = None) -> list[Path]:
     """The same rows as CSV and as Markdown, and the figure where there is one."""
     files = [path.with_suffix(".csv"), path.with_suffix(".md")]
-    with whole_file(files[0]) as part, part.open("w", newline="") as file:
+    with atomic_write(files[0]) as part, part.open("w", newline="") as file:
         csv.writer(file).writerows([heads, *rows])
     cells = [heads, ["---"] * len(heads), *([_shown(value) for value in row] for row in rows)]
-    with whole_file(files[1]) as part:
+    with atomic_write(files[1]) as part:
         part.write_text("".join(f"| {' | '.join(row)} |\n" for row in cells))
     if figure is not None:
         files.append(path.with_suffix(".png"))
-        with whole_file(files[-1]) as part:
+        with atomic_write(files[-1]) as part:
             figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor="white")
     return files
 

@@ -14,7 +14,7 @@ from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import draw_scan
 from amvnet.inference.methods import COMPARED
-from amvnet.inference.segmenter import Segmenter, checked_scan
+from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.progress import Progress
 from amvnet.scan import Scan
 
@@ -39,7 +39,7 @@ def evaluate(
     mine = Evaluation(dataset.taxonomy)
     places = np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int)
     drawn = {records[place].name for place in places}
-    for record, scan in labelled(dataset, processes.share(records), progress):
+    for record, scan in read_labelled(dataset, processes.share(records), progress):
         assert scan.labels is not None
         found, uncertain = label(record, scan)
         mine.add(scan.points, scan.labels, found, uncertain)
@@ -51,7 +51,7 @@ def evaluate(
     return sum(processes.gather(mine), Evaluation(dataset.taxonomy))
 
 
-def labelled(
+def read_labelled(
     dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
 ) -> Iterator[tuple[ScanRecord, Scan]]:
     """Read scans that must have labels.
@@ -70,7 +70,7 @@ def labelled(
     progress(len(records), len(records))
 
 
-def by_weights(
+def label_by_weights(
     dataset: Dataset, segmenter: Segmenter, methods: Sequence[str] = COMPARED
 ) -> Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]]:
     """Labels by every one of some methods that the weights have the parts for.
@@ -79,10 +79,10 @@ def by_weights(
         InputError: where the weights know other classes than the data set.
     """
     check_classes(dataset, segmenter.taxonomy)
-    return lambda record, scan: segmenter.by_method(checked_scan(scan), methods)
+    return lambda record, scan: segmenter.by_method(check_scan(scan), methods)
 
 
-def by_files(
+def label_from_files(
     dataset: Dataset, folder: Path
 ) -> Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]]:
     """Labels from a folder of predictions.

@@ -11,7 +11,7 @@ import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 
 REACH = 50.0  # metres from the sensor to each side
 PANEL = 4.6  # inches, width and height of one panel
@@ -68,7 +68,7 @@ def draw_scan(
         figure = scan_figure(points, taxonomy, panels, truth, uncertain, title, reach, marked)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor=GROUND)
     return path
 

@@ -22,11 +22,11 @@ from amvnet.onnx_runner import DESCRIPTION
 
 ENGINES = ("auto", "torch", "compile", "onnx")
 FASTEST = "torch"  # without a long start, see docs/performance.md; what "auto" takes
-Run = Callable[[str], Any]  # from a part's name to what runs it
+PartRunner = Callable[[str], Any]  # from a part's name to what runs it
 CACHE = "AMVNET_CACHE"  # the variable that says where exported networks are kept
 
 
-def engage(segmenter: Segmenter, engine: str) -> str:
+def use_engine(segmenter: Segmenter, engine: str) -> str:
     """Let the networks of a segmenter be run by an engine from now on; returns its name.
 
     What is around the networks stays torch's. `compile` takes a minute before the first scan. `onnx` exports the
@@ -57,7 +57,7 @@ def engage(segmenter: Segmenter, engine: str) -> str:
     return engine
 
 
-def _compiled(segmenter: Segmenter) -> Run:
+def _compiled(segmenter: Segmenter) -> PartRunner:
     model, sizes = segmenter.model, segmenter.weights.model
     a, b = sizes.range_view, sizes.polar_view
     parts: dict[str, tuple[Any, tuple[int, ...]]] = {
@@ -88,7 +88,7 @@ def _inner(net: nn.Module) -> nn.Module:
     return net.net if isinstance(net, InPrecision) else net
 
 
-def _exported(segmenter: Segmenter) -> Run:
+def _exported(segmenter: Segmenter) -> PartRunner:
     if segmenter.device != "cpu" or segmenter.precision != "float32":
         found = f"{segmenter.precision} on {segmenter.device}"
         raise InputError(f"expected float32 on cpu for the engine onnx, found {found}; use compile")

@@ -17,7 +17,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.tasks import Lone, tasks_in
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import Fitting
+from amvnet.sensors.adapt import ScanAdapter
 
 SIMULATED = "simulated"  # in place of a data set: streets of the weights' sensor
 SEED = 20_261_121  # of these streets, far from those of any training
@@ -107,7 +107,7 @@ class _Recorder(OnnxSegmenter):
 def _read(text: str, segmenter: Segmenter) -> list[Scan]:
     by: Callable[[Path, bool], Segmenter] = lambda place, lone: segmenter  # noqa: E731  nothing is segmented
     with TemporaryDirectory() as nowhere:
-        fitting = Fitting(segmenter.weights)
+        fitting = ScanAdapter(segmenter.weights)
         tasks = tasks_in(
             [text], Lone(segmenter.taxonomy, by, fitting, Path(nowhere), None), None, "all"
         )

@@ -21,7 +21,7 @@ from amvnet.config.nested import to_dict
 from amvnet.errors import InputError
 from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, one_line, quiet, strip
-from amvnet.files import make_folder, whole_file
+from amvnet.files import atomic_write, make_folder
 from amvnet.inference.methods import widest_method
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import AMVNet
@@ -114,7 +114,7 @@ def export(
             os.replace(part / f"{name}.onnx", out / f"{name}.onnx")
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    with whole_file(out / DESCRIPTION) as file:
+    with atomic_write(out / DESCRIPTION) as file:
         _save(said, file)
     return measured
 
@@ -132,7 +132,7 @@ def _write_all(
             progress(len(written), total)
             written[name] = _write(graph, name, part / f"{name}.onnx")
     measured = Exported({name: one["difference"] for name, one in written.items()}, {})
-    said = describe(segmenter, written)
+    said = describe_export(segmenter, written)
     _save(said, part / DESCRIPTION)  # which the graphs are run by
     progress(len(graphs), total)
     for name, anew in quantise(part, convolutions, scans):
@@ -159,7 +159,7 @@ def check_libraries() -> None:
             ) from None
 
 
-def describe(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, Any]:
+def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, Any]:
     """All that a user of the graphs needs to know, for JSON."""
     model, classes = segmenter.weights.model, segmenter.taxonomy
     head = {key: getattr(model.point_head, key) for key in ("neighbours", "position_scale")}

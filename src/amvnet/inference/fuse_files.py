@@ -11,15 +11,15 @@ from amvnet.inference.fusion import Fusion
 from amvnet.inference.pipeline import Segment
 from amvnet.inference.predict import run_tasks
 from amvnet.inference.score_files import ScorePair
-from amvnet.inference.segmenter import Segmentation, checked_scan
+from amvnet.inference.segmenter import Segmentation, check_scan
 from amvnet.inference.tasks import Lone, tasks_in
 from amvnet.progress import Progress
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import Fitting
+from amvnet.sensors.adapt import ScanAdapter
 from amvnet.weights.file import Weights
 
 
-def fuse(
+def fuse_files(
     inputs: Sequence[str],
     pair: ScorePair,
     head: Weights | None,
@@ -49,7 +49,7 @@ def fuse(
         place = scores.relative_to(out)
         for folder in (pair.a, pair.b):
             folder.find(place)
-        return lambda scan: segment(place, checked_scan(scan))
+        return lambda scan: segment(place, check_scan(scan))
 
     def segment(place: Path, scan: Scan) -> Segmentation:
         found = fusion(scan, *pair.read(place, scan, taxonomy.size))
@@ -57,7 +57,7 @@ def fuse(
         return found
 
     # The head sees lone scans as the networks beside it would have.
-    fitting = Fitting(head or Weights(ModelConfig(), taxonomy))
+    fitting = ScanAdapter(head or Weights(ModelConfig(), taxonomy))
     tasks = tasks_in(inputs, Lone(taxonomy, by, fitting, out, topic), sequences, split)
     written = run_tasks(tasks, out, {"fused": pair.said()}, progress=progress)
     return written, counts[0] / max(counts[1], 1)

@@ -11,7 +11,7 @@ import torch
 from amvnet.config.schema import AssertionConfig
 from amvnet.errors import InputError
 from amvnet.inference.score_files import SURE, check_probabilities
-from amvnet.inference.segmenter import Segmentation, checked_scan, segmentation
+from amvnet.inference.segmenter import Segmentation, check_scan, segmentation
 from amvnet.models.amvnet import Scores, merge, refine
 from amvnet.models.assertions import Assertion, Disagreement, build_assertion
 from amvnet.models.point_head import PointHead
@@ -38,7 +38,7 @@ class Fusion:
 
     def __call__(self, points: np.ndarray | Scan, f: np.ndarray, g: np.ndarray) -> Segmentation:
         """Fuse (N, K) class probabilities of one scan's N points; raises InputError where they are none."""
-        scan = checked_scan(points)
+        scan = check_scan(points)
         self._check_shapes(scan, f, g)
         x, a, b = (np.asarray(v, dtype=np.float32)[scan.valid] for v in (scan.points, f, g))
         for name, values in (("f", a), ("g", b)):

@@ -9,7 +9,7 @@ from typing import Any
 
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
-from amvnet.files import PARTS, make_folder, whole_file
+from amvnet.files import PARTS, atomic_write, make_folder
 
 PATTERN = ".unfinished-*.jsonl"  # one of each process; they are gone when the run is over
 
@@ -43,7 +43,7 @@ class Journal:
                 path.unlink()
         processes.wait()
         self.path = folder / PATTERN.replace("*", str(processes.rank))
-        with whole_file(self.path) as part:
+        with atomic_write(self.path) as part:
             part.write_text(
                 "".join(f"{json.dumps(line)}\n" for line in (dict(settings), *sorted(self.done)))
             )

@@ -16,7 +16,7 @@ import torch
 
 from amvnet.data.label_files import write_uncertain
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
 
@@ -153,5 +153,5 @@ def write_scores(path: Path, result: Segmentation) -> None:
         for name, v in (("rv", result.rv), ("bev", result.bev))
         if v is not None
     }
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         np.savez_compressed(part, **found)  # type: ignore[arg-type]  # of the arrays, none is an option

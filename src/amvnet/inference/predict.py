@@ -14,7 +14,7 @@ from amvnet.inference.pipeline import Segment, Task, stream
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.tasks import Lone, tasks_in
 from amvnet.progress import Progress
-from amvnet.sensors.adapt import Fitting
+from amvnet.sensors.adapt import ScanAdapter
 
 
 def predict(
@@ -26,7 +26,7 @@ def predict(
     progress: Progress = lambda done, total: None,
     split: str = "all",
     topic: str | None = None,
-    fitting: Fitting | None = None,
+    fitting: ScanAdapter | None = None,
     resume: bool = False,
     processes: Processes = ALONE,
     kind: str = "label",
@@ -64,7 +64,11 @@ def predict(
     for option, count in (("batch", batch), ("at-once", 1 if at_once is None else at_once)):
         if count < 1:
             raise InputError(f"expected one scan or more at a time, found {count}; set --{option}")
-    out, fitting, by_ring = Path(out), fitting or Fitting(segmenter.weights), segmenter.by_ring()
+    out, fitting, by_ring = (
+        Path(out),
+        fitting or ScanAdapter(segmenter.weights),
+        segmenter.by_ring(),
+    )
 
     def by(place: Path, lone: bool) -> Segment:
         return by_ring if lone else segmenter

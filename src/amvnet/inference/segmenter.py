@@ -14,7 +14,7 @@ from torch import Tensor
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.methods import COMPARED, METHODS, NEEDED, Method
-from amvnet.memory import keep_memory
+from amvnet.memory import keep_freed_memory
 from amvnet.models.amvnet import ENSEMBLES, AMVNet, Scores, merge
 from amvnet.models.layers import fold_batch_norms
 from amvnet.models.precision import InPrecision, Precision, check_precision
@@ -78,7 +78,7 @@ class Segmenter:
         self.device, self.precision = _checked_device(device), precision
         check_precision(precision, device)
         if device == "cpu":
-            keep_memory()
+            keep_freed_memory()
         self.model = self.weights.build().to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         fold_batch_norms(self.model)
         _arrange(self.model, device, precision)
@@ -111,7 +111,7 @@ class Segmenter:
         Raises:
             InputError: where one of them cannot be segmented; segment them one by one to see which.
         """
-        checked = [checked_scan(points) for points in scans]
+        checked = [check_scan(points) for points in scans]
         batch = self._batch(checked)
         labels, found = _fetched(self._scores(batch))
         places = batch.slices()
@@ -132,10 +132,8 @@ class Segmenter:
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
         """The (N,) train ids by each method that the weights have the parts for, and which points are uncertain."""
         found, uncertain = self.scores_by_method(scan, methods)
-        labels = {
-            name: labels_in_place(found[name], scan.valid) for name in methods if name in found
-        }
-        return labels, None if uncertain is None else in_place(uncertain, scan.valid)
+        labels = {name: expand_labels(found[name], scan.valid) for name in methods if name in found}
+        return labels, None if uncertain is None else expand_to_scan(uncertain, scan.valid)
 
     @torch.inference_mode()
     def scores_by_method(
@@ -177,7 +175,7 @@ class Segmenter:
         return Scores(ENSEMBLES[self.method](f, g), model.assertion(f, g, batch.points), f, g)
 
 
-def checked_scan(points: np.ndarray | Scan) -> Scan:
+def check_scan(points: np.ndarray | Scan) -> Scan:
     """A scan that holds something to work on.
 
     Raises:
@@ -238,14 +236,14 @@ def _fetched(scores: Scores) -> tuple[Tensor, Scores]:
 def _segmentation(valid: np.ndarray, labels: Tensor, scores: Scores, place: slice) -> Segmentation:
     """Of the scan whose valid points stand at this place of a batch."""
     rv, bev = (
-        None if values is None else in_place(values[place], valid)
+        None if values is None else expand_to_scan(values[place], valid)
         for values in (scores.rv, scores.bev)
     )
     uncertain, merged = (
-        in_place(scores.uncertain[place], valid),
-        in_place(scores.merged[place], valid),
+        expand_to_scan(scores.uncertain[place], valid),
+        expand_to_scan(scores.merged[place], valid),
     )
-    return Segmentation(in_place(labels[place], valid), uncertain, merged, rv, bev)
+    return Segmentation(expand_to_scan(labels[place], valid), uncertain, merged, rv, bev)
 
 
 def _on_gpu(device: str) -> bool:
@@ -261,7 +259,7 @@ def _arrange(model: AMVNet, device: str, precision: Precision) -> None:
         model.polar_net = InPrecision(model.polar_net, device, precision)
 
 
-def in_place(values: Tensor, valid: np.ndarray) -> np.ndarray:
+def expand_to_scan(values: Tensor, valid: np.ndarray) -> np.ndarray:
     """(P, ...) of the valid points -> (N, ...) of all, zeros for the others."""
     found = values.cpu().numpy()
     if valid.all():
@@ -271,9 +269,9 @@ def in_place(values: Tensor, valid: np.ndarray) -> np.ndarray:
     return out
 
 
-def labels_in_place(scores: Tensor, valid: np.ndarray) -> np.ndarray:
+def expand_labels(scores: Tensor, valid: np.ndarray) -> np.ndarray:
     """(P, K) scores of the valid points -> (N,) uint8 train ids of all, 0 where a point is not valid."""
-    return in_place(label_ids(scores), valid)
+    return expand_to_scan(label_ids(scores), valid)
 
 
 def label_ids(scores: Tensor) -> Tensor:

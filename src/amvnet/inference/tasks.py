@@ -10,8 +10,8 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import is_dataset, open_dataset
-from amvnet.data.datasets.select import check_classes, choose_records, own_classes
-from amvnet.data.formats.detect import READERS, NamedScan, named_scans
+from amvnet.data.datasets.select import check_classes, choose_records, custom_taxonomy
+from amvnet.data.formats.detect import READERS, NamedScan, scans_in_file
 from amvnet.data.label_files import write_scan_labels
 from amvnet.data.scan_files import find_scans
 from amvnet.data.taxonomy import Taxonomy
@@ -19,7 +19,7 @@ from amvnet.errors import InputError
 from amvnet.inference.pipeline import Segment, Task
 from amvnet.inference.segmenter import Segmentation
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import MEASURED, Fitting
+from amvnet.sensors.adapt import MEASURED, ScanAdapter
 
 By = Callable[
     [Path, bool], Segment
@@ -32,7 +32,7 @@ class Lone:
 
     taxonomy: Taxonomy
     by: By
-    fitting: Fitting
+    fitting: ScanAdapter
     out: Path
     topic: str | None
     kind: str = "label"
@@ -40,7 +40,7 @@ class Lone:
     first: dict[str, list[NamedScan]] = field(default_factory=dict)
 
     def tasks(self, path: Path) -> Iterator[Task]:
-        for scan in named_scans(path, self.topic):
+        for scan in scans_in_file(path, self.topic):
             first = self.first.setdefault(scan.source, [])
             if len(first) < MEASURED:
                 first.append(scan)
@@ -91,7 +91,7 @@ def tasks_in(
 
 def _tasks(text: str, lone: Lone, sequences: Sequence[str] | None, split: str) -> Iterator[Task]:
     if is_dataset(text):
-        dataset = open_dataset(text, own_classes(lone.taxonomy))
+        dataset = open_dataset(text, custom_taxonomy(lone.taxonomy))
         check_classes(dataset, lone.taxonomy)
         for record in choose_records(dataset, sequences, split):
             yield _record_task(dataset, record, lone.by, lone.out)

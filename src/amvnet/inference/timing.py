@@ -24,7 +24,7 @@ from amvnet.models.layers import linear
 from amvnet.models.point_head import nearest_neighbours
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.weights.file import PARTS, Weights, state_of
+from amvnet.weights.file import PARTS, Weights, part_state
 
 STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")
 NETWORKS = ("RV", "BEV")
@@ -57,7 +57,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Run:
+class Timing:
     """Seconds of each stage, and of `MEAN`; how many points the scan has, and how many of them were uncertain."""
 
     seconds: dict[str, float]
@@ -89,7 +89,7 @@ def time_jobs(
             raise InputError(
                 f"expected a share of uncertain points from 0 to 1, found {job.share}; give another"
             )
-    found: list[list[Run]] = [[] for _ in jobs]
+    found: list[list[Timing]] = [[] for _ in jobs]
     limits: dict[str, float] = {}
     for number in range(runs + WARM_UP):
         for kind, speed in product_limits(jobs[0].segmenter.device).items():
@@ -101,7 +101,7 @@ def time_jobs(
 
 
 @torch.inference_mode()
-def run_once(job: Job) -> Run:
+def run_once(job: Job) -> Timing:
     """Time a job once: the steps of `AMVNet.forward`, each with a clock beside it."""
     model, device = job.segmenter.model, job.segmenter.device
     head = model.point_head
@@ -131,7 +131,7 @@ def run_once(job: Job) -> Run:
         labels = label_ids(merge(f, g, uncertain, h)).cpu().numpy()
     with clock("write"):
         job.write(labels)
-    return Run(clock.seconds, len(f), len(index))
+    return Timing(clock.seconds, len(f), len(index))
 
 
 def _least(f: Tensor, g: Tensor, share: float) -> Tensor:
@@ -158,7 +158,7 @@ class _Clock:
         self.seconds[stage] = time.perf_counter() - start
 
 
-def _report(job: Job, runs: Sequence[Run], limits: dict[str, float]) -> dict[str, Any]:
+def _report(job: Job, runs: Sequence[Timing], limits: dict[str, float]) -> dict[str, Any]:
     stages = {stage: _spread([run.seconds[stage] for run in runs]) for stage in (*STAGES, MEAN)}
     fusion = _spread(
         [sum(run.seconds[stage] for stage in FUSION) / run.all for run in runs], unit=1
@@ -249,6 +249,8 @@ def untrained(recipe: Recipe) -> Weights:
     taxonomy = TAXONOMIES[recipe.taxonomy]
     model = build_amvnet(recipe.model, taxonomy.size)
     tensors = {
-        key: value for part in PARTS for key, value in state_of(part, getattr(model, part)).items()
+        key: value
+        for part in PARTS
+        for key, value in part_state(part, getattr(model, part)).items()
     }
     return Weights(recipe.model, taxonomy, recipe.sensor, tensors)

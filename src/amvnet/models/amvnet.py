@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from amvnet.config.schema import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
-from amvnet.models.point_head import PointHead, nearest_neighbours, only_asked, point_table
+from amvnet.models.point_head import PointHead, nearest_neighbours, point_table, select_used_points
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.streams import Arrangement, in_turn
@@ -84,7 +84,7 @@ def settle(
     head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor
 ) -> Tensor:
     """h: (U, K) of the points with these indices (U,), whose neighbours are (U, n)."""
-    asked, (index, near) = only_asked(len(points), index, near)
+    asked, (index, near) = select_used_points(len(points), index, near)
     table = point_table(*(values.index_select(0, asked) for values in (points, f, g)))
     return head.score(table, index, near).softmax(dim=1)
 

@@ -67,7 +67,7 @@ def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
     return torch.cat([f, g, points], dim=1)
 
 
-def only_asked(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
+def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     """The points, of so many, that occur in some tensors of indices: (M,), and the tensors as places among these.
 
     On a GPU all of them: it would be waited for to count them.

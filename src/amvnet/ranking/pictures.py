@@ -8,8 +8,8 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.evaluation.top_view import draw_scan
-from amvnet.inference.segmenter import Segmenter, checked_scan
-from amvnet.ranking.rank import By, Ranking, clusters_of, doubts_of
+from amvnet.inference.segmenter import Segmenter, check_scan
+from amvnet.ranking.rank import Criterion, Ranking, find_clusters, find_doubts
 
 PICTURES = 12  # clusters that are drawn
 REACH = 8.0  # metres from the cluster to each side
@@ -17,7 +17,7 @@ DEEP = 6.0  # metres above and below it: what is farther would hide it
 
 
 def draw(
-    ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, folder: Path
+    ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: Criterion, folder: Path
 ) -> list[Path]:
     """Draw the first clusters, each with its surroundings; returns the files, RANK.png."""
     return [
@@ -27,12 +27,17 @@ def draw(
 
 
 def _draw(
-    row: np.void, ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: By, path: Path
+    row: np.void,
+    ranking: Ranking,
+    dataset: Dataset,
+    segmenter: Segmenter,
+    by: Criterion,
+    path: Path,
 ) -> Path:
     record = ranking.records[row["scan"]]
-    scan = checked_scan(dataset.read(record))
-    doubts = doubts_of(scan, segmenter, by)
-    _, of = clusters_of(doubts)
+    scan = check_scan(dataset.read(record))
+    doubts = find_doubts(scan, segmenter, by)
+    _, of = find_clusters(doubts)
     points = scan.points[:, :3] - row["xyz"]
     near = (np.abs(points) <= (REACH, REACH, DEEP)).all(axis=1)
     panels = {

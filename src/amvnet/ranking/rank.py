@@ -15,14 +15,14 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.select import check_classes
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import whole_file
-from amvnet.inference.segmenter import Segmenter, checked_scan, in_place
+from amvnet.files import atomic_write
+from amvnet.inference.segmenter import Segmenter, check_scan, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
 from amvnet.progress import Progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan
 
-By = Literal["disagreement", "labels"]
+Criterion = Literal["disagreement", "labels"]
 
 NEAR = 1.5  # metres: what is nearer to the sensor is the vehicle that carries it
 FEW = 20.0  # points: a cluster counts as if so many more of it were beyond doubt, so that stray points do not lead
@@ -88,7 +88,7 @@ def rank(
     dataset: Dataset,
     records: Sequence[ScanRecord],
     segmenter: Segmenter,
-    by: By,
+    by: Criterion,
     progress: Progress = lambda done, total: None,
 ) -> Ranking:
     """Rank the clusters of some scans, one scan in memory at a time and 39 bytes a cluster.
@@ -110,8 +110,8 @@ def rank(
     )
     for place, record in enumerate(records):
         progress(place, len(records))
-        doubts = doubts_of(checked_scan(dataset.read(record)), segmenter, by)
-        rows, _ = clusters_of(doubts)
+        doubts = find_doubts(check_scan(dataset.read(record)), segmenter, by)
+        rows, _ = find_clusters(doubts)
         rows["scan"] = place
         found.append(rows)
         means[place], sizes[place] = doubts.doubt.mean(), len(doubts.doubt)
@@ -124,7 +124,7 @@ def rank(
     return Ranking(records, rows[order], scans, means[scans], sizes[scans])
 
 
-def doubts_of(scan: Scan, segmenter: Segmenter, by: By) -> Doubts:
+def find_doubts(scan: Scan, segmenter: Segmenter, by: Criterion) -> Doubts:
     """What is doubted of one scan's points.
 
     Raises:
@@ -139,13 +139,15 @@ def doubts_of(scan: Scan, segmenter: Segmenter, by: By) -> Doubts:
     f, g = scores["rv"], scores["bev"]
     xyz, valid = scan.points[:, :3], scan.valid
     seen = torch.from_numpy(np.hypot(*scan.points[valid, :2].T) >= NEAR).to(f.device)
-    rv, bev = (in_place((one.argmax(dim=1) + 1).to(torch.uint8), valid) for one in (f, g))
+    rv, bev = (expand_to_scan((one.argmax(dim=1) + 1).to(torch.uint8), valid) for one in (f, g))
     label = np.zeros(len(scan), dtype=np.uint8) if scan.labels is None else scan.labels
     if by == "disagreement":
-        doubt = in_place((1 - cosine_similarity(f, g)).clamp(0, 1) * (uncertain & seen), valid)
+        doubt = expand_to_scan(
+            (1 - cosine_similarity(f, g)).clamp(0, 1) * (uncertain & seen), valid
+        )
         return Doubts(xyz, doubt, rv, bev, label, _pair(rv, bev))
     against, said = _contradicted(f, g, torch.from_numpy(label[valid]).to(f.device))
-    doubt, kind = in_place(against * seen, valid), _pair(label, in_place(said, valid))
+    doubt, kind = expand_to_scan(against * seen, valid), _pair(label, expand_to_scan(said, valid))
     return Doubts(xyz, doubt, rv, bev, label, kind, _sizes_of_things(xyz, label, valid))
 
 
@@ -169,7 +171,7 @@ def _contradicted(
     return (other - own).clamp_min(0) * (label > 0), (said + 1).to(torch.uint8)
 
 
-def clusters_of(doubts: Doubts) -> tuple[np.ndarray, np.ndarray]:
+def find_clusters(doubts: Doubts) -> tuple[np.ndarray, np.ndarray]:
     """The clusters of one scan, rows of `ROW` in no order, and (N,) which of them a point is in, -1 for none."""
     of = np.full(len(doubts.doubt), -1)
     index = np.flatnonzero(doubts.doubt > 0)
@@ -211,7 +213,7 @@ def _times(kind: np.ndarray) -> np.ndarray:
     return times[which]
 
 
-def write(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
+def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
     """Write the clusters to `path` (CSV), and the scans beside it; returns the latter's file."""
     _write(path, COLUMNS, _cluster_rows(ranking, taxonomy))
     scans = path.with_name(f"{path.stem}-scans{path.suffix}")
@@ -220,7 +222,7 @@ def write(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
 
 
 def _write(path: Path, columns: Sequence[str], rows: Iterator[list[Any]]) -> None:
-    with whole_file(path) as part, part.open("w", newline="") as file:
+    with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows([place, *row] for place, row in enumerate(rows, start=1))

@@ -41,7 +41,7 @@ class _Source:
     said: bool = False
 
 
-class Fitting:
+class ScanAdapter:
     """Turns what scan files hold into scans for some weights.
 
     Intensities are brought to [0, 1], the axes turned level, and the scan is moved up or down so that its sensor is

@@ -138,7 +138,7 @@ SENSORS: dict[str, Sensor] = {
 }
 
 
-def describe(sensor: str | None = None, **options: Any) -> Sensor:
+def make_sensor(sensor: str | None = None, **options: Any) -> Sensor:
     """A sensor by its name or its YAML file, and options that override what it says.
 
     Args:

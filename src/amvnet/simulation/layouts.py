@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.simulation.materials import MOVING, NUSCENES_CATEGORIES, SEMANTICKITTI_IDS
 
 Row = dict[str, Any]
@@ -224,7 +224,7 @@ def _write_empty_map(path: Path) -> None:
     """nuScenes' tools want a picture of the map; ours shows nothing."""
     from matplotlib.image import imsave
 
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         imsave(part, np.zeros((8, 8, 3), dtype=np.uint8))
 
 
@@ -233,5 +233,5 @@ def _row(matrix: np.ndarray) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_bytes(content)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan
 from amvnet.simulation.lidar import require_embree
@@ -177,7 +177,7 @@ def _write(sequence: Sequence) -> Iterator[int]:
         layout.scan(index, scan)
         yield 1
     rows = layout.finish()
-    with whole_file(sequence.done) as part:
+    with atomic_write(sequence.done) as part:
         part.write_text(json.dumps({**sequence.made, "rows": rows}))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from amvnet.errors import InputError
 from amvnet.submission.rules import Rules, Sources
-from amvnet.submission.zips import Archive, opened, written
+from amvnet.submission.zips import Archive, open_archive, write_archive
 
 ENDING = ".zip"
 SHOWN = 5  # folders in a message
@@ -70,7 +70,7 @@ def write(
     _check_missing(rules.required, set(names), str(folder))
     for name in names:
         rules.check_size(name, (folder / name).stat().st_size, str(folder / name))
-    with written(out) as add:
+    with write_archive(out) as add:
         for entry in rules.folders:
             add(entry, b"")
         if rules.meta is not None:
@@ -91,7 +91,7 @@ def check(rules: Rules, path: Path, progress: Progress = lambda done, total: Non
         InputError: at the first rule that it breaks.
     """
     _check_ending(path)
-    with opened(path) as archive:
+    with open_archive(path) as archive:
         _check_tree(rules, archive)
         for name, size in archive.sizes.items():
             rules.check_size(name, size, f"{path}: {name}")

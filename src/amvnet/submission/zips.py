@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what every unpacker knows
 ENCRYPTED = 0x1  # bit of an entry's flags
@@ -77,7 +77,7 @@ class Archive:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Archive]:
+def open_archive(path: Path) -> Iterator[Archive]:
     """Open an archive of anyone's. Nothing is unpacked and no name in it becomes a path.
 
     Raises:
@@ -104,7 +104,7 @@ def opened(path: Path) -> Iterator[Archive]:
 
 
 @contextmanager
-def written(path: Path) -> Iterator[Callable[[str, bytes], None]]:
+def write_archive(path: Path) -> Iterator[Callable[[str, bytes], None]]:
     """Write an archive that appears whole or not at all; yields what adds a file, or a folder (NAME/, b"").
 
     Entries stand in the order in which they are added; at no time is more than one in memory.
@@ -112,7 +112,7 @@ def written(path: Path) -> Iterator[Callable[[str, bytes], None]]:
     Raises:
         InputError: where the file cannot be written.
     """
-    with whole_file(path) as part, zipfile.ZipFile(part, "w") as archive:
+    with atomic_write(path) as part, zipfile.ZipFile(part, "w") as archive:
         yield lambda name, data: archive.writestr(_entry(name), data, compresslevel=LEVEL)
 
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.evaluation.top_view import scan_figure
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
@@ -28,7 +28,7 @@ PICTURE_DOTS = 60  # an inch
 
 
 @dataclass(frozen=True)
-class Kept:
+class KeptWeights:
     """Where a stage's run keeps its weights, and what they reached."""
 
     best: Path
@@ -45,7 +45,7 @@ class KeepWeights(Callback):
         self, write: Callable[[nn.Module, Path, dict[str, float]], None], folder: Path
     ) -> None:
         self.write, self.highest = write, -1.0
-        self.kept = Kept(folder / "best.safetensors", folder / "last.safetensors")
+        self.kept = KeptWeights(folder / "best.safetensors", folder / "last.safetensors")
 
     def state_dict(self) -> dict[str, Any]:
         return {"highest": self.highest}
@@ -77,7 +77,7 @@ class Curves(Callback):
             **{k: float(v) for k, v in trainer.callback_metrics.items()},
         }
         rows = [row for row in self._kept() if int(row["epoch"]) < now["epoch"]] + [now]
-        with whole_file(self.path) as part, part.open("w", newline="") as file:
+        with atomic_write(self.path) as part, part.open("w", newline="") as file:
             table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
             table.writeheader()
             table.writerows(rows)

@@ -32,7 +32,7 @@ LAST = "last.ckpt"  # what --resume goes on from
 
 
 @dataclass(frozen=True)
-class Course:
+class FitOptions:
     """How a stage is trained.
 
     Attributes:
@@ -62,7 +62,7 @@ class Course:
 
 def fit(
     stage: Stage,
-    course: Course,
+    course: FitOptions,
     train: DataLoader[Any],
     val: DataLoader[Any] | None,
     kept: Sequence[Callback] = (),
@@ -98,7 +98,7 @@ def fit(
 
 
 def _trainer(
-    course: Course, batches: int, callbacks: Sequence[Callback], validates: bool
+    course: FitOptions, batches: int, callbacks: Sequence[Callback], validates: bool
 ) -> L.Trainer:
     training, processes, folder, trial = (
         course.training,

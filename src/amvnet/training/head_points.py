@@ -24,7 +24,7 @@ from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.training.head_scores import Source
+from amvnet.training.head_scores import ScoreSource
 from amvnet.training.loaders import ScanSet, collate
 
 # p_i (U, 2 K + 4), S_i (U, n, 2 K + 4), train ids (U,), and for how many points of its scan each stands (U,)
@@ -102,7 +102,7 @@ class PointSampler(data.Sampler[np.ndarray]):
             ]
 
 
-def head_loader(
+def make_head_loader(
     points: HeadPoints, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
 ) -> data.DataLoader[HeadBatch]:
     """Batches of uncertain points, of each process its own part."""
@@ -111,7 +111,7 @@ def head_loader(
 
 
 def gather_points(
-    sources: Sequence[Source],
+    sources: Sequence[ScoreSource],
     dataset: Dataset,
     model: ModelConfig,
     training: TrainingConfig,
@@ -159,7 +159,7 @@ def _everywhere(f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = No
 
 
 def _gather(
-    sources: Sequence[Source],
+    sources: Sequence[ScoreSource],
     dataset: Dataset,
     config: PointHeadConfig,
     training: TrainingConfig,

@@ -24,7 +24,7 @@ Scorer = Callable[
 ]  # f and g of a scan's valid points, (P, K)
 
 
-class Source(Protocol):
+class ScoreSource(Protocol):
     """Anything that gives f and g of some scans.
 
     Attributes:
@@ -43,7 +43,7 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True)
-class Networks:
+class NetworkScores:
     """Frozen networks, and the scans that they score."""
 
     weights: Weights
@@ -59,7 +59,7 @@ class Networks:
 
 
 @dataclass(frozen=True)
-class Files:
+class FileScores:
     """Two other models' scores in files, of the scans as they are."""
 
     pair: ScorePair
@@ -76,22 +76,24 @@ class Files:
         return score
 
 
-def source_of(networks: Weights, scores: ScorePair | None, records: Sequence[ScanRecord]) -> Source:
+def score_source(
+    networks: Weights, scores: ScorePair | None, records: Sequence[ScanRecord]
+) -> ScoreSource:
     """The networks, or files of scores where there are any.
 
     Raises:
         InputError: where there are no files, and a network is missing.
     """
     if scores is not None:
-        return Files(scores, records, networks.taxonomy.size)
+        return FileScores(scores, records, networks.taxonomy.size)
     if missing := [part for part in ("range_net", "polar_net") if part not in networks.parts]:
         raise InputError(
             f"expected trained networks for the head, found no {missing[0]}; train it, or give --init"
         )
-    return Networks(networks, records)
+    return NetworkScores(networks, records)
 
 
-def scored_with(networks: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
+def scorer_with_head(networks: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
     """The (P, K) scores of a batch by AMVNet whose head is being trained."""
     model = networks.build()
     model.point_head = head

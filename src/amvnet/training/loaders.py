@@ -16,7 +16,7 @@ from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.training.augment import augment, mix
@@ -105,7 +105,7 @@ def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
     return PointBatch.of(scans), torch.from_numpy(np.concatenate(labels).astype(np.int64))
 
 
-def loader(
+def make_loader(
     scans: ScanSet, batch: int, workers: int, shuffle: bool, processes: Processes = ALONE
 ) -> data.DataLoader[tuple[PointBatch, Tensor]]:
     """Batches of scans, of each process its own; the last one of a training epoch may be smaller."""
@@ -135,7 +135,7 @@ def count_classes(
             mine += np.bincount(labels, minlength=len(mine))
     counts = np.sum(processes.gather(mine), axis=0)[1:]
     if processes.first:
-        with whole_file(kept) as part:
+        with atomic_write(kept) as part:
             np.savez(
                 part,
                 counts=counts,

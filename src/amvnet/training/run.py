@@ -22,21 +22,27 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.inference.score_files import ScorePair
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
-from amvnet.training.fit import Course, fit
-from amvnet.training.head_points import gather_points, head_loader
-from amvnet.training.head_scores import Networks, Source, scored_with, source_of
+from amvnet.training.fit import FitOptions, fit
+from amvnet.training.head_points import gather_points, make_head_loader
+from amvnet.training.head_scores import NetworkScores, ScoreSource, score_source, scorer_with_head
 from amvnet.training.head_stage import HeadStage
-from amvnet.training.loaders import ScanSet, count_classes, loader
+from amvnet.training.loaders import ScanSet, count_classes, make_loader
 from amvnet.training.losses import class_weights
-from amvnet.training.run_record import SETTINGS, check_begun, describe, names_of, settings
+from amvnet.training.run_record import (
+    SETTINGS,
+    check_begun,
+    sequence_names,
+    stage_settings,
+    write_record,
+)
 from amvnet.training.stages import PolarStage, RangeStage, Stage
 from amvnet.weights import file as weights_file
-from amvnet.weights.file import Weights, state_of
+from amvnet.weights.file import Weights, part_state
 
 PART = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 PICTURED_SCANS = 2
@@ -116,7 +122,7 @@ class Run:
             check_begun(self._folder(name), self._settings(name, current), self.resume)
         self.processes.wait()
         if self.processes.first:
-            describe(
+            write_record(
                 self.out, self.recipe, self.dataset, self.train, self.val, stage, init, self.scores
             )
         for name in names:
@@ -150,7 +156,9 @@ class Run:
         return self._folder(name) / f"{self.recipe.training.keep}.safetensors"
 
     def _settings(self, name: str, current: Weights) -> dict[str, Any]:
-        return settings(self.recipe, name, PART[name], self.train, self.val, current, self.scores)
+        return stage_settings(
+            self.recipe, name, PART[name], self.train, self.val, current, self.scores
+        )
 
     def _stage(self, name: str, current: Weights) -> Weights:
         done = self._folder(name) / "done"
@@ -232,7 +240,7 @@ class Run:
         )
         scored = model.score_range_view if name == "rv" else model.score_polar_view
         part = config.batch // config.accumulate // self.processes.size
-        load = functools.partial(loader, workers=training.workers, processes=self.processes)
+        load = functools.partial(make_loader, workers=training.workers, processes=self.processes)
         course = self._course(name, config.epochs, config.accumulate, config.clip)
         return fit(
             stage,
@@ -250,7 +258,7 @@ class Run:
 
     def _fit_head(self, current: Weights) -> None:
         training, config = self.recipe.training, self.recipe.training.head
-        folder, validated = self._folder("head"), source_of(current, self.scores, self.val)
+        folder, validated = self._folder("head"), score_source(current, self.scores, self.val)
         gather = functools.partial(gather_points, dataset=self.dataset, model=current.model, training=training,
                                    processes=self.processes)  # fmt: skip
         train = gather(
@@ -260,7 +268,7 @@ class Run:
         head = self._module(PART["head"], current).point_head
         assert head is not None
         weights = class_weights(self._counts()) if config.class_weights else None
-        load = functools.partial(head_loader, seed=training.seed, processes=self.processes)
+        load = functools.partial(make_head_loader, seed=training.seed, processes=self.processes)
         fit(
             HeadStage(head, train, val, config, self.dataset.taxonomy, weights, self.processes),
             self._course("head", config.epochs),
@@ -269,7 +277,7 @@ class Run:
             # The pictures' scans are scored as they come, and of files nobody knows which scan that is.
             [
                 self._keep("head", current),
-                *([] if self.scores else [self._pictures(scored_with(current, head))]),
+                *([] if self.scores else [self._pictures(scorer_with_head(current, head))]),
             ],
         )
         self.processes.wait()
@@ -277,11 +285,13 @@ class Run:
             for kind in ("train", "val"):
                 shutil.rmtree(folder / kind, ignore_errors=True)
 
-    def _course(self, name: str, epochs: int, parts: int = 1, clip: float | None = None) -> Course:
+    def _course(
+        self, name: str, epochs: int, parts: int = 1, clip: float | None = None
+    ) -> FitOptions:
         training = self.recipe.training
         if name == "head":  # of so few multiplications bfloat16 would save nothing
             training = dataclasses.replace(training, precision="32-true")
-        return Course(
+        return FitOptions(
             training,
             self._folder(name),
             epochs,
@@ -301,19 +311,19 @@ class Run:
         )
         return Pictures(scans, self.dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
 
-    def _sources(self, current: Weights) -> list[Source]:
+    def _sources(self, current: Weights) -> list[ScoreSource]:
         """What scores which training scans for the head: with folds, networks that have not seen them."""
         folds = self.recipe.training.head.folds
         if folds < 2 or self.scores is not None:
-            return [source_of(current, self.scores, self.train)]
-        names = names_of(self.train)
+            return [score_source(current, self.scores, self.train)]
+        names = sequence_names(self.train)
         if len(names) < folds:
             raise InputError(
                 f"expected at least {folds} training sequences for {folds} folds, found {len(names)}"
             )
         return [self._fold(index, set(names[index::folds])) for index in range(folds)]
 
-    def _fold(self, index: int, left_out: set[str]) -> Networks:
+    def _fold(self, index: int, left_out: set[str]) -> NetworkScores:
         """Networks trained without some sequences, and the scans of these."""
         seen = [r for r in self.train if r.sequence not in left_out]
         unseen = [r for r in self.train if r.sequence in left_out]
@@ -322,7 +332,7 @@ class Run:
             self.recipe, self.dataset, seen, unseen, out, True, self.say, self.bars, self.processes
         )
         fold.stages("rv")
-        return Networks(weights_file.load(fold.stages("bev")), unseen)
+        return NetworkScores(weights_file.load(fold.stages("bev")), unseen)
 
     def _counts(self) -> Any:
         return count_classes(
@@ -333,20 +343,20 @@ class Run:
         """How the part of a stage is written: with the description of what made it."""
         part, started = PART[name], time.time()
         settings = self._settings(name, current)
-        made = {**settings["training"], "sequences": names_of(self.train),
-                "validated_on": names_of(self.val), "scans": len(self.train),
+        made = {**settings["training"], "sequences": sequence_names(self.train),
+                "validated_on": sequence_names(self.val), "scans": len(self.train),
                 **{key: settings[key] for key in ("scores",) if key in settings}}  # fmt: skip
 
         def write(module: nn.Module, path: Path, reached: dict[str, float]) -> None:
             seconds = round(time.time() - started)
             kept = dataclasses.replace(
                 current,
-                tensors=state_of(part, module),
+                tensors=part_state(part, module),
                 training={part: {**made, "seconds": seconds}},
                 metrics={part: reached},
             )
             weights_file.save(kept, path)
-            with whole_file(path.parent / SETTINGS) as file:
+            with atomic_write(path.parent / SETTINGS) as file:
                 file.write_text(yaml.safe_dump(settings, sort_keys=False))
 
         return KeepWeights(write, self._folder(name))

@@ -16,7 +16,7 @@ from amvnet.config.nested import to_dict
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.inference.score_files import ScorePair
 from amvnet.training.fit import LAST
 from amvnet.weights.file import SIZES, Weights
@@ -24,7 +24,7 @@ from amvnet.weights.file import SIZES, Weights
 SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with
 
 
-def describe(
+def write_record(
     out: Path,
     recipe: Recipe,
     dataset: Dataset,
@@ -45,8 +45,8 @@ def describe(
         "python": platform.python_version(),
         "data": str(dataset.root),
         "classes": dataset.taxonomy.name,
-        "train": names_of(train),
-        "val": names_of(val),
+        "train": sequence_names(train),
+        "val": sequence_names(val),
         "init": None if init is None else {part: init.digest(part) for part in init.parts},
         **({} if scores is None else {"scores": scores.said()}),
     }
@@ -54,7 +54,7 @@ def describe(
         "recipe.yaml": to_dict(recipe),
         "run.yaml": {**earlier, stage: said},
     }.items():
-        with whole_file(out / name) as part:
+        with atomic_write(out / name) as part:
             part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
 
 
@@ -77,10 +77,10 @@ def _repeat(
     scores: ScorePair | None,
 ) -> list[Any]:
     """The command that makes a run again."""
-    validated = ["--val-sequences", ",".join(names_of(val))] if val else ["--with-val"]
+    validated = ["--val-sequences", ",".join(sequence_names(val))] if val else ["--with-val"]
     return [
         *("amvnet", "train", out / "recipe.yaml", "--data", dataset.root, "--stage", stage),
-        *("--train-sequences", ",".join(names_of(train)), *validated),
+        *("--train-sequences", ",".join(sequence_names(train)), *validated),
         # Weights that were given have no name here; their digests tell whether it is they.
         *([] if init is None else ["--init", "WEIGHTS"]),
         *([] if scores is None else scores.options()),
@@ -88,7 +88,7 @@ def _repeat(
     ]
 
 
-def settings(
+def stage_settings(
     recipe: Recipe,
     name: str,
     part: str,
@@ -126,7 +126,7 @@ def check_begun(folder: Path, now: dict[str, Any], resume: bool) -> None:
                          "resume it with that, or give another folder")  # fmt: skip
 
 
-def names_of(records: Sequence[ScanRecord]) -> list[str]:
+def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
     """The sequences of some scans."""
     return sorted({record.sequence for record in records})
 

@@ -49,7 +49,7 @@ def sweep_neighbours(
         changed = dataclasses.replace(recipe, model=model, training=training)
         run = Run(changed, dataset, train, val, out / "neighbours" / str(n), True, say)
         segmenter = Segmenter(run.stages("head", networks), device)
-        found = jobs.evaluate(dataset, val, jobs.by_weights(dataset, segmenter))
+        found = jobs.evaluate(dataset, val, jobs.label_by_weights(dataset, segmenter))
         yield Swept.of(
             n, found.uncertain / max(found.asked, 1), found.matrices["amvnet"][0], dataset.taxonomy
         )
@@ -91,6 +91,6 @@ def ablate(
         )
         segmenter = Segmenter(path, processes.device(device), "rv")
         scored = jobs.evaluate(
-            dataset, val, jobs.by_weights(dataset, segmenter), processes=processes
+            dataset, val, jobs.label_by_weights(dataset, segmenter), processes=processes
         )
         yield gru, weighted, metrics(scored.matrices["rv"][0], dataset.taxonomy)

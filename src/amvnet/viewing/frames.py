@@ -10,16 +10,16 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import is_dataset, open_dataset
-from amvnet.data.datasets.select import check_classes, choose_records, own_classes
-from amvnet.data.formats.detect import NamedScan, ending_of, named_scans, stem
+from amvnet.data.datasets.select import check_classes, choose_records, custom_taxonomy
+from amvnet.data.formats.detect import NamedScan, ending_of, scan_stem, scans_in_file
 from amvnet.data.scan_files import find_scans, read_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.errors import InputError
-from amvnet.inference.segmenter import Segmenter, checked_scan, in_place, labels_in_place
+from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
 from amvnet.progress import Progress
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import Fitting
+from amvnet.sensors.adapt import ScanAdapter
 
 # Colours on a dark ground, RGB in 0..255. The official one of points without a class is black, as the ground nearly is.
 UNLABELLED = (128, 136, 148)
@@ -85,7 +85,7 @@ class Frames:
         progress(len(self), len(self))
 
     def _frame(self, source: Source) -> Frame:
-        scan = checked_scan(source.read())
+        scan = check_scan(source.read())
         given = (
             {} if self.labels is None else {"labels": source.read_labels(self.labels, len(scan))}
         )
@@ -137,21 +137,24 @@ def choose_frames(
 
 def _segmented(frame: Frame, scan: Scan, segmenter: Segmenter) -> Frame:
     scores, uncertain = segmenter.scores_by_method(scan)
-    labels = {name: labels_in_place(values, scan.valid) for name, values in scores.items()}
+    labels = {name: expand_labels(values, scan.valid) for name, values in scores.items()}
     if uncertain is None:
         return replace(frame, labels=labels)
-    disagreement = in_place(
+    disagreement = expand_to_scan(
         (1 - cosine_similarity(scores["rv"], scores["bev"])).clamp(0, 1), scan.valid
     )
     return replace(
-        frame, labels=labels, uncertain=in_place(uncertain, scan.valid), disagreement=disagreement
+        frame,
+        labels=labels,
+        uncertain=expand_to_scan(uncertain, scan.valid),
+        disagreement=disagreement,
     )
 
 
 def _given_taxonomy(text: str | None, segmenter: Segmenter | None) -> Taxonomy | None:
     """The classes that the user named; None where the input is to say them."""
     if text is None:
-        return None if segmenter is None else own_classes(segmenter.taxonomy)
+        return None if segmenter is None else custom_taxonomy(segmenter.taxonomy)
     if segmenter is not None:
         raise InputError(
             "expected no --taxonomy beside --weights, which say their classes; leave it out"
@@ -171,10 +174,10 @@ def _sources(
     paths = find_scans(text)
     ours = NUSCENES if ending_of(paths[0]) == ".pcd.bin" else SEMANTICKITTI
     taxonomy = given or (ours if segmenter is None else segmenter.taxonomy)
-    fit = None if segmenter is None else Fitting(segmenter.weights)
+    fit = None if segmenter is None else ScanAdapter(segmenter.weights)
     by_ring = None if segmenter is None else segmenter.by_ring()
     return taxonomy, [
-        _lone_source(scan, taxonomy, by_ring, fit) for path in paths for scan in named_scans(path)
+        _lone_source(scan, taxonomy, by_ring, fit) for path in paths for scan in scans_in_file(path)
     ]
 
 
@@ -183,7 +186,7 @@ def _record_source(dataset: Dataset, record: ScanRecord, segmenter: Segmenter | 
     name = (
         record.name
         if "/" in record.name
-        else f"{record.sequence}/{stem(record.points_path).split('__')[-1]}"
+        else f"{record.sequence}/{scan_stem(record.points_path).split('__')[-1]}"
     )
 
     def labels(folder: Path, count: int) -> np.ndarray:
@@ -193,7 +196,7 @@ def _record_source(dataset: Dataset, record: ScanRecord, segmenter: Segmenter | 
 
 
 def _lone_source(
-    scan: NamedScan, taxonomy: Taxonomy, segmenter: Segmenter | None, fit: Fitting | None
+    scan: NamedScan, taxonomy: Taxonomy, segmenter: Segmenter | None, fit: ScanAdapter | None
 ) -> Source:
     def read() -> Scan:
         return scan.read().to_scan() if fit is None else fit(scan.read(), scan.source)

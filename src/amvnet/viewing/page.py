@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.inference.methods import TITLES
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
@@ -61,7 +61,7 @@ def write_page(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy, ti
     """
     packed = [pack(frame) for frame in frames]
     page = assemble(packed, taxonomy, title)
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_bytes(page.encode("utf-8", "replace"))  # names of files need not be Unicode
     return Path(path)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.inference.methods import TITLES
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 
@@ -61,7 +61,7 @@ def save_recording(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy
         InputError: where Rerun is not installed, or the file cannot be written.
     """
     stream, first, frames = _stream(), *_first(frames)
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         stream.save(part, default_blueprint=blueprint(first))
         try:
             log(stream, frames, taxonomy)

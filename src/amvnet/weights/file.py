@@ -21,7 +21,7 @@ from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
 from amvnet.weights import hub
@@ -145,7 +145,7 @@ def _only(values: Mapping[str, Any], name: str) -> dict[str, Any]:
     return {name: values[name]} if name in values else {}
 
 
-def state_of(part: str, module: torch.nn.Module) -> dict[str, Tensor]:
+def part_state(part: str, module: torch.nn.Module) -> dict[str, Tensor]:
     """A module's parameters under its part's name, on the CPU and apart from the module."""
     return {
         f"{part}.{k}": v.detach().cpu().clone().contiguous() for k, v in module.state_dict().items()
@@ -170,7 +170,7 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
         "metrics": weights.metrics,
     }
     tensors = {k: v.half() if half and v.ndim > 1 else v for k, v in weights.tensors.items()}
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         try:
             save_file(tensors, part, metadata={KEY: json.dumps(description)})
         except SafetensorError as error:  # a full disk

@@ -22,7 +22,7 @@ def fetch(name: str) -> Path:
     place, _, revision = name.removeprefix(PREFIX).partition("@")
     check_name(place, name)
     hub = client()
-    with one_line(name, f"check the name and the network, and that {FILE} is there"):
+    with hub_errors(name, f"check the name and the network, and that {FILE} is there"):
         return Path(hub.hf_hub_download(repo_id=place, filename=FILE, revision=revision or None))
 
 
@@ -44,7 +44,7 @@ def client() -> Any:
 
 
 @contextmanager
-def one_line(name: str, cure: str) -> Iterator[None]:
+def hub_errors(name: str, cure: str) -> Iterator[None]:
     """What the hub's client complains of as one line, with what to do."""
     try:
         yield

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 from amvnet.weights.card import front_matter, model_card
 from amvnet.weights.file import Weights, load, save
-from amvnet.weights.hub import FILE, PREFIX, check_name, client, one_line
+from amvnet.weights.hub import FILE, PREFIX, check_name, client, hub_errors
 
 CARD = "README.md"
 
@@ -37,7 +37,7 @@ def push(
         save(given, Path(folder) / FILE)
         card = front_matter(given, licence) + model_card(given, f"{PREFIX}{name}", licence)
         (Path(folder) / CARD).write_text(card, encoding="utf-8")
-        with one_line(name, "check the name and the network, and log in by hf auth login"):
+        with hub_errors(name, "check the name and the network, and log in by hf auth login"):
             hub.create_repo(repo_id=name, private=private, exist_ok=True)
             made = hub.upload_folder(
                 repo_id=name,

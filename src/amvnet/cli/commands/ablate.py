@@ -7,7 +7,7 @@ from typing import Any
 
 from amvnet.cli.commands.train import _calm_lightning
 from amvnet.cli.console import on_terminal, say
-from amvnet.cli.options import listed, meet, names_in, open_data
+from amvnet.cli.options import describe_records, join_processes, open_data, parse_names
 
 
 def ablate(
@@ -34,10 +34,10 @@ def ablate(
     from amvnet.training.studies import ablate as compare
 
     _calm_lightning()
-    processes = meet(device_of(recipe.training.accelerator) == "cuda")
+    processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     dataset = open_data(data, None)
-    learnt, val = split_records(dataset, names_in(train_sequences), names_in(val_sequences))
-    say(f"training on {listed(learnt)}; scoring on {listed(val)}")
+    learnt, val = split_records(dataset, parse_names(train_sequences), parse_names(val_sequences))
+    say(f"training on {describe_records(learnt)}; scoring on {describe_records(val)}")
     rows = list(compare(recipe, dataset, learnt, val, out, say, on_terminal(), device, processes))
     if processes.first:
         files = charts.write_ablation(rows, out / "ablation")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.commands.train import _calm_lightning
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import names_in, numbers_in, open_data
+from amvnet.cli.options import open_data, parse_names, parse_numbers
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def analyze(
         device: cpu, cuda, cuda:1, ...
     """
     from amvnet.config.recipes import load_recipe
-    from amvnet.data.datasets.select import check_classes, choose_records, own_classes
+    from amvnet.data.datasets.select import check_classes, choose_records, custom_taxonomy
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as score
     from amvnet.files import make_folder
@@ -54,15 +54,15 @@ def analyze(
             "expected --neighbours and --recipe together, found one of them; give both or neither"
         )
     given = load(weights)
-    dataset = open_data(data, None, own_classes(given.taxonomy))
+    dataset = open_data(data, None, custom_taxonomy(given.taxonomy))
     segmenter = Segmenter(given, device)
     check_classes(dataset, given.taxonomy)
-    records = choose_records(dataset, names_in(sequences), split)
+    records = choose_records(dataset, parse_names(sequences), split)
     heads: Iterable[Swept] = ()
     if recipe is not None:
         _calm_lightning()
-        learnt = dataset.records(names_in(train_sequences) or dataset.sequences("train"))
-        chosen, counts = load_recipe(recipe), numbers_in(str(neighbours))
+        learnt = dataset.records(parse_names(train_sequences) or dataset.sequences("train"))
+        chosen, counts = load_recipe(recipe), parse_numbers(str(neighbours))
         Run(chosen, dataset, learnt, records, out)  # so that nothing is scored in vain
         heads = sweep_neighbours(chosen, given, dataset, learnt, records, counts, out, say, device)
     make_folder(out)

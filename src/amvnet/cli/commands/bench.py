@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Literal
 
 from amvnet.cli.console import console, progress
-from amvnet.cli.options import names_in
+from amvnet.cli.options import parse_names
 
 PrecisionName = Literal["float32", "bfloat16", "float16"]
 
@@ -40,8 +40,8 @@ def bench(
     from amvnet.cli.tables import timing_table
     from amvnet.config.recipes import load_recipe
     from amvnet.data.scan_files import read_scan, write_labels
-    from amvnet.export.engines import engage
-    from amvnet.files import whole_file
+    from amvnet.export.engines import use_engine
+    from amvnet.files import atomic_write
     from amvnet.inference.segmenter import Segmenter
     from amvnet.inference.timing import UNCERTAIN, Job, time_jobs, untrained
     from amvnet.simulation import simulate as write
@@ -56,9 +56,9 @@ def bench(
             Path(folder) / "labels.label",
         )
         jobs = []
-        for engine in names_in(engines) or []:
+        for engine in parse_names(engines) or []:
             segmenter = Segmenter(given, device, precision=precision)
-            name = engage(segmenter, engine)
+            name = use_engine(segmenter, engine)
             name = name if precision == "float32" else f"{name}, {precision}"
             jobs.append(
                 Job(
@@ -73,5 +73,5 @@ def bench(
             reports = time_jobs(jobs, runs, step)
     console.print(*(timing_table(report) for report in reports), sep="\n")
     if json is not None:
-        with whole_file(json) as part:
+        with atomic_write(json) as part:
             part.write_text(dumps(reports, indent=1))

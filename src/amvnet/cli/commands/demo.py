@@ -37,7 +37,7 @@ def demo(out: Path = Path("demo"), seed: int | None = None, weights: str = WEIGH
     with progress("segmenting") as step:
         segment([str(out / "data")], segmenter, out / "predictions", progress=step)
     with progress("scoring") as step:
-        label = jobs.by_weights(dataset, segmenter)
+        label = jobs.label_by_weights(dataset, segmenter)
         found = jobs.evaluate(dataset, records, label, out / "pictures", step)
     show_evaluation(
         found, f"simulated streets, seed {seed}", dataset.taxonomy, out / "metrics.json"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.commands.predict import PrecisionName
 from amvnet.cli.console import console, progress
-from amvnet.cli.options import meet, methods_in, names_in, open_data
+from amvnet.cli.options import join_processes, open_data, parse_methods, parse_names
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def evaluate(
         device: cpu, cuda, cuda:1, ...
         precision: of the networks; float16 on a GPU only.
     """
-    from amvnet.data.datasets.select import choose_records, own_classes
+    from amvnet.data.datasets.select import choose_records, custom_taxonomy
     from amvnet.evaluation import scoring as jobs
     from amvnet.files import make_folder
     from amvnet.inference.methods import widest_method
@@ -55,15 +55,15 @@ def evaluate(
         raise InputError(
             "expected either --weights or --predictions, found both or neither; give one of them"
         )
-    processes = meet()
+    processes = join_processes()
     given = None if weights is None else load(weights)
-    dataset = open_data(data, taxonomy, None if given is None else own_classes(given.taxonomy))
-    records = choose_records(dataset, names_in(sequences), split)
+    dataset = open_data(data, taxonomy, None if given is None else custom_taxonomy(given.taxonomy))
+    records = choose_records(dataset, parse_names(sequences), split)
     if given is not None:
         segmenter = Segmenter(given, processes.device(device), widest_method(given), precision)
-        label = jobs.by_weights(dataset, segmenter, methods_in(methods))
+        label = jobs.label_by_weights(dataset, segmenter, parse_methods(methods))
     else:
-        label = jobs.by_files(dataset, Path(str(predictions)))
+        label = jobs.label_from_files(dataset, Path(str(predictions)))
     for path in (json, pictures):  # so that nothing is scored in vain
         if path is not None:
             make_folder(path.parent)
@@ -78,10 +78,10 @@ def show_evaluation(
 ) -> None:
     """Print the table, and write the same figures as JSON."""
     from amvnet.cli.tables import evaluation_table
-    from amvnet.files import whole_file
+    from amvnet.files import atomic_write
 
     figures = evaluation.report(dataset)
     console.print(evaluation_table(figures, taxonomy))
     if path is not None:
-        with whole_file(path) as part:
+        with atomic_write(path) as part:
             part.write_text(json.dumps(figures, indent=1))

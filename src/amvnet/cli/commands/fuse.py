@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import names_in, scores_in
+from amvnet.cli.options import parse_names, parse_scores
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,16 +47,16 @@ def fuse(
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the head's or data's.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
     """
-    from amvnet.inference.fuse_files import fuse as run
+    from amvnet.inference.fuse_files import fuse_files as run
     from amvnet.weights.file import load
 
-    pair = scores_in(scores_a, scores_b, key_a, key_b, logits)
+    pair = parse_scores(scores_a, scores_b, key_a, key_b, logits)
     assert pair is not None
     given = None if head is None else load(head)
     classes = _classes(inputs, taxonomy, given)
     with progress("fusing") as step:
         written, uncertain = run(
-            inputs, pair, given, classes, out, names_in(sequences), step, split, tau, topic
+            inputs, pair, given, classes, out, parse_names(sequences), step, split, tau, topic
         )
     say(f"{written} label files in {out}; the two models disagree on {uncertain:.1%} of the points")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import meet, names_in
+from amvnet.cli.options import join_processes, parse_names
 
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 EngineName = Literal["auto", "torch", "compile", "onnx"]
@@ -65,13 +65,13 @@ def predict(
         rotate: of lone scans, yaw,pitch,roll in degrees that turn them level.
         offset: of lone scans, metres to add to x,y,z after that.
     """
-    from amvnet.export.engines import engage
+    from amvnet.export.engines import use_engine
     from amvnet.inference.predict import predict as segment
     from amvnet.inference.segmenter import Segmenter
-    from amvnet.sensors.adapt import Fitting
-    from amvnet.sensors.lidars import describe
+    from amvnet.sensors.adapt import ScanAdapter
+    from amvnet.sensors.lidars import make_sensor
 
-    processes = meet()
+    processes = join_processes()
     options = {
         "height": height,
         "intensity_scale": intensity_scale,
@@ -79,10 +79,10 @@ def predict(
         "rotate": rotate,
         "offset": offset,
     }
-    given = describe(sensor, **options)
+    given = make_sensor(sensor, **options)
     segmenter = Segmenter(weights, processes.device(device), method, precision)
-    engage(segmenter, engine)
-    fitting, chosen = Fitting(segmenter.weights, given, say), names_in(sequences)
+    use_engine(segmenter, engine)
+    fitting, chosen = ScanAdapter(segmenter.weights, given, say), parse_names(sequences)
     with progress("segmenting") as step:
         written = segment(
             inputs, segmenter, out, chosen, scores, step, split, topic, fitting, resume, processes, format, uncertain,

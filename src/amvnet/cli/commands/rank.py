@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import names_in, open_data
+from amvnet.cli.options import open_data, parse_names
 
 
 def rank(
@@ -31,7 +31,7 @@ def rank(
         pictures: folder for drawings of the first clusters from above.
         device: cpu, cuda, cuda:1, ...
     """
-    from amvnet.data.datasets.select import choose_records, own_classes
+    from amvnet.data.datasets.select import choose_records, custom_taxonomy
     from amvnet.files import make_folder
     from amvnet.inference.methods import widest_method
     from amvnet.inference.segmenter import Segmenter
@@ -40,8 +40,8 @@ def rank(
     from amvnet.weights.file import load
 
     given = load(weights)
-    dataset = open_data(data, None, own_classes(given.taxonomy))
-    records = choose_records(dataset, names_in(sequences), split)
+    dataset = open_data(data, None, custom_taxonomy(given.taxonomy))
+    records = choose_records(dataset, parse_names(sequences), split)
     segmenter = Segmenter(given, device, widest_method(given))
     for folder in (
         out.parent,
@@ -50,7 +50,7 @@ def rank(
         make_folder(folder)
     with progress("scoring") as step:
         found = ranking.rank(dataset, records, segmenter, by, step)
-    scans = ranking.write(found, dataset.taxonomy, out)
+    scans = ranking.write_ranking(found, dataset.taxonomy, out)
     say(f"{len(found.clusters)} clusters in {out}, {len(records)} scans in {scans}")
     if pictures is not None:
         say(f"{len(draw(found, dataset, segmenter, by, pictures))} pictures in {pictures}")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import names_in, open_data
+from amvnet.cli.options import open_data, parse_names
 from amvnet.errors import InputError
 
 
@@ -42,7 +42,7 @@ def submit(
     from amvnet.submission.rules import Sources, rules_for
 
     sources = Sources(use_camera, use_lidar, use_radar, use_map, use_external)
-    rules = rules_for(open_data(data, None), split, names_in(sequences))
+    rules = rules_for(open_data(data, None), split, parse_names(sequences))
     if sources != Sources() and (check is not None or rules.meta is None):
         raise InputError(
             "expected no --use-... but to write an archive for nuScenes, found one; leave it out"

@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from amvnet.cli.console import on_terminal, say
-from amvnet.cli.options import listed, meet, names_in, open_data, scores_in
+from amvnet.cli.options import (
+    describe_records,
+    join_processes,
+    open_data,
+    parse_names,
+    parse_scores,
+)
 
 
 def train(
@@ -54,14 +60,14 @@ def train(
     from amvnet.weights import file as weights
 
     _calm_lightning()
-    processes = meet(device_of(recipe.training.accelerator) == "cuda")
+    processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     dataset = open_data(data, taxonomy)
     learnt, val = split_records(
-        dataset, names_in(train_sequences), names_in(val_sequences), with_val
+        dataset, parse_names(train_sequences), parse_names(val_sequences), with_val
     )
-    say(f"training on {listed(learnt)}; validating on {listed(val)}")
+    say(f"training on {describe_records(learnt)}; validating on {describe_records(val)}")
     given = None if init is None else weights.load(init)
-    pair = scores_in(scores_a, scores_b, key_a, key_b, logits)
+    pair = parse_scores(scores_a, scores_b, key_a, key_b, logits)
     run = Run(recipe, dataset, learnt, val, out, resume, say, on_terminal(), processes, pair)
     if dry_run:
         for trial in run.trials(stage):

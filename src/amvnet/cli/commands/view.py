@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import names_in
+from amvnet.cli.options import parse_names
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def view(
     if weights is not None:
         given = load(weights)
         segmenter = Segmenter(given, device, widest_method(given))
-    chosen = choose_frames(inputs, scans, segmenter, labels, taxonomy, names_in(sequences))
+    chosen = choose_frames(inputs, scans, segmenter, labels, taxonomy, parse_names(sequences))
     _show(chosen, _title(inputs, weights), html, save)
 
 

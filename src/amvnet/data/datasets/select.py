@@ -9,7 +9,7 @@ from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
 
 
-def own_classes(taxonomy: Taxonomy) -> Taxonomy | None:
+def custom_taxonomy(taxonomy: Taxonomy) -> Taxonomy | None:
     """A user's own classes, with which a data set has to be read; None for those of a benchmark."""
     return taxonomy if taxonomy.name not in TAXONOMIES else None
 

@@ -106,7 +106,7 @@ def _no_points(xyz: np.ndarray) -> str:
     )
 
 
-def check_number(count: int, path: Path | str, least: int = 0) -> int:
+def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
     """Hand back a number of points that a header claims, if a scan can have so many.
 
     Args:
@@ -145,7 +145,7 @@ def refusing(path: Path | str, expected: str, advice: str) -> Iterator[None]:
         ) from None
 
 
-def picked(names: Sequence[str]) -> dict[str, int]:
+def find_columns(names: Sequence[str]) -> dict[str, int]:
     """Which of a file's columns are x, y, z, intensity and ring, by their names; the last two can be missing."""
     lower = [name.lower() for name in names]
     found = {
@@ -155,9 +155,9 @@ def picked(names: Sequence[str]) -> dict[str, int]:
     return {key: places[0] for key, places in found.items() if places}
 
 
-def picked_or_refused(names: Sequence[str], path: Path | str) -> dict[str, int]:
+def require_columns(names: Sequence[str], path: Path | str) -> dict[str, int]:
     """The same; raises InputError where x, y or z is missing."""
-    found = picked(names)
+    found = find_columns(names)
     if not {"x", "y", "z"} <= set(found):
         shown = ", ".join(names[:20]) or "none"
         raise InputError(
@@ -166,7 +166,7 @@ def picked_or_refused(names: Sequence[str], path: Path | str) -> dict[str, int]:
     return found
 
 
-def cloud_of(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
+def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     """A cloud of the columns x, y, z and, where there are any, intensity and ring."""
     wide = any(
         columns[axis].dtype.itemsize > 4 or columns[axis].dtype.kind in "iu" for axis in "xyz"
@@ -174,11 +174,11 @@ def cloud_of(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     xyz = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(
         np.float64 if wide else np.float32
     )
-    return Cloud(xyz, columns.get("intensity"), rings(columns.get("ring")), name)
+    return Cloud(xyz, columns.get("intensity"), ring_indices(columns.get("ring")), name)
 
 
 @np.errstate(invalid="ignore")
-def rings(values: np.ndarray | None) -> np.ndarray | None:
+def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
     """(N,) int64 ring indices, or None where the values are no such thing; what is not finite counts as 0."""
     if values is None or not len(values):
         return None

@@ -66,7 +66,7 @@ def is_bag_folder(path: Path) -> bool:
     )
 
 
-def is_scan(path: Path) -> bool:
+def is_scan_file(path: Path) -> bool:
     """Whether the name of a file in a folder says that it is a scan or a bag, and not what was found of one."""
     if path.name.startswith(".") or path.name.endswith(".uncertain.npy"):
         return False
@@ -118,7 +118,7 @@ def read_cloud(path: Path | str) -> Cloud:
     return bag.read(0)
 
 
-def named_scans(path: Path, topic: str | None = None) -> Iterator[NamedScan]:
+def scans_in_file(path: Path, topic: str | None = None) -> Iterator[NamedScan]:
     """The scans of a file: itself, or those of a bag, in order of time.
 
     Args:
@@ -129,14 +129,16 @@ def named_scans(path: Path, topic: str | None = None) -> Iterator[NamedScan]:
     """
     ending = ending_of(path)
     if ending in READERS:
-        yield NamedScan(stem(path), str(path.parent / f"*{ending}"), lambda: READERS[ending](path))
+        yield NamedScan(
+            scan_stem(path), str(path.parent / f"*{ending}"), lambda: READERS[ending](path)
+        )
         return
     bag = Bag(path, ending, topic)
     for place in range(len(bag)):
-        yield NamedScan(f"{stem(path)}/{place:06d}", str(path), partial(bag.read, place))
+        yield NamedScan(f"{scan_stem(path)}/{place:06d}", str(path), partial(bag.read, place))
 
 
-def stem(path: Path) -> str:
+def scan_stem(path: Path) -> str:
     """A scan file's name without its ending, `.pcd.bin` included."""
     name = path.absolute().name if path.name in ("", "..") else path.name
     found = next((ending for ending in ENDINGS if name.lower().endswith(ending)), path.suffix)

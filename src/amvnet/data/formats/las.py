@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, refusing
+from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, refusing
 from amvnet.errors import InputError
 
 ADVICE = "write the file again"
@@ -36,7 +36,7 @@ def read_las(path: Path) -> Cloud:
         raise InputError(
             f"{path}: expected {count} points, found {len(columns['x'])}; the file is truncated, copy it again"
         )
-    return cloud_of(columns, str(path))
+    return make_cloud(columns, str(path))
 
 
 def _check_header(path: Path) -> tuple[int, bool]:
@@ -56,7 +56,7 @@ def _check_header(path: Path) -> tuple[int, bool]:
             f"{path}: expected points after {records} records, found {end} bytes in all; {ADVICE}"
         )
     compressed = bool(kind & COMPRESSED)
-    return check_number(count, path, 0 if compressed else begin + row * count), compressed
+    return check_point_count(count, path, 0 if compressed else begin + row * count), compressed
 
 
 def _require_laspy(path: Path) -> None:

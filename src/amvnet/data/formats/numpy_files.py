@@ -11,11 +11,11 @@ import numpy as np
 
 from amvnet.data.formats.cloud import (
     Cloud,
-    check_number,
-    cloud_of,
-    picked_or_refused,
+    check_point_count,
+    make_cloud,
     refusing,
-    rings,
+    require_columns,
+    ring_indices,
 )
 from amvnet.data.formats.raw import ring_column
 from amvnet.errors import InputError
@@ -75,7 +75,7 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
         raise InputError(
             f"{path}: expected {length} bytes for its shape {shape}, found {size}; {ADVICE}"
         )
-    check_number(math.prod(shape[:1] if len(shape) < 3 else shape[:-1]), path)
+    check_point_count(math.prod(shape[:1] if len(shape) < 3 else shape[:-1]), path)
     flat = np.frombuffer(file.read(length), dtype)
     return flat.reshape(shape, order="F" if fortran else "C")
 
@@ -83,8 +83,8 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
 def _cloud(array: np.ndarray, path: Path) -> Cloud:
     if array.dtype.names is not None:
         flat, names = array.ravel(), array.dtype.names
-        return cloud_of(
-            {key: flat[names[i]] for key, i in picked_or_refused(names, path).items()}, str(path)
+        return make_cloud(
+            {key: flat[names[i]] for key, i in require_columns(names, path).items()}, str(path)
         )
     if array.ndim not in (2, 3) or array.shape[-1] < 3:
         raise InputError(
@@ -94,7 +94,7 @@ def _cloud(array: np.ndarray, path: Path) -> Cloud:
     table = array.reshape(-1, array.shape[-1])
     found = {name: table[:, i] for i, name in enumerate(COLUMNS[: table.shape[1]])}
     what, ring = _others(table, array.ndim == 3, path)
-    cloud = cloud_of(found, str(path))
+    cloud = make_cloud(found, str(path))
     return Cloud(cloud.xyz, cloud.intensity, ring, cloud.name, note=_note(array, what))
 
 
@@ -107,7 +107,7 @@ def _others(table: np.ndarray, image: bool, path: Path) -> tuple[list[str], np.n
         return ["range"], None
     if table.shape[1] == 5 and not image:
         return ["ring"], ring_column(fifth, path)
-    found = rings(fifth)
+    found = ring_indices(fifth)
     return (["ring"], found) if found is not None and found.any() else ([], None)
 
 

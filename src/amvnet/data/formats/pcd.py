@@ -12,7 +12,13 @@ from typing import BinaryIO
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused, refusing
+from amvnet.data.formats.cloud import (
+    Cloud,
+    check_point_count,
+    make_cloud,
+    refusing,
+    require_columns,
+)
 from amvnet.errors import InputError
 
 HEADER = 65_536  # bytes that a header has at most
@@ -60,9 +66,9 @@ def read_pcd(path: Path) -> Cloud:
     """
     with refusing(path, "a PCD file", ADVICE), path.open("rb") as file:
         header = _read_header(file, path)
-        wanted = picked_or_refused([column.name for column in header.columns], path)
+        wanted = require_columns([column.name for column in header.columns], path)
         columns = {key: header.columns[place] for key, place in wanted.items()}
-        return cloud_of(READERS[header.encoding](file, header, columns, path), str(path))
+        return make_cloud(READERS[header.encoding](file, header, columns, path), str(path))
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
@@ -108,7 +114,7 @@ def _read_ascii(
     file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
 ) -> dict[str, np.ndarray]:
     values = sum(column.count for column in header.columns)
-    count = check_number(header.points, path, 2 * values * header.points - 1)
+    count = check_point_count(header.points, path, 2 * values * header.points - 1)
     return read_text(
         file, count, {key: (column.place, column.dtype) for key, column in columns.items()}, path
     )
@@ -143,7 +149,7 @@ def _typed(values: np.ndarray, dtype: str) -> np.ndarray:
 def _read_binary(
     file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
 ) -> dict[str, np.ndarray]:
-    count = check_number(header.points, path, file.tell() + header.points * header.row)
+    count = check_point_count(header.points, path, file.tell() + header.points * header.row)
     return read_rows(
         file, count, header.row, {key: (c.dtype, c.offset) for key, c in columns.items()}
     )
@@ -168,7 +174,7 @@ def _read_compressed(
     file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
 ) -> dict[str, np.ndarray]:
     packed, unpacked = struct.unpack("<II", file.read(8))
-    count = check_number(header.points, path, file.tell() + packed)
+    count = check_point_count(header.points, path, file.tell() + packed)
     if unpacked != count * header.row or unpacked * SHORTEST > packed * LONGEST:
         raise InputError(
             f"{path}: expected {count * header.row} bytes of points, found {unpacked}; {ADVICE}"

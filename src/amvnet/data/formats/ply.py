@@ -11,7 +11,13 @@ from typing import BinaryIO
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused, refusing
+from amvnet.data.formats.cloud import (
+    Cloud,
+    check_point_count,
+    make_cloud,
+    refusing,
+    require_columns,
+)
 from amvnet.data.formats.pcd import HEADER, read_rows, read_text
 from amvnet.errors import InputError
 
@@ -52,9 +58,9 @@ def read_ply(path: Path) -> Cloud:
             raise InputError(
                 f"{path}: expected vertices without lists, found a list; write the points alone"
             )
-        wanted = picked_or_refused([name for name, _ in vertex.properties], path)
+        wanted = require_columns([name for name, _ in vertex.properties], path)
         read = _read_text if encoding == "ascii" else _read_binary
-        return cloud_of(
+        return make_cloud(
             read(file, elements[:before], vertex, wanted, ORDERS[encoding], path), str(path)
         )
 
@@ -96,7 +102,7 @@ def _read_text(
 ) -> dict[str, np.ndarray]:
     skipped = sum(element.count for element in before)
     least = 2 * (skipped + vertex.count * len(vertex.properties)) - 1
-    check_number(skipped + vertex.count, path, least)
+    check_point_count(skipped + vertex.count, path, least)
     for _ in range(skipped):
         file.readline()
     columns = {key: (place, order + vertex.properties[place][1]) for key, place in wanted.items()}
@@ -112,7 +118,7 @@ def _read_binary(
     path: Path,
 ) -> dict[str, np.ndarray]:
     skipped = sum(element.count * element.row for element in before)
-    check_number(vertex.count, path, file.tell() + skipped + vertex.count * vertex.row)
+    check_point_count(vertex.count, path, file.tell() + skipped + vertex.count * vertex.row)
     file.seek(skipped, 1)
     ends = np.cumsum([0, *(int(dtype[1:]) for _, dtype in vertex.properties)]).tolist()
     columns = {

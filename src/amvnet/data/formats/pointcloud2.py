@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_number, cloud_of, picked_or_refused
+from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, require_columns
 from amvnet.errors import InputError
 
 TYPES = {
@@ -28,11 +28,10 @@ def read_message(message: Any, name: str) -> Cloud:
         InputError: where there is no x, y, z, or the data are shorter than the message claims.
     """
     height, width, step = message.height, message.width, message.point_step
-    count = check_number(height * width, name)
+    count = check_point_count(height * width, name)
     fields = list(message.fields)
     wanted = {
-        key: fields[i]
-        for key, i in picked_or_refused([field.name for field in fields], name).items()
+        key: fields[i] for key, i in require_columns([field.name for field in fields], name).items()
     }
     order = ">" if message.is_bigendian else "<"
     point = np.dtype(
@@ -50,4 +49,4 @@ def read_message(message: Any, name: str) -> Cloud:
         )
     data = np.ascontiguousarray(message.data) if count else b""
     table = np.ndarray((height, width), point, data, strides=(row, step)).ravel()
-    return cloud_of({key: table[key] for key in wanted}, name)
+    return make_cloud({key: table[key] for key in wanted}, name)

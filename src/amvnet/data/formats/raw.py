@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.formats.cloud import MAX_POINTS, MOST_RINGS, Cloud, check_number
+from amvnet.data.formats.cloud import MAX_POINTS, MOST_RINGS, Cloud, check_point_count
 from amvnet.errors import InputError
 
 KITTI_COLUMNS = 4  # x, y, z, intensity
@@ -25,7 +25,7 @@ def read_raw(path: Path) -> Cloud:
         InputError: where the file is no whole number of rows, or has five columns and the last is no ring.
     """
     columns = columns_of(path) or (NUSCENES_COLUMNS if _named_nuscenes(path) else KITTI_COLUMNS)
-    check_number(count_rows(path, np.float32, columns), path)
+    check_point_count(count_rows(path, np.float32, columns), path)
     table = read_table(path, np.float32, columns)
     ring = None if columns == KITTI_COLUMNS else ring_column(table[:, 4], path)
     full = FULL_INTENSITY if ring is not None and _named_nuscenes(path) else None
