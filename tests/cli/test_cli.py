@@ -196,8 +196,8 @@ def test_a_recipe_counts_wherever_it_stands(
     )
     assert code in (0, 2)
     if code == 0:
-        assert made[0].recipe.model.range_view.width == 64
-        assert made[0].recipe.training.rv.epochs == 3
+        assert made[0].plan.recipe.model.range_view.width == 64
+        assert made[0].plan.recipe.training.rv.epochs == 3
 
 
 # ---- predict

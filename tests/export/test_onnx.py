@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.inference.methods import Method
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.methods import Method
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan

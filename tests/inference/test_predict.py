@@ -7,20 +7,25 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.inference import predict as prediction
+from amvnet.inference.inputs import InputScan, adapter_for
 from amvnet.inference.journal import Journal
-from amvnet.inference.pipeline import AHEAD, Task, stream
+from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
+from amvnet.inference.predict import NetworkSegmentation
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
 from amvnet.weights.file import save
 
+from fixtures.counted_scans import Counter, counted_scans
 from fixtures.worlds import files, fresh_weights, make_streets, run_cli, street
 
 WEIGHTS = "w.safetensors"
@@ -92,8 +97,15 @@ def test_a_killed_run_goes_on_where_it_stopped(
 ) -> None:
     """SIGKILL in the midst of it, once or twice; what is done is not done again, and the end is the same."""
     out = tmp_path / "out"
-    slow = "import time; from amvnet import streaming, cli; write = streaming._write\n"
-    slow += "streaming._write = lambda *a: (time.sleep(0.1), write(*a))\nimport sys; sys.exit(cli.main())"
+    slow = """
+import sys, time
+from amvnet.cli.main import main
+from amvnet.inference.pipeline import Pipeline
+
+write = Pipeline._write
+Pipeline._write = lambda *arguments: (time.sleep(0.1), write(*arguments))
+sys.exit(main())
+"""
     arguments = [
         "predict",
         str(world / "scans"),
@@ -202,35 +214,28 @@ def test_a_part_of_a_folder_is_labelled_as_in_the_whole(
 def settings_of(world: Path) -> dict[str, object]:
     weights = Segmenter(str(world / WEIGHTS)).weights
     parts = {part: weights.digest(part) for part in weights.parts}
-    sensor = repr(prediction.ScanAdapter(weights).given)
+    sensor = repr(adapter_for(weights).given)
     kept = {"scores": False, "uncertain": False, "format": "label"}
     return {"weights": parts, "method": "amvnet", "sensor": sensor, **kept}
 
 
 @pytest.mark.parametrize("at_once", [1, 3])
-def test_few_scans_are_in_memory_however_many_there_are(world: Path, at_once: int) -> None:
+def test_few_scans_are_in_memory_however_many_there_are(
+    world: Path, tmp_path: Path, at_once: int
+) -> None:
     """Counted: those that are read and not yet written."""
-    held, most = set(), []
-    segmenter = Segmenter(str(world / WEIGHTS))
-
-    def task(place: int) -> Task:
-        def read() -> object:
-            held.add(place)
-            most.append(len(held))
-            return Scan(street(place)[0])
-
-        def write(result: object) -> Path:
-            time.sleep(0.02)  # slower than the reading
-            held.remove(place)
-            return Path()
-
-        return Task(str(place), read, segmenter, write, Path())  # type: ignore[arg-type]
-
-    tasks = [task(place) for place in range(30)]
-    done = [one.name for one, fault in stream(tasks, False, False, at_once=at_once) if not fault]
-    assert done == [str(place) for place in range(30)]
-    assert max(most) <= 2 * AHEAD + 2 * at_once
-    assert not held
+    counter = Counter()
+    scans = counted_scans(30, counter, seconds_to_write=0.02)  # slower than the reading
+    pipeline = Pipeline(
+        NetworkSegmentation(Segmenter(str(world / WEIGHTS))),
+        OutputOptions(tmp_path),
+        SEMANTICKITTI,
+        ExecutionOptions(at_once=at_once),
+    )
+    done = [scan.name for scan, fault in pipeline.stream(scans) if fault is None]
+    assert done == [str(index) for index in range(30)]
+    assert counter.most <= 2 * AHEAD + 2 * at_once
+    assert not counter.held
 
 
 def test_what_a_killed_run_left_half_written_is_taken_away(
@@ -266,16 +271,29 @@ def test_scans_side_by_side_get_the_labels_they_get_one_by_one(
     assert torch.get_num_threads() == threads
 
 
-def test_scans_side_by_side_really_run_at_the_same_time() -> None:
+def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
     """Each waits for the other."""
     both = threading.Barrier(2, timeout=30)
 
-    def segment(scan: Scan) -> Segmentation:
+    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
         both.wait()
-        return Segmentation(*np.zeros((3, len(scan))))
+        return [Segmentation(*np.zeros((3, len(scan)))) for scan in scans]
 
-    tasks = [
-        Task(str(n), lambda: Scan(np.zeros((5, 4), np.float32)), segment, lambda _: Path(), Path())
-        for n in (0, 1)
-    ]
-    assert [fault for _, fault in stream(tasks, False, False, at_once=2)] == [None, None]
+    pipeline = Pipeline(
+        segment, OutputOptions(tmp_path), SEMANTICKITTI, ExecutionOptions(at_once=2)
+    )
+    scans = counted_scans(2, Counter())
+    assert [fault for _, fault in pipeline.stream(scans)] == [None, None]
+
+
+def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> None:
+    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+        if any(scan_input.name == "3" for scan_input in inputs):
+            raise InputError("3: broken")
+        return [Segmentation(*np.zeros((3, len(scan)))) for scan in scans]
+
+    output = OutputOptions(tmp_path)
+    pipeline = Pipeline(segment, output, SEMANTICKITTI, ExecutionOptions(batch=4))
+    faults = {scan.name: fault for scan, fault in pipeline.stream(counted_scans(8, Counter()))}
+    assert {name for name, fault in faults.items() if fault} == {"3"}
+    assert faults["3"] == "3: broken"

@@ -12,7 +12,7 @@ import pytest
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
 from amvnet.data.taxonomy import NUSCENES
-from amvnet.inference.methods import METHODS
+from amvnet.models.methods import METHODS
 from amvnet.weights.file import save
 
 from fixtures.worlds import THRESHOLD, fails, fresh_weights, street, without
@@ -125,7 +125,7 @@ def test_scores_that_are_no_numbers_are_refused() -> None:
 
 
 def test_by_method_is_what_each_method_gives_alone(segmenter: Segmenter) -> None:
-    found, uncertain = segmenter.by_method(Scan(POINTS))
+    found, uncertain = segmenter.labels_by_method(Scan(POINTS))
     for method, labels in found.items():
         assert np.array_equal(labels, Segmenter(WEIGHTS, method=method)(POINTS).labels)
     assert np.array_equal(uncertain, segmenter(POINTS).uncertain)
@@ -202,7 +202,7 @@ def test_each_method_has_its_own_scores(result: Segmentation) -> None:
 
 def test_by_method_equals_each_method(segmenter: Segmenter) -> None:
     points, _ = lost(POINTS)
-    found, uncertain = segmenter.by_method(Scan(points), METHODS)
+    found, uncertain = segmenter.labels_by_method(Scan(points), METHODS)
     assert list(found) == list(METHODS)
     for method, labels in found.items():
         assert np.array_equal(labels, Segmenter(WEIGHTS, method=method)(points).labels)
@@ -213,7 +213,7 @@ def test_by_method_equals_each_method(segmenter: Segmenter) -> None:
 def test_by_method_of_one_network_is_that_network(part: str) -> None:
     method = {"range_net": "rv", "polar_net": "bev"}[part]
     alone = without(WEIGHTS, "point_head", *({"range_net", "polar_net"} - {part}))
-    found, uncertain = Segmenter(alone, method=method).by_method(Scan(POINTS))
+    found, uncertain = Segmenter(alone, method=method).labels_by_method(Scan(POINTS))
     assert (list(found), uncertain) == ([method], None)
     assert np.array_equal(found[method], Segmenter(WEIGHTS, method=method)(POINTS).labels)
 

@@ -96,7 +96,7 @@ def test_every_scan_is_in_the_page_as_it_is(world: Path, dataset: SemanticKitti)
         )
         assert scan.labels is not None
         np.testing.assert_array_equal(planes["truth"], scan.labels)
-        labels, uncertain = segmenter.by_method(scan)
+        labels, uncertain = segmenter.labels_by_method(scan)
         assert list(labels) == ["rv", "bev", "ensemble", "amvnet"]
         for method, ids in labels.items():
             np.testing.assert_array_equal(planes[method], ids)
@@ -437,7 +437,7 @@ def test_a_recording_reads_back(world: Path, tmp_path: Path, dataset: SemanticKi
     segmenter = Segmenter(world / "w.safetensors")
     for step, record in enumerate(dataset.records(["08"])):
         scan = dataset.read(record)
-        labels, uncertain = segmenter.by_method(scan)
+        labels, uncertain = segmenter.labels_by_method(scan)
         assert uncertain is not None
         assert scan.labels is not None
         wrong = (scan.labels > 0) & (labels["rv"] != scan.labels)
