@@ -20,7 +20,7 @@ from amvnet.errors import InputError
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan
 from amvnet.simulation.lidar import require_embree
-from amvnet.simulation.sensors import SENSORS, Sensor
+from amvnet.simulation.sensors import SENSORS, LidarModel
 
 Progress = Callable[[int, int], None]  # scans done, in all
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -181,7 +181,7 @@ def _at_least(least: int, **numbers: int) -> None:
             raise InputError(f"simulate: expected {name} of {least} or more, found {value}; give a larger number")
 
 
-def _sensor(name: str) -> Sensor:
+def _sensor(name: str) -> LidarModel:
     if name not in SENSORS:
         raise InputError(f"sensor: expected one of {', '.join(SENSORS)}, found {name!r}; name one of these")
     return SENSORS[name]
