@@ -5,4 +5,12 @@ from amvnet.simulation.layouts import SimulatedScan
 from amvnet.simulation.sensors import SENSORS, LidarModel
 from amvnet.simulation.writing import simulate, simulate_scan
 
-__all__ = ["SENSORS", "Drive", "LidarModel", "SimulatedScan", "drive_street", "simulate", "simulate_scan"]
+__all__ = [
+    "SENSORS",
+    "Drive",
+    "LidarModel",
+    "SimulatedScan",
+    "drive_street",
+    "simulate",
+    "simulate_scan",
+]

@@ -20,7 +20,9 @@ def building(
     walls += _annexes(rng, width, depth, height)
     if rng.random() < 0.35:
         wing_height = height * rng.uniform(0.4, 0.7) + 1.5
-        walls.append(box((width * 0.5, depth * 0.6, wing_height), (width * 0.3, -depth * 0.5, -1.5)))
+        walls.append(
+            box((width * 0.5, depth * 0.6, wing_height), (width * 0.3, -depth * 0.5, -1.5))
+        )
 
     roof = _roof(rng, width, depth, height, flat)
     windows = _windows(rng, width, depth, height)

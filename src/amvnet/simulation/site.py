@@ -48,7 +48,9 @@ class Site:
     def is_free(self, x: float, t: float, margin: float) -> bool:
         """Return whether no side road is within the margin of a place."""
         px, py, _ = self.ground.pose_at(x, t)
-        distance = self.ground.distance_from_crossings(np.array([px]), np.array([py]), np.array([t]))
+        distance = self.ground.distance_from_crossings(
+            np.array([px]), np.array([py]), np.array([t])
+        )
         return bool(distance[0] > margin)
 
     def put(
