@@ -105,7 +105,7 @@ def _moving_mesh(site: Site, ego_x: float, time: float) -> Mesh:
 def _draw_pose(
     ground: Ground, sensor: LidarModel, x: float, t: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return the pose of the sensor above a place, tilted by the road and the suspension: (4, 4)."""
+    """Return the (4, 4) pose of the sensor above a place, tilted by road and suspension."""
     px, py, yaw = ground.pose_at(x, t)
     yaw += rng.normal(scale=0.02)
     forward = np.array([np.cos(yaw), np.sin(yaw)])

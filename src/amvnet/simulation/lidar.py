@@ -32,7 +32,7 @@ def require_embree() -> tuple[ModuleType, ModuleType]:
         from embreex import mesh_construction, rtcore_scene
     except ImportError as error:
         raise InputError(
-            "simulation: expected trimesh and embreex to cast rays, found that one is missing; "
+            "simulation: expected trimesh and embreex to cast rays, found at least one missing; "
             'run pip install "amvnet[simulate]"'
         ) from error
     return rtcore_scene, mesh_construction

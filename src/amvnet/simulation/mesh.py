@@ -71,8 +71,14 @@ class Mesh:
         return len(self.triangles)
 
 
-def part(triangles: np.ndarray, surface: Surface, label: Label | int, depth: float = 0) -> Mesh:
-    """Return triangles as a mesh of one surface and one class; see `Mesh` for the depth."""
+def part(
+    solids: Sequence[np.ndarray], surface: Surface, label: Label | int, depth: float = 0
+) -> Mesh:
+    """Return solids, (T, 3, 3) each, as one mesh of one surface and one class.
+
+    See `Mesh` for the depth.
+    """
+    triangles = np.concatenate(solids)
     count = len(triangles)
     return Mesh(
         triangles=triangles.astype(np.float32),
@@ -87,7 +93,7 @@ def part(triangles: np.ndarray, surface: Surface, label: Label | int, depth: flo
 def join(meshes: Sequence[Mesh]) -> Mesh:
     """Return several meshes as one; the result is empty if there are none."""
     if not meshes:
-        return part(np.zeros((0, 3, 3)), Surface.ASPHALT, 0)
+        return part([np.zeros((0, 3, 3))], Surface.ASPHALT, 0)
 
     columns = {}
     for column in fields(Mesh):
@@ -158,10 +164,11 @@ def tube(
 ) -> np.ndarray:
     """Return the (4 sides, 3, 3) triangles of a closed round bar between two points.
 
-    Its radius is `radius` at the start and, if given, `end_radius` at the end.
+    Its radius is `radius`, or goes from `radius` at the start to `end_radius` at the end.
     """
     if end_radius is None:
         end_radius = radius
+
     start_point = np.array(start, dtype=float)
     end_point = np.array(end, dtype=float)
     axis = (end_point - start_point) / np.linalg.norm(end_point - start_point)
@@ -200,6 +207,7 @@ def prism(
     """
     if top_width is None:
         top_width = width
+
     xz = np.array(profile, dtype=float)
     rise = (xz[:, 1] - xz[:, 1].min()) / np.ptp(xz[:, 1])
     half_width = 0.5 * (width + rise * (top_width - width))

@@ -214,7 +214,7 @@ def _park_two_wheelers(site: Site) -> None:
 
 
 def _add_work_zones(site: Site) -> None:
-    """Put rows of barriers or cones at the edge of the road, with an excavator behind half of them."""
+    """Put rows of barriers or cones at the edge of the road, some with an excavator behind."""
     rng = site.rng
     ground = site.ground
     style = ground.style

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh, join, part
+from amvnet.simulation.mesh import Mesh, part
 from amvnet.simulation.styles import Style
 
 # 2 pi, rounded. The exact value would change every street that a seed stands for.
@@ -217,10 +217,10 @@ class Ground:
         return 0.8 * self._tints[label] + 0.8 * pattern * np.sin(0.33 * y + 0.05 * x)
 
     def mesh(self) -> Mesh:
-        """Return the ground as triangles of class 0: a fine grid near the road, a coarse one around."""
+        """Return the ground as triangles of class 0: a fine grid along the road in a coarse one."""
         fine = self._grid(FINE_STEP, FINE_REACH, 0.0)
         coarse = self._grid(COARSE_STEP, COARSE_REACH, COARSE_DROP)
-        return join([part(fine, Surface.GRASS, 0), part(coarse, Surface.GRASS, 0)])
+        return part([fine, coarse], Surface.GRASS, 0)
 
     def _grid(self, step: float, reach: float, drop: float) -> np.ndarray:
         """Return the (T, 3, 3) triangles of a square grid up to `reach` from the middle line."""

@@ -27,6 +27,7 @@ class CarShape:
     roof: float
 
 
+# The types of cars and their shares.
 CAR_SHAPES = (
     CarShape(4.0, 1.70, 1.47, belt=0.92, bonnet=0.22, boot=0.02, roof=0.72),  # hatchback
     CarShape(4.6, 1.78, 1.43, belt=0.90, bonnet=0.25, boot=0.17, roof=0.58),  # saloon
@@ -47,23 +48,25 @@ def car(rng: np.random.Generator) -> Mesh:
     rear = -half + shape.length * shape.boot  # x of the cabin's rear end
     paint = Surface.LIGHT_PAINT if rng.random() < 0.45 else Surface.DARK_PAINT
 
-    # The cabin: windows all round, and the roof on top of them, moved back by the lean.
+    # The cabin: windows on all sides, narrower towards the roof, which lies further back.
     window_height = shape.height - shape.belt - 0.06
-    lean = cabin * (1 - shape.roof) * rng.uniform(-0.35, 0.0)
+    shift = cabin * (1 - shape.roof) * rng.uniform(-0.35, 0.0)
     window_size = (cabin, shape.width * 0.94, window_height)
-    windows = box(window_size, (rear + cabin / 2, 0, shape.belt), (shape.roof, 0.84), lean)
+    window_base = (rear + cabin / 2, 0, shape.belt)
+    windows = box(window_size, window_base, top=(shape.roof, 0.84), shift=shift)
     roof_size = (cabin * shape.roof, shape.width * 0.80, 0.07)
-    roof_base = (rear + cabin / 2 + lean, 0, shape.belt + window_height)
-    roof = box(roof_size, roof_base, (0.9, 0.9))
+    roof_base = (rear + cabin / 2 + shift, 0, shape.belt + window_height)
+    roof = box(roof_size, roof_base, top=(0.9, 0.9))
 
     body = prism(_lower_body(shape), shape.width, shape.width * 0.95)
-    painted = np.concatenate([body, roof, *_pillars(shape, rear, cabin)])
+    pillars = _pillars(shape, rear, cabin)
     plates = copies(box((0.04, 0.5, 0.11)), x=[-(half + 0.01), half + 0.01], z=0.5)
+
     mesh = join(
         [
-            part(painted, paint, Label.CAR),
-            part(windows, Surface.GLASS, Label.CAR),
-            part(plates, Surface.PLATE, Label.CAR),
+            part([body, roof, *pillars], paint, Label.CAR),
+            part([windows], Surface.GLASS, Label.CAR),
+            part([plates], Surface.PLATE, Label.CAR),
             _wheels(Label.CAR, shape.length, shape.width, 0.32, (-0.31, 0.31)),
         ]
     )
@@ -101,14 +104,14 @@ def _pillars(shape: CarShape, rear: float, cabin: float) -> list[np.ndarray]:
 def _wheels(
     label: Label, length: float, width: float, radius: float, axles: tuple[float, ...]
 ) -> Mesh:
-    """Return two wheels an axle; `axles` are their places as shares of the length."""
+    """Return two wheels per axle; `axles` are their x as shares of the length."""
     wheels = []
     for axle in axles:
         for side in (-1, 1):
             inside = (axle * length, side * (width / 2 - 0.2), radius)
             outside = (axle * length, side * (width / 2 + 0.01), radius)
             wheels.append(tube(inside, outside, radius))
-    return part(np.concatenate(wheels), Surface.RUBBER, label)
+    return part(wheels, Surface.RUBBER, label)
 
 
 def _scaled(mesh: Mesh, factor: float) -> Mesh:
@@ -122,17 +125,18 @@ def truck(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(2.7, 3.7)
     nose = length / 2
 
-    cab = box((2.0, width, 1.7), (nose - 1.0, 0, 0.6), (0.9, 0.95), -0.1)
+    cab = box((2.0, width, 1.7), (nose - 1.0, 0, 0.6), top=(0.9, 0.95), shift=-0.1)
     windscreen = box((0.05, width * 0.85, 0.8), (nose - 0.05, 0, 1.4))
     load_height = height - 1.0 if rng.random() < 0.75 else rng.uniform(0.5, 1.0)
     load = box((length - 2.3, width, load_height), (-1.15, 0, 1.0))
     frame = box((length - 0.5, width * 0.5, 0.4), (-0.2, 0, 0.6))
+
     paint = Surface.LIGHT_PAINT if rng.random() < 0.7 else Surface.DARK_PAINT
     return join(
         [
-            part(np.concatenate([cab, frame]), paint, Label.TRUCK),
-            part(load, Surface.PLASTIC, Label.TRUCK),
-            part(windscreen, Surface.GLASS, Label.TRUCK),
+            part([cab, frame], paint, Label.TRUCK),
+            part([load], Surface.PLASTIC, Label.TRUCK),
+            part([windscreen], Surface.GLASS, Label.TRUCK),
             _wheels(Label.TRUCK, length, width, 0.48, (-0.36, -0.22, 0.36)),
         ]
     )
@@ -148,10 +152,11 @@ def bus(rng: np.random.Generator) -> Mesh:
     post_x = np.linspace(-length / 2 + 0.2, length / 2 - 0.2, 7)
     posts = copies(box((0.25, width, 1.1)), x=post_x, z=1.3)
     windows = box((length * 0.98, width * 0.98, 1.1), (0, 0, 1.3))
+
     return join(
         [
-            part(np.concatenate([lower, upper, posts]), Surface.LIGHT_PAINT, Label.BUS),
-            part(windows, Surface.GLASS, Label.BUS),
+            part([lower, upper, posts], Surface.LIGHT_PAINT, Label.BUS),
+            part([windows], Surface.GLASS, Label.BUS),
             _wheels(Label.BUS, length, width, 0.48, (-0.28, 0.33)),
         ]
     )
@@ -161,11 +166,12 @@ def trailer(rng: np.random.Generator) -> Mesh:
     """Return a caravan or a flat trailer, which SemanticKITTI counts as another vehicle."""
     length = rng.uniform(2.5, 5.5)
     height = rng.choice([0.6, 1.9])
-    body = box((length, 2.0, height), (0, 0, 0.5), (0.95, 0.97))
+
+    body = box((length, 2.0, height), (0, 0, 0.5), top=(0.95, 0.97))
     drawbar = tube((length / 2, 0, 0.5), (length / 2 + 1.0, 0, 0.45), 0.06)
     return join(
         [
-            part(np.concatenate([body, drawbar]), Surface.LIGHT_PAINT, Label.TRAILER),
+            part([body, drawbar], Surface.LIGHT_PAINT, Label.TRAILER),
             _wheels(Label.TRAILER, length, 2.0, 0.33, (-0.05,)),
         ]
     )
@@ -173,23 +179,25 @@ def trailer(rng: np.random.Generator) -> Mesh:
 
 def excavator(rng: np.random.Generator) -> Mesh:
     """Return an excavator on tracks, its arm raised or lowered."""
-    turn = rng.uniform(-0.6, 0.6)  # y of the arm per metre of x
+    slope = rng.uniform(-0.6, 0.6)  # of the arm, y per x
     reach = rng.uniform(2.5, 4.0)
-    elbow = (1.2 + reach * 0.5, turn * reach * 0.5, rng.uniform(2.8, 4.0))
-    hand = (1.2 + reach, turn * reach, rng.uniform(0.3, 1.5))
+    elbow = (1.2 + reach * 0.5, slope * reach * 0.5, rng.uniform(2.8, 4.0))
+    hand_x = 1.2 + reach
+    hand_y = slope * reach
+    hand = (hand_x, hand_y, rng.uniform(0.3, 1.5))
 
     tracks = copies(box((3.4, 0.5, 0.8)), y=[-1.1, 1.1])
     body = box((2.8, 2.3, 1.0), (-0.5, 0, 0.9))
     upper_arm = tube((0.9, 0.3, 1.4), elbow, 0.22)
     lower_arm = tube(elbow, hand, 0.16)
-    bucket = box((0.7, 0.9, 0.5), (hand[0], hand[1], 0.2))
-    cab = box((1.4, 1.0, 1.5), (0.3, 0.6, 1.5), (0.9, 0.9))
+    bucket = box((0.7, 0.9, 0.5), (hand_x, hand_y, 0.2))
+    cab = box((1.4, 1.0, 1.5), (0.3, 0.6, 1.5), top=(0.9, 0.9))
 
-    solid = np.concatenate([tracks, body, upper_arm, lower_arm, bucket])
+    painted = [tracks, body, upper_arm, lower_arm, bucket]
     return join(
         [
-            part(solid, Surface.LIGHT_PAINT, Label.CONSTRUCTION_VEHICLE),
-            part(cab, Surface.GLASS, Label.CONSTRUCTION_VEHICLE),
+            part(painted, Surface.LIGHT_PAINT, Label.CONSTRUCTION_VEHICLE),
+            part([cab], Surface.GLASS, Label.CONSTRUCTION_VEHICLE),
         ]
     )
 
@@ -197,7 +205,7 @@ def excavator(rng: np.random.Generator) -> Mesh:
 def _human(
     rng: np.random.Generator, label: Label, hip: Vector, feet: tuple[Vector, Vector], lean: float
 ) -> Mesh:
-    """Return a human from the place of hip and feet; `lean` moves the shoulders forward."""
+    """Return a human with hip and feet at given places; `lean` moves the shoulders forward."""
     hip_x, _, hip_z = hip
     shoulder_x = hip_x + lean
     shoulder_z = hip_z + 0.55
@@ -205,6 +213,7 @@ def _human(
 
     torso = tube((hip_x, 0, hip_z - 0.05), (shoulder_x, 0.0, shoulder_z), 0.17, 0.21)
     head = tube((shoulder_x, 0, shoulder_z), (shoulder_x + 0.05, 0, shoulder_z + 0.32), 0.10, 0.09)
+
     legs = []
     arms = []
     for side, foot in zip((-1, 1), feet, strict=True):
@@ -213,8 +222,8 @@ def _human(
         hand = (hand_x, 0.28 * side, hip_z + 0.05)
         arms.append(tube(shoulder, hand, 0.055))
 
-    clothed = np.concatenate([torso, *legs, *arms])
-    return join([part(clothed, Surface.CLOTH, label), part(head, Surface.SKIN, label)])
+    clothed = part([torso, *legs, *arms], Surface.CLOTH, label)
+    return join([clothed, part([head], Surface.SKIN, label)])
 
 
 def person(rng: np.random.Generator) -> Mesh:
@@ -224,7 +233,8 @@ def person(rng: np.random.Generator) -> Mesh:
     human = _human(rng, Label.PERSON, (0, 0, 0.88), feet, rng.uniform(-0.02, 0.08))
 
     is_adult = rng.random() < 0.88
-    return _scaled(human, rng.uniform(0.95, 1.1) if is_adult else rng.uniform(0.6, 0.9))
+    scale = rng.uniform(0.95, 1.1) if is_adult else rng.uniform(0.6, 0.9)
+    return _scaled(human, scale)
 
 
 def _two_wheeler(label: Label, radius: float, rim: float, wheelbase: float) -> list[Mesh]:
@@ -245,30 +255,27 @@ def _two_wheeler(label: Label, radius: float, rim: float, wheelbase: float) -> l
         tube((front - 0.15, -0.28, 1.02), (front - 0.15, 0.28, 1.02), 0.025, sides=5),
         box((0.25, 0.14, 0.07), (-0.15, 0, 0.88)),
     ]
-    return [
-        part(np.concatenate(tyres), Surface.RUBBER, label),
-        part(np.concatenate(frame), Surface.METAL, label),
-    ]
+    return [part(tyres, Surface.RUBBER, label), part(frame, Surface.METAL, label)]
 
 
 def bicycle(rng: np.random.Generator, label: Label = Label.BICYCLE) -> Mesh:
     """Return a bicycle, sometimes with a basket."""
     pieces = _two_wheeler(label, radius=0.34, rim=0.06, wheelbase=1.05)
+
     if rng.random() < 0.4:
         basket = box((0.3, 0.3, 0.25), (0.55, 0, 0.8))
-        pieces.append(part(basket, Surface.METAL, label))
+        pieces.append(part([basket], Surface.METAL, label))
     return join(pieces)
 
 
 def motorcycle(rng: np.random.Generator, label: Label = Label.MOTORCYCLE) -> Mesh:
     """Return a motorcycle or a scooter."""
-    tank = box((0.6, 0.32, 0.4), (0.1, 0, 0.5), (0.8, 0.7))
+    tank = box((0.6, 0.32, 0.4), (0.1, 0, 0.5), top=(0.8, 0.7))
     tail = box((rng.uniform(0.6, 0.8), 0.26, 0.22), (-0.4, 0, 0.62))
-    shield = box((0.08, 0.4, 0.45), (0.55, 0, 0.8), (1, 0.7), -0.1)
-    painted = np.concatenate([tank, tail, shield])
+    shield = box((0.08, 0.4, 0.45), (0.55, 0, 0.8), top=(1, 0.7), shift=-0.1)
 
     pieces = _two_wheeler(label, radius=0.31, rim=0.16, wheelbase=1.35)
-    pieces.append(part(painted, Surface.LIGHT_PAINT, label))
+    pieces.append(part([tank, tail, shield], Surface.LIGHT_PAINT, label))
     return join(pieces)
 
 

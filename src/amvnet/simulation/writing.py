@@ -151,7 +151,7 @@ def _write_sequences(sequences: list[Sequence], processes: int) -> Iterator[int]
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Let processes that are started in this context use one thread: a third faster on two cores."""
+    """Let processes started in this context use one thread each: a third faster on two cores."""
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
