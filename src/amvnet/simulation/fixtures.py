@@ -216,7 +216,6 @@ def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
 
     # In the benchmark, the class trunk ends where the boughs begin.
     trunk = tube((0, 0, -0.5), fork, trunk_radius, trunk_radius * 0.8)
-
     return join(
         [
             part([trunk], Surface.BARK, Label.TRUNK),
