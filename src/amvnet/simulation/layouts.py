@@ -159,7 +159,7 @@ class NuScenesLayout:
     def complete(out: Path, sequences: list[Row]) -> None:
         """Write the tables of all scenes, and an empty map."""
         tables: dict[str, list[Row]] = {name: [] for name in TABLES}
-        _add_devices(tables)
+        _add_shared_rows(tables)
         for sequence in sequences:
             _add_scene(tables, sequence)
 
@@ -195,14 +195,16 @@ def nuscenes_indices(labels: np.ndarray) -> np.ndarray:
     return table[labels & CLASS_MASK]
 
 
-def _add_devices(tables: dict[str, list[Row]]) -> None:
+def _add_shared_rows(tables: dict[str, list[Row]]) -> None:
     """Add the rows that all scenes share: categories, the LiDAR, the log and the map."""
     for index, name in enumerate(_CATEGORIES):
         token = _token("category", index)
         tables["category"].append({"token": token, "name": name, "description": "", "index": index})
+
     tables["sensor"].append(
         {"token": _token("sensor"), "channel": "LIDAR_TOP", "modality": "lidar"}
     )
+
     half = float(np.sqrt(0.5))
     tables["calibrated_sensor"].append(
         {
@@ -213,6 +215,7 @@ def _add_devices(tables: dict[str, list[Row]]) -> None:
             "camera_intrinsic": [],
         }
     )
+
     tables["log"].append(
         {
             "token": _token("log"),
@@ -256,6 +259,7 @@ def _add_scene(tables: dict[str, list[Row]], sequence: Row) -> None:
         token = scan["token"]
         time = scan["time"]
         pose = np.array(scan["pose"])
+
         tables["sample"].append(
             {
                 "token": samples[index],

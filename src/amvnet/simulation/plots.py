@@ -14,7 +14,7 @@ from amvnet.simulation.site import Site
 from amvnet.simulation.streets import Patch
 from amvnet.simulation.styles import Style
 
-# What stands on a plot, and how often.
+# Shares of what stands along the front of a plot, and of the vehicles in a car park.
 BOUNDARIES = {"hedge": 0.40, "wall": 0.16, "board fence": 0.26, "rail fence": 0.18}
 CAR_PARK_VEHICLES = {
     vehicles.car: 0.90,
@@ -88,11 +88,12 @@ def fill_plots(site: Site, side: int) -> None:
     """Fill one side of a street (-1 right, 1 left) with plots, one after the other."""
     fillers = (_fill_house, _fill_row, _fill_wood, _fill_field, _fill_car_park)
     rng = site.rng
+
     x = rng.uniform(0, 8)
     while x < site.ground.length:
         fill = fillers[rng.choice(len(fillers), p=site.ground.style.plots)]
-        is_built = fill in (_fill_house, _fill_row)
-        width = rng.uniform(12, 24) if is_built else rng.uniform(18, 45)
+        has_house = fill in (_fill_house, _fill_row)
+        width = rng.uniform(12, 24) if has_house else rng.uniform(18, 45)
 
         plot = Plot(site, side, x, width)
         if site.is_free(plot.middle, side * (plot.front + 8), width / 2 - 1):
@@ -103,9 +104,10 @@ def fill_plots(site: Site, side: int) -> None:
 
 
 def _fill_house(plot: Plot) -> None:
-    """Put a house in a garden, with a drive and perhaps something along the front."""
+    """Put a house in a garden, with a drive and perhaps a hedge, wall or fence along the front."""
     rng = plot.rng
     style = plot.style
+
     width = plot.width * rng.uniform(0.45, 0.75)
     depth = rng.uniform(8, 12)
     setback = rng.uniform(*style.setback)
@@ -114,8 +116,8 @@ def _fill_house(plot: Plot) -> None:
     house = fixtures.building(
         rng, width, depth, height=rng.uniform(*style.storeys), flat=rng.random() < 0.15
     )
-    distance = plot.front + setback + depth / 2
-    plot.put(house, x, distance, rng.normal(scale=0.03), margin=width * 0.5)
+    middle = plot.front + setback + depth / 2
+    plot.put(house, x, middle, rng.normal(scale=0.03), margin=width * 0.5)
 
     drive_x = plot.x + 0.3 if rng.random() < 0.5 else plot.x + plot.width - 3.3
     _add_drive(plot, drive_x, setback + 5.0)
@@ -125,21 +127,31 @@ def _fill_house(plot: Plot) -> None:
         facing = 0.0 if plot.side > 0 else np.pi
         plot.put(fixtures.steps(rng), x, plot.front + setback, facing)
 
-    _plant_bushes(plot, rng.poisson(4.5 * style.green), setback)
-    for _ in range(rng.poisson(0.6 * style.green)):
-        distance = plot.front + rng.uniform(1, setback + 1)
+    _plant_garden(plot, setback)
+    _add_side_fence(plot, plot.front + setback)
+
+
+def _plant_garden(plot: Plot, depth: float) -> None:
+    """Plant bushes, trees and perhaps thickets in a front garden."""
+    rng = plot.rng
+    green = plot.style.green
+
+    _plant_bushes(plot, rng.poisson(4.5 * green), depth)
+    for _ in range(rng.poisson(0.6 * green)):
+        distance = plot.front + rng.uniform(1, depth + 1)
         tree = random_tree(rng, rng.uniform(3, 8))
         plot.put(tree, plot.random_x(), distance)
-    if rng.random() < 0.3 * style.green:
+
+    if rng.random() < 0.3 * green:
         overgrown = replace(plot, width=plot.width * 0.7)
         plant_thickets(overgrown, plot.front + rng.uniform(1.8, 3.0))
-    _add_side_fence(plot, plot.front + setback)
 
 
 def _add_drive(plot: Plot, x: float, depth: float) -> None:
     """Pave a way to a garage, sometimes with a car on it."""
     rng = plot.rng
     front = plot.front
+
     label = Label.PARKING if rng.random() < 0.2 else Label.SIDEWALK
     plot.pave((x, x + DRIVE_WIDTH), (front, front + depth), label)
 
@@ -155,13 +167,15 @@ def _add_drive(plot: Plot, x: float, depth: float) -> None:
 def _add_boundary(plot: Plot, drive_x: float | None = None) -> None:
     """Put a hedge, wall or fence along the front of a plot, with a gap for its drive if any."""
     rng = plot.rng
+
     kind = weighted_choice(rng, BOUNDARIES)
     height = rng.uniform(0.7, 1.9)
-
     half = BOUNDARY_SEGMENT / 2
+
     for x in np.arange(plot.x + half, plot.x + plot.width, BOUNDARY_SEGMENT):
         if drive_x is not None and drive_x - half < x < drive_x + DRIVE_WIDTH + half:
             continue
+
         segment = _boundary_segment(rng, kind, height)
         plot.put(segment, x, plot.front + 0.5, margin=1.5)
 
@@ -177,15 +191,15 @@ def _boundary_segment(rng: np.random.Generator, kind: str, height: float) -> Mes
     return fixtures.rail_fence(BOUNDARY_SEGMENT, height)
 
 
-def _add_side_fence(plot: Plot, depth: float) -> None:
-    """Put a hedge or a fence between a garden and the next one, across the street's direction."""
+def _add_side_fence(plot: Plot, house_front: float) -> None:
+    """Put a hedge or a fence between a garden and the next one, past the front of the house."""
     rng = plot.rng
     if rng.random() > plot.style.fenced:
         return
 
     is_hedge = rng.random() < 0.4
     height = rng.uniform(1.0, 1.9)
-    for distance in np.arange(plot.front + 1.8, depth + 8, 2.5):
+    for distance in np.arange(plot.front + 1.8, house_front + 8, 2.5):
         if is_hedge:
             segment = fixtures.hedge(rng, 2.5, height)
         else:
@@ -198,6 +212,7 @@ def _fill_row(plot: Plot) -> None:
     rng = plot.rng
     style = plot.style
     front = plot.front
+
     setback = rng.uniform(*style.setback)
     depth = rng.uniform(9, 14)
 
@@ -215,10 +230,11 @@ def _fill_row(plot: Plot) -> None:
 def _park_two_wheelers(plot: Plot) -> None:
     """Put up to three bicycles or motorcycles side by side at the front of a plot."""
     rng = plot.rng
+
     make = vehicles.bicycle if rng.random() < 0.75 else vehicles.motorcycle
     for index in range(int(rng.integers(1, 4))):
-        x = plot.x + plot.width * 0.3 + 0.6 * index
         two_wheeler = make(rng)
+        x = plot.x + plot.width * 0.3 + 0.6 * index
         yaw = np.pi / 2 + rng.normal(scale=0.1)
         plot.put(two_wheeler, x, plot.front - 0.4, yaw, thing=True)
 
@@ -227,9 +243,9 @@ def _fill_wood(plot: Plot) -> None:
     """Plant trees and undergrowth."""
     rng = plot.rng
     front = plot.front
+
     depth = rng.uniform(12, 28)
     density = rng.uniform(0.006, 0.022)  # trees per square metre
-
     for _ in range(rng.poisson(density * plot.width * depth)):
         tree = random_tree(rng, rng.uniform(4, 13))
         plot.put(tree, plot.random_x(), front + rng.uniform(1.5, depth))
@@ -246,6 +262,7 @@ def _fill_field(plot: Plot) -> None:
     """Leave open ground: a meadow or gravel, with a few bushes, perhaps a fence and a barn."""
     rng = plot.rng
     front = plot.front
+
     if rng.random() < 0.35:
         gravel = (front + 1, front + rng.uniform(6, 25))
         plot.pave((plot.x, plot.x + plot.width), gravel, Label.OTHER_GROUND)
@@ -267,6 +284,7 @@ def _fill_car_park(plot: Plot) -> None:
     """Pave a lot and put two rows of vehicles on it."""
     rng = plot.rng
     front = plot.front
+
     plot.pave((plot.x + 1, plot.x + plot.width - 1), (front + 0.5, front + 20), Label.PARKING)
 
     chance = plot.style.parked + 0.2
@@ -274,8 +292,8 @@ def _fill_car_park(plot: Plot) -> None:
         for x in np.arange(plot.x + 3, plot.x + plot.width - 3, 2.8):
             make = weighted_choice(rng, CAR_PARK_VEHICLES)
             is_taken = rng.random() < chance
-            is_room = make is not vehicles.truck or row > 10  # the front row is too short for one
-            if is_taken and is_room:
+            has_room = make is not vehicles.truck or row > 10  # trucks are too long for the front
+            if is_taken and has_room:
                 yaw = rng.choice([-1, 1]) * np.pi / 2 + rng.normal(scale=0.03)
                 plot.put(make(rng), x, front + row, yaw, thing=True, margin=3.0)
 
@@ -283,6 +301,7 @@ def _fill_car_park(plot: Plot) -> None:
 def plant_thickets(plot: Plot, distance: float) -> None:
     """Plant undergrowth in a line along the street, its height changing slowly, with gaps."""
     rng = plot.rng
+
     height = rng.uniform(1.2, 4.5)
     for x in np.arange(plot.x + 2, plot.x + plot.width, 4.0):
         height = float(np.clip(height + rng.normal(scale=0.5), 0.8, 6.0))

@@ -49,6 +49,7 @@ def populate(ground: Ground, rng: np.random.Generator, ego_speed: float, ego_x: 
         _fill_parking_lane(site, side)
         _fill_roadside(site, side)
         _fill_background(site, side)
+
     _fill_side_roads(site)
     _add_traffic(site, ego_speed, ego_x)
     _add_people(site)
@@ -61,6 +62,7 @@ def _fill_parking_lane(site: Site, side: int) -> None:
     rng = site.rng
     style = site.ground.style
     lane = style.parking[int(side > 0)]
+
     x = rng.uniform(0, 6)
     while lane and x < site.ground.length:
         make = weighted_choice(rng, PARKED_VEHICLES)
@@ -73,13 +75,11 @@ def _fill_parking_lane(site: Site, side: int) -> None:
 
 
 def _fill_roadside(site: Site, side: int) -> None:
-    """Put lamps, trees, signs, posts, bins and shelters along the kerb.
-
-    Put a crash barrier along most fast roads.
-    """
+    """Put lamps, trees, signs, posts, bins, shelters and perhaps a crash barrier along the road."""
     rng = site.rng
     ground = site.ground
     style = ground.style
+
     kerb = side * (style.road / 2 + style.parking[int(side > 0)] + 0.35)
     back = side * (ground.front(side) - 0.3)
     yaw = _along_road(side)
@@ -115,11 +115,13 @@ def _fill_background(site: Site, side: int) -> None:
     ground = site.ground
     front = ground.front(side)
     has_houses = ground.style.kind in ("residential", "urban")
+
     for x in np.arange(rng.uniform(0, 10), ground.length, BACKGROUND_STEP):
         t = side * (front + rng.uniform(32, 45))
         if rng.random() < 0.45:
             plot = Plot(site, side, x, BACKGROUND_STEP)
             plant_thickets(plot, front + rng.uniform(24, 34))
+
         if rng.random() < 0.35 and has_houses:
             _put_background_house(site, x, t)
         else:
@@ -132,9 +134,11 @@ def _fill_background(site: Site, side: int) -> None:
 
 def _put_background_house(site: Site, x: float, t: float) -> None:
     rng = site.rng
+
     width = rng.uniform(9, 16)
     depth = rng.uniform(8, 12)
     height = rng.uniform(*site.ground.style.storeys)
+
     house = fixtures.building(rng, width, depth, height, flat=rng.random() < 0.2)
     site.put(house, x, t, rng.normal(scale=0.3), margin=6.0)
 
@@ -142,6 +146,7 @@ def _put_background_house(site: Site, x: float, t: float) -> None:
 def _fill_side_roads(site: Site) -> None:
     """Put waiting cars into the side roads, and a traffic light or a sign at their mouths."""
     rng = site.rng
+
     for crossing in site.ground.crossings:
         for side in crossing.sides:
             for _ in range(rng.poisson(0.8)):
@@ -168,6 +173,7 @@ def _add_traffic(site: Site, ego_speed: float, ego_x: float) -> None:
     rng = site.rng
     ground = site.ground
     style = ground.style
+
     oncoming_speed = -ego_speed * rng.uniform(0.8, 1.3)
     for direction, speed in ((1, ego_speed), (-1, oncoming_speed)):
         x = rng.uniform(5, 60)
@@ -183,9 +189,11 @@ def _add_people(site: Site) -> None:
     rng = site.rng
     ground = site.ground
     style = ground.style
+
     for _ in range(rng.poisson(style.people * ground.length / 100)):
         side = int(rng.choice([-1, 1]))
         x = rng.uniform(0, ground.length)
+
         if rng.random() < 0.3:
             make = vehicles.bicyclist if rng.random() < 0.85 else vehicles.motorcyclist
             t = side * (style.road / 2 - 0.5)
@@ -204,6 +212,7 @@ def _park_two_wheelers(site: Site) -> None:
     """Put bicycles and motorcycles at the fronts of the plots."""
     rng = site.rng
     ground = site.ground
+
     for _ in range(rng.poisson(0.8 * ground.style.people * ground.length / 100)):
         side = int(rng.choice([-1, 1]))
         make = vehicles.bicycle if rng.random() < 0.7 else vehicles.motorcycle
@@ -218,6 +227,7 @@ def _add_work_zones(site: Site) -> None:
     rng = site.rng
     ground = site.ground
     style = ground.style
+
     for _ in range(rng.poisson(WORK_ZONES * ground.length / 100)):
         side = int(rng.choice([-1, 1]))
         start = rng.uniform(0, ground.length)
@@ -228,6 +238,7 @@ def _add_work_zones(site: Site) -> None:
         for x in np.arange(start, start + length, 2.05 if has_barriers else 3.0):
             segment = fixtures.barrier(2.0) if has_barriers else fixtures.traffic_cone(rng)
             site.put(segment, x, edge)
+
         if rng.random() < 0.5:
             t = side * (ground.front(side) + 2.5)
             excavator = vehicles.excavator(rng)

@@ -44,8 +44,7 @@ class LidarModel:
     keeps_lost_returns: bool
     # Layout of the files: semantickitti or nuscenes.
     layout: str
-    # Angles that the car and its racks hide, in degrees: azimuth from and to, elevation from and
-    # to.
+    # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
     shadow: tuple[tuple[float, float, float, float], ...]
 
 

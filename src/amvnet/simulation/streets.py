@@ -10,7 +10,7 @@ from amvnet.simulation.materials import Label, Surface
 from amvnet.simulation.mesh import Mesh, part
 from amvnet.simulation.styles import Style
 
-# 2 pi, rounded. The exact value would change every street that a seed stands for.
+# 2 pi, rounded: the exact value would change the streets of every seed.
 _TURN = 6.283185
 _COARSE_TURN = 6.28
 
@@ -108,12 +108,14 @@ class Ground:
 
     def _draw_crossings(self, rng: np.random.Generator) -> list[Crossing]:
         crossings: list[Crossing] = []
+
         x = rng.uniform(40, 140)
         while self.style.kind != "fast" and x < self.length - 20:
             sides = ((-1, 1), (-1,), (1,))[rng.choice(3, p=[0.4, 0.3, 0.3])]
             yaw = float(self.yaw(x) + np.pi / 2 + rng.normal(scale=0.12))
             width = rng.uniform(4.5, 8.0)
             crossings.append(Crossing(x, float(self.middle(x)), yaw, width, sides))
+
             x += rng.uniform(60, 160)
         return crossings
 
@@ -194,6 +196,7 @@ class Ground:
         verge = _of_side(self.style.verge, places.t)
         sidewalk = _of_side(self.style.sidewalk, places.t)
 
+        # From the plots to the road: each step may overwrite those before it.
         label = np.full(np.shape(x), Label.TERRAIN, dtype=np.uint16)
         label[(kerb >= verge) & (kerb < verge + sidewalk)] = Label.SIDEWALK
 
@@ -217,7 +220,7 @@ class Ground:
         return 0.8 * self._tints[label] + 0.8 * pattern * np.sin(0.33 * y + 0.05 * x)
 
     def mesh(self) -> Mesh:
-        """Return the ground as triangles of class 0: a fine grid along the road in a coarse one."""
+        """Return the ground as triangles of class 0: a fine grid near the road, a coarse one below."""
         fine = self._grid(FINE_STEP, FINE_REACH, 0.0)
         coarse = self._grid(COARSE_STEP, COARSE_REACH, COARSE_DROP)
         return part([fine, coarse], Surface.GRASS, 0)
@@ -232,6 +235,7 @@ class Ground:
 
         _, t = self.street_coordinates(x[:-1, :-1], y[:-1, :-1])
         within = np.abs(t) < reach
+
         a = corners[:-1, :-1][within]
         b = corners[1:, :-1][within]
         c = corners[1:, 1:][within]

@@ -158,7 +158,7 @@ def draw_style(rng: np.random.Generator) -> Style:
     name = weighted_choice(rng, shares)
     kind = KINDS[name]
 
-    # 8: how close the shares of one street are to those of its kind.
+    # The larger the factor, the closer the street's shares are to those of its kind.
     house, row, wood, field, lot = rng.dirichlet(np.array(kind.plots) * 8 + 1e-3).tolist()
 
     return Style(
