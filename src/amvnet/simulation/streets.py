@@ -220,7 +220,7 @@ class Ground:
         return 0.8 * self._tints[label] + 0.8 * pattern * np.sin(0.33 * y + 0.05 * x)
 
     def mesh(self) -> Mesh:
-        """Return the ground as triangles of class 0: a fine grid near the road, a coarse one below."""
+        """Return the ground as triangles of class 0: a fine grid over a coarse one."""
         fine = self._grid(FINE_STEP, FINE_REACH, 0.0)
         coarse = self._grid(COARSE_STEP, COARSE_REACH, COARSE_DROP)
         return part([fine, coarse], Surface.GRASS, 0)

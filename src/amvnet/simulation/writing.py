@@ -26,7 +26,7 @@ Progress = Callable[[int, int], None]  # scans written, scans in all
 # Environment variables that set the number of threads of the numerical libraries.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 # Folder with a file for each complete sequence: its settings, and what the layout keeps of it.
-DONE = ".simulation"
+MARKERS = ".simulation"
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Sequence:
     @property
     def marker(self) -> Path:
         """The file that exists once the sequence is complete."""
-        return self.out / DONE / f"{self.number:04d}.json"
+        return self.out / MARKERS / f"{self.number:04d}.json"
 
 
 def simulate(
@@ -100,7 +100,7 @@ def simulate(
         progress(done, scans * sequences)
 
     # The layout's tables cover all sequences in the folder, those of earlier calls too.
-    markers = sorted((out / DONE).glob("*.json"))
+    markers = sorted((out / MARKERS).glob("*.json"))
     rows = [json.loads(path.read_text())["rows"] for path in markers]
     LAYOUTS[model.layout].complete(out, rows)
     return out
