@@ -1,6 +1,8 @@
-"""A drive of 1,000 scans through predict: memory in its course, and whether killed runs end as an undisturbed one.
+"""Run predict on a drive of 1,000 scans: measure its memory, and compare with a run that is killed.
 
-python benchmarks/long_drive.py FOLDER [SCANS] [METHOD]; the drive is simulated in FOLDER.
+python benchmarks/long_drive.py FOLDER [SCANS] [METHOD]
+
+The drive is simulated in FOLDER. One run is left alone, another is killed twice and resumed.
 """
 
 from __future__ import annotations
@@ -12,31 +14,25 @@ from pathlib import Path
 
 from amvnet.simulation import simulate
 
-KILLED_AT = (0.3, 0.6)  # of the scans
+KILLED_AT = (0.3, 0.6)  # shares of the scans
 
 
-def run(folder: Path, out: Path, method: str, until: int) -> list[int]:
-    """Segment on until so many labels are there, then kill; memory in kB after each tenth of them."""
-    command = [
-        "predict",
-        str(folder / "drive/samples"),
-        "--weights",
-        "sim-hdl32e",
-        "--method",
-        method,
-    ]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "amvnet", *command, "--out", str(out), "--resume"],
-        stdout=subprocess.DEVNULL,
-    )
-    memory, tenth = [], max(until // 10, 1)
+def predict(folder: Path, out: Path, method: str, until: int) -> list[int]:
+    """Resume a run, and kill it once `until` scans are segmented.
+
+    Returns:
+        Memory in kB after each tenth of `until`.
+    """
+    command = [sys.executable, "-m", "amvnet", "predict", str(folder / "drive/samples")]
+    options = ["--weights", "sim-hdl32e", "--method", method, "--out", str(out), "--resume"]
+    process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL)
+
+    memory: list[int] = []
+    tenth = max(until // 10, 1)
     while process.poll() is None:
         done = len(list(out.glob("*.label")))
         if done >= tenth * (len(memory) + 1):
-            status = Path(f"/proc/{process.pid}/status").read_text()
-            memory += [
-                int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")
-            ]
+            memory += resident_memory(process.pid)
         if done >= until and list(out.glob(".unfinished-*")):
             process.kill()
             break
@@ -45,32 +41,49 @@ def run(folder: Path, out: Path, method: str, until: int) -> list[int]:
     return memory
 
 
-def main(folder: Path, scans: int = 1000, method: str = "amvnet") -> None:
+def resident_memory(pid: int) -> list[int]:
+    """Return the resident memory of a process in kB; empty if the process has just ended."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    lines = [line for line in status.splitlines() if line.startswith("VmRSS")]
+    return [int(line.split()[1]) for line in lines]
+
+
+def simulate_drive(folder: Path, scans: int) -> None:
+    """Simulate one drive, as a flat folder of scans."""
     if not (folder / "drive").exists():
         simulate(folder / "drive", sensor="hdl32e", sequences=1, scans=scans)
+
     samples = folder / "drive/samples"
-    if not any(samples.glob("*.pcd.bin")):  # a folder of lone scans
+    if not any(samples.glob("*.pcd.bin")):
         for path in sorted(samples.rglob("*.pcd.bin")):
             path.rename(samples / path.name)
-    if not (folder / "whole").exists():
-        started = time.perf_counter()
-        memory = run(folder, folder / "whole", method, scans + 1)
-        seconds = time.perf_counter() - started
-        print(
-            f"{scans} scans in {seconds:.0f} s; memory at each tenth, MiB:",
-            [kb // 1024 for kb in memory],
-        )
-    for share in (*KILLED_AT, 2):
-        run(folder, folder / "killed", method, int(share * scans))
-    names = sorted(path.name for path in (folder / "whole").iterdir())
-    same = all(
-        (folder / "killed" / name).read_bytes() == (folder / "whole" / name).read_bytes()
-        for name in names
-    )
-    left = sorted(path.name for path in (folder / "killed").iterdir())
-    print(
-        f"killed twice and gone on with: {len(names)} files, {'the same' if same and left == names else 'others'}"
-    )
+
+
+def have_same_files(folder: Path, other: Path) -> bool:
+    """Return whether two folders hold the same files."""
+    names = sorted(path.name for path in folder.iterdir())
+    if names != sorted(path.name for path in other.iterdir()):
+        return False
+    return all((folder / name).read_bytes() == (other / name).read_bytes() for name in names)
+
+
+def main(folder: Path, scans: int = 1000, method: str = "amvnet") -> None:
+    simulate_drive(folder, scans)
+    whole = folder / "whole"
+    if not whole.exists():
+        start = time.perf_counter()
+        memory = predict(folder, whole, method, until=scans + 1)
+        seconds = time.perf_counter() - start
+        mebibytes = [kilobytes // 1024 for kilobytes in memory]
+        print(f"{scans} scans in {seconds:.0f} s; memory at each tenth, MiB:", mebibytes)
+
+    killed = folder / "killed"
+    for share in (*KILLED_AT, 2):  # 2: never killed
+        predict(folder, killed, method, until=int(share * scans))
+
+    files = len(list(whole.iterdir()))
+    verdict = "the same" if have_same_files(whole, killed) else "others"
+    print(f"killed twice and resumed: {files} files, {verdict}")
 
 
 if __name__ == "__main__":

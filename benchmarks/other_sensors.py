@@ -1,8 +1,9 @@
-"""What measuring is worth: simulated scans of other sensors, labelled as they are and as `amvnet predict` fits them.
+"""Measure what fitting is worth: segment simulated scans of sensors that the weights do not know.
 
     python benchmarks/other_sensors.py [FOLDER]
 
-FOLDER (other_sensors) keeps the scans: six each, of three streets that no training has seen.
+Each scan is segmented as it is, and as `amvnet predict` fits it to the weights. FOLDER
+(other_sensors) keeps the scans: six for each sensor, of three streets that no training has seen.
 """
 
 from __future__ import annotations
@@ -13,27 +14,29 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.evaluation.metrics import Evaluation
+from amvnet.inference.inputs import adapter_for
 from amvnet.inference.segmenter import Segmenter
-from amvnet.sensors.adapt import ScanAdapter
 from amvnet.simulation import simulate
-from amvnet.simulation.sensors import HDL64E, SENSORS, Sensor
+from amvnet.simulation.sensors import HDL64E, SENSORS, LidarModel
 
 SEED = 78
 VLP32C = (
-    15, 10.333, 7, 4.667, 3.333, 2.333, 1.667, 1.333, 1, 0.667, 0.333, 0, -0.333, -0.667, -1, -1.333, -1.667, -2,
-    -2.333, -2.667, -3, -3.333, -3.667, -4, -4.667, -5.333, -6.148, -7.254, -8.843, -11.31, -15.639, -25,
+    15, 10.333, 7, 4.667, 3.333, 2.333, 1.667, 1.333, 1, 0.667, 0.333, 0, -0.333, -0.667, -1,
+    -1.333, -1.667, -2, -2.333, -2.667, -3, -3.333, -3.667, -4, -4.667, -5.333, -6.148, -7.254,
+    -8.843, -11.31, -15.639, -25,
 )  # fmt: skip
 
 
-def sensor(elevations: tuple[float, ...], height: float, steps: int) -> Sensor:
-    """An HDL-64E with other lasers at another height, on no car."""
+def sensor(elevations: tuple[float, ...], height: float, steps: int) -> LidarModel:
+    """Return an HDL-64E with other lasers, at another height, on no car."""
     return replace(HDL64E, elevations=elevations, height=height, azimuth_steps=steps, shadow=())
 
 
 def evenly(end: float, beams: int) -> tuple[float, ...]:
+    """Return elevations that are evenly spaced from `end` down to `-end` degrees."""
     return tuple(np.linspace(end, -end, beams).tolist())
 
 
@@ -51,29 +54,33 @@ OTHERS = {
 
 
 def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
-    """Print mIoU over the classes present and accuracy of AMVNet, both ways."""
+    """Print mIoU over the classes present and accuracy of AMVNet, without and with fitting."""
     dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
-    fit, by_row = ScanAdapter(segmenter.weights), segmenter.by_ring()
-    found = {way: Evaluation(dataset.taxonomy) for way in ("as it is", "measured")}
+    fit = adapter_for(segmenter.weights)
+    segment_by_ring = segmenter.by_ring()
+    unfitted = Evaluation(dataset.taxonomy)
+    fitted = Evaluation(dataset.taxonomy)
+
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record)
-        fitted = fit(Cloud(scan.points[:, :3], scan.points[:, 3], name=name), name)
-        for evaluation, labels in zip(
-            found.values(), (segmenter(scan).labels, by_row(fitted).labels), strict=True
-        ):
-            assert scan.labels is not None
-            evaluation.add(scan.points, scan.labels, {"amvnet": labels}, None)
-    for way, evaluation in found.items():
-        figures = evaluation.report(name)["methods"]["amvnet"]
-        print(
-            f"{name:14} {way:9} {100 * figures['miou_present']:.1f} ({100 * figures['accuracy']:.1f})",
-            flush=True,
-        )
+        assert scan.labels is not None
+        labels = segmenter(scan).labels
+        unfitted.add(scan.points, scan.labels, {"amvnet": labels}, None)
+
+        cloud = Cloud(scan.points[:, :3], scan.points[:, 3], name=name)
+        labels = segment_by_ring(fit(cloud, name)).labels
+        fitted.add(scan.points, scan.labels, {"amvnet": labels}, None)
+
+    for title, evaluation in (("as it is", unfitted), ("measured", fitted)):
+        report = evaluation.report(name)["methods"]["amvnet"]
+        miou = 100 * report["miou_present"]
+        accuracy = 100 * report["accuracy"]
+        print(f"{name:14} {title:9} {miou:.1f} ({accuracy:.1f})", flush=True)
 
 
 if __name__ == "__main__":
     SENSORS.update(OTHERS)
     root = Path(sys.argv[1] if len(sys.argv) > 1 else "other_sensors")
     segmenter = Segmenter("sim-hdl64e")
-    for other in OTHERS:
-        compare(other, root / other, segmenter)
+    for name in OTHERS:
+        compare(name, root / name, segmenter)

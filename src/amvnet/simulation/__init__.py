@@ -2,13 +2,13 @@
 
 from amvnet.simulation.drive import Drive, drive_street
 from amvnet.simulation.layouts import SimulatedScan
-from amvnet.simulation.sensors import SENSORS, Sensor
+from amvnet.simulation.sensors import SENSORS, LidarModel
 from amvnet.simulation.writing import simulate, simulate_scan
 
 __all__ = [
     "SENSORS",
     "Drive",
-    "Sensor",
+    "LidarModel",
     "SimulatedScan",
     "drive_street",
     "simulate",

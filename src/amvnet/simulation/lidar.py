@@ -1,4 +1,4 @@
-"""A spinning LiDAR: which rays it fires, and what they hit."""
+"""Casts the rays of a rotating LiDAR and finds what they hit."""
 
 from __future__ import annotations
 
@@ -13,63 +13,70 @@ import numpy as np
 from amvnet.errors import InputError
 from amvnet.simulation.materials import ground_surface_table
 from amvnet.simulation.mesh import Mesh
-from amvnet.simulation.sensors import Sensor
+from amvnet.simulation.sensors import LidarModel
 
 SHADOW_EDGE = 6.0  # degrees by which the edges of the car's shadow differ between lasers
-SKINS = 16  # of clumps of leaves that a pulse may pass on its way in and out
-BEYOND = 0.002  # metres behind a surface where a ray goes on
-LEAF_COSINE = 0.5  # leaves look every way
+MOST_CROSSINGS = 16  # surfaces of clumps of leaves that a pulse may cross on its way in and out
+BEYOND = 0.002  # metres behind a surface at which a ray continues
+LEAF_COSINE = 0.5  # mean cosine of the angle of incidence: leaves point in all directions
 
 
 def require_embree() -> tuple[ModuleType, ModuleType]:
-    """The two modules of embreex that cast rays.
+    """Return the two modules of embreex that cast rays.
 
     Raises:
-        InputError: where the extra `simulate` is not installed.
+        InputError: if the extra `simulate` is not installed.
     """
     try:
-        import trimesh  # noqa: F401  whose spheres the bodies are made from
+        import trimesh  # noqa: F401  makes the spheres of the foliage
         from embreex import mesh_construction, rtcore_scene
     except ImportError as error:
         raise InputError(
-            'simulation: expected trimesh and embreex to cast rays, found none; do pip install "amvnet[simulate]"'
+            "simulation: expected trimesh and embreex to cast rays, found at least one missing; "
+            'run pip install "amvnet[simulate]"'
         ) from error
     return rtcore_scene, mesh_construction
 
 
 class RayScene:
-    """Meshes that rays can be cast at."""
+    """A mesh that rays can be cast at."""
 
     def __init__(self, mesh: Mesh) -> None:
         scenes, meshes = require_embree()
         self.mesh = mesh
         self._scene = scenes.EmbreeScene()
-        self._kept = meshes.TriangleMesh(self._scene, mesh.triangles)
+        self._triangles = meshes.TriangleMesh(self._scene, mesh.triangles)
+
         edges = mesh.triangles[:, 1:] - mesh.triangles[:, :1]
         normals = np.cross(edges[:, 0], edges[:, 1])
         length = np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         self.normals = (normals / length).astype(np.float32)
 
-    def cast(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance and triangle of the first hit of each ray; infinite and -1 where there is none. (R,), (R,)."""
-        found = self._scene.run(origin, directions, output=1)
-        triangle = found["primID"].astype(np.int64)
-        return np.where(triangle >= 0, found["tfar"], np.inf), triangle
+    def cast(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return distance and triangle of the first hit of each ray: (R,) and (R,).
+
+        They are infinite and -1 if a ray hits nothing.
+        """
+        hits = self._scene.run(origin, direction, output=1)
+        triangle = hits["primID"].astype(np.int64)
+        return np.where(triangle >= 0, hits["tfar"], np.inf), triangle
 
 
-class GroundLook(Protocol):
-    """What the ground, whose triangles have no class, looks like at places x, y; all arrays are (N,)."""
+class GroundAppearance(Protocol):
+    """Class and tint of the ground, whose triangles have no class; all arrays are (N,)."""
 
     def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Raw class ids."""
+        """Return the class ids at places."""
 
     def tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
-        """How bright, as in `Mesh`."""
+        """Return the tint at places, as in `Mesh`."""
 
 
 @dataclass(frozen=True)
 class Rays:
-    """The shots of one turn that the own car lets out, in the sensor's frame; laser by laser, azimuth from +x.
+    """The shots of one rotation that the car does not block, in the sensor's frame.
+
+    They are sorted by laser from the top down, then by azimuth from +x.
 
     Attributes:
         direction: (R, 3) float32 unit vectors.
@@ -84,7 +91,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the rays of one turn hit, in the sensor's frame.
+    """What the rays of one rotation hit, in the sensor's frame.
 
     Attributes:
         direction: (N, 3) unit vectors.
@@ -110,147 +117,184 @@ class Hits:
 
 
 @lru_cache(maxsize=4)
-def fired(sensor: Sensor) -> Rays:
-    """The shots of one turn."""
+def rays_of(sensor: LidarModel) -> Rays:
+    """Return the rays of one rotation; the arrays are shared and read-only."""
+    lasers = len(sensor.elevations)
     elevation = np.radians(np.array(sensor.elevations))[:, None]
-    # The lasers of a real device do not sit on one line: each is turned by a little of its own.
-    skew = ((np.arange(len(elevation)) * 0.618) % 1.0)[:, None]
-    turned = (np.arange(sensor.azimuth_steps) + skew) / sensor.azimuth_steps
-    azimuth, level = 2 * np.pi * turned, np.cos(elevation)
-    rays = np.stack(
-        [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1
+
+    # The lasers of a real device are not in one line: each has an azimuth offset of its own.
+    offset = ((np.arange(lasers) * 0.618) % 1.0)[:, None]
+    fraction = (np.arange(sensor.azimuth_steps) + offset) / sensor.azimuth_steps  # of a rotation
+    azimuth = 2 * np.pi * fraction
+
+    horizontal = np.cos(elevation)
+    x = horizontal * np.cos(azimuth)
+    y = horizontal * np.sin(azimuth)
+    z = np.sin(elevation) + 0 * azimuth
+    direction = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+
+    ring = np.repeat(np.arange(lasers, dtype=np.uint8)[::-1], sensor.azimuth_steps)
+    sign = 1 if sensor.counter_clockwise else -1
+    time = sensor.rotation_period * ((fraction + 0.5) % 1 - 0.5) * sign
+
+    free = ~_is_hidden(sensor)
+    rays = Rays(
+        direction=direction[free].astype(np.float32),
+        ring=ring[free],
+        time=time.ravel()[free].astype(np.float32),
     )
-    ring = np.repeat(np.arange(len(sensor.elevations), dtype=np.uint8)[::-1], sensor.azimuth_steps)
-    time = sensor.turn * ((turned + 0.5) % 1 - 0.5) * (1 if sensor.counter_clockwise else -1)
-    free = ~_hidden(sensor)
-    columns = (
-        rays.reshape(-1, 3)[free].astype(np.float32),
-        ring[free],
-        time.ravel()[free].astype(np.float32),
-    )
-    for array in columns:
+    for array in (rays.direction, rays.ring, rays.time):
         array.flags.writeable = False
-    return Rays(*columns)
+    return rays
 
 
-def _hidden(sensor: Sensor) -> np.ndarray:
-    """(R,) True where the own car stops a shot; laser by laser."""
+def _is_hidden(sensor: LidarModel) -> np.ndarray:
+    """Return whether the car blocks each shot, laser by laser: (R,) bool."""
     elevation = np.array(sensor.elevations)[:, None]
     azimuth = np.arange(sensor.azimuth_steps) * 360 / sensor.azimuth_steps
-    # The edges differ between lasers, which look out of the device at several places.
-    azimuth = azimuth + SHADOW_EDGE * ((np.arange(len(elevation)) * 0.382) % 1.0 - 0.5)[:, None]
+
+    # The edges differ between lasers, which look out of the device at different places.
+    offset = (np.arange(len(elevation)) * 0.382) % 1.0 - 0.5
+    azimuth = azimuth + SHADOW_EDGE * offset[:, None]
+
     hidden = np.zeros((len(elevation), sensor.azimuth_steps), dtype=bool)
-    for start, end, low, high in sensor.shadow:
-        hidden |= ((azimuth - start) % 360 < end - start) & (elevation > low) & (elevation < high)
+    for start, end, lowest, highest in sensor.shadow:
+        within_azimuth = (azimuth - start) % 360 < end - start
+        hidden |= within_azimuth & (elevation > lowest) & (elevation < highest)
     return hidden.ravel()
 
 
-class _Front:
-    """How far some rays have come: the nearest hit of each over all scenes.
+class _NearestHits:
+    """The nearest hit of each ray over all scenes.
 
     Attributes:
-        distance: (R,) float32 metres; infinite where there is none.
-        facing: (R,) product of ray and normal, negative where the ray comes from outside.
-        surface, label, instance, depth, tint: (R,) as in `Mesh`, of what was hit.
+        distance: (R,) float32 metres; infinite if a ray hits nothing.
+        facing: (R,) product of ray and normal; negative if the ray comes from outside.
+        surface, label, instance, depth, tint: (R,) as in `Mesh`, of the triangle that is hit.
     """
 
     def __init__(
         self, scenes: Sequence[RayScene], origin: np.ndarray, direction: np.ndarray
     ) -> None:
-        self.distance = np.full(len(direction), np.inf, dtype=np.float32)
-        self.facing = np.zeros(len(direction), dtype=np.float32)
-        self.depth, self.tint = np.zeros((2, len(direction)), dtype=np.float32)
-        self.surface = np.zeros(len(direction), dtype=np.uint8)
-        self.label, self.instance = np.zeros((2, len(direction)), dtype=np.uint16)
+        count = len(direction)
+        self.distance = np.full(count, np.inf, dtype=np.float32)
+        self.facing = np.zeros(count, dtype=np.float32)
+        self.surface = np.zeros(count, dtype=np.uint8)
+        self.label = np.zeros(count, dtype=np.uint16)
+        self.instance = np.zeros(count, dtype=np.uint16)
+        self.depth = np.zeros(count, dtype=np.float32)
+        self.tint = np.zeros(count, dtype=np.float32)
+
         for scene in scenes:
-            far, triangle = scene.cast(origin, direction)
-            hit = np.flatnonzero(far < self.distance)
-            struck, mesh = triangle[hit], scene.mesh
-            self.distance[hit] = far[hit]
-            self.facing[hit] = np.einsum("ij,ij->i", scene.normals[struck], direction[hit])
-            for name in _OF_TRIANGLES:
-                getattr(self, name)[hit] = getattr(mesh, name)[struck]
+            distance, triangle = scene.cast(origin, direction)
+            nearer = np.flatnonzero(distance < self.distance)
+            hit = triangle[nearer]
+            self.distance[nearer] = distance[nearer]
+            self.facing[nearer] = np.einsum("ij,ij->i", scene.normals[hit], direction[nearer])
+            for name in _MESH_COLUMNS:
+                getattr(self, name)[nearer] = getattr(scene.mesh, name)[hit]
 
-    def move(self, index: np.ndarray, to: _Front, rows: np.ndarray, gone: np.ndarray) -> None:
-        """Let some rays, which had gone so far, arrive where some rows of another front are."""
-        self.distance[index] = gone + to.distance[rows]
-        for name in ("facing", *_OF_TRIANGLES):
-            getattr(self, name)[index] = getattr(to, name)[rows]
+    def replace(
+        self, index: np.ndarray, hits: _NearestHits, rows: np.ndarray, start: np.ndarray
+    ) -> None:
+        """Replace the hits of some rays by rows of others, whose rays began at `start` metres."""
+        self.distance[index] = start + hits.distance[rows]
+        for name in ("facing", *_MESH_COLUMNS):
+            getattr(self, name)[index] = getattr(hits, name)[rows]
 
 
-_OF_TRIANGLES = ("surface", "label", "instance", "depth", "tint")
+_MESH_COLUMNS = ("surface", "label", "instance", "depth", "tint")
 
 
 def trace(
     scenes: Sequence[RayScene],
-    sensor: Sensor,
+    sensor: LidarModel,
     pose: np.ndarray,
-    ground: GroundLook,
+    ground: GroundAppearance,
     rng: np.random.Generator,
     speed: float = 0.0,
 ) -> Hits:
-    """What each shot hits first, or where in foliage it ends.
+    """Return what each shot of one rotation hits first, or where it ends in foliage.
 
     Args:
-        scenes: what there is, in the street's frame.
-        sensor: which shots are fired.
-        pose: (4, 4) from the sensor's frame to the street's, when it looks ahead.
-        ground: what triangles of class 0 are.
-        rng: decides how deep pulses go into foliage.
-        speed: of the sensor along its x, metres per second.
+        scenes: everything that can be hit, in the street's frame.
+        sensor: the LiDAR that fires.
+        pose: (4, 4) from the sensor's frame to the street's, when the sensor looks ahead.
+        ground: appearance of the triangles of class 0.
+        rng: draws how deep pulses enter foliage.
+        speed: of the sensor along its x axis, metres per second.
     """
-    rays = fired(sensor)
-    turn = pose[:3, :3].astype(np.float32)
-    direction = rays.direction @ turn.T
+    rays = rays_of(sensor)
+    rotation = pose[:3, :3].astype(np.float32)
+    direction = rays.direction @ rotation.T
     shift = np.zeros_like(direction)
     shift[:, 0] = speed * rays.time
-    origin = (pose[:3, 3] + shift @ turn.T).astype(np.float32)
-    front = _Front(scenes, origin, direction)
-    _enter_foliage(front, scenes, origin, direction, rng)
-    seen = np.flatnonzero(np.isfinite(front.distance))
-    distance, label, surface, tint = (
-        x[seen] for x in (front.distance, front.label, front.surface, front.tint)
-    )
+    origin = (pose[:3, 3] + shift @ rotation.T).astype(np.float32)
+
+    nearest = _NearestHits(scenes, origin, direction)
+    _enter_foliage(nearest, scenes, origin, direction, rng)
+
+    hit = np.flatnonzero(np.isfinite(nearest.distance))
+    distance = nearest.distance[hit]
+    label = nearest.label[hit]
+    surface = nearest.surface[hit]
+    tint = nearest.tint[hit]
+
+    # The ground's triangles have no class: ask the ground for it.
     bare = np.flatnonzero(label == 0)
-    x, y = (origin[seen[bare], :2] + direction[seen[bare], :2] * distance[bare, None]).T
+    x, y = (origin[hit[bare], :2] + direction[hit[bare], :2] * distance[bare, None]).T
     label[bare] = ground.label(x, y)
-    surface[bare], tint[bare] = ground_surface_table()[label[bare]], ground.tint(x, y, label[bare])
-    cosine = np.where(front.depth[seen] > 0, LEAF_COSINE, np.abs(front.facing[seen]))
-    kept = (
-        rays.direction[seen],
-        distance,
-        cosine,
-        surface,
-        tint,
-        label,
-        front.instance[seen],
-        rays.ring[seen],
+    surface[bare] = ground_surface_table()[label[bare]]
+    tint[bare] = ground.tint(x, y, label[bare])
+
+    is_foliage = nearest.depth[hit] > 0
+    return Hits(
+        direction=rays.direction[hit],
+        distance=distance,
+        cosine=np.where(is_foliage, LEAF_COSINE, np.abs(nearest.facing[hit])),
+        surface=surface,
+        tint=tint,
+        label=label,
+        instance=nearest.instance[hit],
+        ring=rays.ring[hit],
+        shift=shift[hit],
     )
-    return Hits(*kept, shift[seen])
 
 
 def _enter_foliage(
-    front: _Front,
+    nearest: _NearestHits,
     scenes: Sequence[RayScene],
     origin: np.ndarray,
     direction: np.ndarray,
     rng: np.random.Generator,
 ) -> None:
-    """Move rays that hit foliage on to the leaf that they end at, or through to what is behind it."""
-    index = np.flatnonzero(front.depth > 0)
-    clumps = np.zeros(len(index), dtype=np.int32)  # that a ray is in: they overlap
-    for _ in range(SKINS):
+    """Extend rays that hit foliage to the leaf that stops them, or to what is behind it.
+
+    The length of the way inside is exponential: its mean is the depth of the foliage.
+    """
+    index = np.flatnonzero(nearest.depth > 0)  # of the rays that are still on their way
+    clumps = np.zeros(len(index), dtype=np.int32)  # that each ray is inside of: clumps overlap
+    for _ in range(MOST_CROSSINGS):
         if not len(index):
             return
-        clumps += np.where(front.facing[index] < 0, 1, -1)
-        on = front.distance[index] + BEYOND
-        beyond = _Front(scenes, origin[index] + direction[index] * on[:, None], direction[index])
-        free = rng.standard_exponential(len(index), dtype=np.float32) * front.depth[index]
-        free[clumps <= 0] = np.inf
-        stopped = free < beyond.distance
-        front.distance[index[stopped]] += free[stopped]
-        through = np.flatnonzero(~stopped)
-        index, clumps = index[through], clumps[through]
-        front.move(index, beyond, through, on[through])
-        leafy = front.depth[index] > 0
-        index, clumps = index[leafy], clumps[leafy]
+
+        # Each ray has reached the surface of a clump: look for the next surface behind it.
+        clumps += np.where(nearest.facing[index] < 0, 1, -1)
+        start = nearest.distance[index] + BEYOND
+        next_origin = origin[index] + direction[index] * start[:, None]
+        behind = _NearestHits(scenes, next_origin, direction[index])
+
+        # Between the two surfaces, a leaf may stop it.
+        free_path = rng.standard_exponential(len(index), dtype=np.float32) * nearest.depth[index]
+        free_path[clumps <= 0] = np.inf
+        stops = free_path < behind.distance
+        nearest.distance[index[stops]] += free_path[stops]
+
+        # The other rays reach the next surface; those whose surface is foliage's continue.
+        rows = np.flatnonzero(~stops)
+        index = index[rows]
+        clumps = clumps[rows]
+        nearest.replace(index, behind, rows, start[rows])
+        leafy = nearest.depth[index] > 0
+        index = index[leafy]
+        clumps = clumps[leafy]

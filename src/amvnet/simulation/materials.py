@@ -1,4 +1,4 @@
-"""Classes as SemanticKITTI numbers them, and how each surface answers a laser pulse."""
+"""The classes of a simulated street, and how each kind of surface reflects a laser pulse."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import numpy as np
 
 
 class Label(IntEnum):
-    """What stands in a simulated street: raw SemanticKITTI ids, and from 300 on what only nuScenes tells apart."""
+    """A class of a simulated street.
+
+    The values are raw SemanticKITTI ids; those from 300 are classes that only nuScenes has.
+    """
 
     CAR = 10
     BICYCLE = 11
@@ -41,7 +44,7 @@ class Label(IntEnum):
     TRAILER = 303
 
 
-# The id of the same thing while it moves.
+# The SemanticKITTI id of a class while it moves.
 MOVING = {
     Label.CAR: 252,
     Label.BICYCLIST: 253,
@@ -52,7 +55,7 @@ MOVING = {
     Label.OTHER_VEHICLE: 259,
 }
 
-# The raw SemanticKITTI ids of what only nuScenes tells apart.
+# The raw SemanticKITTI ids of the classes that only nuScenes has.
 SEMANTICKITTI_IDS = {
     Label.BARRIER: Label.OTHER_STRUCTURE,
     Label.TRAFFIC_CONE: Label.OTHER_OBJECT,
@@ -60,7 +63,7 @@ SEMANTICKITTI_IDS = {
     Label.TRAILER: Label.OTHER_VEHICLE,
 }
 
-# The category of nuScenes-lidarseg of everything.
+# The nuScenes-lidarseg category of each class.
 NUSCENES_CATEGORIES = {
     Label.CAR: "vehicle.car",
     Label.BICYCLE: "vehicle.bicycle",
@@ -69,7 +72,7 @@ NUSCENES_CATEGORIES = {
     Label.TRUCK: "vehicle.truck",
     Label.OTHER_VEHICLE: "vehicle.trailer",
     Label.PERSON: "human.pedestrian.adult",
-    Label.BICYCLIST: "vehicle.bicycle",  # nuScenes counts riders with what they ride
+    Label.BICYCLIST: "vehicle.bicycle",  # nuScenes counts riders as part of the vehicle
     Label.MOTORCYCLIST: "vehicle.motorcycle",
     Label.ROAD: "flat.driveable_surface",
     Label.PARKING: "flat.driveable_surface",
@@ -93,7 +96,7 @@ NUSCENES_CATEGORIES = {
 
 
 class Surface(IntEnum):
-    """Row of the tables below."""
+    """A kind of surface: a row of the tables below."""
 
     ASPHALT = 0
     PAVING = 1
@@ -121,19 +124,19 @@ class Surface(IntEnum):
 
 @dataclass(frozen=True)
 class Reflection:
-    """How one surface answers a pulse; figures as in KITTI's scans."""
+    """How one kind of surface reflects a pulse; measured on KITTI's scans."""
 
-    # Intensity that an HDL-64E reports of a near, head-on return, 0 to 1.
+    # Intensity that an HDL-64E reports if it is near and hit head-on, 0 to 1.
     reflectivity: float
-    # Relative standard deviation of the intensity between returns.
+    # Relative standard deviation of the intensity between returns of one body.
     spread: float
-    # Standard deviation of the reflectivity's logarithm between things.
+    # Standard deviation of the logarithm of the reflectivity between bodies.
     shade: float
-    # Share of the returns that come with intensity 0, as glossy surfaces send most light elsewhere.
+    # Share of the returns with intensity 0: glossy surfaces reflect most of the light elsewhere.
     dark: float = 0.02
-    # Share of the pulses that never come back, whatever the range.
+    # Share of the pulses that never return, whatever the range.
     drop: float = 0.0
-    # Mean height in metres of the relief that is too small for triangles.
+    # Mean height in metres of the relief that is too small to model with triangles.
     rough: float = 0.0
 
 
@@ -163,11 +166,11 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.PLATE: Reflection(0.95, spread=0.10, shade=0.10, dark=0.0),
     Surface.PLASTIC: Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03),
     Surface.ROOF_TILE: Reflection(0.33, spread=0.13, shade=0.20, drop=0.01, rough=0.003),
-    # A house's window shows curtains and frames behind its pane; a car's mostly does not.
+    # The window of a house: unlike a car's, it shows curtains and frames behind the pane.
     Surface.WINDOW: Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01),
 }
 
-# The surface of each kind of ground, by raw id.
+# The surface of each class of ground.
 GROUND_SURFACES: dict[Label, Surface] = {
     Label.ROAD: Surface.ASPHALT,
     Label.PARKING: Surface.PAVING,
@@ -180,13 +183,17 @@ GROUND_SURFACES: dict[Label, Surface] = {
 
 @lru_cache(maxsize=1)
 def reflection_table() -> np.ndarray:
-    """The reflections as rows by surface, columns in the order of the fields of `Reflection`. (S, 6) float32."""
-    return np.array([astuple(REFLECTIONS[surface]) for surface in Surface], dtype=np.float32)
+    """Return `REFLECTIONS` as an (S, 6) float32 table.
+
+    Rows are surfaces; columns are the fields of `Reflection` in their order.
+    """
+    rows = [astuple(REFLECTIONS[surface]) for surface in Surface]
+    return np.array(rows, dtype=np.float32)
 
 
 @lru_cache(maxsize=1)
 def ground_surface_table() -> np.ndarray:
-    """The surface of each ground id, to be indexed by raw id. (256,) uint8."""
+    """Return the surface of each class of ground, indexed by class id: (256,) uint8."""
     table = np.zeros(256, dtype=np.uint8)
     for label, surface in GROUND_SURFACES.items():
         table[label] = surface

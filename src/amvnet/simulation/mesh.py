@@ -1,4 +1,4 @@
-"""Triangles with a surface, a class and an instance each, and the few solids that bodies are built from."""
+"""Labelled triangle meshes, and the few solids that all bodies are built from."""
 
 from __future__ import annotations
 
@@ -7,12 +7,25 @@ from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from amvnet.simulation.materials import Label, Surface
 
 Vector = tuple[float, float, float]
 
-_BOX_CORNERS = np.array([[x, y, z] for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+# Corners of the unit box, whose lower face is centred on the origin.
+_BOX_CORNERS = np.array(
+    [
+        (-0.5, -0.5, 0.0),
+        (0.5, -0.5, 0.0),
+        (-0.5, 0.5, 0.0),
+        (0.5, 0.5, 0.0),
+        (-0.5, -0.5, 1.0),
+        (0.5, -0.5, 1.0),
+        (-0.5, 0.5, 1.0),
+        (0.5, 0.5, 1.0),
+    ]
+)
 _BOX_FACES = np.array(
     [
         (0, 1, 3),
@@ -33,16 +46,18 @@ _BOX_FACES = np.array(
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles and what each is.
+    """Triangles with a surface, a class and an instance each.
 
     Attributes:
-        triangles: (T, 3, 3) float32 corners in metres; z = 0 is where a body stands.
+        triangles: (T, 3, 3) float32 corners in metres; a body stands on z = 0.
         surface: (T,) uint8 rows of the reflection table.
-        label: (T,) uint16 raw class ids; 0 is ground, whose class depends on the place.
+        label: (T,) uint16 class ids; 0 is ground, whose class depends on the place.
         instance: (T,) uint16 instance ids; 0 is none.
-        depth: (T,) float32 metres that a pulse goes into what the triangles enclose, on average; 0 is solid. What is
-            not solid must be closed, its corners counter-clockwise seen from outside.
-        tint: (T,) float32 by how many standard deviations a surface is brighter than others of its kind.
+        depth: (T,) float32 mean distance in metres that a pulse travels inside the triangles
+            before it is reflected; 0 is solid. A mesh that is not solid must be closed, with its
+            corners counter-clockwise seen from outside.
+        tint: (T,) float32 brightness of the surface, in standard deviations from the mean of its
+            kind.
     """
 
     triangles: np.ndarray
@@ -56,46 +71,60 @@ class Mesh:
         return len(self.triangles)
 
 
-def part(triangles: np.ndarray, surface: Surface, label: Label | int, depth: float = 0) -> Mesh:
-    """Triangles that are all of one surface and one class; see `Mesh` for the depth."""
+def part(
+    solids: Sequence[np.ndarray], surface: Surface, label: Label | int, depth: float = 0
+) -> Mesh:
+    """Return solids, (T, 3, 3) each, as one mesh of one surface and one class.
+
+    See `Mesh` for the depth.
+    """
+    triangles = np.concatenate(solids)
     count = len(triangles)
     return Mesh(
-        triangles.astype(np.float32),
-        np.full(count, surface, dtype=np.uint8),
-        np.full(count, label, dtype=np.uint16),
-        np.zeros(count, dtype=np.uint16),
-        np.full(count, depth, dtype=np.float32),
-        np.zeros(count, dtype=np.float32),
+        triangles=triangles.astype(np.float32),
+        surface=np.full(count, surface, dtype=np.uint8),
+        label=np.full(count, label, dtype=np.uint16),
+        instance=np.zeros(count, dtype=np.uint16),
+        depth=np.full(count, depth, dtype=np.float32),
+        tint=np.zeros(count, dtype=np.float32),
     )
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """Several meshes as one; none at all as an empty one."""
+    """Return several meshes as one; the result is empty if there are none."""
     if not meshes:
-        return part(np.zeros((0, 3, 3)), Surface.ASPHALT, 0)
-    return Mesh(*(np.concatenate([getattr(m, f.name) for m in meshes]) for f in fields(Mesh)))
+        return part([np.zeros((0, 3, 3))], Surface.ASPHALT, 0)
+
+    columns = {}
+    for column in fields(Mesh):
+        arrays = [getattr(mesh, column.name) for mesh in meshes]
+        columns[column.name] = np.concatenate(arrays)
+    return Mesh(**columns)
 
 
 def place(mesh: Mesh, x: float, y: float, z: float, yaw: float) -> Mesh:
-    """The mesh turned about its upright axis and moved to a place."""
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])  # transposed: corners are rows
-    moved = mesh.triangles @ turn + np.array([x, y, z])
-    return replace(mesh, triangles=moved.astype(np.float32))
+    """Return the mesh turned by `yaw` (radians) about its vertical axis, then moved."""
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    rotation = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # transposed: corners are rows
+
+    corners = mesh.triangles @ rotation + np.array([x, y, z])
+    return replace(mesh, triangles=corners.astype(np.float32))
 
 
-def named(mesh: Mesh, instance: int) -> Mesh:
-    """The mesh as one instance."""
+def with_instance(mesh: Mesh, instance: int) -> Mesh:
+    """Return the mesh as one instance."""
     return replace(mesh, instance=np.full(len(mesh), instance, dtype=np.uint16))
 
 
-def tinted(mesh: Mesh, rng: np.random.Generator) -> Mesh:
-    """The mesh with each of its surfaces a little brighter or darker than usual."""
-    return replace(mesh, tint=rng.standard_normal(len(Surface), dtype=np.float32)[mesh.surface])
+def with_random_tint(mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """Return the mesh with each of its surfaces a little brighter or darker than usual."""
+    tints = rng.standard_normal(len(Surface), dtype=np.float32)
+    return replace(mesh, tint=tints[mesh.surface])
 
 
-def relabelled(mesh: Mesh, labels: dict[Label, int]) -> Mesh:
-    """The mesh with some class ids replaced by others."""
+def with_labels(mesh: Mesh, labels: dict[Label, int]) -> Mesh:
+    """Return the mesh with the class ids that are keys of `labels` replaced by their values."""
     label = mesh.label.copy()
     for old, new in labels.items():
         label[mesh.label == old] = new
@@ -105,70 +134,130 @@ def relabelled(mesh: Mesh, labels: dict[Label, int]) -> Mesh:
 def box(
     size: Vector, at: Vector = (0, 0, 0), top: tuple[float, float] = (1, 1), shift: float = 0
 ) -> np.ndarray:
-    """A box standing on `at`; `top` narrows its upper face in x and y, `shift` moves that face along x. (12, 3, 3)."""
+    """Return the (12, 3, 3) triangles of a box.
+
+    Args:
+        size: edge lengths in metres.
+        at: centre of the lower face.
+        top: factors by which the upper face is narrower in x and y.
+        shift: metres by which the upper face is moved along x.
+    """
     corners = _BOX_CORNERS * np.array(size)
     corners[4:, :2] *= np.array(top)
     corners[4:, 0] += shift
     return (corners + np.array(at))[_BOX_FACES]
 
 
+def copies(
+    triangles: np.ndarray, x: ArrayLike = 0.0, y: ArrayLike = 0.0, z: ArrayLike = 0.0
+) -> np.ndarray:
+    """Return copies of (T, 3, 3) triangles, one moved by each of the offsets.
+
+    The offsets are broadcast against each other: `x=[0, 1], z=2` are two copies, both 2 m up.
+    """
+    offsets = np.stack(np.broadcast_arrays(x, y, z), axis=-1)
+    return (triangles + offsets[..., None, None, :]).reshape(-1, 3, 3)
+
+
 def tube(
     start: Vector, end: Vector, radius: float, end_radius: float | None = None, sides: int = 8
 ) -> np.ndarray:
-    """A closed round bar from one point to another, with another radius at its end if given. (4 sides, 3, 3)."""
-    a, b = np.array(start, dtype=float), np.array(end, dtype=float)
-    axis = (b - a) / np.linalg.norm(b - a)
+    """Return the (4 sides, 3, 3) triangles of a closed round bar between two points.
+
+    Its radius is `radius`, or goes from `radius` at the start to `end_radius` at the end.
+    """
+    if end_radius is None:
+        end_radius = radius
+
+    start_point = np.array(start, dtype=float)
+    end_point = np.array(end, dtype=float)
+    axis = (end_point - start_point) / np.linalg.norm(end_point - start_point)
+
+    # A circle about the axis, (sides, 3).
     across = np.cross(axis, (1.0, 0, 0) if abs(axis[0]) < 0.9 else (0, 1.0, 0))
     across /= np.linalg.norm(across)
     angle = np.arange(sides) * 2 * np.pi / sides
-    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(
-        axis, across
-    )  # (sides, 3)
-    low, high = a + circle * radius, b + circle * (radius if end_radius is None else end_radius)
-    next_low, next_high = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
-    starts, ends = np.broadcast_to(a, low.shape), np.broadcast_to(b, low.shape)
-    quads = [
-        (low, next_low, next_high),
-        (low, next_high, high),
-        (starts, next_low, low),
-        (ends, high, next_high),
-    ]
-    return np.concatenate([np.stack(corners, axis=1) for corners in quads])
+    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
+
+    low = start_point + circle * radius
+    high = end_point + circle * end_radius
+    next_low = np.roll(low, -1, axis=0)
+    next_high = np.roll(high, -1, axis=0)
+    start_points = np.broadcast_to(start_point, low.shape)
+    end_points = np.broadcast_to(end_point, high.shape)
+    return np.concatenate(
+        [
+            _triangles(low, next_low, next_high),
+            _triangles(low, next_high, high),
+            _triangles(start_points, next_low, low),
+            _triangles(end_points, high, next_high),
+        ]
+    )
 
 
 def prism(
     profile: Sequence[tuple[float, float]], width: float, top_width: float | None = None
 ) -> np.ndarray:
-    """A side view (x, z), convex or nearly so, drawn out across y; narrower towards its top if given. (4 n, 3, 3)."""
+    """Return the (4 n, 3, 3) triangles of a side view drawn out across y.
+
+    Args:
+        profile: n corners (x, z) of the side view, which is convex or nearly so.
+        width: width in y.
+        top_width: width at the top, if it differs.
+    """
+    if top_width is None:
+        top_width = width
+
     xz = np.array(profile, dtype=float)
     rise = (xz[:, 1] - xz[:, 1].min()) / np.ptp(xz[:, 1])
-    half = 0.5 * (width + rise * ((width if top_width is None else top_width) - width))
-    left = np.column_stack([xz[:, 0], half, xz[:, 1]])
+    half_width = 0.5 * (width + rise * (top_width - width))
+
+    left = np.column_stack([xz[:, 0], half_width, xz[:, 1]])
     right = left * np.array([1, -1, 1])
-    next_left, next_right = np.roll(left, -1, axis=0), np.roll(right, -1, axis=0)
-    middles = [np.broadcast_to(side.mean(axis=0), side.shape) for side in (left, right)]
-    faces = [(left, next_left, next_right), (left, next_right, right)]
-    faces += [(middles[0], left, next_left), (middles[1], right, next_right)]
-    return np.concatenate([np.stack(corners, axis=1) for corners in faces])
+    next_left = np.roll(left, -1, axis=0)
+    next_right = np.roll(right, -1, axis=0)
+    left_middle = np.broadcast_to(left.mean(axis=0), left.shape)
+    right_middle = np.broadcast_to(right.mean(axis=0), right.shape)
+    return np.concatenate(
+        [
+            _triangles(left, next_left, next_right),
+            _triangles(left, next_right, right),
+            _triangles(left_middle, left, next_left),
+            _triangles(right_middle, right, next_right),
+        ]
+    )
 
 
 def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.ndarray:
-    """A flat ring in the x-z plane, as the rim of a bicycle wheel. (2 sides, 3, 3)."""
+    """Return the (2 sides, 3, 3) triangles of a flat ring in the x-z plane, such as a wheel's rim.
+
+    `at` is its centre.
+    """
     angle = np.arange(sides) * 2 * np.pi / sides
     circle = np.column_stack([np.cos(angle), np.zeros(sides), np.sin(angle)])
-    outer, inner = circle * radius, circle * (radius - thickness)
-    next_outer, next_inner = np.roll(outer, -1, axis=0), np.roll(inner, -1, axis=0)
-    faces = [(outer, next_outer, next_inner), (outer, next_inner, inner)]
-    return np.concatenate([np.stack(corners, axis=1) for corners in faces]) + np.array(at)
+
+    outer = circle * radius
+    inner = circle * (radius - thickness)
+    next_outer = np.roll(outer, -1, axis=0)
+    next_inner = np.roll(inner, -1, axis=0)
+    ring = np.concatenate(
+        [_triangles(outer, next_outer, next_inner), _triangles(outer, next_inner, inner)]
+    )
+    return ring + np.array(at)
+
+
+def _triangles(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Return the (n, 3, 3) triangles between three lists of n corners."""
+    return np.stack([a, b, c], axis=1)
 
 
 @lru_cache(maxsize=4)
 def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (V, 3) and faces (T, 3) of a unit sphere."""
+    """Return the corners (V, 3) and the faces (T, 3) of a unit sphere."""
     from trimesh.creation import icosphere
 
-    ball = icosphere(subdivisions=subdivisions)
-    return np.asarray(ball.vertices), np.asarray(ball.faces)
+    sphere = icosphere(subdivisions=subdivisions)
+    return np.asarray(sphere.vertices), np.asarray(sphere.faces)
 
 
 def hull(
@@ -179,21 +268,23 @@ def hull(
     square: float = 1,
     fine: bool = True,
 ) -> np.ndarray:
-    """The bumpy, closed hull of a clump of leaves; counter-clockwise seen from outside. (T, 3, 3).
+    """Return the (T, 3, 3) triangles of the bumpy, closed hull of a clump of leaves.
+
+    The corners are counter-clockwise seen from outside.
 
     Args:
-        rng: where the bumps come from.
-        centre: its middle in metres.
-        radii: its half axes in metres.
-        taper: by what share it is narrower at its top and wider at its foot.
-        square: below 1 it comes closer to a box.
+        rng: draws the bumps.
+        centre: centre of the hull in metres.
+        radii: half axes of the hull in metres.
+        taper: share by which it is narrower at the top and wider at the bottom.
+        square: exponent of the shape; below 1 it is closer to a box.
         fine: 320 triangles instead of 80.
     """
     corners, faces = _sphere(2 if fine else 1)
-    waves = np.sin(corners @ rng.normal(scale=3.0, size=(3, 3)) + rng.uniform(0, 6.3, size=3)).sum(
-        axis=1
-    )
-    swell = 1 + 0.09 * waves + rng.normal(scale=0.11, size=len(corners))
+
+    waves = np.sin(corners @ rng.normal(scale=3.0, size=(3, 3)) + rng.uniform(0, 6.3, size=3))
+    swell = 1 + 0.09 * waves.sum(axis=1) + rng.normal(scale=0.11, size=len(corners))
+
     shape = np.sign(corners) * np.abs(corners) ** square * swell[:, None]
-    shape[:, :2] *= np.maximum(1 - taper * shape[:, 2:], 0.05)  # a tip stays a tip
+    shape[:, :2] *= np.maximum(1 - taper * shape[:, 2:], 0.05)  # keep the tip from turning over
     return (shape * np.array(radii) + np.array(centre))[faces]

@@ -4,50 +4,51 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from amvnet.sensors.lidars import HEIGHTS
-
 
 @dataclass(frozen=True)
-class Sensor:
-    """A LiDAR as a table of numbers."""
+class LidarModel:
+    """The numbers that describe one LiDAR and the car that carries it."""
 
-    # Elevation of each laser in degrees, from the top down: the order in which points are written.
+    # Elevation of each laser in degrees, from the top down: points are written in this order.
     elevations: tuple[float, ...]
-    # Shots of each laser per turn.
+    # Shots of each laser per rotation.
     azimuth_steps: int
     # Height above the ground in metres.
     height: float
-    # Nearest and farthest range that is measured, in metres.
+    # Smallest and largest range that is measured, in metres.
     min_range: float
     max_range: float
     # Standard deviation of the range in metres.
     range_noise: float
-    # Share of the returns that are lost whatever they hit.
+    # Share of the returns that are lost, whatever they hit.
     drop: float
-    # Range in metres at which half the returns of a white, head-on surface are lost.
+    # Range in metres at which half of the returns of a white surface hit head-on are lost.
     reach: float
-    # Share of the returns at an edge in depth that lie somewhere between the two surfaces.
+    # Share of the returns at a depth edge that lie between the two surfaces.
     mixed: float
-    # Near and head-on, the device reports an intensity of gain * reflectivity ** gamma, with so many decimals.
+    # A near surface hit head-on has the intensity gain * reflectivity ** gamma, rounded to
+    # `decimals`.
     gain: float
     gamma: float
     decimals: int
-    # How much the lasers' gains differ, of reflectivity: scale of Student's t with three degrees of freedom.
+    # Spread of the gains between lasers: scale of a Student's t distribution with three degrees
+    # of freedom.
     gain_spread: float
-    # Seconds that a turn takes, at whose middle the sensor looks ahead; counter-clockwise seen from above, or not.
-    turn: float
+    # Seconds per rotation; the sensor looks ahead in the middle of it.
+    rotation_period: float
+    # Direction of the rotation, seen from above.
     counter_clockwise: bool
-    # True where the files hold points as if the sensor had stood still.
-    corrected: bool
-    # True where a lost return is written all the same, somewhere within a metre of the sensor.
-    keeps_lost: bool
-    # The layout that its scans are written in: semantickitti or nuscenes.
+    # True if the motion of the sensor during a rotation is removed from the points.
+    motion_corrected: bool
+    # True if lost returns are written too, as points within a metre of the sensor.
+    keeps_lost_returns: bool
+    # Layout of the files: semantickitti or nuscenes.
     layout: str
-    # What the own car and its racks hide: azimuth from and to, elevation from and to, in degrees.
+    # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
     shadow: tuple[tuple[float, float, float, float], ...]
 
 
-# Degrees, from the top down: medians over points of KITTI's scans, laser by laser.
+# Degrees, from the top down: medians over the points of KITTI's scans, laser by laser.
 _HDL64E_ELEVATIONS = (
     2.59, 2.20, 1.96, 1.51, 1.22, 0.81, 0.54, 0.17, -0.18, -0.59, -0.89,
     -1.23, -1.58, -1.89, -2.17, -2.52, -2.84, -3.25, -3.51, -3.92, -4.22, -4.56,
@@ -56,11 +57,12 @@ _HDL64E_ELEVATIONS = (
     -14.21, -14.64, -15.14, -15.51, -16.13, -16.66, -17.21, -17.67, -18.16, -18.58, -19.01,
     -19.58, -20.07, -20.71, -21.17, -21.59, -22.01, -22.67, -23.13, -23.64,
 )  # fmt: skip
-# The shadow is what the car of KITTI hides.
-HDL64E = Sensor(
+
+# The shadow is that of KITTI's car.
+HDL64E = LidarModel(
     elevations=_HDL64E_ELEVATIONS,
     azimuth_steps=2180,
-    height=HEIGHTS["hdl64e"],
+    height=1.73,
     min_range=1.5,
     max_range=80.0,
     range_noise=0.0085,
@@ -71,10 +73,10 @@ HDL64E = Sensor(
     gamma=1.0,
     decimals=2,
     gain_spread=0.12,
-    turn=0.1,
+    rotation_period=0.1,
     counter_clockwise=True,
-    corrected=True,
-    keeps_lost=False,
+    motion_corrected=True,
+    keeps_lost_returns=False,
     layout="semantickitti",
     shadow=(
         (-14, 14, -90, -20.9),
@@ -91,11 +93,13 @@ HDL64E = Sensor(
         (336, 340, -90, -21.9),
     ),
 )
-# Evenly spaced; noise, intensity and shadow as in nuScenes, whose scans have a row for every shot.
-HDL32E = Sensor(
+
+# The lasers are evenly spaced. Noise, intensity and shadow are those of nuScenes, whose scans have
+# a point for every shot.
+HDL32E = LidarModel(
     elevations=tuple(10.67 - i * 4 / 3 for i in range(32)),
     azimuth_steps=1084,
-    height=HEIGHTS["hdl32e"],
+    height=1.84,
     min_range=1.0,
     max_range=100.0,
     range_noise=0.005,
@@ -106,10 +110,10 @@ HDL32E = Sensor(
     gamma=2.6,
     decimals=3,
     gain_spread=0.05,
-    turn=0.05,
+    rotation_period=0.05,
     counter_clockwise=False,
-    corrected=True,
-    keeps_lost=True,
+    motion_corrected=True,
+    keeps_lost_returns=True,
     layout="nuscenes",
     shadow=(
         (-50, 50, -90, -23.5),
@@ -127,4 +131,5 @@ HDL32E = Sensor(
         (170, 190, -90, -18),
     ),
 )
-SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E, "hdl32e": HDL32E}
+
+SENSORS: dict[str, LidarModel] = {"hdl64e": HDL64E, "hdl32e": HDL32E}

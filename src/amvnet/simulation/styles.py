@@ -1,4 +1,4 @@
-"""What sets one street apart from another: the kinds of streets, and one street drawn from them."""
+"""What makes one street differ from another: the kinds of streets, and how one is drawn."""
 
 from __future__ import annotations
 
@@ -6,62 +6,67 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from amvnet.simulation.chance import weighted_choice
+
 
 @dataclass(frozen=True)
 class Style:
-    """What sets one street apart from another; lengths in metres, pairs are (right, left) of the road."""
+    """The numbers of one street.
+
+    Lengths are in metres; pairs of one number a side are (right, left) of the road.
+    """
 
     # One of residential, urban, rural, fast.
     kind: str
     # Width of the carriageway.
     road: float
-    # Width of the lane of parked cars on either side; 0 is none.
+    # Width of the lane of parked cars on each side; 0 is none.
     parking: tuple[float, float]
-    # Width of the strip of grass between kerb and sidewalk.
+    # Width of the strip of grass between kerb and sidewalk on each side.
     verge: tuple[float, float]
-    # Width of the sidewalk; 0 is none.
+    # Width of the sidewalk on each side; 0 is none.
     sidewalk: tuple[float, float]
     # Height of the kerb.
     kerb: float
-    # Rise of the ground beside the street per metre, from the sidewalk outwards.
+    # Slope of the ground on each side, from the sidewalk outwards.
     bank: tuple[float, float]
-    # Chances, per plot, of house, contiguous houses, wood, open field, car park.
+    # Chances that a plot has a house, a row of houses, a wood, an open field, a car park.
     plots: tuple[float, float, float, float, float]
-    # Smallest and largest distance of a house from its plot's front.
+    # Smallest and largest distance of a house from the front of its plot.
     setback: tuple[float, float]
-    # Smallest and largest height of walls.
+    # Smallest and largest height of a house's walls.
     storeys: tuple[float, float]
     # Chance that a place in the parking lane is taken.
     parked: float
     # Distance between trees along the street; infinite is none.
     trees: float
-    # Chance of a hedge, wall or fence before a plot.
+    # Chance of a hedge, wall or fence along the front of a plot.
     fenced: float
     # Driving cars per 100 m of lane.
     traffic: float
     # People and cyclists per 100 m of street.
     people: float
-    # Scale of plants in gardens.
+    # Scale of the number of plants in gardens.
     green: float
     # Distance between lamps or utility poles.
     lamps: float
-    # True where lanes are painted.
+    # True if lane markings are painted.
     painted: bool
 
 
 @dataclass(frozen=True)
 class Kind:
-    """What the streets of one kind have in common; `draw_style` shakes it."""
+    """The numbers that the streets of one kind have in common; `draw_style` varies them."""
 
     # Share of all streets.
     share: float
     # Smallest and largest width of the carriageway.
     road: tuple[float, float]
-    # Chances, on either side, of a parking lane, a verge, a sidewalk.
+    # Chances of a parking lane, a verge and a sidewalk on each side.
     parking: float
     verge: float
     sidewalk: float
-    # The others are as in `Style`.
+    # As in `Style`.
     plots: tuple[float, float, float, float, float]
     setback: tuple[float, float]
     storeys: tuple[float, float]
@@ -71,7 +76,7 @@ class Kind:
     traffic: float
     people: float
     green: float
-    # Chance that lanes are painted.
+    # Chance that lane markings are painted.
     painted: float
 
 
@@ -147,25 +152,21 @@ KINDS = {
 }
 
 
-def _pair(rng: np.random.Generator, low: float, high: float, chance: float) -> tuple[float, float]:
-    """A value for each side of the road, 0 where the chance fails."""
-    right, left = (
-        float(rng.uniform(low, high)) if rng.random() < chance else 0.0 for _ in range(2)
-    )
-    return right, left
-
-
 def draw_style(rng: np.random.Generator) -> Style:
-    """A street of a random kind, each of its numbers shaken."""
-    name = str(rng.choice(list(KINDS), p=[kind.share for kind in KINDS.values()]))
+    """Draw a street of a random kind and vary the numbers of that kind."""
+    shares = {name: kind.share for name, kind in KINDS.items()}
+    name = weighted_choice(rng, shares)
     kind = KINDS[name]
+
+    # The larger the factor, the closer the street's shares are to those of its kind.
     house, row, wood, field, lot = rng.dirichlet(np.array(kind.plots) * 8 + 1e-3).tolist()
+
     return Style(
         kind=name,
         road=float(rng.uniform(*kind.road)),
-        parking=_pair(rng, 2.0, 2.5, kind.parking),
-        verge=_pair(rng, 0.8, 3.5, kind.verge),
-        sidewalk=_pair(rng, 1.4, 4.0, kind.sidewalk),
+        parking=_draw_widths(rng, 2.0, 2.5, kind.parking),
+        verge=_draw_widths(rng, 0.8, 3.5, kind.verge),
+        sidewalk=_draw_widths(rng, 1.4, 4.0, kind.sidewalk),
         kerb=float(rng.uniform(0.04, 0.16)),
         bank=(float(rng.normal(0.02, 0.06)), float(rng.normal(0.02, 0.06))),
         plots=(house, row, wood, field, lot),
@@ -180,3 +181,18 @@ def draw_style(rng: np.random.Generator) -> Style:
         lamps=float(rng.uniform(24, 55)),
         painted=bool(rng.random() < kind.painted),
     )
+
+
+def _draw_widths(
+    rng: np.random.Generator, low: float, high: float, chance: float
+) -> tuple[float, float]:
+    """Draw a width for each side of the road, which is 0 unless the chance comes true."""
+    right = _draw_width(rng, low, high, chance)
+    left = _draw_width(rng, low, high, chance)
+    return right, left
+
+
+def _draw_width(rng: np.random.Generator, low: float, high: float, chance: float) -> float:
+    if rng.random() < chance:
+        return float(rng.uniform(low, high))
+    return 0.0

@@ -1,4 +1,4 @@
-"""Simulates sequences of scans on several processes, and goes on where it was stopped."""
+"""Simulates sequences on several processes, and continues where an earlier call was stopped."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.errors import InputError
 from amvnet.files import atomic_write
+from amvnet.errors import InputError
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan
 from amvnet.simulation.lidar import require_embree
-from amvnet.simulation.sensors import SENSORS, Sensor
+from amvnet.simulation.sensors import SENSORS, LidarModel
 
-Progress = Callable[[int, int], None]  # scans done, in all
+Progress = Callable[[int, int], None]  # scans written, scans in all
+# Environment variables that set the number of threads of the numerical libraries.
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-DONE = (
-    ".simulation"  # folder of a file for each sequence that is written: what made it, and its rows
-)
+# Folder with a file for each complete sequence: its settings, and what the layout keeps of it.
+MARKERS = ".simulation"
 
 
 @dataclass(frozen=True)
 class Sequence:
-    """One sequence to be written."""
+    """One sequence to write."""
 
     out: Path
     sensor: str
@@ -40,14 +40,14 @@ class Sequence:
     seed: int
 
     @property
-    def made(self) -> dict[str, Any]:
-        """What the bytes of the sequence depend on."""
+    def settings(self) -> dict[str, Any]:
+        """The settings that the bytes of the sequence depend on, besides its number."""
         return {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
 
     @property
-    def done(self) -> Path:
-        """The file that says that the sequence is written."""
-        return self.out / DONE / f"{self.number:04d}.json"
+    def marker(self) -> Path:
+        """The file that exists once the sequence is complete."""
+        return self.out / MARKERS / f"{self.number:04d}.json"
 
 
 def simulate(
@@ -61,78 +61,89 @@ def simulate(
     processes: int = 1,
     progress: Progress = lambda done, total: None,
 ) -> Path:
-    """Write labelled scans of procedural streets; the same seed gives the same bytes on any number of processes.
+    """Write labelled scans of procedural streets.
 
-    Sequences that an earlier call has written are left as they are.
+    The same seed gives the same bytes on any number of processes. Sequences that an earlier call
+    has completed are kept.
 
     Args:
-        out: folder to write to, in SemanticKITTI's layout (HDL-64E) or that of nuScenes-lidarseg (HDL-32E).
+        out: folder to write to, in the layout of SemanticKITTI (HDL-64E) or nuScenes-lidarseg
+            (HDL-32E).
         sensor: name of a sensor in `SENSORS`.
         sequences: number of sequences; each is another street.
         scans: number of scans in each sequence.
-        seed: where all randomness comes from.
+        seed: seed of all randomness.
         first_sequence: number of the first sequence.
-        processes: so many sequences are simulated side by side; a script that asks for more than one needs
-            Python's `if __name__ == "__main__"`.
-        progress: called with (scans done, scans in all).
+        processes: number of sequences that are simulated in parallel; a script that asks for more
+            than one needs Python's `if __name__ == "__main__"`.
+        progress: called with the number of scans written and the number in all.
 
     Returns:
         The folder `out`.
 
     Raises:
-        InputError: where the sensor is unknown, a number is too small, embreex is missing, or the folder holds
-            a sequence that was simulated otherwise.
+        InputError: if the sensor is unknown, a number is too small, embreex is missing, or the
+            folder holds a sequence with other settings.
     """
-    device = _sensor(sensor)
-    _at_least(1, sequences=sequences, scans=scans, processes=processes)
-    _at_least(0, seed=seed, first_sequence=first_sequence)
+    model = _sensor(sensor)
+    _check_at_least(1, sequences=sequences, scans=scans, processes=processes)
+    _check_at_least(0, seed=seed, first_sequence=first_sequence)
     require_embree()
+
     out = Path(out)
-    wanted = [Sequence(out, sensor, first_sequence + i, scans, seed) for i in range(sequences)]
-    missing = [sequence for sequence in wanted if not _is_written(sequence)]
+    numbers = range(first_sequence, first_sequence + sequences)
+    wanted = [Sequence(out, sensor, number, scans, seed) for number in numbers]
+    missing = [sequence for sequence in wanted if not _is_complete(sequence)]
     done = scans * (len(wanted) - len(missing))
-    for more in _written(missing, min(processes, len(missing))):
-        done += more
+    for written in _write_sequences(missing, min(processes, len(missing))):
+        done += written
         progress(done, scans * sequences)
-    kept = [json.loads(path.read_text())["rows"] for path in sorted((out / DONE).glob("*.json"))]
-    LAYOUTS[device.layout].complete(out, kept)
+
+    # The layout's tables cover all sequences in the folder, those of earlier calls too.
+    markers = sorted((out / MARKERS).glob("*.json"))
+    rows = [json.loads(path.read_text())["rows"] for path in markers]
+    LAYOUTS[model.layout].complete(out, rows)
     return out
 
 
 def simulate_scan(sensor: str = "hdl64e", seed: int = 0) -> SimulatedScan:
-    """One scan of a street in memory."""
+    """Return one scan of a street."""
     return next(drive_street(_sensor(sensor), 1, np.random.SeedSequence((seed, 0))))
 
 
-def _is_written(sequence: Sequence) -> bool:
-    """Whether an earlier call has written the sequence; raises where it was made otherwise."""
-    if not sequence.done.is_file():
+def _is_complete(sequence: Sequence) -> bool:
+    """Return whether an earlier call has completed a sequence.
+
+    Raises:
+        InputError: if it has other settings.
+    """
+    if not sequence.marker.is_file():
         return False
-    found = {
-        key: value for key, value in json.loads(sequence.done.read_text()).items() if key != "rows"
-    }
-    if found != sequence.made:
+
+    settings = json.loads(sequence.marker.read_text())
+    del settings["rows"]
+    if settings != sequence.settings:
         raise InputError(
-            f"{sequence.out}: expected sequence {sequence.number} of {sequence.made}, found one of {found}; "
-            "give another folder"
+            f"{sequence.out}: expected sequence {sequence.number} with {sequence.settings}, "
+            f"found it with {settings}; choose another folder"
         )
     return True
 
 
-def _written(sequences: list[Sequence], processes: int) -> Iterator[int]:
-    """Write sequences; yields the number of scans that have been added."""
+def _write_sequences(sequences: list[Sequence], processes: int) -> Iterator[int]:
+    """Write sequences; yield the number of scans each time that some are written."""
     if processes <= 1:
         for sequence in sequences:
             yield from _write(sequence)
         return
-    # Started afresh, as a copy of a process that has computed with torch may hang.
+
+    # Spawned, as a fork of a process that has computed with torch may hang.
     context = multiprocessing.get_context("spawn")
     with _one_thread_each(), ProcessPoolExecutor(processes, context, _end_with_parent) as pool:
         try:
-            for written in as_completed(
-                [pool.submit(_write_all, sequence) for sequence in sequences]
-            ):
-                yield written.result()
+            jobs = [pool.submit(_write_all, sequence) for sequence in sequences]
+            for job in as_completed(jobs):
+                yield job.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -140,7 +151,7 @@ def _written(sequences: list[Sequence], processes: int) -> Iterator[int]:
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Processes that are started meanwhile leave the processors to each other: a third faster on two."""
+    """Let processes started in this context use one thread each: a third faster on two cores."""
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
@@ -153,7 +164,7 @@ def _one_thread_each() -> Iterator[None]:
 
 
 def _end_with_parent() -> None:
-    """A pool's process would wait for ever for one that was killed."""
+    """End this process of the pool if its parent is killed; it would wait for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -169,19 +180,20 @@ def _write_all(sequence: Sequence) -> int:
 
 
 def _write(sequence: Sequence) -> Iterator[int]:
-    """Write one sequence; yields 1 after each scan."""
-    device = SENSORS[sequence.sensor]
-    layout = LAYOUTS[device.layout](sequence.out, sequence.number)
-    seeds = np.random.SeedSequence((sequence.seed, sequence.number))
-    for index, scan in enumerate(drive_street(device, sequence.scans, seeds)):
-        layout.scan(index, scan)
+    """Write one sequence; yield 1 after each scan."""
+    model = SENSORS[sequence.sensor]
+    layout = LAYOUTS[model.layout](sequence.out, sequence.number)
+    seed = np.random.SeedSequence((sequence.seed, sequence.number))
+    for index, scan in enumerate(drive_street(model, sequence.scans, seed)):
+        layout.write_scan(index, scan)
         yield 1
+
     rows = layout.finish()
-    with atomic_write(sequence.done) as part:
-        part.write_text(json.dumps({**sequence.made, "rows": rows}))
+    with atomic_write(sequence.marker) as part:
+        part.write_text(json.dumps({**sequence.settings, "rows": rows}))
 
 
-def _at_least(least: int, **numbers: int) -> None:
+def _check_at_least(least: int, **numbers: int) -> None:
     for name, value in numbers.items():
         if value < least:
             raise InputError(
@@ -189,9 +201,9 @@ def _at_least(least: int, **numbers: int) -> None:
             )
 
 
-def _sensor(name: str) -> Sensor:
+def _sensor(name: str) -> LidarModel:
+    """Return the sensor of a name, or raise an InputError if there is none."""
     if name not in SENSORS:
-        raise InputError(
-            f"sensor: expected one of {', '.join(SENSORS)}, found {name!r}; name one of these"
-        )
+        names = ", ".join(SENSORS)
+        raise InputError(f"sensor: expected one of {names}, found {name!r}; choose one of them")
     return SENSORS[name]

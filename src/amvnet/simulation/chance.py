@@ -1,0 +1,16 @@
+"""Weighted random choice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TypeVar
+
+import numpy as np
+
+Option = TypeVar("Option")
+
+
+def weighted_choice(rng: np.random.Generator, chances: Mapping[Option, float]) -> Option:
+    """Draw one of the keys, each with the chance that is its value; the chances add up to 1."""
+    options = list(chances)
+    return options[rng.choice(len(options), p=list(chances.values()))]
