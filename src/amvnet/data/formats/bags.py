@@ -8,7 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from amvnet.data.formats.cloud import Cloud, refusing
+from amvnet.data.formats.cloud import Cloud, reading
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.errors import InputError
 
@@ -35,7 +35,7 @@ class Bag:
 
     def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
         self.path, self._ending = path, ending
-        with refusing(path, EXPECTED, ADVICE), _opened(path, ending) as reader:
+        with reading(path, EXPECTED, ADVICE), _opened(path, ending) as reader:
             self.topic = _choose(_topics(reader), topic, path)
             self._count = sum(c.msgcount for c in _connections(reader, self.topic))
         if not 0 < self._count <= _size(path) // SMALLEST:
@@ -58,7 +58,7 @@ class Bag:
         if not self._next:
             self._messages = self._read_all()
         name = f"{self.path} ({self.topic}, {place})"
-        with refusing(name, "a PointCloud2 message", ADVICE):
+        with reading(name, "a PointCloud2 message", ADVICE):
             for message in self._messages:
                 self._next += 1
                 if self._next > place:

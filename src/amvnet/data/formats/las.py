@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, refusing
+from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, reading
 from amvnet.errors import InputError
 
 ADVICE = "write the file again"
@@ -28,7 +28,7 @@ def read_las(path: Path) -> Cloud:
     Raises:
         InputError: where it is no such file, truncated, or laspy is missing.
     """
-    with refusing(path, "a LAS or LAZ file", ADVICE):
+    with reading(path, "a LAS or LAZ file", ADVICE):
         count, compressed = _check_header(path)
         _require_laspy(path)
         columns = _read_apart(path, count) if compressed else read_columns(path)

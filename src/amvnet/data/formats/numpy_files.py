@@ -13,7 +13,7 @@ from amvnet.data.formats.cloud import (
     Cloud,
     check_point_count,
     make_cloud,
-    refusing,
+    reading,
     require_columns,
     ring_indices,
 )
@@ -32,14 +32,14 @@ def read_npy(path: Path) -> Cloud:
     Raises:
         InputError: where it is no array of numbers, of another shape, or truncated.
     """
-    with refusing(path, "a plain NumPy array", ADVICE), path.open("rb") as file:
+    with reading(path, "a plain NumPy array", ADVICE), path.open("rb") as file:
         return _cloud(_load(file, path.stat().st_size, path), path)
 
 
 def read_npz(path: Path) -> Cloud:
     """Read the one array of an archive, or the one named `points`, `xyz`, `scan` or `arr_0`; raises as `read_npy`."""
     with (
-        refusing(path, "a NumPy archive", "save it again with np.savez"),
+        reading(path, "a NumPy archive", "save it again with np.savez"),
         zipfile.ZipFile(path) as archive,
     ):
         names = {

@@ -16,7 +16,7 @@ from amvnet.data.formats.cloud import (
     Cloud,
     check_point_count,
     make_cloud,
-    refusing,
+    reading,
     require_columns,
 )
 from amvnet.errors import InputError
@@ -64,7 +64,7 @@ def read_pcd(path: Path) -> Cloud:
     Raises:
         InputError: where it is no such file, truncated, or has no x, y, z.
     """
-    with refusing(path, "a PCD file", ADVICE), path.open("rb") as file:
+    with reading(path, "a PCD file", ADVICE), path.open("rb") as file:
         header = _read_header(file, path)
         wanted = require_columns([column.name for column in header.columns], path)
         columns = {key: header.columns[place] for key, place in wanted.items()}

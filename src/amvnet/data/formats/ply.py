@@ -15,7 +15,7 @@ from amvnet.data.formats.cloud import (
     Cloud,
     check_point_count,
     make_cloud,
-    refusing,
+    reading,
     require_columns,
 )
 from amvnet.data.formats.pcd import HEADER, read_rows, read_text
@@ -50,7 +50,7 @@ def read_ply(path: Path) -> Cloud:
     Raises:
         InputError: where it is no such file, truncated, or has no vertices with x, y, z.
     """
-    with refusing(path, "a PLY file", ADVICE), path.open("rb") as file:
+    with reading(path, "a PLY file", ADVICE), path.open("rb") as file:
         encoding, elements = _read_header(file, path)
         before = [element.name for element in elements].index("vertex")
         vertex = elements[before]
