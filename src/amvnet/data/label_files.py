@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from amvnet.data.formats.cloud import split_records
 from amvnet.data.scan_files import check_count, write_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -67,6 +68,7 @@ def check_kind(kind: str) -> None:
         raise InputError(
             f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them"
         )
+
     if kind == "las":
         try:
             import laspy  # noqa: F401
@@ -116,6 +118,7 @@ def write_scan_labels(
     """
     check_kind(kind)
     path = stem.with_name(f"{stem.name}.{kind}")
+
     ids = check_count(ids, path, len(xyz))
     raw = taxonomy.to_raw(ids)
     if kind == "label":
@@ -144,26 +147,34 @@ def _write_ply(path: Path, points: LabelledPoints) -> None:
     table = _table(columns | _flags(points.uncertain))
 
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    for name, dtype in _fields(table):
-        header.append(f"property {PLY_TYPES[dtype.str[1:]]} {name}")
+    for name in table.dtype.names or ():
+        header.append(f"property {PLY_TYPES[table.dtype[name].str[1:]]} {name}")
     header.append("end_header\n")
+
     path.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
 
 
 def _write_pcd(path: Path, points: LabelledPoints) -> None:
     columns = _coordinates(points.xyz)
+
     # PCL stores the three bytes of a colour as the bits of a float.
     red, green, blue = points.colors.astype(np.uint32).T
     columns["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+
     columns["label"] = points.raw
     table = _table(columns | _flags(points.uncertain))
 
-    fields = _fields(table)
+    sizes = []
+    types = []
+    for values in split_records(table).values():
+        sizes.append(str(values.dtype.itemsize))
+        types.append(values.dtype.kind.upper())
+
     header = PCD_HEADER.format(
-        names=" ".join(name for name, _ in fields),
-        sizes=" ".join(str(dtype.itemsize) for _, dtype in fields),
-        types=" ".join(dtype.kind.upper() for _, dtype in fields),
-        counts=" ".join("1" for _ in fields),
+        names=" ".join(table.dtype.names or ()),
+        sizes=" ".join(sizes),
+        types=" ".join(types),
+        counts=" ".join("1" * len(sizes)),
         points=len(table),
     )
     path.write_bytes(header.encode("ascii") + table.tobytes())
@@ -183,15 +194,18 @@ def _write_las(path: Path, points: LabelledPoints) -> None:
     header = laspy.LasHeader(point_format=LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP)
     header.offsets = offset
-    header.add_extra_dims(
-        [laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()]
-    )
+    dimensions = []
+    for name, values in extra.items():
+        dimensions.append(laspy.ExtraBytesParams(name, values.dtype))
+    header.add_extra_dims(dimensions)
 
     record = laspy.ScaleAwarePointRecord.zeros(len(points.xyz), header=header)
     las = laspy.LasData(header, record)
     las.X, las.Y, las.Z = steps.T
+
     # The specification scales 8 bits of colour to 16 by 256.
     las.red, las.green, las.blue = points.colors.T.astype(np.uint16) * 256
+
     for name, values in extra.items():
         las[name] = values
     las.write(str(path))
@@ -248,13 +262,9 @@ def _flags(uncertain: np.ndarray | None) -> Columns:
 def _table(columns: Columns) -> np.ndarray:
     """Return (N,) records of the columns, packed and little endian."""
     fields = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    (count,) = {len(values) for values in columns.values()}
+    (count,) = set(map(len, columns.values()))  # one length for all columns
+
     table = np.empty(count, fields)
     for name, values in columns.items():
         table[name] = values
     return table
-
-
-def _fields(table: np.ndarray) -> list[tuple[str, np.dtype]]:
-    """Return the names and types of the columns of a table."""
-    return [(name, table.dtype[name]) for name in table.dtype.names or ()]

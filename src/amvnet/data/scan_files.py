@@ -61,7 +61,7 @@ def find_scans(path: Path | str) -> list[Path]:
             f"{path}: expected a scan file or a folder of scans, found nothing; check the path"
         )
 
-    scans = sorted(entry for entry in path.iterdir() if is_scan_file(entry))
+    scans = sorted(filter(is_scan_file, path.iterdir()))
     if not scans:
         raise InputError(
             f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; "
@@ -126,6 +126,7 @@ def read_labels(
             f"{path}: expected {count} labels, one per point, found {len(raw)}; "
             "give the label file of this scan"
         )
+
     try:
         return to_train(raw)
     except InputError as error:

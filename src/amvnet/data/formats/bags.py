@@ -37,6 +37,7 @@ class Bag:
     def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
         self.path = path
         self._ending = ending
+
         with reading(path, EXPECTED, ADVICE), _open_reader(path, ending) as reader:
             counts = _count_messages(reader)
             self.topic = _choose_topic(counts, topic, path)
@@ -162,4 +163,9 @@ def _size(path: Path) -> int:
     """Return the bytes of a file, or of the files in a folder."""
     if not path.is_dir():
         return path.stat().st_size
-    return sum(entry.stat().st_size for entry in path.iterdir() if entry.is_file())
+
+    size = 0
+    for entry in path.iterdir():
+        if entry.is_file():
+            size += entry.stat().st_size
+    return size

@@ -71,6 +71,7 @@ class Cloud:
             return self.full
         if self.intensity is None:
             return None
+
         finite = self.intensity[np.isfinite(self.intensity)]
         if not len(finite):
             return None
@@ -186,6 +187,7 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
         # must pass.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
+
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise InputError(
             f"{path}: expected {expected}, found a broken one ({reason}); {advice}"
@@ -198,9 +200,9 @@ def find_columns(names: Sequence[str]) -> dict[str, int]:
     Args:
         names: the names of all columns of the file.
     """
-    lower_names = [name.lower() for name in names]
-    columns = {}
+    lower_names = list(map(str.lower, names))
 
+    columns = {}
     for key, aliases in COLUMN_NAMES.items():
         for alias in aliases:
             if alias in lower_names:
@@ -236,6 +238,11 @@ def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
     )
 
 
+def split_records(records: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the (N,) columns of (N,) records, without a copy."""
+    return {name: records[name] for name in records.dtype.names or ()}
+
+
 def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     """Return the cloud of the (N,) columns x, y, z and, if present, intensity and ring.
 
@@ -244,6 +251,7 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     axes = (columns["x"], columns["y"], columns["z"])
     is_float32 = all(axis.dtype.kind not in "iu" and axis.dtype.itemsize <= 4 for axis in axes)
     xyz = np.stack(axes, axis=1).astype(np.float32 if is_float32 else np.float64)
+
     return Cloud(xyz, columns.get("intensity"), ring_indices(columns.get("ring")), name)
 
 

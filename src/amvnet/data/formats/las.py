@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, reading
+from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, reading, split_records
 from amvnet.errors import InputError
 
 ADVICE = "write the file again"
-COLUMNS = ("x", "y", "z", "intensity")
 RECORD = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("intensity", "u2")])
 CHUNK = 1_000_000  # points read at once
 
@@ -39,14 +38,14 @@ def read_las(path: Path) -> Cloud:
     with reading(path, "a LAS or LAZ file", ADVICE):
         count, is_compressed = _check_header(path)
         _require_laspy(path)
-        columns = _read_in_process(path, count) if is_compressed else read_columns(path)
+        records = _read_in_process(path, count) if is_compressed else read_records(path)
 
-    if len(columns["x"]) < count:
+    if len(records) < count:
         raise InputError(
-            f"{path}: expected {count} points, found {len(columns['x'])}; "
+            f"{path}: expected {count} points, found {len(records)}; "
             "the file is truncated, copy it again"
         )
-    return make_cloud(columns, str(path))
+    return make_cloud(split_records(records), str(path))
 
 
 def _check_header(path: Path) -> tuple[int, bool]:
@@ -86,29 +85,27 @@ def _require_laspy(path: Path) -> None:
         ) from None
 
 
-def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """Read the columns x, y, z (float64, metres) and intensity (uint16) with laspy."""
+def read_records(path: Path) -> np.ndarray:
+    """Read all points as (N,) records of `RECORD`, coordinates in metres, with laspy."""
     import laspy
 
-    chunks: dict[str, list[np.ndarray]] = {name: [] for name in COLUMNS}
+    chunks = [np.empty(0, RECORD)]
     with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
         for points in file.chunk_iterator(CHUNK):
-            for name in COLUMNS:
-                chunks[name].append(np.asarray(points[name]))
-
-    columns = {}
-    for name, values in chunks.items():
-        columns[name] = np.concatenate(values) if values else np.zeros(0)
-    return columns
+            records = np.empty(len(points), RECORD)
+            for name in RECORD.names or ():
+                records[name] = points[name]
+            chunks.append(records)
+    return np.concatenate(chunks)
 
 
-def _read_in_process(path: Path, count: int) -> dict[str, np.ndarray]:
-    """Read the same as `read_columns`, in a process with limited memory and time.
+def _read_in_process(path: Path, count: int) -> np.ndarray:
+    """Read the same as `read_records`, in a process with limited memory and time.
 
     On broken bytes, lazrs 0.8 can take any amount of memory or abort its process.
     """
     code = (
-        "import sys; from amvnet.data.formats.las import write_columns; write_columns(sys.argv[1])"
+        "import sys; from amvnet.data.formats.las import write_records; write_records(sys.argv[1])"
     )
     environment = dict(os.environ)
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
@@ -125,13 +122,11 @@ def _read_in_process(path: Path, count: int) -> dict[str, np.ndarray]:
     )
     if process.returncode:
         raise ValueError("its points cannot be unpacked")
-
-    table = np.frombuffer(process.stdout, RECORD)
-    return {name: table[name] for name in COLUMNS}
+    return np.frombuffer(process.stdout, RECORD)
 
 
-def write_columns(path: str) -> None:
-    """Write the points of a file to standard output as rows of `RECORD`, with limited memory.
+def write_records(path: str) -> None:
+    """Write the records of a file to standard output, with limited memory.
 
     This is what the process of `_read_in_process` runs.
     """
@@ -141,9 +136,4 @@ def write_columns(path: str) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     except (ImportError, ValueError):  # Windows has no such limit, and some systems refuse it
         pass
-
-    columns = read_columns(Path(path))
-    table = np.empty(len(columns["x"]), RECORD)
-    for name, values in columns.items():
-        table[name] = values
-    sys.stdout.buffer.write(table.tobytes())
+    sys.stdout.buffer.write(read_records(Path(path)).tobytes())

@@ -20,6 +20,7 @@ from amvnet.data.formats.cloud import (
     reading,
     record_dtype,
     require_columns,
+    split_records,
 )
 from amvnet.errors import InputError
 
@@ -168,9 +169,9 @@ def read_text(
     Raises:
         InputError: if there are fewer lines.
     """
+    indices, dtypes = zip(*columns.values(), strict=True)
     table = np.zeros((0, len(columns)))
     if count:
-        indices = [index for index, _ in columns.values()]
         table = np.loadtxt(file, usecols=indices, max_rows=count, comments=None, ndmin=2)
     if len(table) < count:
         raise InputError(
@@ -179,7 +180,7 @@ def read_text(
 
     arrays = {}
     with np.errstate(invalid="ignore"):
-        for values, (key, (_, dtype)) in zip(table.T, columns.items(), strict=True):
+        for key, dtype, values in zip(columns, dtypes, table.T, strict=True):
             # A column with NaN or infinity stays float64, as integers cannot hold them.
             arrays[key] = values.astype(dtype) if np.isfinite(values).all() else values
     return arrays
@@ -204,8 +205,7 @@ def read_rows(file: BinaryIO, count: int, row: int, columns: dict[str, tuple[str
     Returns:
         (count,) values of each column.
     """
-    table = np.fromfile(file, dtype=record_dtype(columns, row), count=count)
-    return {key: table[key] for key in columns}
+    return split_records(np.fromfile(file, dtype=record_dtype(columns, row), count=count))
 
 
 def _read_compressed(file: BinaryIO, header: Header, columns: Columns, path: Path) -> Arrays:

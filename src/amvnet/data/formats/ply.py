@@ -5,7 +5,7 @@ We do not use plyfile: it allocates whatever a header claims, and is under the G
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -50,31 +50,24 @@ class Element:
     Attributes:
         name: its name.
         count: how many rows it has.
-        properties: name and NumPy type of each property; the type is empty for a list.
+        properties: the names of its properties.
+        dtypes: the NumPy types of its properties, without byte order; empty for a list.
     """
 
     name: str
     count: int
-    properties: list[tuple[str, str]]
-
-    @property
-    def names(self) -> list[str]:
-        """The names of its properties."""
-        return [name for name, _ in self.properties]
+    properties: list[str] = field(default_factory=list)
+    dtypes: list[str] = field(default_factory=list)
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes of each property, if there is no list."""
-        return [int(dtype[1:]) for _, dtype in self.properties]
+        """Bytes of each property; only if none is a list."""
+        return [int(dtype[1:]) for dtype in self.dtypes]
 
     @property
     def row(self) -> int:
-        """Bytes of one row."""
+        """Bytes of one row; only if no property is a list."""
         return sum(self.sizes)
-
-    @property
-    def has_lists(self) -> bool:
-        return any(not dtype for _, dtype in self.properties)
 
 
 @dataclass(frozen=True)
@@ -103,12 +96,12 @@ def read_ply(path: Path) -> Cloud:
         vertex_index = [element.name for element in elements].index("vertex")
         layout = Layout(elements[:vertex_index], elements[vertex_index], BYTE_ORDERS[encoding])
 
-        if any(element.has_lists for element in elements[: vertex_index + 1]):
+        if any("" in element.dtypes for element in elements[: vertex_index + 1]):
             raise InputError(
                 f"{path}: expected vertices without lists, found a list; write the points alone"
             )
 
-        columns = require_columns(layout.vertex.names, path)
+        columns = require_columns(layout.vertex.properties, path)
         read_vertices = _read_ascii if encoding == "ascii" else _read_binary
         return make_cloud(read_vertices(file, layout, columns, path), str(path))
 
@@ -124,13 +117,16 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
         if keyword == "format":
             encoding = words[1]
         elif keyword == "element":
-            elements.append(Element(words[1], int(words[2]), []))
+            element = Element(words[1], int(words[2]))
+            if element.count < 0:
+                raise ValueError(f"{element.count} of element {element.name}")
+            elements.append(element)
         elif keyword == "property":
-            dtype = "" if words[1] == "list" else TYPES[words[1]]
-            elements[-1].properties.append((words[-1], dtype))
+            elements[-1].properties.append(words[-1])
+            elements[-1].dtypes.append("" if words[1] == "list" else TYPES[words[1]])
         words = _read_words(file, path)
 
-    if encoding not in BYTE_ORDERS or any(element.count < 0 for element in elements):
+    if encoding not in BYTE_ORDERS:
         raise InputError(
             f"{path}: expected the format {', '.join(BYTE_ORDERS)}, "
             f"found {encoding[:30]!a}; {ADVICE}"
@@ -161,7 +157,7 @@ def _read_ascii(file: BinaryIO, layout: Layout, columns: dict[str, int], path: P
 
     positions = {}
     for key, index in columns.items():
-        positions[key] = (index, layout.order + vertex.properties[index][1])
+        positions[key] = (index, layout.order + vertex.dtypes[index])
     return read_text(file, vertex.count, positions, path)
 
 
@@ -175,5 +171,5 @@ def _read_binary(file: BinaryIO, layout: Layout, columns: dict[str, int], path: 
     offsets = np.cumsum([0, *vertex.sizes]).tolist()
     positions = {}
     for key, index in columns.items():
-        positions[key] = (layout.order + vertex.properties[index][1], offsets[index])
+        positions[key] = (layout.order + vertex.dtypes[index], offsets[index])
     return read_rows(file, vertex.count, vertex.row, positions)

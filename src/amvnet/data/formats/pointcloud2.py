@@ -12,6 +12,7 @@ from amvnet.data.formats.cloud import (
     make_cloud,
     record_dtype,
     require_columns,
+    split_records,
 )
 from amvnet.errors import InputError
 
@@ -42,7 +43,7 @@ def read_message(message: Any, name: str) -> Cloud:
     for key, index in require_columns([field.name for field in fields], name).items():
         field = fields[index]
         columns[key] = (byte_order + TYPES[field.datatype], field.offset)
-    point = record_dtype(columns, message.point_step)
+    dtype = record_dtype(columns, message.point_step)
 
     # Rows can have padding, too. Some drivers leave out row_step.
     row_size = message.width * message.point_step
@@ -57,5 +58,5 @@ def read_message(message: Any, name: str) -> Cloud:
     data = np.ascontiguousarray(message.data) if count else b""
     shape = (message.height, message.width)
     strides = (row_step, message.point_step)
-    table = np.ndarray(shape, point, data, strides=strides).ravel()
-    return make_cloud({key: table[key] for key in columns}, name)
+    records = np.ndarray(shape, dtype, data, strides=strides).ravel()
+    return make_cloud(split_records(records), name)
