@@ -104,7 +104,7 @@ def test_a_truncated_file_is_refused(folder: Path, tmp_path: Path, name: str) ->
 # --- variants of PCD ---
 
 
-def _fill(table: np.ndarray, points: np.ndarray) -> None:
+def fill_coordinates(table: np.ndarray, points: np.ndarray) -> None:
     """Set the columns x, y, z of a table."""
     for name, values in zip("xyz", points[:, :3].T, strict=True):
         table[name] = values
@@ -122,7 +122,7 @@ def test_columns_of_any_order_type_and_padding_are_read(tmp_path: Path, size: in
     padding_within = ("_b", "f4")
     axes = [padding_before, ("y", real), ("x", real), padding_within, ("z", real)]
     table = np.zeros(60, [*axes, ("ring", "u2"), ("intensity", "u1")])
-    _fill(table, points)
+    fill_coordinates(table, points)
     table["ring"] = ring
     table["intensity"] = intensity
 
@@ -310,7 +310,7 @@ def test_intensities_are_scaled_by_their_range(tmp_path: Path, largest: int, kin
     path = tmp_path / "a.npy"
     points = some_points()
     table = np.zeros(60, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", kind)])
-    _fill(table, points)
+    fill_coordinates(table, points)
     table["intensity"] = np.round(points[:, 3] * largest) if largest > 1 else points[:, 3]
 
     np.save(path, table)
@@ -469,7 +469,7 @@ def test_headers_that_claim_billions_are_refused_before_memory_is_taken(
         assert peak < 20e6, (name, peak)
 
 
-def test_broken_compressed_files_end_in_one_line(
+def test_broken_compressed_files_give_an_error_of_one_line(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "a.laz"

@@ -80,13 +80,14 @@ def change(content: bytes, changes: list[Change], share: float) -> bytes:
     changed = bytearray(content)
     for each in changes:
         each.apply(changed)
+
     return bytes(changed[: int(share * len(changed))])
 
 
 @pytest.fixture(scope="module")
 def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The bytes of a sound file of every format."""
-    folder = tmp_path_factory.mktemp("sound")
+    """The bytes of an intact file of every format."""
+    folder = tmp_path_factory.mktemp("intact")
     for name, write in WRITERS.items():
         write(folder / name, some_points())
     write_bag2(folder / "drive", {"/lidar": [some_points()]}, StoragePlugin.MCAP)
@@ -118,6 +119,7 @@ def test_a_broken_file_gives_a_scan_or_an_error_of_one_line(
     def check_broken_file(changes: list[Change], share: float, random: bytes | None) -> None:
         broken = change(contents[name], changes, share) if random is None else random
         file.write_bytes(broken)
+
         message = error_of(scan_path)
         assert "\n" not in message
         assert not message or message.startswith(str(scan_path))

@@ -23,7 +23,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import save
 
 from fixtures.scan_writers import some_points, write_bag1, write_pcd
-from fixtures.worlds import fails, files, fresh_weights, make_streets, run_cli, without
+from fixtures.worlds import fails, files, fresh_weights, make_streets, run_cli
 
 COUNT = 60
 LOST = 7  # the index of a point with NaN
@@ -42,7 +42,9 @@ class LabelFile:
 
 def read_ply(path: Path) -> LabelFile:
     file = plyfile.PlyData.read(path)
-    assert (file.text, file.byte_order) == (False, "<")
+    assert not file.text
+    assert file.byte_order == "<"
+
     vertex = file["vertex"].data
     assert vertex.dtype["red"].str == "|u1"
     assert vertex.dtype["class"].str == "<i4"
@@ -63,6 +65,7 @@ def read_pcd(path: Path) -> LabelFile:
 def read_las(path: Path) -> LabelFile:
     las = laspy.read(path)
     colors = np.stack([las.red, las.green, las.blue], axis=1) >> 8
+
     extra = set(las.point_format.extra_dimension_names)
     assert extra <= {"class", "uncertain"}
     uncertain = np.asarray(las["uncertain"]) if "uncertain" in extra else None
@@ -84,7 +87,7 @@ READERS: dict[str, Callable[[Path], LabelFile]] = {
 }
 
 
-def a_scan(
+def make_scan(
     dtype: type = np.float32, offset: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return coordinates and labels of a scan, one point of which is lost.
@@ -118,7 +121,8 @@ def test_every_kind_has_a_reader_here_and_is_offered_by_the_command_line() -> No
 @pytest.mark.parametrize("with_uncertain", [True, False])
 @pytest.mark.parametrize("kind", KINDS)
 def test_other_libraries_read_the_files(kind: str, with_uncertain: bool, tmp_path: Path) -> None:
-    xyz, ids, uncertain = a_scan()
+    xyz, ids, uncertain = make_scan()
+
     written_uncertain = uncertain if with_uncertain else None
     path = write_scan_labels(
         tmp_path / "a.b", kind, xyz, ids, taxonomy=SEMANTICKITTI, uncertain=written_uncertain
@@ -141,25 +145,27 @@ def test_other_libraries_read_the_files(kind: str, with_uncertain: bool, tmp_pat
 
 @pytest.mark.parametrize("kind", WITH_POINTS)
 def test_map_coordinates_keep_their_millimetres(kind: str, tmp_path: Path) -> None:
-    xyz, ids, _ = a_scan(np.float64, 5_400_000.0)
+    xyz, ids, _ = make_scan(np.float64, 5_400_000.0)
     path = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
     written = READERS[kind](path).xyz
     assert written is not None
+
     errors = np.delete(np.abs(written - xyz), LOST, axis=0)
     assert errors.max() < 0.0005
 
 
 @pytest.mark.parametrize("kind", ["ply", "pcd"])
 def test_float64_takes_no_space_if_float32_is_exact_enough(kind: str, tmp_path: Path) -> None:
-    xyz, ids, _ = a_scan()
+    xyz, ids, _ = make_scan()
     wide = xyz.astype(np.float64)
+
     path_32 = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
     path_64 = write_scan_labels(tmp_path / "b", kind, wide, ids, SEMANTICKITTI)
     assert path_32.read_bytes() == path_64.read_bytes()
 
 
 def test_points_that_las_cannot_hold_keep_their_rows_and_move_no_others(tmp_path: Path) -> None:
-    xyz, ids, _ = a_scan()
+    xyz, ids, _ = make_scan()
     xyz[[3, 4, 5]] = [[1e30, 0, 0], [0, -np.inf, 0], [0, 0, 3e5]]
     fits = ~np.isin(np.arange(COUNT), [3, 4, 5, LOST])
 
@@ -191,7 +197,7 @@ def test_scans_without_a_finite_point_are_written(kind: str, count: int, tmp_pat
 
 @pytest.mark.parametrize("kind", WITH_POINTS)
 def test_the_files_can_be_read_as_scans_again(kind: str, tmp_path: Path) -> None:
-    xyz, ids, uncertain = a_scan()
+    xyz, ids, uncertain = make_scan()
     path = write_scan_labels(
         tmp_path / "a", kind, xyz, ids, taxonomy=SEMANTICKITTI, uncertain=uncertain
     )
@@ -205,10 +211,11 @@ def test_the_files_can_be_read_as_scans_again(kind: str, tmp_path: Path) -> None
 def test_an_existing_file_survives_a_write_that_fails(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    xyz, ids, _ = a_scan()
+    xyz, ids, _ = make_scan()
     stem = tmp_path / "a"
     path = write_scan_labels(stem, kind, xyz, ids, SEMANTICKITTI)
     before = path.read_bytes()
+
     fails(lambda: write_scan_labels(stem, kind, xyz, ids + 20, SEMANTICKITTI), "0..19")
     fails(lambda: write_scan_labels(stem, kind, xyz, ids[1:], SEMANTICKITTI), path, COUNT)
 
@@ -218,6 +225,7 @@ def test_an_existing_file_survives_a_write_that_fails(
     monkeypatch.setattr(os, "replace", disk_full)
     with pytest.raises(OSError, match="No space"):
         write_scan_labels(stem, kind, xyz + 1, ids, SEMANTICKITTI)
+
     assert path.read_bytes() == before
     assert files(tmp_path) == {path.name}
 
@@ -246,7 +254,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("world")
     make_streets(root / "data")
     save(fresh_weights(), root / "w.safetensors")
-    save(without(fresh_weights(), "polar_net"), root / "rv.safetensors")
 
     points = some_points(400)
     (root / "scans").mkdir()
@@ -359,6 +366,6 @@ def test_uncertain_points_next_to_scans_are_not_scans(world: Path, tmp_path: Pat
     assert files(tmp_path) == {"a.bin", "a.label", "a.uncertain.npy"}
 
 
-def test_an_unknown_format_is_one_line(world: Path, tmp_path: Path) -> None:
+def test_an_unknown_format_gives_an_error_of_one_line(world: Path, tmp_path: Path) -> None:
     message = failure(world, tmp_path, world / "scans/a.bin", "--format", "xyz")
     assert "ply" in message

@@ -104,8 +104,7 @@ def write_scan_labels(
 
     Args:
         stem: the path without an ending; `.` and the kind are added.
-        xyz: (N, 3) coordinates, metres, as in the scan's file. `label` and `npy` use only their
-            number.
+        xyz: (N, 3) coordinates, metres, as in the scan's file. `label` and `npy` use only N.
         ids: (N,) train ids in 0..K.
         uncertain: (N,) bool; None if unknown, which leaves the column out.
 
@@ -144,7 +143,7 @@ def _write_ply(path: Path, points: LabelledPoints) -> None:
     columns = _coordinates(points.xyz)
     columns["red"], columns["green"], columns["blue"] = points.colors.T
     columns["class"] = points.raw.astype(np.int32)
-    table = _table(columns | _flags(points.uncertain))
+    table = _to_records(columns | _uncertain_column(points.uncertain))
 
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     for name in table.dtype.names or ():
@@ -162,7 +161,7 @@ def _write_pcd(path: Path, points: LabelledPoints) -> None:
     columns["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
 
     columns["label"] = points.raw
-    table = _table(columns | _flags(points.uncertain))
+    table = _to_records(columns | _uncertain_column(points.uncertain))
 
     sizes = []
     types = []
@@ -189,7 +188,9 @@ def _write_las(path: Path, points: LabelledPoints) -> None:
     import laspy
 
     steps, offset, fits = _las_coordinates(points.xyz)
-    extra = {"class": np.where(fits, points.raw, 0).astype(np.uint16)} | _flags(points.uncertain)
+    extra = {"class": np.where(fits, points.raw, 0).astype(np.uint16)} | _uncertain_column(
+        points.uncertain
+    )
 
     header = laspy.LasHeader(point_format=LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP)
@@ -252,14 +253,14 @@ def _coordinates(xyz: np.ndarray) -> Columns:
     return {"x": x, "y": y, "z": z}
 
 
-def _flags(uncertain: np.ndarray | None) -> Columns:
+def _uncertain_column(uncertain: np.ndarray | None) -> Columns:
     """Return the column of uncertain points; none if unknown."""
     if uncertain is None:
         return {}
     return {"uncertain": np.asarray(uncertain).astype(np.uint8)}
 
 
-def _table(columns: Columns) -> np.ndarray:
+def _to_records(columns: Columns) -> np.ndarray:
     """Return (N,) records of the columns, packed and little endian."""
     fields = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
     (count,) = set(map(len, columns.values()))  # one length for all columns

@@ -141,7 +141,7 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
     """Return the number of points that a header claims, if it is plausible.
 
     Args:
-        least: the size in bytes that a file with these points has at least; 0 if unknown.
+        least: bytes of the smallest file with these points; 0 if unknown.
 
     Raises:
         InputError: if no scan has that many points, or the file is too short for them.
@@ -195,10 +195,10 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
 
 def find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Return the indices of the columns x, y, z, intensity and ring, as far as there are any.
+    """Find the columns x, y, z, intensity and ring by the names of all columns of a file.
 
-    Args:
-        names: the names of all columns of the file.
+    Returns:
+        The index of each of the five that the file has.
     """
     lower_names = list(map(str.lower, names))
 
@@ -212,7 +212,7 @@ def find_columns(names: Sequence[str]) -> dict[str, int]:
 
 
 def require_columns(names: Sequence[str], path: Path | str) -> dict[str, int]:
-    """Return the same as `find_columns`.
+    """Find the columns as `find_columns`, and check that the coordinates are among them.
 
     Raises:
         InputError: if x, y or z is missing.
@@ -227,10 +227,10 @@ def require_columns(names: Sequence[str], path: Path | str) -> dict[str, int]:
 
 
 def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
-    """Return the NumPy type of a record of `size` bytes, bytes between its columns ignored.
+    """Return the NumPy type of records of `size` bytes. Bytes outside the columns are skipped.
 
     Args:
-        columns: for each column, its NumPy type and its offset in the record, bytes.
+        columns: for each column, its NumPy type and its offset in a record, bytes.
     """
     formats, offsets = zip(*columns.values(), strict=True)
     return np.dtype(
@@ -257,7 +257,7 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
 
 @np.errstate(invalid="ignore")
 def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
-    """Return (N,) int64 ring indices; values that are not finite become 0.
+    """Return values as (N,) int64 ring indices, 0 for those that are not finite.
 
     None if there are no values, or one is negative, too large or not a whole number.
     """

@@ -112,6 +112,7 @@ def _to_cloud(array: np.ndarray, path: Path) -> Cloud:
     columns = dict(zip(COLUMNS, table.T, strict=False))
     cloud = make_cloud(columns, str(path))
 
+    # A column after the intensity can be the distance, the ring or anything else.
     ring = None
     fifth = ""
     if len(table) and table.shape[1] > len(COLUMNS):

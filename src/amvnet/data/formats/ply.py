@@ -119,7 +119,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
         elif keyword == "element":
             element = Element(words[1], int(words[2]))
             if element.count < 0:
-                raise ValueError(f"{element.count} of element {element.name}")
+                raise ValueError(f"element {element.name} of {element.count} rows")
             elements.append(element)
         elif keyword == "property":
             elements[-1].properties.append(words[-1])
