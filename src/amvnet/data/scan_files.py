@@ -1,4 +1,4 @@
-"""Read and write scan and label files, with every check; files are written completely or not."""
+"""Read and check scan and label files, and write label files completely or not at all."""
 
 from __future__ import annotations
 

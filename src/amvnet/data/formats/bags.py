@@ -48,7 +48,8 @@ class Bag:
                 f"{path}: expected scans under {self.topic}, found {self._count} messages; {ADVICE}"
             )
 
-        # Reading goes on where it stopped: the index of the next message, and an open reader there.
+        # For reading in order without a seek: the index of the next message, and the messages from
+        # there on.
         self._next = 0
         self._messages: Iterator[Decode] = iter(())
 

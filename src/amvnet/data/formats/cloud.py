@@ -18,7 +18,7 @@ from amvnet.scan import FARTHEST, Scan
 MAX_POINTS = 10_000_000
 MOST_RINGS = 256
 
-# The largest intensity of a device, for fractions, 8 bits and 16 bits. Integers are no fractions.
+# The largest intensities of devices: fractions, 8 bits, 16 bits. Integers cannot be fractions.
 FLOAT_RANGES = (1.0, 255.0, 65535.0)
 INTEGER_RANGES = (255.0, 65535.0)
 

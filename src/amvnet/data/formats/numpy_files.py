@@ -24,8 +24,8 @@ from amvnet.data.formats.raw import ring_column
 from amvnet.errors import InputError
 
 COLUMNS = ("x", "y", "z", "intensity")
-KEYS = ("points", "xyz", "scan", "arr_0")  # the array to read from an archive of several
-RANGE_TOLERANCE = 0.05  # metres between a column and the distances, for it to hold the distances
+KEYS = ("points", "xyz", "scan", "arr_0")  # names of the array to read, if there are several
+RANGE_TOLERANCE = 0.05  # metres by which a column of distances may differ from them
 ADVICE = "save it again with np.save"
 
 

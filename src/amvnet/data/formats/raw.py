@@ -75,9 +75,9 @@ def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
 
 @np.errstate(invalid="ignore", over="ignore")
 def columns_of(path: Path) -> int | None:
-    """Return the number of columns, 4 or 5, that the values of a file show, whatever its name.
+    """Tell the number of columns, 4 or 5, from the values of a file, whatever its name.
 
-    None if the values look like neither layout.
+    None if the values fit neither layout.
     """
     size = path.stat().st_size
     if not size or size % 4 or size > MAX_POINTS * 4 * NUSCENES_COLUMNS:
@@ -98,7 +98,8 @@ def _has_nuscenes_name(path: Path) -> bool:
 def _is_nuscenes(table: np.ndarray) -> bool:
     """Return whether (N, 5) values can be x, y, z, intensity and ring.
 
-    Only the ring is whole numbers, at least two of them. Intensities are never negative.
+    The ring holds whole numbers, at least two different ones, and the coordinates do not.
+    Intensities are never negative.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]
@@ -112,7 +113,7 @@ def _is_nuscenes(table: np.ndarray) -> bool:
 def _is_kitti(table: np.ndarray) -> bool:
     """Return whether (N, 4) values can be x, y, z and intensity.
 
-    Only intensities are never negative. Some coordinates are.
+    Intensities are never negative, but some coordinates are.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]
