@@ -1,10 +1,10 @@
-"""Broken files of every format end in a scan or in one line, soon and in little memory."""
+"""Broken files of every format give a scan or an error of one line, soon and in little memory."""
 
 from __future__ import annotations
 
 import resource
 import sys
-from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
@@ -20,50 +20,89 @@ from amvnet.scan import Scan
 from fixtures.scan_writers import WRITERS, some_points, write_bag2
 
 CASES = 200  # of each format
-SLOW_CASES = 25  # of the one that starts a process for each
+SLOW_CASES = 25  # of the format that starts a process for each case
 METADATA = "drive/metadata.yaml"
 FORMATS = [*WRITERS, METADATA]
-BEGIN = 400  # bytes: most headers are within them
-LONGEST, MOST_MEMORY = timedelta(seconds=10), 2 << 30
-Change = Callable[[bytes], bytes]
+HEADER = 400  # bytes: most headers are within them
+LONGEST = timedelta(seconds=10)
+MOST_MEMORY = 2 << 30  # bytes
+TELLING_BYTES = [
+    b"\x00",
+    b"\xff",
+    b"\x7f",
+    b"9",
+    b"-",
+    b" ",
+    b"\n",
+    bytes(4),
+    b"\xff" * 4,
+    b"\xff" * 8,
+]
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of some bytes of a file.
+
+    Attributes:
+        position: the share of the file, or of its header, before the change.
+        in_header: whether the position is within the header.
+        removed: how many bytes are removed.
+        inserted: the bytes that are inserted instead.
+    """
+
+    position: float
+    in_header: bool
+    removed: int
+    inserted: bytes
+
+    def apply(self, content: bytearray) -> None:
+        length = min(len(content), HEADER) if self.in_header else len(content)
+        start = int(self.position * length)
+        content[start : start + self.removed] = self.inserted
+
+
+CHANGES = st.lists(
+    st.builds(
+        Change,
+        position=st.floats(0, 1, exclude_max=True),
+        in_header=st.booleans(),
+        removed=st.integers(0, 9),
+        inserted=st.sampled_from(TELLING_BYTES) | st.binary(max_size=9),
+    ),
+    min_size=1,
+    max_size=6,
+)
+
+
+def change(content: bytes, changes: list[Change], share: float) -> bytes:
+    """Return the first share of the content after some changes."""
+    changed = bytearray(content)
+    for each in changes:
+        each.apply(changed)
+
+    return bytes(changed[: int(share * len(changed))])
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """A whole file of every format."""
-    folder = tmp_path_factory.mktemp("whole")
+def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The bytes of an intact file of every format."""
+    folder = tmp_path_factory.mktemp("intact")
     for name, write in WRITERS.items():
         write(folder / name, some_points())
     write_bag2(folder / "drive", {"/lidar": [some_points()]}, StoragePlugin.MCAP)
     return {name: (folder / name).read_bytes() for name in FORMATS}
 
 
-def changes() -> st.SearchStrategy[list[tuple[float, bool, int, bytes]]]:
-    """Where (as a share of the file, or of its beginning), how many bytes go there, and what comes in their place."""
-    telling = st.sampled_from(
-        [b"\x00", b"\xff", b"\x7f", b"9", b"-", b" ", b"\n", bytes(4), b"\xff" * 4, b"\xff" * 8]
-    )
-    place = st.floats(0, 1, exclude_max=True)
-    change = st.tuples(place, st.booleans(), st.integers(0, 9), telling | st.binary(max_size=9))
-    return st.lists(change, min_size=1, max_size=6)
-
-
-def changed(content: bytes, how: list[tuple[float, bool, int, bytes]], kept: float) -> bytes:
-    """The content after some changes, cut off after a share of it."""
-    broken = bytearray(content)
-    for share, begin, gone, come in how:
-        place = int(share * min(len(broken), BEGIN if begin else len(broken)))
-        broken[place : place + gone] = come
-    return bytes(broken[: int(kept * len(broken))])
-
-
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_broken_file_ends_in_a_scan_or_in_one_line(
-    name: str, whole: dict[str, bytes], tmp_path: Path
+def test_a_broken_file_gives_a_scan_or_an_error_of_one_line(
+    name: str, contents: dict[str, bytes], tmp_path: Path
 ) -> None:
-    content, path = whole[name], tmp_path / ("drive" if name == METADATA else name)
+    file = tmp_path / name
+    scan_path = file
     if name == METADATA:
-        write_bag2(tmp_path / "drive", {"/lidar": [some_points()]}, StoragePlugin.MCAP)
+        scan_path = tmp_path / "drive"
+        write_bag2(scan_path, {"/lidar": [some_points()]}, StoragePlugin.MCAP)
 
     @settings(
         max_examples=SLOW_CASES if name.endswith(".laz") else CASES,
@@ -73,31 +112,26 @@ def test_a_broken_file_ends_in_a_scan_or_in_one_line(
         suppress_health_check=list(HealthCheck),
     )
     @given(
-        how=changes(),
-        kept=st.just(1.0) | st.floats(0, 1),
+        changes=CHANGES,
+        share=st.just(1.0) | st.floats(0, 1),
         random=st.none() | st.binary(max_size=300),
     )
-    def breaks(
-        how: list[tuple[float, bool, int, bytes]], kept: float, random: bytes | None
-    ) -> None:
-        (tmp_path / name).write_bytes(changed(content, how, kept) if random is None else random)
-        ends_well(path)
+    def check_broken_file(changes: list[Change], share: float, random: bytes | None) -> None:
+        broken = change(contents[name], changes, share) if random is None else random
+        file.write_bytes(broken)
 
-    (tmp_path / name).write_bytes(content)
-    assert refusal(path) == ""
-    breaks()
-    assert most_memory() < MOST_MEMORY
+        message = error_of(scan_path)
+        assert "\n" not in message
+        assert not message or message.startswith(str(scan_path))
 
-
-def ends_well(path: Path) -> None:
-    """Every scan of a file is read, or refused in one line that names the file."""
-    message = refusal(path)
-    assert "\n" not in message
-    assert message.startswith(str(path) if message else "")
+    file.write_bytes(contents[name])
+    assert error_of(scan_path) == ""
+    check_broken_file()
+    assert peak_memory() < MOST_MEMORY
 
 
-def refusal(path: Path) -> str:
-    """What is said of a file that is refused; nothing where all of its scans are read."""
+def error_of(path: Path) -> str:
+    """Return the InputError of reading all scans of a file; empty if there is none."""
     try:
         for scan in scans_in_file(path):
             assert isinstance(scan.read().to_scan(), Scan)
@@ -106,7 +140,7 @@ def refusal(path: Path) -> str:
     return ""
 
 
-def most_memory() -> int:
-    """Bytes that this process had at most."""
+def peak_memory() -> int:
+    """Return the most bytes that this process has had."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak

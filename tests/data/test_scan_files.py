@@ -1,4 +1,4 @@
-"""Lone scan files in every format agree; label tables are checked by plain loops; wrong input is named."""
+"""Scan files of every format agree, label tables equal plain loops, and errors name the input."""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ from amvnet.files import atomic_write
 
 from fixtures.worlds import fails, label_map
 
-# --- lone files ---
+# --- single files ---
 
 
 @pytest.mark.parametrize("scale", [1.0, 255.0])
-def test_lone_scans_in_every_format_agree(tmp_path: Path, scale: float) -> None:
+def test_single_scans_in_every_format_agree(tmp_path: Path, scale: float) -> None:
     points = np.random.default_rng(0).random((9, 4)).astype(np.float32)
     points[0, 3] = 1.0
-    raw = points * np.array([1, 1, 1, scale], dtype=np.float32)
+    scaled = points * np.array([1, 1, 1, scale], dtype=np.float32)
+    scaled_to_255 = points * np.array([1, 1, 1, 255], dtype=np.float32)
     ring = np.arange(9, dtype=np.float32)[:, None]
-    raw.tofile(tmp_path / "a.bin")
-    np.save(tmp_path / "b.npy", raw.astype(np.float64))
-    np.save(tmp_path / "c.npy", np.hstack([raw, ring]))
-    np.hstack([points * np.array([1, 1, 1, 255], dtype=np.float32), ring]).tofile(
-        tmp_path / "d.pcd.bin"
-    )
-    found = find_scans(tmp_path)
-    assert [path.name for path in found] == ["a.bin", "b.npy", "c.npy", "d.pcd.bin"]
-    for path in found:
+
+    scaled.tofile(tmp_path / "a.bin")
+    np.save(tmp_path / "b.npy", scaled.astype(np.float64))
+    np.save(tmp_path / "c.npy", np.hstack([scaled, ring]))
+    np.hstack([scaled_to_255, ring]).tofile(tmp_path / "d.pcd.bin")
+
+    names = ["a.bin", "b.npy", "c.npy", "d.pcd.bin"]
+    assert find_scans(tmp_path) == [tmp_path / name for name in names]
+    for name in names:
+        path = tmp_path / name
         scan = read_scan(path)
         np.testing.assert_allclose(scan.points, points, rtol=1e-6)
-        assert (scan.ring is not None) == (path.name[0] in "cd")
+        assert (scan.ring is not None) == (name in ("c.npy", "d.pcd.bin"))
         assert scan.name == str(path)
 
 
@@ -65,23 +67,35 @@ def test_unusable_arrays_are_named(tmp_path: Path, array: np.ndarray) -> None:
     fails(lambda: read_scan(path), path)
 
 
-def test_unusable_files_are_named(tmp_path: Path) -> None:
-    for name, content in {
-        "a.bin": b"",
-        "b.bin": bytes(17),
-        "c.pcd.bin": bytes(16),
-        "d.npy": b"not numpy",
-        "f.npy": b"",
-        "e.xyz": b"1 2 3",
-    }.items():
-        (tmp_path / name).write_bytes(content)
-        fails(lambda path=tmp_path / name: read_scan(path), tmp_path / name)  # type: ignore[misc]
-    fails(lambda: read_scan(tmp_path / "e.xyz"), ".pcd.bin", ".bin", ".npy")
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.bin", b""),
+        ("b.bin", bytes(17)),
+        ("c.pcd.bin", bytes(16)),
+        ("d.npy", b"not numpy"),
+        ("e.xyz", b"1 2 3"),
+        ("f.npy", b""),
+    ],
+)
+def test_unusable_files_are_named(tmp_path: Path, name: str, content: bytes) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    fails(lambda: read_scan(path), path)
+    assert find_scans(path) == [path]
+
+
+def test_an_unknown_format_is_refused_with_the_known_ones(tmp_path: Path) -> None:
+    path = tmp_path / "a.xyz"
+    path.write_bytes(b"1 2 3")
+    fails(lambda: read_scan(path), ".pcd.bin", ".bin", ".npy")
+
+
+def test_missing_files_and_empty_folders_are_named(tmp_path: Path) -> None:
     fails(lambda: read_scan(tmp_path / "no.bin"), tmp_path / "no.bin")
     fails(lambda: find_scans(tmp_path / "no"), tmp_path / "no")
     (tmp_path / "empty").mkdir()
     fails(lambda: find_scans(tmp_path / "empty"), tmp_path / "empty")
-    assert find_scans(tmp_path / "a.bin") == [tmp_path / "a.bin"]
 
 
 def test_files_appear_whole_or_not_at_all(tmp_path: Path) -> None:
@@ -95,8 +109,10 @@ def test_files_appear_whole_or_not_at_all(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError):
         stop_halfway()
     assert list(target.parent.iterdir()) == []
+
     write_labels(target, np.array([10, 259], dtype=np.uint32))
     assert np.fromfile(target, np.uint32).tolist() == [10, 259]
+
     fails(lambda: write_labels(target / "b.label", np.zeros(1)), target, "folder")
     fails(lambda: write_labels(tmp_path, np.zeros(1)), tmp_path)
 
@@ -110,15 +126,19 @@ def test_raw_and_train_ids_are_inverse(taxonomy: Taxonomy) -> None:
     raw = taxonomy.to_raw(ids)
     assert raw.dtype == np.uint32
     assert taxonomy.to_train(raw).tolist() == ids.tolist()
-    assert taxonomy.to_train(raw | np.uint32(7 << 16)).tolist() == ids.tolist()
+    with_instances = raw | np.uint32(7 << 16)
+    assert taxonomy.to_train(with_instances).tolist() == ids.tolist()
     assert len(taxonomy.colors) == taxonomy.size + 1
+
     fails(lambda: taxonomy.to_train(np.array([400], dtype=np.uint32)), "400", taxonomy.name)
     fails(lambda: taxonomy.to_raw(np.array([taxonomy.size + 1])), taxonomy.size + 1)
 
 
 def test_lookup_equals_a_plain_loop() -> None:
     raw = np.random.default_rng(0).choice(list(SEMANTICKITTI.raw_to_train), 200).astype(np.uint32)
-    assert SEMANTICKITTI.to_train(raw).tolist() == [SEMANTICKITTI.raw_to_train[int(r)] for r in raw]
+    train = SEMANTICKITTI.to_train(raw)
+    for raw_id, train_id in zip(raw.tolist(), train.tolist(), strict=True):
+        assert train_id == SEMANTICKITTI.raw_to_train[raw_id]
     assert SEMANTICKITTI.to_train(raw[:0]).shape == (0,)
 
 
@@ -141,16 +161,21 @@ def test_yaml_label_map_is_the_built_in_one(tmp_path: Path) -> None:
     assert taxonomy_from_yaml(path) == SEMANTICKITTI
 
 
-def test_incomplete_label_maps_are_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("key", label_map())
+def test_label_maps_without_a_key_are_named(tmp_path: Path, key: str) -> None:
+    path = tmp_path / "labels.yaml"
+    incomplete = label_map()
+    del incomplete[key]
+    path.write_text(yaml.safe_dump(incomplete))
+    fails(lambda: taxonomy_from_yaml(path), path, key)
+
+
+def test_unusable_label_maps_are_named(tmp_path: Path) -> None:
     path = tmp_path / "labels.yaml"
     fails(lambda: taxonomy_from_yaml(path), path)
-    for key in label_map():
-        path.write_text(yaml.safe_dump({k: v for k, v in label_map().items() if k != key}))
-        fails(lambda: taxonomy_from_yaml(path), path, key)
-    wrong = [
-        {**label_map(), "labels": {0: "unlabeled"}},
-        {**label_map(), "learning_map": {70_000: 1}},
-    ]
-    for content in ("a: [", "[1]", *map(yaml.safe_dump, wrong)):
+
+    few_labels = yaml.safe_dump({**label_map(), "labels": {0: "unlabeled"}})
+    large_ids = yaml.safe_dump({**label_map(), "learning_map": {70_000: 1}})
+    for content in ("a: [", "[1]", few_labels, large_ids):
         path.write_text(content)
         fails(lambda: taxonomy_from_yaml(path), path)

@@ -1,4 +1,4 @@
-"""What predict writes is what other libraries read: coordinates, colours, ids, order, lost points in their places."""
+"""Other libraries read what predict writes: coordinates, colours and ids, in the scan's order."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import save
 
 from fixtures.scan_writers import some_points, write_bag1, write_pcd
-from fixtures.worlds import fails, files, fresh_weights, make_streets, run_cli, without
+from fixtures.worlds import fails, files, fresh_weights, make_streets, run_cli
 
 COUNT = 60
-LOST = 7  # the place of a point with NaN
-WITH_POINTS = ("ply", "pcd", "las")
+LOST = 7  # the index of a point with NaN
+WITH_POINTS = ("ply", "pcd", "las")  # kinds of files with coordinates
 
 
 @dataclass(frozen=True)
-class Read:
-    """What another library finds in a file."""
+class LabelFile:
+    """The columns of a file as another library reads them."""
 
     raw: np.ndarray
     xyz: np.ndarray | None = None
@@ -40,48 +40,46 @@ class Read:
     uncertain: np.ndarray | None = None
 
 
-def read_ply(path: Path) -> Read:
+def read_ply(path: Path) -> LabelFile:
     file = plyfile.PlyData.read(path)
-    assert (file.text, file.byte_order) == (False, "<")
+    assert not file.text
+    assert file.byte_order == "<"
+
     vertex = file["vertex"].data
-    names, columns = (
-        vertex.dtype.names,
-        {name: np.asarray(vertex[name]) for name in vertex.dtype.names},
-    )
-    assert [vertex.dtype[name].str for name in ("red", "class")] == ["|u1", "<i4"]
-    xyz, colors = (
-        np.stack([columns[n] for n in some], 1)
-        for some in (("x", "y", "z"), ("red", "green", "blue"))
-    )
-    return Read(
-        columns["class"], xyz, colors, columns["uncertain"] if "uncertain" in names else None
-    )
+    assert vertex.dtype["red"].str == "|u1"
+    assert vertex.dtype["class"].str == "<i4"
+
+    xyz = np.stack([vertex["x"], vertex["y"], vertex["z"]], axis=1)
+    colors = np.stack([vertex["red"], vertex["green"], vertex["blue"]], axis=1)
+    uncertain = vertex["uncertain"] if "uncertain" in vertex.dtype.names else None
+    return LabelFile(vertex["class"], xyz, colors, uncertain)
 
 
-def read_pcd(path: Path) -> Read:
+def read_pcd(path: Path) -> LabelFile:
     cloud = PointCloud.from_path(path)
-    columns = {name: cloud.pc_data[name] for name in cloud.fields}
-    colors = PointCloud.decode_rgb(columns["rgb"])
-    return Read(columns["label"], cloud.numpy(("x", "y", "z")), colors, columns.get("uncertain"))
+    colors = PointCloud.decode_rgb(cloud.pc_data["rgb"])
+    uncertain = cloud.pc_data["uncertain"] if "uncertain" in cloud.fields else None
+    return LabelFile(cloud.pc_data["label"], cloud.numpy(("x", "y", "z")), colors, uncertain)
 
 
-def read_las(path: Path) -> Read:
+def read_las(path: Path) -> LabelFile:
     las = laspy.read(path)
-    colors = np.stack([las.red, las.green, las.blue], 1) >> 8
+    colors = np.stack([las.red, las.green, las.blue], axis=1) >> 8
+
     extra = set(las.point_format.extra_dimension_names)
     assert extra <= {"class", "uncertain"}
     uncertain = np.asarray(las["uncertain"]) if "uncertain" in extra else None
-    return Read(np.asarray(las["class"]), np.asarray(las.xyz), colors, uncertain)
+    return LabelFile(np.asarray(las["class"]), np.asarray(las.xyz), colors, uncertain)
 
 
-def read_npy(path: Path) -> Read:
+def read_npy(path: Path) -> LabelFile:
     raw = np.load(path, allow_pickle=False)
     assert raw.dtype == np.uint32
-    return Read(raw)
+    return LabelFile(raw)
 
 
-READERS: dict[str, Callable[[Path], Read]] = {
-    "label": lambda path: Read(np.fromfile(path, "<u4")),
+READERS: dict[str, Callable[[Path], LabelFile]] = {
+    "label": lambda path: LabelFile(np.fromfile(path, "<u4")),
     "npy": read_npy,
     "ply": read_ply,
     "pcd": read_pcd,
@@ -89,226 +87,255 @@ READERS: dict[str, Callable[[Path], Read]] = {
 }
 
 
-def a_scan(
+def make_scan(
     dtype: type = np.float32, offset: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N, 3) coordinates, (N,) train ids with every class, (N,) bool; one point is lost."""
+    """Return coordinates and labels of a scan, one point of which is lost.
+
+    Returns:
+        (N, 3) coordinates, (N,) uint8 train ids with every class, (N,) bool uncertain points.
+    """
     xyz = some_points(COUNT)[:, :3].astype(dtype) + dtype(offset)
     ids = np.random.default_rng(1).permutation(COUNT) % (SEMANTICKITTI.size + 1)
-    xyz[LOST], ids[LOST] = np.nan, 0
-    return xyz, ids.astype(np.uint8), np.arange(COUNT) % 3 == 0
+    xyz[LOST] = np.nan
+    ids[LOST] = 0
+    uncertain = np.arange(COUNT) % 3 == 0
+    return xyz, ids.astype(np.uint8), uncertain
 
 
-def where_lost(kind: str, xyz: np.ndarray) -> np.ndarray:
-    """The coordinates that a file of this kind should have."""
-    return np.where(np.isfinite(xyz), xyz, 0) if kind == "las" else xyz
+def check_coordinates(kind: str, xyz: np.ndarray | None, expected: np.ndarray) -> None:
+    """Check the coordinates of a file against the scan's. LAS rounds, and cannot hold NaN."""
+    assert xyz is not None
+    if kind == "las":
+        expected = np.where(np.isfinite(expected), expected, 0)
+    np.testing.assert_allclose(xyz, expected, rtol=0, atol=1e-4 if kind == "las" else 0)
 
 
-# --- the files
+# --- the files ---
 
 
-def test_every_kind_is_read_back_here_and_offered_by_the_command_line() -> None:
+def test_every_kind_has_a_reader_here_and_is_offered_by_the_command_line() -> None:
     assert set(READERS) == set(KINDS) == set(get_args(verbs.FormatName))
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("with_uncertain", [True, False])
 @pytest.mark.parametrize("kind", KINDS)
-def test_other_libraries_read_what_was_written(kind: str, known: bool, tmp_path: Path) -> None:
-    xyz, ids, uncertain = a_scan()
+def test_other_libraries_read_the_files(kind: str, with_uncertain: bool, tmp_path: Path) -> None:
+    xyz, ids, uncertain = make_scan()
+
+    written_uncertain = uncertain if with_uncertain else None
     path = write_scan_labels(
-        tmp_path / "a.b", kind, xyz, ids, SEMANTICKITTI, uncertain if known else None
+        tmp_path / "a.b", kind, xyz, ids, taxonomy=SEMANTICKITTI, uncertain=written_uncertain
     )
     assert path == tmp_path / f"a.b.{kind}"
     assert files(tmp_path) == {path.name}
-    found = READERS[kind](path)
-    assert found.raw.tolist() == [SEMANTICKITTI.train_to_raw[i] for i in ids]
-    if kind in WITH_POINTS:
-        assert found.xyz is not None
-        assert found.colors is not None
-        np.testing.assert_allclose(
-            found.xyz, where_lost(kind, xyz), rtol=0, atol=1e-4 if kind == "las" else 0
-        )
-        assert [tuple(color) for color in found.colors.tolist()] == [
-            SEMANTICKITTI.colors[i] for i in ids
-        ]
-        assert (found.uncertain is None) == (not known)
-        if found.uncertain is not None:
-            assert found.uncertain.tolist() == uncertain.tolist()
+
+    content = READERS[kind](path)
+    assert content.raw.tolist() == np.array(SEMANTICKITTI.train_to_raw)[ids].tolist()
+    if kind not in WITH_POINTS:
+        return
+
+    check_coordinates(kind, content.xyz, xyz)
+    np.testing.assert_array_equal(content.colors, np.array(SEMANTICKITTI.colors)[ids])
+    if with_uncertain:
+        np.testing.assert_array_equal(content.uncertain, uncertain)
+    else:
+        assert content.uncertain is None
 
 
 @pytest.mark.parametrize("kind", WITH_POINTS)
-def test_coordinates_of_a_map_keep_their_millimetres(kind: str, tmp_path: Path) -> None:
-    xyz, ids, _ = a_scan(np.float64, 5_400_000.0)
-    found = READERS[kind](write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)).xyz
-    kept = np.arange(COUNT) != LOST
-    assert found is not None
-    assert np.abs(found - xyz)[kept].max() < 0.0005
+def test_map_coordinates_keep_their_millimetres(kind: str, tmp_path: Path) -> None:
+    xyz, ids, _ = make_scan(np.float64, 5_400_000.0)
+    path = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
+    written = READERS[kind](path).xyz
+    assert written is not None
+
+    errors = np.delete(np.abs(written - xyz), LOST, axis=0)
+    assert errors.max() < 0.0005
 
 
 @pytest.mark.parametrize("kind", ["ply", "pcd"])
-def test_float64_takes_no_room_where_float32_is_enough(kind: str, tmp_path: Path) -> None:
-    xyz, ids, _ = a_scan()
-    narrow, wide = (
-        write_scan_labels(tmp_path / name, kind, xyz.astype(dtype), ids, SEMANTICKITTI)
-        for name, dtype in (("a", np.float32), ("b", np.float64))
-    )
-    assert narrow.read_bytes() == wide.read_bytes()
+def test_float64_takes_no_space_if_float32_is_exact_enough(kind: str, tmp_path: Path) -> None:
+    xyz, ids, _ = make_scan()
+    wide = xyz.astype(np.float64)
+
+    path_32 = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
+    path_64 = write_scan_labels(tmp_path / "b", kind, wide, ids, SEMANTICKITTI)
+    assert path_32.read_bytes() == path_64.read_bytes()
 
 
-def test_points_that_las_cannot_hold_keep_their_places_and_move_no_others(tmp_path: Path) -> None:
-    xyz, ids, _ = a_scan()
+def test_points_that_las_cannot_hold_keep_their_rows_and_move_no_others(tmp_path: Path) -> None:
+    xyz, ids, _ = make_scan()
     xyz[[3, 4, 5]] = [[1e30, 0, 0], [0, -np.inf, 0], [0, 0, 3e5]]
-    found = read_las(write_scan_labels(tmp_path / "a", "las", xyz, ids, SEMANTICKITTI))
-    held = ~np.isin(np.arange(COUNT), [3, 4, 5, LOST])
-    assert found.xyz is not None
-    assert not found.xyz[~held].any()
-    assert not found.raw[~held].any()
-    np.testing.assert_allclose(found.xyz[held], xyz[held], rtol=0, atol=1e-4)
-    assert np.array_equal(found.raw[held], SEMANTICKITTI.to_raw(ids)[held])
+    fits = ~np.isin(np.arange(COUNT), [3, 4, 5, LOST])
+
+    content = read_las(write_scan_labels(tmp_path / "a", "las", xyz, ids, SEMANTICKITTI))
+    assert content.xyz is not None
+    assert not content.xyz[~fits].any()
+    assert not content.raw[~fits].any()
+    np.testing.assert_allclose(content.xyz[fits], xyz[fits], rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(content.raw[fits], SEMANTICKITTI.to_raw(ids)[fits])
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("raw", [0, 260, 65535])
 def test_raw_ids_of_more_than_a_byte_survive(kind: str, raw: int, tmp_path: Path) -> None:
     taxonomy = replace(NUSCENES, train_to_raw=(0, raw, *range(2, 17)))
-    found = READERS[kind](
-        write_scan_labels(tmp_path / "a", kind, np.zeros((2, 3)), np.array([1, 2]), taxonomy)
-    )
-    assert found.raw.tolist() == [raw, 2]
+    ids = np.array([1, 2])
+    path = write_scan_labels(tmp_path / "a", kind, np.zeros((2, 3)), ids, taxonomy)
+    assert READERS[kind](path).raw.tolist() == [raw, 2]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_scan_without_a_finite_point_or_any(kind: str, tmp_path: Path) -> None:
-    for count in (0, 3):
-        xyz, ids = np.full((count, 3), np.nan, np.float32), np.zeros(count, np.uint8)
-        assert (
-            len(READERS[kind](write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)).raw)
-            == count
-        )
+@pytest.mark.parametrize("count", [0, 3])
+def test_scans_without_a_finite_point_are_written(kind: str, count: int, tmp_path: Path) -> None:
+    xyz = np.full((count, 3), np.nan, np.float32)
+    ids = np.zeros(count, np.uint8)
+    path = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
+    assert len(READERS[kind](path).raw) == count
 
 
 @pytest.mark.parametrize("kind", WITH_POINTS)
-def test_what_was_written_can_be_segmented_again(kind: str, tmp_path: Path) -> None:
-    xyz, ids, uncertain = a_scan()
-    cloud = read_cloud(write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI, uncertain))
-    np.testing.assert_allclose(cloud.xyz, where_lost(kind, xyz), rtol=0, atol=1e-4)
+def test_the_files_can_be_read_as_scans_again(kind: str, tmp_path: Path) -> None:
+    xyz, ids, uncertain = make_scan()
+    path = write_scan_labels(
+        tmp_path / "a", kind, xyz, ids, taxonomy=SEMANTICKITTI, uncertain=uncertain
+    )
+    check_coordinates(kind, read_cloud(path).xyz, xyz)
 
 
-# --- what goes wrong
+# --- errors ---
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_an_existing_file_survives_a_write_that_fails(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    xyz, ids, _ = a_scan()
-    path = write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)
+    xyz, ids, _ = make_scan()
+    stem = tmp_path / "a"
+    path = write_scan_labels(stem, kind, xyz, ids, SEMANTICKITTI)
     before = path.read_bytes()
-    fails(lambda: write_scan_labels(tmp_path / "a", kind, xyz, ids + 20, SEMANTICKITTI), "0..19")
-    fails(lambda: write_scan_labels(tmp_path / "a", kind, xyz, ids[1:], SEMANTICKITTI), path, COUNT)
 
-    def full(*_: object) -> None:
+    fails(lambda: write_scan_labels(stem, kind, xyz, ids + 20, SEMANTICKITTI), "0..19")
+    fails(lambda: write_scan_labels(stem, kind, xyz, ids[1:], SEMANTICKITTI), path, COUNT)
+
+    def disk_full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "replace", full)
+    monkeypatch.setattr(os, "replace", disk_full)
     with pytest.raises(OSError, match="No space"):
-        write_scan_labels(tmp_path / "a", kind, xyz + 1, ids, SEMANTICKITTI)
+        write_scan_labels(stem, kind, xyz + 1, ids, SEMANTICKITTI)
+
     assert path.read_bytes() == before
     assert files(tmp_path) == {path.name}
 
 
 def test_an_unknown_format_is_named() -> None:
-    fails(
-        lambda: write_scan_labels(Path("a"), "xyz", np.zeros((1, 3)), np.zeros(1), SEMANTICKITTI),
-        "xyz",
-        "ply",
-    )
+    xyz = np.zeros((1, 3))
+    ids = np.zeros(1)
+    fails(lambda: write_scan_labels(Path("a"), "xyz", xyz, ids, SEMANTICKITTI), "xyz", "ply")
 
 
 def test_a_missing_extra_is_named(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "laspy", None)
-    code, message = predict(world, tmp_path, world / "scans/a.bin", "--format", "las")
-    assert (code, message.count("\n")) == (2, 1)
+    message = failure(world, tmp_path, world / "scans/a.bin", "--format", "las")
     assert 'pip install "amvnet[formats]"' in message
     assert not files(tmp_path)
 
 
-# --- predict
+# --- predict ---
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights, a data set, and lone scans of three formats."""
+    """A folder with weights, a dataset, and single scans of three formats."""
     root = tmp_path_factory.mktemp("world")
-    save(fresh_weights(), root / "w.safetensors")
-    save(without(fresh_weights(), "polar_net"), root / "rv.safetensors")
     make_streets(root / "data")
-    (root / "scans").mkdir()
+    save(fresh_weights(), root / "w.safetensors")
+
     points = some_points(400)
+    (root / "scans").mkdir()
     points.tofile(root / "scans/a.bin")
     points[LOST] = np.nan
     points[LOST + 1, :3] = 0
+
     write_pcd(root / "scans/b.pcd", points, "binary")
     write_bag1(root / "drive.bag", {"/lidar": [points, points[::-1].copy()]})
     return root
 
 
 def predict(world: Path, out: Path, *words: object) -> tuple[int, str]:
+    """Run `amvnet predict`; return the exit code and the text of stderr."""
     return run_cli("predict", *words, "--weights", world / "w.safetensors", "--out", out)
 
 
+def failure(world: Path, out: Path, *words: object) -> str:
+    """Check that `amvnet predict` ends in an error of one line, and return it."""
+    code, message = predict(world, out, *words)
+    assert code == 2
+    assert message.count("\n") == 1
+    return message
+
+
 @pytest.mark.parametrize("kind", KINDS)
-def test_predict_writes_the_files_own_points_though_the_network_sees_others(
+def test_predict_writes_the_points_of_the_file_though_the_network_gets_others(
     kind: str, world: Path, tmp_path: Path
 ) -> None:
     inputs = (world / "scans", world / "drive.bag", "--axes", "y-forward", "--height", "0.5")
     assert predict(world, tmp_path / "label", *inputs)[0] == 0
     assert predict(world, tmp_path / "out", *inputs, "--format", kind)[0] == 0
-    sources = {
-        "a": read_cloud(world / "scans/a.bin").xyz,
-        "b": read_cloud(world / "scans/b.pcd").xyz,
-    }
-    sources |= {"drive/000000": sources["b"], "drive/000001": sources["b"][::-1]}
-    assert files(tmp_path / "out") == {f"{name}.{kind}" for name in sources}
-    for name, xyz in sources.items():
-        found = READERS[kind](tmp_path / "out" / f"{name}.{kind}")
-        assert np.array_equal(
-            found.raw, np.fromfile(tmp_path / "label" / f"{name}.label", np.uint32)
-        )
-        if found.xyz is not None:
-            assert found.uncertain is not None
-            np.testing.assert_allclose(
-                found.xyz, where_lost(kind, xyz), rtol=0, atol=1e-4 if kind == "las" else 0
-            )
+
+    first = read_cloud(world / "scans/a.bin").xyz
+    second = read_cloud(world / "scans/b.pcd").xyz
+    scans = {"a": first, "b": second, "drive/000000": second, "drive/000001": second[::-1]}
+    assert files(tmp_path / "out") == {f"{name}.{kind}" for name in scans}
+
+    for name, xyz in scans.items():
+        raw = np.fromfile(tmp_path / "label" / f"{name}.label", np.uint32)
+        content = READERS[kind](tmp_path / "out" / f"{name}.{kind}")
+        np.testing.assert_array_equal(content.raw, raw)
+        if kind in WITH_POINTS:
+            assert content.uncertain is not None
+            check_coordinates(kind, content.xyz, xyz)
 
 
 def test_uncertain_points_are_those_of_the_segmenter(world: Path, tmp_path: Path) -> None:
     options = ("--uncertain", "--sequences", "08", "--format", "ply")
     assert predict(world, tmp_path, world / "data", world / "scans", *options)[0] == 0
+
+    # A dataset keeps its layout and its format.
     folder = "sequences/08/predictions"
-    names = {f"{folder}/{i:06d}" for i in range(2)}
-    expected = {f"{name}.label" for name in names} | {
+    assert files(tmp_path) == {
+        f"{folder}/000000.label",
+        f"{folder}/000000.uncertain.npy",
+        f"{folder}/000001.label",
+        f"{folder}/000001.uncertain.npy",
         "a.ply",
+        "a.uncertain.npy",
         "b.ply",
-    }  # a data set keeps its layout
-    assert files(tmp_path) == expected | {f"{name}.uncertain.npy" for name in (*names, "a", "b")}
+        "b.uncertain.npy",
+    }
+
     points = np.fromfile(world / "data/sequences/08/velodyne/000000.bin", np.float32).reshape(-1, 4)
-    found = np.load(tmp_path / folder / "000000.uncertain.npy", allow_pickle=False)
-    assert found.dtype == bool
-    assert np.array_equal(found, Segmenter(str(world / "w.safetensors"))(points).uncertain)
-    beside = np.load(tmp_path / "b.uncertain.npy", allow_pickle=False)
-    assert np.array_equal(beside, read_ply(tmp_path / "b.ply").uncertain)
-    assert not beside[[LOST, LOST + 1]].any()
+    expected = Segmenter(str(world / "w.safetensors"))(points).uncertain
+    uncertain = np.load(tmp_path / folder / "000000.uncertain.npy", allow_pickle=False)
+    assert uncertain.dtype == bool
+    np.testing.assert_array_equal(uncertain, expected)
+
+    uncertain = np.load(tmp_path / "b.uncertain.npy", allow_pickle=False)
+    np.testing.assert_array_equal(uncertain, read_ply(tmp_path / "b.ply").uncertain)
+    assert not uncertain[[LOST, LOST + 1]].any()
 
 
-def test_one_network_alone_is_never_said_to_be_certain(world: Path, tmp_path: Path) -> None:
-    scan, options = world / "scans/a.bin", ("--method", "rv", "--format", "ply")
+def test_one_network_alone_reports_no_uncertain_points(world: Path, tmp_path: Path) -> None:
+    scan = world / "scans/a.bin"
+    options = ("--method", "rv", "--format", "ply")
     assert predict(world, tmp_path, scan, *options)[0] == 0
     assert read_ply(tmp_path / "a.ply").uncertain is None
-    code, message = predict(world, tmp_path / "other", scan, *options, "--uncertain")
-    assert (code, message.count("\n")) == (2, 1)
+
+    message = failure(world, tmp_path / "other", scan, *options, "--uncertain")
     assert "--uncertain" in message
     assert not (tmp_path / "other").exists()
 
@@ -317,29 +344,28 @@ def test_one_network_alone_is_never_said_to_be_certain(world: Path, tmp_path: Pa
     ("scan", "options"),
     [("b.pcd", ("--format", "pcd")), ("a.bin", ("--format", "ply")), ("c.npz", ("--scores",))],
 )
-def test_scans_are_never_written_over(
+def test_scans_are_never_overwritten(
     scan: str, options: tuple[str, ...], world: Path, tmp_path: Path
 ) -> None:
     points = some_points(400)
-    for name, content in (("a.bin", points.tobytes()), ("a.ply", b"another scan of mine")):
-        (tmp_path / name).write_bytes(content)
+    points.tofile(tmp_path / "a.bin")
+    (tmp_path / "a.ply").write_bytes(b"another scan of mine")
     write_pcd(tmp_path / "b.pcd", points, "binary")
     np.savez(tmp_path / "c.npz", points=points)
+
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    code, message = predict(world, tmp_path, tmp_path / scan, *options)
-    assert (code, message.count("\n")) == (2, 1)
+    message = failure(world, tmp_path, tmp_path / scan, *options)
     assert "--out" in message
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_uncertain_points_beside_scans_are_no_scans(world: Path, tmp_path: Path) -> None:
+def test_uncertain_points_next_to_scans_are_not_scans(world: Path, tmp_path: Path) -> None:
     some_points(400).tofile(tmp_path / "a.bin")
     for _ in range(2):
         assert predict(world, tmp_path, tmp_path, "--uncertain")[0] == 0
     assert files(tmp_path) == {"a.bin", "a.label", "a.uncertain.npy"}
 
 
-def test_an_unknown_format_is_one_line(world: Path, tmp_path: Path) -> None:
-    code, message = predict(world, tmp_path, world / "scans/a.bin", "--format", "xyz")
-    assert (code, message.count("\n")) == (2, 1)
+def test_an_unknown_format_gives_an_error_of_one_line(world: Path, tmp_path: Path) -> None:
+    message = failure(world, tmp_path, world / "scans/a.bin", "--format", "xyz")
     assert "ply" in message

@@ -1,13 +1,15 @@
-"""The labels of a lone scan, written alone or as coloured points that other programs open."""
+"""The labels of a single scan: alone, or as coloured points that other programs open."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
+from amvnet.data.formats.cloud import split_records
 from amvnet.data.scan_files import check_count, write_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -15,9 +17,12 @@ from amvnet.files import atomic_write
 
 Kind = Literal["label", "npy", "ply", "pcd", "las"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-EXACT = 0.0005  # metres: where float32 is farther off than this, coordinates are written as float64
+
+EXACT = 0.0005  # metres: if float32 is off by more, coordinates are written as float64
 LAS_STEP = 0.0001  # metres: the unit of LAS coordinates
-LAS_REACH = 200_000.0  # metres: what 32 bits hold of that, either way
+LAS_REACH = 200_000.0  # metres: the range of 32 bits of that unit, either way
+LAS_POINT_FORMAT = 7  # of LAS 1.4, with colours
+
 PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 PCD_HEADER = """\
 # .PCD v0.7 - Point Cloud Data file format
@@ -33,19 +38,44 @@ POINTS {points}
 DATA binary
 """
 
+Columns = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class LabelledPoints:
+    """The points of a scan and their labels.
+
+    Attributes:
+        xyz: (N, 3) coordinates, metres.
+        raw: (N,) uint32 raw ids.
+        colors: (N, 3) uint8 RGB.
+        uncertain: (N,) bool, or None if unknown.
+    """
+
+    xyz: np.ndarray
+    raw: np.ndarray
+    colors: np.ndarray
+    uncertain: np.ndarray | None
+
 
 def check_kind(kind: str) -> None:
-    """Raises InputError where a format is unknown, or laspy is missing for it; to be asked before anything is done."""
+    """Check that a format can be written. Call it before any work is done.
+
+    Raises:
+        InputError: if the format is unknown, or needs laspy and that is missing.
+    """
     if kind not in KINDS:
         raise InputError(
             f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them"
         )
+
     if kind == "las":
         try:
             import laspy  # noqa: F401
         except ImportError:
             raise InputError(
-                'expected laspy to write LAS, found none; do pip install "amvnet[formats]"'
+                "expected the package laspy to write LAS, found none; "
+                'run pip install "amvnet[formats]"'
             ) from None
 
 
@@ -57,118 +87,132 @@ def write_scan_labels(
     taxonomy: Taxonomy,
     uncertain: np.ndarray | None = None,
 ) -> Path:
-    """Write the labels of a scan, one row for each of its points in their order; whole or not at all.
+    """Write the labels of a scan, one row per point in the scan's order, completely or not at all.
 
-    - `label`: uint32 raw ids and nothing else, as SemanticKITTI has them.
+    - `label`: uint32 raw ids only, as in SemanticKITTI.
     - `npy`: the same as an array (N,).
     - `ply` (binary): x, y, z, red, green, blue, class (raw id), uncertain (0 or 1).
-    - `pcd` (binary): x, y, z, rgb (packed as PCL does), label (raw id), uncertain. NaN stays NaN, as in `ply`.
-    - `las`: coordinates to 0.1 mm, colours, and the dimensions class (raw id) and uncertain. What LAS cannot hold, NaN
-      and points 200 km from the others, keeps its place with class 0 and the coordinates 0, 0, 0; of a scan far from
-      the origin, as in a map's coordinates, those of the file's offset.
+    - `pcd` (binary): x, y, z, rgb (packed as in PCL), label (raw id), uncertain. NaN stays NaN, as
+      in `ply`.
+    - `las`: coordinates to 0.1 mm, colours, and the extra dimensions class (raw id) and uncertain.
+      LAS cannot hold NaN, nor points 200 km from the others. They keep their row, with class 0 and
+      the coordinates of the file's offset: 0, 0, 0 unless the scan is far from the origin, as in
+      map coordinates.
 
-    Coordinates of `ply` and `pcd` are float32, or float64 where that would be off by more than half a millimetre.
+    Coordinates of `ply` and `pcd` are float32, or float64 if float32 would be off by more than half
+    a millimetre.
 
     Args:
         stem: the path without an ending; `.` and the kind are added.
-        xyz: (N, 3) coordinates, metres, as the scan's file has them; `label` and `npy` do without.
+        xyz: (N, 3) coordinates, metres, as in the scan's file. `label` and `npy` use only N.
         ids: (N,) train ids in 0..K.
-        uncertain: (N,) bool; None where that is not known, and the column is left out.
+        uncertain: (N,) bool; None if unknown, which leaves the column out.
 
     Returns:
         The path of the file.
 
     Raises:
-        InputError: as `check_kind`, where there is not one id per point or an id is outside 0..K, or where the file
-            cannot be written.
+        InputError: as `check_kind`, or if there is not one id per point, an id is outside 0..K, or
+            the file cannot be written.
     """
     check_kind(kind)
     path = stem.with_name(f"{stem.name}.{kind}")
+
     ids = check_count(ids, path, len(xyz))
     raw = taxonomy.to_raw(ids)
     if kind == "label":
         return write_labels(path, raw)
+
     with atomic_write(path) as part:
         if kind == "npy":
             np.save(part, raw)
         else:
-            POINT_WRITERS[kind](
-                part, xyz, raw, np.asarray(taxonomy.colors, dtype=np.uint8)[ids], uncertain
-            )
+            colors = np.asarray(taxonomy.colors, dtype=np.uint8)[ids]
+            POINT_WRITERS[kind](part, LabelledPoints(xyz, raw, colors, uncertain))
     return path
 
 
 def write_uncertain(path: Path, uncertain: np.ndarray) -> Path:
-    """Write which points are uncertain, (N,) bool, as `.npy`; whole or not at all."""
+    """Write which points are uncertain, (N,) bool, as `.npy`, completely or not at all."""
     with atomic_write(path) as part:
         np.save(part, np.asarray(uncertain, dtype=bool))
     return path
 
 
-Columns = dict[str, np.ndarray]
+def _write_ply(path: Path, points: LabelledPoints) -> None:
+    columns = _coordinates(points.xyz)
+    columns["red"], columns["green"], columns["blue"] = points.colors.T
+    columns["class"] = points.raw.astype(np.int32)
+    table = _to_records(columns | _uncertain_column(points.uncertain))
 
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    for name in table.dtype.names or ():
+        header.append(f"property {PLY_TYPES[table.dtype[name].str[1:]]} {name}")
+    header.append("end_header\n")
 
-def _write_ply(
-    path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None
-) -> None:
-    columns = _coordinates(xyz) | dict(zip(("red", "green", "blue"), colors.T, strict=True))
-    table = _table(columns | {"class": raw.astype(np.int32)} | _flags(uncertain))
-    properties = [f"property {PLY_TYPES[dtype.str[1:]]} {name}" for name, dtype in _fields(table)]
-    header = [
-        "ply",
-        "format binary_little_endian 1.0",
-        f"element vertex {len(table)}",
-        *properties,
-        "end_header\n",
-    ]
     path.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
 
 
-def _write_pcd(
-    path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None
-) -> None:
-    red, green, blue = colors.astype(np.uint32).T
-    packed = (
-        (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
-    )  # PCL keeps the three bytes as a float's
-    table = _table(_coordinates(xyz) | {"rgb": packed, "label": raw} | _flags(uncertain))
-    fields = _fields(table)
+def _write_pcd(path: Path, points: LabelledPoints) -> None:
+    columns = _coordinates(points.xyz)
+
+    # PCL stores the three bytes of a colour as the bits of a float.
+    red, green, blue = points.colors.astype(np.uint32).T
+    columns["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+
+    columns["label"] = points.raw
+    table = _to_records(columns | _uncertain_column(points.uncertain))
+
+    sizes = []
+    types = []
+    for values in split_records(table).values():
+        sizes.append(str(values.dtype.itemsize))
+        types.append(values.dtype.kind.upper())
+
     header = PCD_HEADER.format(
-        names=" ".join(name for name, _ in fields),
-        sizes=" ".join(str(dtype.itemsize) for _, dtype in fields),
-        types=" ".join(dtype.kind.upper() for _, dtype in fields),
-        counts=" ".join("1" for _ in fields),
+        names=" ".join(table.dtype.names or ()),
+        sizes=" ".join(sizes),
+        types=" ".join(types),
+        counts=" ".join("1" * len(sizes)),
         points=len(table),
     )
     path.write_bytes(header.encode("ascii") + table.tobytes())
 
 
-def _write_las(
-    path: Path, xyz: np.ndarray, raw: np.ndarray, colors: np.ndarray, uncertain: np.ndarray | None
-) -> None:
-    """The class is a dimension of its own: LAS's has a byte, and other meanings for its numbers."""
+def _write_las(path: Path, points: LabelledPoints) -> None:
+    """Write LAS 1.4.
+
+    The raw ids are an extra dimension: LAS's own classification is one byte, and its numbers have
+    fixed meanings.
+    """
     import laspy
 
-    places, offset, held = _las_places(xyz)
-    extra = {"class": np.where(held, raw, 0).astype(np.uint16)} | _flags(uncertain)
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    header.scales, header.offsets = np.full(3, LAS_STEP), offset
-    header.add_extra_dims(
-        [laspy.ExtraBytesParams(name, values.dtype) for name, values in extra.items()]
+    steps, offset, fits = _las_coordinates(points.xyz)
+    extra = {"class": np.where(fits, points.raw, 0).astype(np.uint16)} | _uncertain_column(
+        points.uncertain
     )
-    las = laspy.LasData(header, laspy.ScaleAwarePointRecord.zeros(len(xyz), header=header))
-    las.X, las.Y, las.Z = places.T
-    las.red, las.green, las.blue = (
-        colors.T.astype(np.uint16) * 256
-    )  # as the specification brings 8 bits to 16
+
+    header = laspy.LasHeader(point_format=LAS_POINT_FORMAT, version="1.4")
+    header.scales = np.full(3, LAS_STEP)
+    header.offsets = offset
+    dimensions = []
+    for name, values in extra.items():
+        dimensions.append(laspy.ExtraBytesParams(name, values.dtype))
+    header.add_extra_dims(dimensions)
+
+    record = laspy.ScaleAwarePointRecord.zeros(len(points.xyz), header=header)
+    las = laspy.LasData(header, record)
+    las.X, las.Y, las.Z = steps.T
+
+    # The specification scales 8 bits of colour to 16 by 256.
+    las.red, las.green, las.blue = points.colors.T.astype(np.uint16) * 256
+
     for name, values in extra.items():
         las[name] = values
     las.write(str(path))
 
 
-POINT_WRITERS: dict[
-    str, Callable[[Path, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None], None]
-] = {
+POINT_WRITERS: dict[str, Callable[[Path, LabelledPoints], None]] = {
     "ply": _write_ply,
     "pcd": _write_pcd,
     "las": _write_las,
@@ -176,42 +220,52 @@ POINT_WRITERS: dict[
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def _las_places(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N, 3) int32 steps from the (3,) offset, which is 0 where that is near enough, and the (N,) points that it holds.
+def _las_coordinates(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how LAS holds (N, 3) coordinates.
 
-    The median is what a few broken points, however far, cannot move.
+    Returns:
+        (N, 3) int32 steps from the offset, 0 for points that do not fit; the (3,) offset, 0 unless
+        the scan is far from the origin; and the (N,) points that fit, bool.
     """
-    finite = np.isfinite(xyz).all(axis=1)
-    middle = (
-        np.round(np.median(xyz[finite].astype(np.float64), axis=0)) if finite.any() else np.zeros(3)
-    )
-    offset = middle if (np.abs(middle) > LAS_REACH / 2).any() else np.zeros(3)
-    apart = xyz.astype(np.float64) - offset
-    held = finite & (np.abs(apart) < LAS_REACH).all(axis=1)
-    return np.round(np.where(held[:, None], apart, 0) / LAS_STEP).astype(np.int32), offset, held
+    wide = xyz.astype(np.float64)
+    is_finite = np.isfinite(xyz).all(axis=1)
+
+    # A few broken points, however far away, do not move the median.
+    offset = np.zeros(3)
+    if is_finite.any():
+        middle = np.round(np.median(wide[is_finite], axis=0))
+        if (np.abs(middle) > LAS_REACH / 2).any():
+            offset = middle
+
+    distances = wide - offset
+    fits = is_finite & (np.abs(distances) < LAS_REACH).all(axis=1)
+    steps = np.round(np.where(fits[:, None], distances, 0) / LAS_STEP).astype(np.int32)
+    return steps, offset, fits
 
 
 @np.errstate(invalid="ignore", over="ignore")
 def _coordinates(xyz: np.ndarray) -> Columns:
-    narrow = xyz.astype(np.float32)
-    exact = not (np.abs(narrow - xyz) > EXACT).any()
-    return dict(zip("xyz", (narrow if exact else xyz.astype(np.float64)).T, strict=True))
+    """Return the columns x, y, z as float32, or as float64 if that is not exact enough."""
+    values = xyz.astype(np.float32)
+    if (np.abs(values - xyz) > EXACT).any():
+        values = xyz.astype(np.float64)
+    x, y, z = values.T
+    return {"x": x, "y": y, "z": z}
 
 
-def _flags(uncertain: np.ndarray | None) -> Columns:
-    return {} if uncertain is None else {"uncertain": np.asarray(uncertain).astype(np.uint8)}
+def _uncertain_column(uncertain: np.ndarray | None) -> Columns:
+    """Return the column of uncertain points; none if unknown."""
+    if uncertain is None:
+        return {}
+    return {"uncertain": np.asarray(uncertain).astype(np.uint8)}
 
 
-def _table(columns: Columns) -> np.ndarray:
-    """(N,) records, packed and little endian."""
-    (count,) = {len(values) for values in columns.values()}
-    table = np.empty(
-        count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    )
+def _to_records(columns: Columns) -> np.ndarray:
+    """Return (N,) records of the columns, packed and little endian."""
+    fields = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
+    (count,) = set(map(len, columns.values()))  # one length for all columns
+
+    table = np.empty(count, fields)
     for name, values in columns.items():
         table[name] = values
     return table
-
-
-def _fields(table: np.ndarray) -> list[tuple[str, np.dtype]]:
-    return [(name, table.dtype[name]) for name in table.dtype.names or ()]

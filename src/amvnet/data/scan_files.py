@@ -1,4 +1,4 @@
-"""Scan and label files, read with every check and written whole or not at all."""
+"""Read and check scan and label files, and write label files completely or not at all."""
 
 from __future__ import annotations
 
@@ -23,28 +23,35 @@ from amvnet.scan import Scan
 
 
 def read_scan(path: Path | str) -> Scan:
-    """Read a lone scan; what is in the file says the format, its name only where that does not.
+    """Read a single scan.
 
-    Rows of float32 (x, y, z, intensity as KITTI has them, or x, y, z, intensity 0..255, ring as nuScenes), `.npy` and
-    `.npz` ((N, 3..), or (H, W, C) row by row), `.pcd`, `.ply`, `.las`, `.laz`, and bags of one scan.
+    The content of the file decides on its format, or its name if the content is ambiguous:
 
-    The intensity is taken as 0..255 where a value is above 1, as 0..65535 where one is above 255, and scaled. A
-    point at 0, 0, 0 is a lost return: its place is kept, its coordinates become NaN.
+    - rows of float32: x, y, z, intensity as in KITTI, or x, y, z, intensity 0..255, ring as in
+      nuScenes;
+    - `.npy` and `.npz`: arrays (N, 3 or more), or range images (H, W, C), read row by row;
+    - `.pcd`, `.ply`, `.las`, `.laz`;
+    - bags of one scan.
+
+    Intensities are divided by 255 if one is above 1, and by 65535 if one is above 255. A point at
+    0, 0, 0 is a lost return: it keeps its index, and its coordinates become NaN.
 
     Returns:
-        Scan with points (N, 4), metres and intensity in [0, 1], `ring` where the file has it.
+        Scan with points (N, 4) in metres, intensity in [0, 1], and `ring` if the file has it.
 
     Raises:
-        InputError: where the file is missing, of another format, truncated, empty or all NaN.
+        InputError: if the file is missing, of another format, truncated, empty or all NaN.
     """
     return read_cloud(path).to_scan()
 
 
 def find_scans(path: Path | str) -> list[Path]:
-    """List the scan files and bags of a folder, sorted by name (hidden ones left out); a file is its own list.
+    """Return the scan files and bags of a folder, sorted by name; only the path if it is a file.
+
+    Hidden files are left out.
 
     Raises:
-        InputError: where the path is not there or the folder has no scan.
+        InputError: if the path does not exist, or the folder has no scan.
     """
     path = Path(path)
     if path.is_file() or is_bag_folder(path):
@@ -53,35 +60,49 @@ def find_scans(path: Path | str) -> list[Path]:
         raise InputError(
             f"{path}: expected a scan file or a folder of scans, found nothing; check the path"
         )
-    if found := sorted(entry for entry in path.iterdir() if is_scan_file(entry)):
-        return found
-    raise InputError(
-        f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; give the folder of scans"
-    )
+
+    scans = sorted(filter(is_scan_file, path.iterdir()))
+    if not scans:
+        raise InputError(
+            f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; "
+            "give the folder of scans"
+        )
+    return scans
 
 
 def check_points(points: np.ndarray, path: Path) -> np.ndarray:
-    """Hand back (N, 4) points as float32, where they hold anything to work on.
+    """Return (N, 4) points as float32, if there is anything to work on.
 
     Raises:
-        InputError: where there is no point, or none with a finite position.
+        InputError: if there is no point, or none with finite coordinates.
     """
     if not len(points):
         raise InputError(f"{path}: expected a scan with points, found 0 points; leave the file out")
-    if not np.isfinite(points[:, :3]).all(axis=1).any():
+
+    is_finite = np.isfinite(points[:, :3]).all(axis=1)
+    if not is_finite.any():
         raise InputError(
-            f"{path}: expected finite coordinates, found NaN or infinity in every point; leave it out"
+            f"{path}: expected finite coordinates, found NaN or infinity in every point; "
+            "leave the file out"
         )
     return np.ascontiguousarray(points, dtype=np.float32)
 
 
 def read_kitti(path: Path) -> np.ndarray:
-    """Read (N, 4) float32 x, y, z, intensity as they are; raises as `read_table` and `check_points`."""
+    """Read (N, 4) float32 x, y, z, intensity, unchanged.
+
+    Raises:
+        InputError: as `read_table` and `check_points`.
+    """
     return check_points(read_table(path, np.float32, KITTI_COLUMNS), path)
 
 
 def read_nuscenes(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read (N, 4) float32 points, intensity scaled from 0..255 to [0, 1], and the (N,) int64 ring."""
+    """Read (N, 4) float32 points, intensity scaled from 0..255 to [0, 1], and the (N,) int64 ring.
+
+    Raises:
+        InputError: as `read_table`, `check_points` and `ring_column`.
+    """
     table = read_table(path, np.float32, NUSCENES_COLUMNS)
     points = check_points(table[:, :4], path)
     points[:, 3] /= FULL_INTENSITY
@@ -91,16 +112,21 @@ def read_nuscenes(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def read_labels(
     path: Path, dtype: DTypeLike, count: int, to_train: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
-    """Read `count` raw labels of `dtype` and turn them into (N,) uint8 train ids by `to_train`.
+    """Read `count` raw labels of `dtype` and return them as (N,) uint8 train ids.
+
+    Args:
+        to_train: converts (N,) raw labels to train ids.
 
     Raises:
-        InputError: where the file is missing, has another number of labels, or an unknown id.
+        InputError: if the file is missing, has another number of labels, or an unknown id.
     """
     raw = read_table(path, dtype, 1)[:, 0]
     if len(raw) != count:
         raise InputError(
-            f"{path}: expected {count} labels, one per point, found {len(raw)}; give the file of this scan"
+            f"{path}: expected {count} labels, one per point, found {len(raw)}; "
+            "give the label file of this scan"
         )
+
     try:
         return to_train(raw)
     except InputError as error:
@@ -108,21 +134,25 @@ def read_labels(
 
 
 def write_labels(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint32) -> Path:
-    """Write (N,) raw ids as `dtype` (uint32 is the official `.label`), whole or not at all."""
+    """Write (N,) raw ids as `dtype`, completely or not at all, and return the path.
+
+    The official `.label` files have uint32.
+    """
     with atomic_write(path) as part:
         np.asarray(raw_ids).astype(dtype).tofile(part)
     return Path(path)
 
 
 def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
-    """Hand back the ids that are to be written for the scan in `path`.
+    """Return the ids to be written for the scan in `path`, if there is one per point.
 
     Raises:
-        InputError: where they are not (count,).
+        InputError: if their shape is not (count,).
     """
     ids = np.asarray(ids)
     if ids.shape != (count,):
         raise InputError(
-            f"{path}: expected {count} ids, one per point, found shape {ids.shape}; segment the whole scan"
+            f"{path}: expected {count} ids, one per point, found shape {ids.shape}; "
+            "segment the whole scan"
         )
     return ids

@@ -1,112 +1,130 @@
-"""The scans of ROS bags (ROS 1, ROS 2, mcap), by rosbags: the PointCloud2 messages of one topic, one at a time."""
+"""Scans in ROS bags (ROS 1, ROS 2, mcap), by rosbags: the PointCloud2 messages of one topic."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from amvnet.data.formats.cloud import Cloud, refusing
+from amvnet.data.formats.cloud import Cloud, reading
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.errors import InputError
 
 TYPE = "sensor_msgs/msg/PointCloud2"
 METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
-SMALLEST = 16  # bytes of a bag for each message that it claims, compressed ones too
-EXPECTED, ADVICE = (
-    "a ROS bag",
-    "mend it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again",
-)
+MIN_MESSAGE = 16  # bytes of a bag for each message, compressed ones too
+EXPECTED = "a ROS bag"
+ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
+
+Decode = Callable[[], Any]  # deserialises one message
 
 
 class Bag:
-    """The scans of one topic of a bag, in order of time. One message is held at a time.
+    """The scans of one topic of a bag, ordered by time. One message at a time is in memory.
 
     Args:
         path: the file, or the folder of a ROS 2 bag.
-        ending: what its storage is: `.bag`, `.mcap`, `.db3`, or nothing for a folder.
-        topic: of the scans; None is the only one with PointCloud2.
+        ending: the storage format: `.bag`, `.mcap`, `.db3`, or empty for a folder.
+        topic: the topic of the scans; None for the only one with PointCloud2.
 
     Raises:
-        InputError: where it cannot be read, or the topic is not clear.
+        InputError: if the bag cannot be read, or has no such topic, or more than one.
     """
 
     def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
-        self.path, self._ending = path, ending
-        with refusing(path, EXPECTED, ADVICE), _opened(path, ending) as reader:
-            self.topic = _choose(_topics(reader), topic, path)
-            self._count = sum(c.msgcount for c in _connections(reader, self.topic))
-        if not 0 < self._count <= _size(path) // SMALLEST:
+        self.path = path
+        self._ending = ending
+
+        with reading(path, EXPECTED, ADVICE), _open_reader(path, ending) as reader:
+            counts = _count_messages(reader)
+            self.topic = _choose_topic(counts, topic, path)
+        self._count = counts[self.topic]
+
+        if not 0 < self._count <= _size(path) // MIN_MESSAGE:
             raise InputError(
                 f"{path}: expected scans under {self.topic}, found {self._count} messages; {ADVICE}"
             )
-        self._next, self._messages = 0, iter(())  # type: tuple[int, Iterator[Any]]
+
+        # For reading in order without a seek: the index of the next message, and the messages from
+        # there on.
+        self._next = 0
+        self._messages: Iterator[Decode] = iter(())
 
     def __len__(self) -> int:
         return self._count
 
     def read(self, place: int) -> Cloud:
-        """Read the scan at a place, from 0; fastest in order.
+        """Read the scan at this index, from 0. In order is fastest.
 
         Raises:
-            InputError: where the message is broken, or the bag ends before it.
+            InputError: if the message is broken, or the bag ends before it.
         """
-        if place != self._next:
-            self._next, self._messages = 0, iter(())
-        if not self._next:
-            self._messages = self._read_all()
+        if place != self._next or self._next == 0:
+            self._next = 0
+            self._messages = self._read_messages()
+
         name = f"{self.path} ({self.topic}, {place})"
-        with refusing(name, "a PointCloud2 message", ADVICE):
-            for message in self._messages:
+        with reading(name, "a PointCloud2 message", ADVICE):
+            for decode in self._messages:
                 self._next += 1
                 if self._next > place:
                     if self._next == self._count:
-                        self._messages = iter(())  # nothing stays open
-                    return read_message(message(), name)
+                        self._messages = iter(())  # closes the bag
+                    return read_message(decode(), name)
         raise InputError(f"{name}: expected {self._count} scans, found {self._next}; {ADVICE}")
 
-    def _read_all(self) -> Iterator[Any]:
-        """Every message of the topic as a function that deserialises it."""
-        with _opened(self.path, self._ending) as reader:
-            decode = _decoder(self._ending)
-            for _, _, data in reader.messages(connections=_connections(reader, self.topic)):
-                yield lambda data=data: decode(data, TYPE)
+    def _read_messages(self) -> Iterator[Decode]:
+        with _open_reader(self.path, self._ending) as reader:
+            deserialise = _deserialiser(self._ending)
+            connections = _connections(reader, self.topic)
+            for _, _, data in reader.messages(connections=connections):
+                yield partial(deserialise, data, TYPE)
 
 
 @contextmanager
-def _opened(path: Path, ending: str) -> Iterator[Any]:
-    """rosbags' reader; it goes by the ending of the name, so that one that lies needs a link."""
+def _open_reader(path: Path, ending: str) -> Iterator[Any]:
+    """Open a bag with rosbags.
+
+    rosbags tells the storage format from the file's name. If the name has another ending, a link
+    with the right one is opened.
+    """
     try:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
     except ImportError:
         raise InputError(
-            f'{path}: expected rosbags to read it, found none; do pip install "amvnet[formats]"'
+            f"{path}: expected the package rosbags to read it, found none; "
+            'run pip install "amvnet[formats]"'
         ) from None
+
     with ExitStack() as stack:
         if ending in (".mcap", ".db3") and path.suffix != ending:
             folder = Path(stack.enter_context(TemporaryDirectory()))
-            (folder / f"bag{ending}").symlink_to(path.absolute())
-            path = folder / f"bag{ending}"
-        yield stack.enter_context((Reader1 if ending == ".bag" else Reader2)(path))
+            link = folder / f"bag{ending}"
+            link.symlink_to(path.absolute())
+            path = link
+        reader = Reader1(path) if ending == ".bag" else Reader2(path)
+        yield stack.enter_context(reader)
 
 
-def _decoder(ending: str) -> Any:
-    """From bytes and a type's name to a message."""
+def _deserialiser(ending: str) -> Callable[[bytes, str], Any]:
+    """Return the function that turns the bytes of a message and its type's name into a message."""
     from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS1_NOETIC if ending == ".bag" else Stores.ROS2_HUMBLE)
-    return store.deserialize_ros1 if ending == ".bag" else store.deserialize_cdr
+    if ending == ".bag":
+        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
+    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
 
 
 def _connections(reader: Any, topic: str) -> list[Any]:
     return [c for c in reader.connections if c.topic == topic and c.msgtype == TYPE]
 
 
-def _topics(reader: Any) -> dict[str, int]:
-    """The topics with PointCloud2, and how many messages each has."""
+def _count_messages(reader: Any) -> dict[str, int]:
+    """Return the number of messages of each topic with PointCloud2."""
     counts: dict[str, int] = {}
     for connection in reader.connections:
         if connection.msgtype == TYPE:
@@ -114,28 +132,41 @@ def _topics(reader: Any) -> dict[str, int]:
     return counts
 
 
-def _choose(counts: dict[str, int], topic: str | None, path: Path) -> str:
-    shown = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
+def _choose_topic(counts: dict[str, int], topic: str | None, path: Path) -> str:
+    """Return the topic to read: the requested one, or the only one.
+
+    Raises:
+        InputError: if it is missing, or there are several and none is requested.
+    """
+    listing = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
+
     if topic is not None:
         if topic in counts:
             return topic
         raise InputError(
-            f"{path}: expected PointCloud2 under {topic}, found {shown or 'none'}; give another --topic"
+            f"{path}: expected PointCloud2 under {topic}, found {listing or 'none'}; "
+            "give another --topic"
         )
+
     if not counts:
         raise InputError(
-            f"{path}: expected a topic with PointCloud2, found none; convert the driver's packets first"
+            f"{path}: expected a topic with PointCloud2, found none; "
+            "convert the driver's packets first"
         )
     if len(counts) > 1:
         raise InputError(
-            f"{path}: expected one topic with PointCloud2, found {shown}; give one with --topic"
+            f"{path}: expected one topic with PointCloud2, found {listing}; choose one with --topic"
         )
     return next(iter(counts))
 
 
 def _size(path: Path) -> int:
-    return (
-        sum(f.stat().st_size for f in path.iterdir() if f.is_file())
-        if path.is_dir()
-        else path.stat().st_size
-    )
+    """Return the bytes of a file, or of the files in a folder."""
+    if not path.is_dir():
+        return path.stat().st_size
+
+    size = 0
+    for entry in path.iterdir():
+        if entry.is_file():
+            size += entry.stat().st_size
+    return size

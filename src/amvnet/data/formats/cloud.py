@@ -1,4 +1,4 @@
-"""What a scan file holds, before anything is assumed of the sensor that wrote it."""
+"""The points of a scan file, before anything is assumed about the sensor that recorded them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,17 @@ import numpy as np
 from amvnet.errors import InputError
 from amvnet.scan import FARTHEST, Scan
 
-MAX_POINTS = 10_000_000  # of one scan: 40 times what the largest sensors give; a header that claims more is broken
-INTENSITY_RANGES = (1.0, 255.0, 65535.0)
+# Points of one scan: 40 times as many as the largest sensors give. A header that claims more is
+# broken.
+MAX_POINTS = 10_000_000
 MOST_RINGS = 256
-NAMES = {
+
+# The largest intensities of devices: fractions, 8 bits, 16 bits. Integers cannot be fractions.
+FLOAT_RANGES = (1.0, 255.0, 65535.0)
+INTEGER_RANGES = (255.0, 65535.0)
+
+# Names of columns in lower case. If a file has several of them, the first in this order counts.
+COLUMN_NAMES = {
     "x": ("x",),
     "y": ("y",),
     "z": ("z",),
@@ -30,20 +37,20 @@ NAMES = {
         "scalar_intensity",
     ),
     "ring": ("ring", "rings", "channel", "laser_id", "laser", "scalar_ring"),
-}  # of columns, in small letters; the first that a file has counts
+}
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """The points of one scan file, in its own units and frame.
+    """The points of one scan file, in the file's own units and frame.
 
     Attributes:
-        xyz: (N, 3) float32 or float64, metres.
-        intensity: (N,) numbers, or None where the file has none.
+        xyz: (N, 3) float32 or float64 coordinates, metres.
+        intensity: (N,) numbers, or None if the file has none.
         ring: (N,) int64 index of the laser, or None.
-        name: where the scan comes from, for messages.
-        full: the largest intensity there can be, where the format says it.
-        note: what was assumed to read the file; empty where nothing was.
+        name: the origin of the scan, for messages.
+        full: the largest possible intensity, if the format defines it.
+        note: what the reader had to assume about the file; empty if nothing.
     """
 
     xyz: np.ndarray
@@ -54,136 +61,211 @@ class Cloud:
     note: str = ""
 
     def intensity_scale(self) -> float | None:
-        """What the intensities have to be divided by to be in [0, 1]; None where there is none.
+        """Return the divisor that brings the intensities to [0, 1]; None if there are none.
 
-        Fractions up to 1 stay as they are; else the device's range is taken for 0 to 255, or 0 to 65535.
+        If the format does not define the largest intensity, the values decide: floats up to 1 are
+        divided by 1, other values up to 255 by 255, up to 65535 by 65535, and larger ones by the
+        largest of them.
         """
-        if self.full is not None or self.intensity is None:
+        if self.full is not None:
             return self.full
+        if self.intensity is None:
+            return None
+
         finite = self.intensity[np.isfinite(self.intensity)]
         if not len(finite):
             return None
-        most, ranges = float(finite.max()), INTENSITY_RANGES
-        whole = self.intensity.dtype.kind in "iu"
-        return next((full for full in ranges[1 if whole else 0 :] if most <= full), most)
+
+        largest = float(finite.max())
+        is_integer = self.intensity.dtype.kind in "iu"
+        ranges = INTEGER_RANGES if is_integer else FLOAT_RANGES
+        for limit in ranges:
+            if largest <= limit:
+                return limit
+        return largest
 
     def to_scan(self, scale: float | None = None) -> Scan:
-        """The scan; points at the origin, which sensors write for a lost return, become NaN and so get id 0.
+        """Return the scan, with float32 coordinates and intensities clipped to [0, 1].
+
+        Sensors write the origin for a lost return. Points there become NaN, and so get id 0.
 
         Args:
-            scale: what the intensities are divided by, where it is not `intensity_scale()`.
+            scale: the divisor of the intensities; by default `intensity_scale()`.
 
         Raises:
-            InputError: where no point is usable.
+            InputError: if no point is usable.
         """
+        scale = scale or self.intensity_scale()
         points = np.zeros((len(self.xyz), 4), dtype=np.float32)
-        with np.errstate(
-            over="ignore", invalid="ignore"
-        ):  # what does not fit is infinite, and so not valid
+
+        # Numbers too large for float32 become infinite, and such points are not valid.
+        with np.errstate(over="ignore", invalid="ignore"):
             points[:, :3] = self.xyz
-            scale = scale or self.intensity_scale()
             if self.intensity is not None and scale is not None:
                 points[:, 3] = np.clip(self.intensity / scale, 0, 1)
+
         x, y, z = self.xyz.T
-        points[(x == 0) & (y == 0) & (z == 0), :3] = np.nan
+        at_origin = (x == 0) & (y == 0) & (z == 0)
+        points[at_origin, :3] = np.nan
+
         scan = Scan(points, ring=self.ring, name=self.name)
         if not scan.valid.any():
-            raise InputError(f"{self.name}: {_no_points(points[:, :3])}")
+            raise InputError(f"{self.name}: {_why_unusable(points[:, :3])}")
         return scan
 
 
-def _no_points(xyz: np.ndarray) -> str:
+def _why_unusable(xyz: np.ndarray) -> str:
+    """Return the message for a scan without a valid point, given its (N, 3) coordinates."""
     if not len(xyz):
         return "expected a scan with points, found 0 points; leave the file out"
-    finite = np.isfinite(xyz).all(axis=1)
-    if not finite.any():
-        return "expected finite coordinates, found NaN, infinity or 0, 0, 0 in every point; leave it out"
-    if (np.abs(xyz[finite]) < FARTHEST).all(axis=1).any():
-        return "expected finite intensities, found NaN or infinity in every point; leave it out"
+
+    is_finite = np.isfinite(xyz).all(axis=1)
+    if not is_finite.any():
+        return (
+            "expected finite coordinates, found NaN, infinity or 0, 0, 0 in every point; "
+            "leave the file out"
+        )
+
+    is_near = (np.abs(xyz[is_finite]) < FARTHEST).all(axis=1)
+    if is_near.any():
+        return (
+            "expected finite intensities, found NaN or infinity in every point; leave the file out"
+        )
     return (
-        f"expected metres from the sensor, found every point farther than {FARTHEST / 1000:g} km, as in a map's "
-        "coordinates; give the sensor's place with --offset"
+        f"expected metres from the sensor, found every point farther than {FARTHEST / 1000:g} km, "
+        "as in map coordinates; give the sensor's position with --offset"
     )
 
 
 def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
-    """Hand back a number of points that a header claims, if a scan can have so many.
+    """Return the number of points that a header claims, if it is plausible.
 
     Args:
-        least: how many bytes of the file they take at least; 0 where that is not known.
+        least: bytes of the smallest file with these points; 0 if unknown.
 
     Raises:
-        InputError: where a scan cannot, or the file is too short for it.
+        InputError: if no scan has that many points, or the file is too short for them.
     """
     if not 0 <= count <= MAX_POINTS:
         raise InputError(
-            f"{path}: expected a scan of at most {MAX_POINTS:,} points, found {count}; cut it into scans"
+            f"{path}: expected a scan of at most {MAX_POINTS:,} points, found {count}; "
+            "split it into scans"
         )
-    if least and least > (size := Path(path).stat().st_size):
-        raise InputError(
-            f"{path}: expected {least} bytes or more for {count} points, found {size}; "
-            "the file is truncated, copy it again"
-        )
+
+    if least:
+        size = Path(path).stat().st_size
+        if least > size:
+            raise InputError(
+                f"{path}: expected at least {least} bytes for {count} points, found {size}; "
+                "the file is truncated, copy it again"
+            )
     return count
 
 
 @contextmanager
-def refusing(path: Path | str, expected: str, advice: str) -> Iterator[None]:
-    """Turn whatever a reader raises on broken bytes into an InputError of one line; its warnings are for nobody."""
+def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
+    """Turn every error of a reader in this block into an InputError of one line.
+
+    Readers raise all kinds of exceptions on broken bytes. An InputError passes unchanged. Warnings
+    are silenced.
+
+    Args:
+        path: the file, or another name of the input.
+        expected: what was expected there, such as "a PCD file".
+        advice: what the user can do about it.
+
+    Raises:
+        InputError: if the block raises anything but an interrupt or an exit.
+    """
     try:
         with warnings.catch_warnings(action="ignore"):
             yield
     except InputError:
         raise
     except BaseException as error:
-        # A panic of a library in Rust is no Exception; an interrupt by the user is none either, and goes on.
+        # The panic of a Rust library is not an Exception. Neither is the user's interrupt, which
+        # must pass.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        found = " ".join(str(error).split())[:160] or type(error).__name__
+
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise InputError(
-            f"{path}: expected {expected}, found a broken one ({found}); {advice}"
+            f"{path}: expected {expected}, found a broken one ({reason}); {advice}"
         ) from None
 
 
 def find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Which of a file's columns are x, y, z, intensity and ring, by their names; the last two can be missing."""
-    lower = [name.lower() for name in names]
-    found = {
-        key: [lower.index(alias) for alias in aliases if alias in lower]
-        for key, aliases in NAMES.items()
-    }
-    return {key: places[0] for key, places in found.items() if places}
+    """Find the columns x, y, z, intensity and ring by the names of all columns of a file.
+
+    Returns:
+        The index of each of the five that the file has.
+    """
+    lower_names = list(map(str.lower, names))
+
+    columns = {}
+    for key, aliases in COLUMN_NAMES.items():
+        for alias in aliases:
+            if alias in lower_names:
+                columns[key] = lower_names.index(alias)
+                break
+    return columns
 
 
 def require_columns(names: Sequence[str], path: Path | str) -> dict[str, int]:
-    """The same; raises InputError where x, y or z is missing."""
-    found = find_columns(names)
-    if not {"x", "y", "z"} <= set(found):
-        shown = ", ".join(names[:20]) or "none"
+    """Find the columns as `find_columns`, and check that the coordinates are among them.
+
+    Raises:
+        InputError: if x, y or z is missing.
+    """
+    columns = find_columns(names)
+    if not {"x", "y", "z"} <= set(columns):
+        listing = ", ".join(names[:20]) or "none"
         raise InputError(
-            f"{path}: expected columns x, y, z, found {shown[:200]!a}; name the columns so"
+            f"{path}: expected columns x, y, z, found {listing[:200]!a}; rename the columns"
         )
-    return found
+    return columns
+
+
+def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
+    """Return the NumPy type of records of `size` bytes. Bytes outside the columns are skipped.
+
+    Args:
+        columns: for each column, its NumPy type and its offset in a record, bytes.
+    """
+    formats, offsets = zip(*columns.values(), strict=True)
+    return np.dtype(
+        {"names": list(columns), "formats": formats, "offsets": offsets, "itemsize": size}
+    )
+
+
+def split_records(records: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the (N,) columns of (N,) records, without a copy."""
+    return {name: records[name] for name in records.dtype.names or ()}
 
 
 def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
-    """A cloud of the columns x, y, z and, where there are any, intensity and ring."""
-    wide = any(
-        columns[axis].dtype.itemsize > 4 or columns[axis].dtype.kind in "iu" for axis in "xyz"
-    )
-    xyz = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(
-        np.float64 if wide else np.float32
-    )
+    """Return the cloud of the (N,) columns x, y, z and, if present, intensity and ring.
+
+    Coordinates are float32 if all three columns are floats of at most 32 bits, else float64.
+    """
+    axes = (columns["x"], columns["y"], columns["z"])
+    is_float32 = all(axis.dtype.kind not in "iu" and axis.dtype.itemsize <= 4 for axis in axes)
+    xyz = np.stack(axes, axis=1).astype(np.float32 if is_float32 else np.float64)
+
     return Cloud(xyz, columns.get("intensity"), ring_indices(columns.get("ring")), name)
 
 
 @np.errstate(invalid="ignore")
 def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
-    """(N,) int64 ring indices, or None where the values are no such thing; what is not finite counts as 0."""
+    """Return values as (N,) int64 ring indices, 0 for those that are not finite.
+
+    None if there are no values, or one is negative, too large or not a whole number.
+    """
     if values is None or not len(values):
         return None
+
     finite = np.where(np.isfinite(values), values, 0)
-    whole = (
-        np.array_equal(finite, np.round(finite)) and finite.min() >= 0 and finite.max() < MOST_RINGS
-    )
-    return finite.astype(np.int64) if whole else None
+    is_whole = np.array_equal(finite, np.round(finite))
+    if not is_whole or finite.min() < 0 or finite.max() >= MOST_RINGS:
+        return None
+    return finite.astype(np.int64)

@@ -1,4 +1,4 @@
-"""Scans in LAS and LAZ files, by laspy; compressed ones are read by a process of their own."""
+"""Scans in LAS and LAZ files, by laspy. Compressed files are read in a separate process."""
 
 from __future__ import annotations
 
@@ -10,53 +10,68 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, refusing
+from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, reading, split_records
 from amvnet.errors import InputError
 
 ADVICE = "write the file again"
-OLDEST, NEWEST = 227, 375  # bytes of the header of LAS 1.0 and of LAS 1.4
-RECORD = 54  # bytes that a variable-length record has at least
-COMPRESSED = 0x80  # of the point format
-CHUNK = 1_000_000  # points that are read at once
-MEMORY = 2 << 30  # bytes that reading a compressed file may take
-PATIENCE, PACE = 9.0, 200_000  # seconds that it may take, and points a second beyond that
+RECORD = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("intensity", "u2")])
+CHUNK = 1_000_000  # points read at once
+
+# The header of a file.
+HEADER_1_0 = 227  # bytes of the header of LAS 1.0, the shortest
+HEADER_1_4 = 375  # bytes of the header of LAS 1.4, the longest
+MIN_RECORD = 54  # bytes of the shortest variable-length record
+COMPRESSED = 0x80  # flag of the point format
+
+# Limits of the process that reads a compressed file.
+MEMORY = 2 << 30  # bytes
+BASE_SECONDS = 9.0
+POINTS_PER_SECOND = 200_000
 
 
 def read_las(path: Path) -> Cloud:
-    """Read all points: coordinates as float64, intensity as the file has it (0 to 65535).
+    """Read all points: coordinates as float64, intensities as in the file (0 to 65535).
 
     Raises:
-        InputError: where it is no such file, truncated, or laspy is missing.
+        InputError: if the file is not LAS or LAZ, is truncated, or laspy is missing.
     """
-    with refusing(path, "a LAS or LAZ file", ADVICE):
-        count, compressed = _check_header(path)
+    with reading(path, "a LAS or LAZ file", ADVICE):
+        count, is_compressed = _check_header(path)
         _require_laspy(path)
-        columns = _read_apart(path, count) if compressed else read_columns(path)
-    if len(columns["x"]) < count:
+        records = _read_in_process(path, count) if is_compressed else read_records(path)
+
+    if len(records) < count:
         raise InputError(
-            f"{path}: expected {count} points, found {len(columns['x'])}; the file is truncated, copy it again"
+            f"{path}: expected {count} points, found {len(records)}; "
+            "the file is truncated, copy it again"
         )
-    return make_cloud(columns, str(path))
+    return make_cloud(split_records(records), str(path))
 
 
 def _check_header(path: Path) -> tuple[int, bool]:
-    """How many points the header claims, and whether they are compressed.
+    """Return the number of points that the header claims, and whether they are compressed.
 
     Raises:
-        InputError: where the file is too short for what its header claims.
+        InputError: if the file is too short for what its header claims.
     """
     with path.open("rb") as file:
-        header = file.read(NEWEST)
-    size, begin, records, kind, row, count = struct.unpack_from("<HIIBHI", header, 94)
-    if len(header) == NEWEST and header[24:26] == b"\x01\x04":
+        header = file.read(HEADER_1_4)
+
+    fields = struct.unpack_from("<HIIBHI", header, 94)
+    header_size, points_start, records, point_format, point_size, count = fields
+    if len(header) == HEADER_1_4 and header[24:26] == b"\x01\x04":
         (count,) = struct.unpack_from("<Q", header, 247)
-    end = path.stat().st_size
-    if size < OLDEST or size + RECORD * records > begin or begin > end:
+
+    size = path.stat().st_size
+    records_end = header_size + MIN_RECORD * records
+    if header_size < HEADER_1_0 or records_end > points_start or points_start > size:
         raise InputError(
-            f"{path}: expected points after {records} records, found {end} bytes in all; {ADVICE}"
+            f"{path}: expected points after {records} records, found {size} bytes in all; {ADVICE}"
         )
-    compressed = bool(kind & COMPRESSED)
-    return check_point_count(count, path, 0 if compressed else begin + row * count), compressed
+
+    is_compressed = bool(point_format & COMPRESSED)
+    min_size = 0 if is_compressed else points_start + point_size * count
+    return check_point_count(count, path, min_size), is_compressed
 
 
 def _require_laspy(path: Path) -> None:
@@ -65,55 +80,60 @@ def _require_laspy(path: Path) -> None:
         import lazrs  # noqa: F401
     except ImportError:
         raise InputError(
-            f'{path}: expected laspy and lazrs to read it, found none; do pip install "amvnet[formats]"'
+            f"{path}: expected the packages laspy and lazrs to read it, found none; "
+            'run pip install "amvnet[formats]"'
         ) from None
 
 
-def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """The columns x, y, z (float64 metres) and intensity (uint16), by laspy."""
+def read_records(path: Path) -> np.ndarray:
+    """Read all points as (N,) records of `RECORD`, coordinates in metres, with laspy."""
     import laspy
 
-    pieces = []
+    chunks = [np.empty(0, RECORD)]
     with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
         for points in file.chunk_iterator(CHUNK):
-            pieces.append([np.asarray(points[name]) for name in ("x", "y", "z", "intensity")])
-    joined = [np.concatenate(column) for column in zip(*pieces, strict=True)] or [np.zeros(0)] * 4
-    return dict(zip(("x", "y", "z", "intensity"), joined, strict=True))
+            records = np.empty(len(points), RECORD)
+            for name in RECORD.names or ():
+                records[name] = points[name]
+            chunks.append(records)
+    return np.concatenate(chunks)
 
 
-def _read_apart(path: Path, count: int) -> dict[str, np.ndarray]:
-    """The same in another process: on broken bytes lazrs (0.8) takes any amount of memory, or ends its process."""
+def _read_in_process(path: Path, count: int) -> np.ndarray:
+    """Read the same as `read_records`, in a process with limited memory and time.
+
+    On broken bytes, lazrs 0.8 can take any amount of memory or abort its process.
+    """
     code = (
-        "import sys; from amvnet.data.formats.las import write_columns; write_columns(sys.argv[1])"
+        "import sys; from amvnet.data.formats.las import write_records; write_records(sys.argv[1])"
     )
-    threads = dict.fromkeys(
-        ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1"
-    )  # each takes of the memory allowed
-    found = subprocess.run(
+    environment = dict(os.environ)
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    # Each thread would take its share of the memory limit.
+    environment["OMP_NUM_THREADS"] = "1"
+    environment["OPENBLAS_NUM_THREADS"] = "1"
+
+    process = subprocess.run(
         [sys.executable, "-c", code, str(path.absolute())],
-        env={**os.environ, **threads, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        env=environment,
         stdin=subprocess.DEVNULL,
         capture_output=True,
-        timeout=PATIENCE + count / PACE,
+        timeout=BASE_SECONDS + count / POINTS_PER_SECOND,
     )
-    if found.returncode:
+    if process.returncode:
         raise ValueError("its points cannot be unpacked")
-    points = np.frombuffer(
-        found.stdout, np.dtype([(name, "f8") for name in "xyz"] + [("intensity", "u2")])
-    )
-    return {name: points[name] for name in ("x", "y", "z", "intensity")}
+    return np.frombuffer(process.stdout, RECORD)
 
 
-def write_columns(path: str) -> None:
-    """Write the points to standard output, rows of x, y, z (float64) and intensity (uint16); for `_read_apart`."""
+def write_records(path: str) -> None:
+    """Write the records of a file to standard output, with limited memory.
+
+    This is what the process of `_read_in_process` runs.
+    """
     try:
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     except (ImportError, ValueError):  # Windows has no such limit, and some systems refuse it
         pass
-    columns = read_columns(Path(path))
-    table = np.empty(len(columns["x"]), [(name, "f8") for name in "xyz"] + [("intensity", "u2")])
-    for name, values in columns.items():
-        table[name] = values
-    sys.stdout.buffer.write(table.tobytes())
+    sys.stdout.buffer.write(read_records(Path(path)).tobytes())

@@ -1,6 +1,7 @@
 """Point clouds in PCL's format: ascii, binary and binary_compressed, with any columns in any order.
 
-Own code, as pypcd4 (1.5) reads a truncated file without a word, and ascii only with single spaces between the numbers.
+We do not use pypcd4: version 1.5 reads truncated files without an error, and ascii files only if
+single spaces separate the numbers.
 """
 
 from __future__ import annotations
@@ -16,37 +17,55 @@ from amvnet.data.formats.cloud import (
     Cloud,
     check_point_count,
     make_cloud,
-    refusing,
+    reading,
+    record_dtype,
     require_columns,
+    split_records,
 )
 from amvnet.errors import InputError
 
-HEADER = 65_536  # bytes that a header has at most
-TYPES = {"F": {4: "<f4", 8: "<f8"}, "I": {1: "<i1", 2: "<i2", 4: "<i4", 8: "<i8"},
-         "U": {1: "<u1", 2: "<u2", 4: "<u4", 8: "<u8"}}  # fmt: skip
+HEADER = 65_536  # bytes of the longest header
 ADVICE = "write the file again"
-SHORTEST = 3  # bytes for which a compressed file can stand for LONGEST
-LONGEST = 264
+
+# NumPy types by the letter of TYPE and the bytes of SIZE.
+TYPES = {
+    "F": {4: "<f4", 8: "<f8"},
+    "I": {1: "<i1", 2: "<i2", 4: "<i4", 8: "<i8"},
+    "U": {1: "<u1", 2: "<u2", 4: "<u4", 8: "<u8"},
+}
+
+# The longest repetition that LZF can encode: 264 bytes in 3. Nothing is packed more tightly.
+LONGEST_REPETITION = 264
+REPETITION_CODE = 3
 
 
 @dataclass(frozen=True)
 class Column:
-    """One field: its name, numpy's type, how many values it has, where it begins in a point, and in which column."""
+    """One field of the points of a file.
+
+    Attributes:
+        name: the name in the header.
+        dtype: the NumPy type of its values.
+        count: how many values a point has in it.
+        offset: bytes of a point before this column.
+        index: values of a point before this column.
+    """
 
     name: str
     dtype: str
     count: int
     offset: int
-    place: int
+    index: int
 
     @property
     def size(self) -> int:
+        """Bytes of this column in one point."""
         return int(self.dtype[2:]) * self.count
 
 
 @dataclass(frozen=True)
 class Header:
-    """What a PCD file says of itself."""
+    """The header of a PCD file: the columns, the number of points and the encoding."""
 
     columns: tuple[Column, ...]
     points: int
@@ -54,42 +73,51 @@ class Header:
 
     @property
     def row(self) -> int:
-        """Bytes of a point."""
+        """Bytes of one point."""
         return sum(column.size for column in self.columns)
 
 
+Columns = dict[str, Column]  # by x, y, z, intensity, ring
+Arrays = dict[str, np.ndarray]
+
+
 def read_pcd(path: Path) -> Cloud:
-    """Read one cloud; an organised one row by row.
+    """Read one cloud, row by row if it is organised.
 
     Raises:
-        InputError: where it is no such file, truncated, or has no x, y, z.
+        InputError: if the file is not PCD, is truncated, or has no x, y, z.
     """
-    with refusing(path, "a PCD file", ADVICE), path.open("rb") as file:
+    with reading(path, "a PCD file", ADVICE), path.open("rb") as file:
         header = _read_header(file, path)
-        wanted = require_columns([column.name for column in header.columns], path)
-        columns = {key: header.columns[place] for key, place in wanted.items()}
-        return make_cloud(READERS[header.encoding](file, header, columns, path), str(path))
+
+        columns = {}
+        names = [column.name for column in header.columns]
+        for key, index in require_columns(names, path).items():
+            columns[key] = header.columns[index]
+
+        read_points = READERS[header.encoding]
+        return make_cloud(read_points(file, header, columns, path), str(path))
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
-    words: dict[str, list[str]] = {}
-    while "DATA" not in words:
+    entries: dict[str, list[str]] = {}
+    while "DATA" not in entries:
         line = file.readline(HEADER)
         if not line or file.tell() > HEADER:
             raise InputError(
                 f"{path}: expected the header of a PCD file, found no line DATA; {ADVICE}"
             )
-        parts = line.decode("ascii").split()
-        if parts and not parts[0].startswith("#"):
-            words[parts[0].upper()] = parts[1:]
-    names = words.get("FIELDS") or words["COLUMNS"]
-    columns = _columns(names, words["SIZE"], words["TYPE"], words.get("COUNT", ["1"] * len(names)))
-    points = (
-        int(words["POINTS"][0])
-        if "POINTS" in words
-        else int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
-    )
-    encoding = words["DATA"][0].lower()
+        words = line.decode("ascii").split()
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+
+    columns = _parse_columns(entries)
+    if "POINTS" in entries:
+        points = int(entries["POINTS"][0])
+    else:
+        points = int(entries["WIDTH"][0]) * int(entries["HEIGHT"][0])
+
+    encoding = entries["DATA"][0].lower()
     if encoding not in READERS:
         raise InputError(
             f"{path}: expected DATA {', '.join(READERS)}, found {encoding[:20]!a}; {ADVICE}"
@@ -97,129 +125,146 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
     return Header(columns, points, encoding)
 
 
-def _columns(
-    names: list[str], sizes: list[str], types: list[str], counts: list[str]
-) -> tuple[Column, ...]:
-    found, offset, place = [], 0, 0
+def _parse_columns(entries: dict[str, list[str]]) -> tuple[Column, ...]:
+    names = entries.get("FIELDS") or entries["COLUMNS"]
+    sizes = entries["SIZE"]
+    types = entries["TYPE"]
+    counts = entries.get("COUNT", ["1"] * len(names))
+
+    columns = []
+    offset = 0
+    index = 0
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
-        column = Column(name, TYPES[kind.upper()][int(size)], int(count), offset, place)
+        column = Column(name, TYPES[kind.upper()][int(size)], int(count), offset, index)
         if column.count < 0:
             raise ValueError(f"COUNT {count}")
-        found.append(column)
-        offset, place = offset + column.size, place + column.count
-    return tuple(found)
+        columns.append(column)
+        offset += column.size
+        index += column.count
+    return tuple(columns)
 
 
-def _read_ascii(
-    file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
-) -> dict[str, np.ndarray]:
-    values = sum(column.count for column in header.columns)
-    count = check_point_count(header.points, path, 2 * values * header.points - 1)
-    return read_text(
-        file, count, {key: (column.place, column.dtype) for key, column in columns.items()}, path
-    )
+def _read_ascii(file: BinaryIO, header: Header, columns: Columns, path: Path) -> Arrays:
+    # Each value takes at least one digit and, but for the last, a separator.
+    values_per_point = sum(column.count for column in header.columns)
+    count = check_point_count(header.points, path, 2 * values_per_point * header.points - 1)
+
+    positions = {}
+    for key, column in columns.items():
+        positions[key] = (column.index, column.dtype)
+    return read_text(file, count, positions, path)
 
 
 def read_text(
     file: BinaryIO, count: int, columns: dict[str, tuple[int, str]], path: Path
-) -> dict[str, np.ndarray]:
-    """Columns of the next `count` lines of numbers; each is given as its place and its type.
+) -> Arrays:
+    """Read columns of the next `count` lines of numbers.
+
+    Args:
+        columns: for each column, its index in a line and its NumPy type.
+
+    Returns:
+        (count,) values of each column.
 
     Raises:
-        InputError: where there are fewer lines.
+        InputError: if there are fewer lines.
     """
-    if not count:
-        return {key: np.zeros(0, dtype) for key, (_, dtype) in columns.items()}
-    places = [place for place, _ in columns.values()]
-    table = np.loadtxt(file, usecols=places, max_rows=count, comments=None, ndmin=2)
+    indices, dtypes = zip(*columns.values(), strict=True)
+    table = np.zeros((0, len(columns)))
+    if count:
+        table = np.loadtxt(file, usecols=indices, max_rows=count, comments=None, ndmin=2)
     if len(table) < count:
         raise InputError(
             f"{path}: expected {count} lines of points, found {len(table)}; copy the file again"
         )
+
+    arrays = {}
     with np.errstate(invalid="ignore"):
-        return {
-            key: _typed(table[:, i], dtype) for i, (key, (_, dtype)) in enumerate(columns.items())
-        }
+        for key, dtype, values in zip(columns, dtypes, table.T, strict=True):
+            # A column with NaN or infinity stays float64, as integers cannot hold them.
+            arrays[key] = values.astype(dtype) if np.isfinite(values).all() else values
+    return arrays
 
 
-def _typed(values: np.ndarray, dtype: str) -> np.ndarray:
-    return values.astype(dtype) if np.isfinite(values).all() else values
+def _read_binary(file: BinaryIO, header: Header, columns: Columns, path: Path) -> Arrays:
+    end = file.tell() + header.points * header.row
+    count = check_point_count(header.points, path, end)
+
+    positions = {}
+    for key, column in columns.items():
+        positions[key] = (column.dtype, column.offset)
+    return read_rows(file, count, header.row, positions)
 
 
-def _read_binary(
-    file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
-) -> dict[str, np.ndarray]:
-    count = check_point_count(header.points, path, file.tell() + header.points * header.row)
-    return read_rows(
-        file, count, header.row, {key: (c.dtype, c.offset) for key, c in columns.items()}
-    )
+def read_rows(file: BinaryIO, count: int, row: int, columns: dict[str, tuple[str, int]]) -> Arrays:
+    """Read columns of the next `count` points of `row` bytes each.
+
+    Args:
+        columns: for each column, its NumPy type and its offset in a point, bytes.
+
+    Returns:
+        (count,) values of each column.
+    """
+    return split_records(np.fromfile(file, dtype=record_dtype(columns, row), count=count))
 
 
-def read_rows(
-    file: BinaryIO, count: int, row: int, columns: dict[str, tuple[str, int]]
-) -> dict[str, np.ndarray]:
-    """Columns of the next `count` points of `row` bytes; each is given as its type and where it begins in a point."""
-    formats, offsets = (
-        [dtype for dtype, _ in columns.values()],
-        [offset for _, offset in columns.values()],
-    )
-    point = np.dtype(
-        {"names": list(columns), "formats": formats, "offsets": offsets, "itemsize": row}
-    )
-    table = np.fromfile(file, dtype=point, count=count)
-    return {key: table[key] for key in columns}
-
-
-def _read_compressed(
-    file: BinaryIO, header: Header, columns: dict[str, Column], path: Path
-) -> dict[str, np.ndarray]:
-    packed, unpacked = struct.unpack("<II", file.read(8))
-    count = check_point_count(header.points, path, file.tell() + packed)
-    if unpacked != count * header.row or unpacked * SHORTEST > packed * LONGEST:
+def _read_compressed(file: BinaryIO, header: Header, columns: Columns, path: Path) -> Arrays:
+    packed_size, size = struct.unpack("<II", file.read(8))
+    count = check_point_count(header.points, path, file.tell() + packed_size)
+    is_possible = size * REPETITION_CODE <= packed_size * LONGEST_REPETITION
+    if size != count * header.row or not is_possible:
         raise InputError(
-            f"{path}: expected {count * header.row} bytes of points, found {unpacked}; {ADVICE}"
+            f"{path}: expected {count * header.row} bytes of points, found {size}; {ADVICE}"
         )
-    data = unpack_lzf(file.read(packed), unpacked)
-    return {  # one column after the other
-        key: np.frombuffer(data, c.dtype, count * c.count, count * c.offset)[:: c.count]
-        for key, c in columns.items()
-    }
+
+    # The columns follow each other; the values of a point are adjacent within a column.
+    data = unpack_lzf(file.read(packed_size), size)
+    arrays = {}
+    for key, column in columns.items():
+        values = np.frombuffer(data, column.dtype, count * column.count, count * column.offset)
+        arrays[key] = values[:: column.count]
+    return arrays
 
 
 def unpack_lzf(data: bytes, size: int) -> bytes:
-    """The `size` bytes that LZF made `data` of.
+    """Return the `size` bytes that LZF packed into `data`.
 
     Raises:
-        ValueError, IndexError: where it did not.
+        ValueError, IndexError: if `data` does not unpack to exactly `size` bytes.
     """
-    out, at = bytearray(), 0
-    while at < len(data):
-        control = data[at]
-        at += 1
-        if control < 32:  # so many bytes follow, and one more
-            out += data[at : at + control + 1]
-            at += control + 1
-        else:  # repeat what was seen before
-            length = control >> 5
-            if length == 7:
-                length += data[at]
-                at += 1
-            start = len(out) - ((control & 31) << 8) - data[at] - 1
-            at += 1
-            _repeat(out, start, length + 2)
-        if len(out) > size:
-            break
-    if len(out) != size:
-        raise ValueError(f"{len(out)} unpacked bytes in place of {size}")
-    return bytes(out)
+    output = bytearray()
+    position = 0
+
+    while position < len(data) and len(output) <= size:
+        control = data[position]
+        position += 1
+
+        if control < 32:  # a literal: the next control + 1 bytes as they are
+            output += data[position : position + control + 1]
+            position += control + 1
+            continue
+
+        # A back reference: 3 bits of length, or another byte if they are full, and 13 bits of
+        # distance.
+        length = control >> 5
+        if length == 7:
+            length += data[position]
+            position += 1
+        start = len(output) - ((control & 31) << 8) - data[position] - 1
+        position += 1
+        _repeat(output, start, length + 2)
+
+    if len(output) != size:
+        raise ValueError(f"{len(output)} unpacked bytes instead of {size}")
+    return bytes(output)
 
 
-def _repeat(out: bytearray, start: int, length: int) -> None:
-    """Append what begins at `start`, of which the end may be what is being appended."""
+def _repeat(output: bytearray, start: int, length: int) -> None:
+    """Append the `length` bytes from `start` on; if these run past the end, they start over."""
     if start < 0:
-        raise ValueError("a repetition of what was not there")
-    seen = out[start : start + length]
-    out += (seen * (length // len(seen) + 1))[:length]
+        raise ValueError("a repetition of bytes before the first")
+    pattern = output[start : start + length]
+    output += (pattern * (length // len(pattern) + 1))[:length]
 
 
 READERS = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}

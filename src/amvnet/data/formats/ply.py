@@ -1,11 +1,11 @@
 """Point clouds in PLY files: the element `vertex`, ascii or binary of either byte order.
 
-Own code, as plyfile allocates what a header claims, and is under the GPL.
+We do not use plyfile: it allocates whatever a header claims, and is under the GPL.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,75 +15,127 @@ from amvnet.data.formats.cloud import (
     Cloud,
     check_point_count,
     make_cloud,
-    refusing,
+    reading,
     require_columns,
 )
-from amvnet.data.formats.pcd import HEADER, read_rows, read_text
+from amvnet.data.formats.pcd import HEADER, Arrays, read_rows, read_text
 from amvnet.errors import InputError
 
 TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
-    "uint32": "u4", "float32": "f4", "float64": "f8",
-}  # fmt: skip
-ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+    "char": "i1",
+    "uchar": "u1",
+    "short": "i2",
+    "ushort": "u2",
+    "int": "i4",
+    "uint": "u4",
+    "float": "f4",
+    "double": "f8",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "float32": "f4",
+    "float64": "f8",
+}
+BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 ADVICE = "write the file again"
 
 
 @dataclass
 class Element:
-    """One element: how many there are, and names and types of its properties; a list's type is empty."""
+    """One element of a file, such as `vertex`.
+
+    Attributes:
+        name: its name.
+        count: how many rows it has.
+        properties: the names of its properties.
+        dtypes: the NumPy types of its properties, without byte order; empty for a list.
+    """
 
     name: str
     count: int
-    properties: list[tuple[str, str]]
+    properties: list[str] = field(default_factory=list)
+    dtypes: list[str] = field(default_factory=list)
+
+    @property
+    def sizes(self) -> list[int]:
+        """Bytes of each property; only if none is a list."""
+        return [int(dtype[1:]) for dtype in self.dtypes]
 
     @property
     def row(self) -> int:
-        """Bytes of one."""
-        return sum(int(dtype[1:]) for _, dtype in self.properties)
+        """Bytes of one row; only if no property is a list."""
+        return sum(self.sizes)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The layout of the data up to the last vertex.
+
+    Attributes:
+        before: the elements before the vertices.
+        vertex: the vertices.
+        order: the byte order, "<" or ">".
+    """
+
+    before: list[Element]
+    vertex: Element
+    order: str
 
 
 def read_ply(path: Path) -> Cloud:
     """Read the vertices.
 
     Raises:
-        InputError: where it is no such file, truncated, or has no vertices with x, y, z.
+        InputError: if the file is not PLY, is truncated, or has no vertices with x, y, z.
     """
-    with refusing(path, "a PLY file", ADVICE), path.open("rb") as file:
+    with reading(path, "a PLY file", ADVICE), path.open("rb") as file:
         encoding, elements = _read_header(file, path)
-        before = [element.name for element in elements].index("vertex")
-        vertex = elements[before]
-        if any(not dtype for element in elements[: before + 1] for _, dtype in element.properties):
+        vertex_index = [element.name for element in elements].index("vertex")
+        layout = Layout(elements[:vertex_index], elements[vertex_index], BYTE_ORDERS[encoding])
+
+        if any("" in element.dtypes for element in elements[: vertex_index + 1]):
             raise InputError(
                 f"{path}: expected vertices without lists, found a list; write the points alone"
             )
-        wanted = require_columns([name for name, _ in vertex.properties], path)
-        read = _read_text if encoding == "ascii" else _read_binary
-        return make_cloud(
-            read(file, elements[:before], vertex, wanted, ORDERS[encoding], path), str(path)
-        )
+
+        columns = require_columns(layout.vertex.properties, path)
+        read_vertices = _read_ascii if encoding == "ascii" else _read_binary
+        return make_cloud(read_vertices(file, layout, columns, path), str(path))
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
-    encoding, elements = "", list[Element]()
-    while (words := _line(file, path)) != ["end_header"]:
-        if words[:1] == ["format"]:
+    """Return the encoding of a file and its elements."""
+    encoding = ""
+    elements: list[Element] = []
+
+    words = _read_words(file, path)
+    while words != ["end_header"]:
+        keyword = words[0] if words else ""
+        if keyword == "format":
             encoding = words[1]
-        elif words[:1] == ["element"]:
-            elements.append(Element(words[1], int(words[2]), []))
-        elif words[:1] == ["property"]:
-            elements[-1].properties.append(
-                (words[-1], "" if words[1] == "list" else TYPES[words[1]])
-            )
-    if encoding not in ORDERS or any(element.count < 0 for element in elements):
+        elif keyword == "element":
+            element = Element(words[1], int(words[2]))
+            if element.count < 0:
+                raise ValueError(f"element {element.name} of {element.count} rows")
+            elements.append(element)
+        elif keyword == "property":
+            elements[-1].properties.append(words[-1])
+            elements[-1].dtypes.append("" if words[1] == "list" else TYPES[words[1]])
+        words = _read_words(file, path)
+
+    if encoding not in BYTE_ORDERS:
         raise InputError(
-            f"{path}: expected the format {', '.join(ORDERS)}, found {encoding[:30]!a}; {ADVICE}"
+            f"{path}: expected the format {', '.join(BYTE_ORDERS)}, "
+            f"found {encoding[:30]!a}; {ADVICE}"
         )
     return encoding, elements
 
 
-def _line(file: BinaryIO, path: Path) -> list[str]:
+def _read_words(file: BinaryIO, path: Path) -> list[str]:
+    """Return the words of the next line of the header."""
     line = file.readline(HEADER)
     if not line or file.tell() > HEADER:
         raise InputError(
@@ -92,36 +144,32 @@ def _line(file: BinaryIO, path: Path) -> list[str]:
     return line.decode("latin-1").split()  # comments may be in any language
 
 
-def _read_text(
-    file: BinaryIO,
-    before: list[Element],
-    vertex: Element,
-    wanted: dict[str, int],
-    order: str,
-    path: Path,
-) -> dict[str, np.ndarray]:
-    skipped = sum(element.count for element in before)
-    least = 2 * (skipped + vertex.count * len(vertex.properties)) - 1
-    check_point_count(skipped + vertex.count, path, least)
-    for _ in range(skipped):
+def _read_ascii(file: BinaryIO, layout: Layout, columns: dict[str, int], path: Path) -> Arrays:
+    vertex = layout.vertex
+    lines_before = sum(element.count for element in layout.before)
+
+    # Each value, and each line before the vertices, takes at least one digit and, but for the
+    # last, a separator.
+    values = lines_before + vertex.count * len(vertex.properties)
+    check_point_count(lines_before + vertex.count, path, 2 * values - 1)
+    for _ in range(lines_before):
         file.readline()
-    columns = {key: (place, order + vertex.properties[place][1]) for key, place in wanted.items()}
-    return read_text(file, vertex.count, columns, path)
+
+    positions = {}
+    for key, index in columns.items():
+        positions[key] = (index, layout.order + vertex.dtypes[index])
+    return read_text(file, vertex.count, positions, path)
 
 
-def _read_binary(
-    file: BinaryIO,
-    before: list[Element],
-    vertex: Element,
-    wanted: dict[str, int],
-    order: str,
-    path: Path,
-) -> dict[str, np.ndarray]:
-    skipped = sum(element.count * element.row for element in before)
-    check_point_count(vertex.count, path, file.tell() + skipped + vertex.count * vertex.row)
-    file.seek(skipped, 1)
-    ends = np.cumsum([0, *(int(dtype[1:]) for _, dtype in vertex.properties)]).tolist()
-    columns = {
-        key: (order + vertex.properties[place][1], ends[place]) for key, place in wanted.items()
-    }
-    return read_rows(file, vertex.count, vertex.row, columns)
+def _read_binary(file: BinaryIO, layout: Layout, columns: dict[str, int], path: Path) -> Arrays:
+    vertex = layout.vertex
+    bytes_before = sum(element.count * element.row for element in layout.before)
+    end = file.tell() + bytes_before + vertex.count * vertex.row
+    check_point_count(vertex.count, path, end)
+    file.seek(bytes_before, 1)
+
+    offsets = np.cumsum([0, *vertex.sizes]).tolist()
+    positions = {}
+    for key, index in columns.items():
+        positions[key] = (layout.order + vertex.dtypes[index], offsets[index])
+    return read_rows(file, vertex.count, vertex.row, positions)

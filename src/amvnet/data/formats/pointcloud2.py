@@ -1,4 +1,4 @@
-"""ROS messages of the type sensor_msgs/PointCloud2 as clouds."""
+"""Clouds from ROS messages of the type sensor_msgs/PointCloud2."""
 
 from __future__ import annotations
 
@@ -6,9 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, require_columns
+from amvnet.data.formats.cloud import (
+    Cloud,
+    check_point_count,
+    make_cloud,
+    record_dtype,
+    require_columns,
+    split_records,
+)
 from amvnet.errors import InputError
 
+# NumPy types by their number in a PointField.
 TYPES = {
     1: "i1",
     2: "u1",
@@ -18,35 +26,37 @@ TYPES = {
     6: "u4",
     7: "f4",
     8: "f8",
-}  # by the message's numbers
+}
 
 
 def read_message(message: Any, name: str) -> Cloud:
-    """The points of a deserialised message, row by row; padding of points and of rows is left out.
+    """Return the points of a deserialised message, row by row, without the padding.
 
     Raises:
-        InputError: where there is no x, y, z, or the data are shorter than the message claims.
+        InputError: if x, y or z is missing, or the data are shorter than the message claims.
     """
-    height, width, step = message.height, message.width, message.point_step
-    count = check_point_count(height * width, name)
+    count = check_point_count(message.height * message.width, name)
     fields = list(message.fields)
-    wanted = {
-        key: fields[i] for key, i in require_columns([field.name for field in fields], name).items()
-    }
-    order = ">" if message.is_bigendian else "<"
-    point = np.dtype(
-        {
-            "names": list(wanted),
-            "formats": [order + TYPES[field.datatype] for field in wanted.values()],
-            "offsets": [field.offset for field in wanted.values()],
-            "itemsize": step,
-        }
-    )
-    row = message.row_step or width * step  # some drivers leave it out
-    if count and (row < width * step or len(message.data) < (height - 1) * row + width * step):
+    byte_order = ">" if message.is_bigendian else "<"
+
+    columns = {}
+    for key, index in require_columns([field.name for field in fields], name).items():
+        field = fields[index]
+        columns[key] = (byte_order + TYPES[field.datatype], field.offset)
+    dtype = record_dtype(columns, message.point_step)
+
+    # Rows can have padding, too. Some drivers leave out row_step.
+    row_size = message.width * message.point_step
+    row_step = message.row_step or row_size
+    size = (message.height - 1) * row_step + row_size
+    if count and (row_step < row_size or len(message.data) < size):
         raise InputError(
-            f"{name}: expected {count} points of {step} bytes, found {len(message.data)} bytes"
+            f"{name}: expected {count} points of {message.point_step} bytes, "
+            f"found {len(message.data)} bytes"
         )
+
     data = np.ascontiguousarray(message.data) if count else b""
-    table = np.ndarray((height, width), point, data, strides=(row, step)).ravel()
-    return make_cloud({key: table[key] for key in wanted}, name)
+    shape = (message.height, message.width)
+    strides = (row_step, message.point_step)
+    records = np.ndarray(shape, dtype, data, strides=strides).ravel()
+    return make_cloud(split_records(records), name)
