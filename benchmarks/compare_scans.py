@@ -13,8 +13,8 @@ from matplotlib import pyplot as plt
 from rich.console import Console
 from rich.table import Table
 
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import Taxonomy
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.scan import Scan
 
 RANGES = (0, 1, 5, 10, 15, 20, 30, 40, 50, 80)  # metres
@@ -27,12 +27,18 @@ class Figures:
 
     taxonomy: Taxonomy
     points: list[int] = field(default_factory=list)  # per scan
-    ranges: list[np.ndarray] = field(default_factory=list)  # share of the points in each bin, per scan
+    ranges: list[np.ndarray] = field(
+        default_factory=list
+    )  # share of the points in each bin, per scan
     elevations: list[np.ndarray] = field(default_factory=list)
     lasers: list[np.ndarray] = field(default_factory=list)  # returns of each laser, from the top
-    relief: list[np.ndarray] = field(default_factory=list)  # (n, 2) train id, metres off the middle of both neighbours
+    relief: list[np.ndarray] = field(
+        default_factory=list
+    )  # (n, 2) train id, metres off the middle of both neighbours
     shares: list[np.ndarray] = field(default_factory=list)
-    values: list[np.ndarray] = field(default_factory=list)  # (n, 4) train id, intensity, z, range of some points
+    values: list[np.ndarray] = field(
+        default_factory=list
+    )  # (n, 4) train id, intensity, z, range of some points
 
 
 def measure(spec: str) -> Figures:
@@ -74,7 +80,9 @@ def relief_of(scan: Scan, laser: np.ndarray, ids: np.ndarray, distance: np.ndarr
     order = np.lexsort((azimuth, laser))
     ids, distance, laser, azimuth = ids[order], distance[order], laser[order], azimuth[order]
     close = (laser[1:] == laser[:-1]) & (ids[1:] == ids[:-1]) & (np.diff(azimuth) < np.radians(0.8))
-    middle = np.flatnonzero(close[1:] & close[:-1] & (distance[1:-1] > 5) & (distance[1:-1] < 25)) + 1
+    middle = (
+        np.flatnonzero(close[1:] & close[:-1] & (distance[1:-1] > 5) & (distance[1:-1] < 25)) + 1
+    )
     off = np.abs(distance[middle] - (distance[middle - 1] + distance[middle + 1]) / 2)
     return np.column_stack([ids[middle], off]).astype(np.float32)
 
@@ -86,7 +94,9 @@ def range_images(scans: list[Scan]) -> np.ndarray:
         laser = lasers_of(scan)
         assert laser is not None
         distance = np.linalg.norm(scan.points[:, :3], axis=1)
-        column = ((np.arctan2(-scan.points[:, 1], -scan.points[:, 0]) / (2 * np.pi) + 0.5) * 2048).astype(int) % 2048
+        column = (
+            (np.arctan2(-scan.points[:, 1], -scan.points[:, 0]) / (2 * np.pi) + 0.5) * 2048
+        ).astype(int) % 2048
         shown = np.log(distance / 3) / np.log(25), scan.points[:, 3] / 0.7
         for values in shown:
             image = np.full((laser.max() + 1, 2048), np.nan)
@@ -104,7 +114,11 @@ def draw(specs: tuple[str, str], path: str, count: int = 3) -> None:
         records = dataset.records(dataset.sequences("all"))
         some = [records[int((i + 0.5) * len(records) / count)] for i in range(count)]
         axis.imshow(
-            range_images([dataset.read(record) for record in some]), cmap="cividis", vmin=0, vmax=1, aspect="auto"
+            range_images([dataset.read(record) for record in some]),
+            cmap="cividis",
+            vmin=0,
+            vmax=1,
+            aspect="auto",
         )
         axis.set_axis_off()
     figure.tight_layout(pad=0.3)
@@ -125,7 +139,11 @@ def percent(a: float, b: float) -> tuple[str, str]:
 
 
 def quantiles(values: np.ndarray, at: tuple[float, ...] = (0.1, 0.5, 0.9)) -> str:
-    return " ".join(f"{q:.{2 if len(at) == 3 else 3}f}" for q in np.quantile(values, at)) if len(values) > 50 else "–"
+    return (
+        " ".join(f"{q:.{2 if len(at) == 3 else 3}f}" for q in np.quantile(values, at))
+        if len(values) > 50
+        else "–"
+    )
 
 
 def main(first: str, second: str) -> None:
@@ -135,16 +153,24 @@ def main(first: str, second: str) -> None:
     counts = [(f"{name} points a scan", *(f"{f(x.points):,.0f}" for x in (a, b)))
               for name, f in (("mean", np.mean), ("least", np.min), ("most", np.max))]  # fmt: skip
     console.print(table("points", counts, ("", "A", "B")))
-    for title, key, edges in (("range, m", "ranges", RANGES), ("elevation, degrees", "elevations", ELEVATIONS)):
+    for title, key, edges in (
+        ("range, m", "ranges", RANGES),
+        ("elevation, degrees", "elevations", ELEVATIONS),
+    ):
         means = [np.mean(getattr(x, key), axis=0) for x in (a, b)]
         rows = [(f"{low} to {high}", *percent(p, q))
                 for low, high, p, q in zip(edges[:-1], edges[1:], *means, strict=True)]  # fmt: skip
         console.print(table(f"share of the points by {title}, %", rows, ("", "A", "B")))
     both = [np.mean(x.ranges, axis=0) for x in (a, b)]
-    console.print(f"total variation distance of the ranges: {np.abs(both[0] - both[1]).sum() / 2:.3f}")
+    console.print(
+        f"total variation distance of the ranges: {np.abs(both[0] - both[1]).sum() / 2:.3f}"
+    )
     if a.lasers and b.lasers:
         means = [np.mean(x.lasers, axis=0) for x in (a, b)]
-        rows = [(str(i), f"{p:.0f}", f"{q:.0f}", f"{q / p:.2f}") for i, (p, q) in enumerate(zip(*means, strict=True))]
+        rows = [
+            (str(i), f"{p:.0f}", f"{q:.0f}", f"{q / p:.2f}")
+            for i, (p, q) in enumerate(zip(*means, strict=True))
+        ]
         console.print(table("returns a scan by laser, from the top", rows, ("", "A", "B", "B / A")))
     names = ("unlabelled", *a.taxonomy.classes)
     shares = [np.mean(x.shares, axis=0) for x in (a, b)]
@@ -156,8 +182,15 @@ def main(first: str, second: str) -> None:
         columns = [quantiles(v[:, i]) for i in (1, 2, 3) for v in of_class]
         columns += [quantiles(r[r[:, 0] == c, 1], (0.5, 0.9)) for r in relief]
         rows.append((name, *percent(shares[0][c], shares[1][c]), *columns))
-    heads = ("class", "% A", "% B", *(f"{what} {x}" for what in ("intensity", "z", "range", "relief") for x in "AB"))
-    console.print(table("classes; 10, 50 and 90 % quantiles (relief in metres: 50 and 90 %)", rows, heads))
+    heads = (
+        "class",
+        "% A",
+        "% B",
+        *(f"{what} {x}" for what in ("intensity", "z", "range", "relief") for x in "AB"),
+    )
+    console.print(
+        table("classes; 10, 50 and 90 % quantiles (relief in metres: 50 and 90 %)", rows, heads)
+    )
 
 
 if __name__ == "__main__":

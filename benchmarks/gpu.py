@@ -19,20 +19,27 @@ from tempfile import TemporaryDirectory
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config import ModelConfig, PolarNetConfig, PolarViewConfig, RangeNetConfig, RangeViewConfig, Recipe
-from amvnet.data.files import read_scan
-from amvnet.data.labels import SEMANTICKITTI
+from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import (
+    ModelConfig,
+    PolarNetConfig,
+    PolarViewConfig,
+    RangeNetConfig,
+    RangeViewConfig,
+    Recipe,
+)
+from amvnet.data.scan_files import read_scan
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertions import Disagreement, cosine_similarity
-from amvnet.models.block_search import nearest_others_by_blocks
-from amvnet.neighbours import nearest_others
-from amvnet.recipes import load_recipe
+from amvnet.models.neighbours import nearest_others
+from amvnet.models.neighbours_gpu import nearest_others_by_blocks
+from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter
 from amvnet.simulation import simulate
-from amvnet.training import NetworkStage, PolarStage, RangeStage
-from amvnet.views.points import PointBatch
-from amvnet.weights import Weights, state_of
+from amvnet.training.stages import NetworkStage, PolarStage, RangeStage
+from amvnet.weights.file import Weights, part_state
 
 CLASSES = SEMANTICKITTI.size
 TINY = ModelConfig(
@@ -41,7 +48,11 @@ TINY = ModelConfig(
     RangeNetConfig(stem=8, widths=(8,) * 7, blocks=(1,) * 7, decoder=8, head=8),
     PolarNetConfig(point_widths=(8, 8), pillar=8, widths=(8, 8)),
 )
-RECIPES = {"paper": "semantickitti", "compact": "semantickitti-compact", "tiny": "semantickitti-compact"}
+RECIPES = {
+    "paper": "semantickitti",
+    "compact": "semantickitti-compact",
+    "tiny": "semantickitti-compact",
+}
 WARM_UP = 2
 
 
@@ -80,16 +91,24 @@ def fresh(model: ModelConfig) -> Weights:
     torch.manual_seed(0)
     built = build_amvnet(model, CLASSES)
     parts = {name: getattr(built, name) for name in ("range_net", "polar_net", "point_head")}
-    tensors = {key: value for name, part in parts.items() for key, value in state_of(name, part).items()}
+    tensors = {
+        key: value for name, part in parts.items() for key, value in part_state(name, part).items()
+    }
     return Weights(model, SEMANTICKITTI, "hdl64e", tensors)
 
 
-def segmenter_of(weights: Weights, scan: Scan, device: str, precision: str, uncertain: float) -> Segmenter:
+def segmenter_of(
+    weights: Weights, scan: Scan, device: str, precision: str, uncertain: float
+) -> Segmenter:
     """One for which such a share of the scan's points is uncertain, as with trained weights."""
     segmenter = Segmenter(weights, device, precision=precision)  # type: ignore[arg-type]
     found = segmenter(scan)
-    likeness = cosine_similarity(*map(torch.from_numpy, (found.rv[scan.valid], found.bev[scan.valid])))
-    segmenter.model.assertion = Disagreement(float(likeness.sort().values[int(uncertain * (len(likeness) - 1))]))
+    likeness = cosine_similarity(
+        *map(torch.from_numpy, (found.rv[scan.valid], found.bev[scan.valid]))
+    )
+    segmenter.model.assertion = Disagreement(
+        float(likeness.sort().values[int(uncertain * (len(likeness) - 1))])
+    )
     return segmenter
 
 
@@ -143,11 +162,24 @@ def waits(segmenter: Segmenter, scan: Scan) -> None:
         warnings.simplefilter("always")
         segmenter(scan)
     torch.cuda.set_sync_debug_mode("default")
-    places = Counter(f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchronizing" in str(w.message))
-    print("waits for the GPU in a scan:", ", ".join(f"{place} ({n})" for place, n in places.items()) or "none")
+    places = Counter(
+        f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchronizing" in str(w.message)
+    )
+    print(
+        "waits for the GPU in a scan:",
+        ", ".join(f"{place} ({n})" for place, n in places.items()) or "none",
+    )
 
 
-def training(stage: NetworkStage, scan: Scan, batch: int, part: int, runs: int, limit: float, options: Options) -> None:
+def training(
+    stage: NetworkStage,
+    scan: Scan,
+    batch: int,
+    part: int,
+    runs: int,
+    limit: float,
+    options: Options,
+) -> None:
     """A step of AdamW over a batch in parts, as `amvnet train` takes it with bf16-mixed."""
     device = options.device
     stage.to(device).train()
@@ -191,14 +223,18 @@ class Options(argparse.Namespace):
 
 
 def options() -> Options:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--size", choices=list(RECIPES), default="paper")
     parser.add_argument("--scan", type=Path, help="a scan of an HDL-64E; default: a simulated one")
     parser.add_argument("--precision", default="bfloat16,float32")
     parser.add_argument("--batch", default="1,2,4,8", help="scans at a time")
     parser.add_argument("--part", type=int, default=8, help="scans of a training batch at a time")
-    parser.add_argument("--uncertain", type=float, default=0.1, help="share of the points; the paper's")
+    parser.add_argument(
+        "--uncertain", type=float, default=0.1, help="share of the points; the paper's"
+    )
     parser.add_argument("--runs", type=int, default=10, help="the median is shown")
     parser.add_argument("--compile", action="store_true", help="compile the networks for training")
     return parser.parse_args(namespace=Options())
@@ -213,7 +249,9 @@ def main() -> None:
         scan = read_scan(given.scan or Path(folder) / "sequences/00/velodyne/000000.bin")
     limit = matrix_limit(device, runs)
     name = "CPU" if device == "cpu" else torch.cuda.get_device_name(device)
-    print(f"{name}, torch {torch.__version__}: {limit / 1e12:.2f} TFLOP/s in a bfloat16 matrix product")
+    print(
+        f"{name}, torch {torch.__version__}: {limit / 1e12:.2f} TFLOP/s in a bfloat16 matrix product"
+    )
     print(f"{given.size} size, {scan.valid.sum()} points, {given.uncertain:.0%} uncertain")
     weights = fresh(recipe.model)
     for precision in given.precision.split(","):

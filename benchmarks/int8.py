@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
-from amvnet.data.catalog import open_dataset
-from amvnet.evaluation import Evaluation
+from amvnet.data.datasets.open import open_dataset
+from amvnet.evaluation.metrics import Evaluation
 from amvnet.onnx_runner import OnnxSegmenter, disagree
 from amvnet.scan import Scan
 
@@ -32,8 +32,13 @@ class Runner(OnnxSegmenter):
         super().__init__(folder)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        files = {name: str(Path(folder) / self.description["graphs"][name]["file"]) for name in self._graphs}
-        self._graphs = {name: onnxruntime.InferenceSession(file, options) for name, file in files.items()}
+        files = {
+            name: str(Path(folder) / self.description["graphs"][name]["file"])
+            for name in self._graphs
+        }
+        self._graphs = {
+            name: onnxruntime.InferenceSession(file, options) for name, file in files.items()
+        }
         self.given: dict[str, tuple[np.ndarray, ...]] = {}
 
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
@@ -84,12 +89,16 @@ def main(float32: str, int8: str, data: str, threads: str = "2") -> None:
         report = evaluation.report(data)
         figures = (f"{key} {100 * one['miou']:.2f} ({100 * one['accuracy']:.2f})"
                    for key, one in report["methods"].items())  # fmt: skip
-        print(f"{name}: mIoU (accuracy) {', '.join(figures)}; uncertain {report['uncertain_fraction']:.1%}")
+        print(
+            f"{name}: mIoU (accuracy) {', '.join(figures)}; uncertain {report['uncertain_fraction']:.1%}"
+        )
     print(f"labels of the last method that are the same: {np.mean(same):.1%}")
     first, second = runners.values()
     scan = dataset.read(records[0])
     first.by_method(scan)
-    rows = {name: [one.run_graph(name, first.given[name]) for one in (first, second)] for name in GRAPHS}
+    rows = {
+        name: [one.run_graph(name, first.given[name]) for one in (first, second)] for name in GRAPHS
+    }
     rows["scan"] = [lambda one=one: one(scan.points, scan.ring) for one in (first, second)]  # type: ignore[misc]
     for name, (one, other) in rows.items():
         a, b = race(one, other)

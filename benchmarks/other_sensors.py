@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.clouds import Cloud
-from amvnet.data.semantickitti import SemanticKitti
-from amvnet.evaluation import Evaluation
-from amvnet.fitting import Fitting
-from amvnet.segmenter import Segmenter
+from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.formats.cloud import Cloud
+from amvnet.evaluation.metrics import Evaluation
+from amvnet.inference.segmenter import Segmenter
+from amvnet.sensors.adapt import ScanAdapter
 from amvnet.simulation import simulate
 from amvnet.simulation.sensors import HDL64E, SENSORS, Sensor
 
@@ -53,17 +53,22 @@ OTHERS = {
 def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
     """Print mIoU over the classes present and accuracy of AMVNet, both ways."""
     dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
-    fit, by_row = Fitting(segmenter.weights), segmenter.by_ring()
+    fit, by_row = ScanAdapter(segmenter.weights), segmenter.by_ring()
     found = {way: Evaluation(dataset.taxonomy) for way in ("as it is", "measured")}
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record)
         fitted = fit(Cloud(scan.points[:, :3], scan.points[:, 3], name=name), name)
-        for evaluation, labels in zip(found.values(), (segmenter(scan).labels, by_row(fitted).labels), strict=True):
+        for evaluation, labels in zip(
+            found.values(), (segmenter(scan).labels, by_row(fitted).labels), strict=True
+        ):
             assert scan.labels is not None
             evaluation.add(scan.points, scan.labels, {"amvnet": labels}, None)
     for way, evaluation in found.items():
         figures = evaluation.report(name)["methods"]["amvnet"]
-        print(f"{name:14} {way:9} {100 * figures['miou_present']:.1f} ({100 * figures['accuracy']:.1f})", flush=True)
+        print(
+            f"{name:14} {way:9} {100 * figures['miou_present']:.1f} ({100 * figures['accuracy']:.1f})",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

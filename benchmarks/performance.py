@@ -20,17 +20,17 @@ from salsanext import CHANNELS, SalsaNext
 from torch import nn
 from torch.nn import functional as F
 
+import amvnet.inference.segmenter
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
-import amvnet.segmenter
-from amvnet.bench import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
-from amvnet.data.files import read_scan, write_labels
-from amvnet.engines import OnnxGraph, cache_folder, engage
+from amvnet.config.recipes import load_recipe
+from amvnet.data.scan_files import read_scan, write_labels
+from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
+from amvnet.inference.segmenter import Segmenter
+from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
 from amvnet.models.layers import upsample
 from amvnet.models.point_head import head_features, point_table
-from amvnet.recipes import load_recipe
-from amvnet.segmenter import Segmenter
 from amvnet.simulation import simulate
 
 WIDTH, HEIGHT = 2048, 64  # of the range image that SalsaNext is timed on
@@ -38,11 +38,11 @@ WARM_UP = 2
 
 
 def without_memory() -> None:
-    amvnet.segmenter.keep_memory = lambda: False
+    amvnet.inference.segmenter.keep_freed_memory = lambda: False
 
 
 def without_folding() -> None:
-    amvnet.segmenter.fold_batch_norms = lambda model: None
+    amvnet.inference.segmenter.fold_batch_norms = lambda model: None
 
 
 def without_convolved_rows() -> None:
@@ -82,9 +82,11 @@ def without_sharing() -> None:
     def settle(head, points, f, g, index, near):  # type: ignore[no-untyped-def]
         table = point_table(points, f, g)
         parts = zip(index.split(2048), near.split(2048), strict=True)
-        return torch.cat([head(*head_features(head.config, table, i, n)) for i, n in parts]).softmax(dim=1)
+        return torch.cat(
+            [head(*head_features(head.config, table, i, n)) for i, n in parts]
+        ).softmax(dim=1)
 
-    amvnet.bench.settle = settle
+    amvnet.inference.timing.settle = settle
 
 
 TAKEN_AWAY: dict[str, tuple[Callable[[], None], ...]] = {
@@ -108,11 +110,13 @@ def measure(
     for take_away in TAKEN_AWAY[variant]:
         take_away()
     segmenter = Segmenter(untrained(load_recipe(recipe)) if recipe else "sim-hdl64e")
-    engage(segmenter, engine)
+    use_engine(segmenter, engine)
     salsanext, image = yardstick(engine)
     with TemporaryDirectory() as folder:
         target = Path(folder) / "labels.label"
-        job = Job(segmenter, lambda: read_scan(scan), lambda ids: write_labels(target, ids), engine, share)
+        job = Job(
+            segmenter, lambda: read_scan(scan), lambda ids: write_labels(target, ids), engine, share
+        )
         times: list[dict[str, float]] = []
         for _ in range(runs + WARM_UP):
             started = time.perf_counter()
@@ -135,7 +139,9 @@ def yardstick(engine: str) -> tuple[nn.Module, torch.Tensor]:
     if engine == "onnx":
         path = cache_folder() / "salsanext.onnx"
         path.parent.mkdir(parents=True, exist_ok=True)
-        torch.onnx.export(net, (image.contiguous(),), path, dynamo=True, external_data=False, verbose=False)
+        torch.onnx.export(
+            net, (image.contiguous(),), path, dynamo=True, external_data=False, verbose=False
+        )
         net = OnnxGraph(path, torch.get_num_threads())
     return net, image
 
@@ -147,12 +153,21 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--engines", default="torch")
     parser.add_argument("--recipe")
-    parser.add_argument("--uncertain", type=float)  # share of the points; by default as the weights find
+    parser.add_argument(
+        "--uncertain", type=float
+    )  # share of the points; by default as the weights find
     parser.add_argument("--short", action="store_true")  # the engines alone
     parser.add_argument("--variant")  # of one process of ours
     options = parser.parse_args()
     if options.variant:
-        what = options.variant, options.engines, options.scan, options.runs, options.recipe, options.uncertain
+        what = (
+            options.variant,
+            options.engines,
+            options.scan,
+            options.runs,
+            options.recipe,
+            options.uncertain,
+        )
         print(json.dumps(measure(*what)))
         return
     with TemporaryDirectory() as folder:
@@ -171,20 +186,31 @@ def compare(options: argparse.Namespace, scan: Path) -> None:
             command = [sys.executable, __file__, "--scan", str(scan), "--runs", str(options.runs)]
             command += ["--variant", variant, "--engines", engine]
             command += ["--recipe", options.recipe] if options.recipe else []
-            command += ["--uncertain", str(options.uncertain)] if options.uncertain is not None else []
+            command += (
+                ["--uncertain", str(options.uncertain)] if options.uncertain is not None else []
+            )
             printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
             found[variant, engine].append(json.loads(printed.splitlines()[-1]))
             print(f"round {number + 1}: {engine}, {variant}", file=sys.stderr)
     whole = found[variants[0]]
-    print(f"{whole[0]['points']:,.0f} points, {whole[0]['uncertain']:.1%} of them uncertain; ms, medians of rounds\n")
+    print(
+        f"{whole[0]['points']:,.0f} points, {whole[0]['uncertain']:.1%} of them uncertain; ms, medians of rounds\n"
+    )
     columns = (*STAGES, "all", "fusion", "SalsaNext", "all / SalsaNext")
     print("| |", " | ".join(columns), "|\n|---|" + "---|" * len(columns))
     for (variant, engine), rounds in found.items():
-        print(f"| {variant if engine == 'torch' else engine} |", " | ".join(cells(rounds, columns)), "|")
+        print(
+            f"| {variant if engine == 'torch' else engine} |",
+            " | ".join(cells(rounds, columns)),
+            "|",
+        )
 
 
 def cells(rounds: list[dict[str, float]], columns: tuple[str, ...]) -> list[str]:
-    shown = {key: f"{1e3 * np.median([r[key] for r in rounds]):.1f}" for key in (*STAGES, MEAN, "all", "SalsaNext")}
+    shown = {
+        key: f"{1e3 * np.median([r[key] for r in rounds]):.1f}"
+        for key in (*STAGES, MEAN, "all", "SalsaNext")
+    }
     shares = [sum(r[stage] for stage in FUSION) / r["all"] for r in rounds]
     ratios = [r["all"] / r["SalsaNext"] for r in rounds]
     shown |= {"fusion": f"{np.median(shares):.1%}", "all / SalsaNext": f"{np.median(ratios):.2f}"}

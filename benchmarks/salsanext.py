@@ -17,7 +17,9 @@ CHANNELS, CLASSES = 5, 20
 class Unit(nn.Sequential):
     """Convolution, leaky ReLU, batch norm: in this order no norm can be folded into its convolution."""
 
-    def __init__(self, channels: int, out: int, kernel: int, padding: int = 0, dilation: int = 1) -> None:
+    def __init__(
+        self, channels: int, out: int, kernel: int, padding: int = 0, dilation: int = 1
+    ) -> None:
         convolution = nn.Conv2d(channels, out, kernel, padding=padding, dilation=dilation)
         super().__init__(convolution, nn.LeakyReLU(inplace=True), nn.BatchNorm2d(out))
 

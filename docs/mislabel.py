@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.clusters import cluster
-from amvnet.data.catalog import open_dataset
-from amvnet.data.files import write_labels
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.scan_files import write_labels
+from amvnet.ranking.clusters import cluster
 
 SHARE, LEAST = 0.01, 10  # of the things that have so many points
 ALIKE = [
@@ -32,17 +32,26 @@ def mislabel(data, wrong, seed, alike):
     for place, record in enumerate(records[0]):
         scan = right.read(record)
         thing, first = connected(scan), np.unique(connected(scan), return_index=True)[1]
-        things += [(place, k) for k in np.flatnonzero((np.bincount(thing) >= LEAST) & (scan.labels[first] > 0))]
+        things += [
+            (place, k)
+            for k in np.flatnonzero((np.bincount(thing) >= LEAST) & (scan.labels[first] > 0))
+        ]
     for number in rng.permutation(len(things))[: round(SHARE * len(things))]:
         place, k = things[number]
         scan = right.read(records[0][place])
         points = connected(scan) == k
         own = scan.labels[points][0]
-        others = next(group for group in ALIKE if own in group) if alike else range(1, right.taxonomy.size + 1)
+        others = (
+            next(group for group in ALIKE if own in group)
+            if alike
+            else range(1, right.taxonomy.size + 1)
+        )
         now = copy.read(records[1][place]).labels
         now[points] = rng.choice([other for other in others if other != own])
         write_labels(records[1][place].labels_path, right.taxonomy.to_raw(now))
-        marks.setdefault(records[1][place].name, np.zeros(len(points), dtype=int))[points] = number + 1
+        marks.setdefault(records[1][place].name, np.zeros(len(points), dtype=int))[points] = (
+            number + 1
+        )
     np.savez(Path(wrong, "wrong.npz"), things=len(things), **marks)
 
 
@@ -52,7 +61,10 @@ def connected(scan):
 
 def score(wrong, ranking):
     with np.load(Path(wrong, "wrong.npz")) as file:
-        things, marks = int(file["things"]), {name: file[name] for name in file.files if name != "things"}
+        things, marks = (
+            int(file["things"]),
+            {name: file[name] for name in file.files if name != "things"},
+        )
     with open(ranking, newline="") as file:
         rows = [(row["scan"], int(row["point"])) for row in csv.DictReader(file)]
     found = [marks[scan][point] if scan in marks else 0 for scan, point in rows]
@@ -60,7 +72,9 @@ def score(wrong, ranking):
     print(f"{len(wrong)} of {things} things are wrong; {len(rows)} rows")
     for share in (0.01, 0.05, 0.1, 1):
         hit = wrong & set(found[: round(share * len(rows))])
-        print(f"in the first {share:.0%} of the rows: {len(hit)} of them, {len(hit) / len(wrong):.0%}")
+        print(
+            f"in the first {share:.0%} of the rows: {len(hit)} of them, {len(hit) / len(wrong):.0%}"
+        )
 
 
 if len(sys.argv) > 3:

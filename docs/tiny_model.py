@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 
 
 def cell(points):
     """(N, 4) -> (N,) which of 40 x 20 x 10 cells of height, distance and intensity each point is in."""
     values = [(points[:, 2] + 3) / 8, np.hypot(points[:, 0], points[:, 1]) / 60, points[:, 3]]
-    return np.ravel_multi_index([(v * n).astype(int) for v, n in zip(values, SIZE, strict=True)], SIZE, mode="clip")
+    return np.ravel_multi_index(
+        [(v * n).astype(int) for v, n in zip(values, SIZE, strict=True)], SIZE, mode="clip"
+    )
 
 
 SIZE, (data, out) = (40, 20, 10), sys.argv[1:]

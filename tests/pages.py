@@ -17,9 +17,18 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 FLAGS = [
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--hide-scrollbars"),
+    *(
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+        "--hide-scrollbars",
+    ),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
     *("--virtual-time-budget=6000", "--window-size=800,500"),
@@ -78,7 +87,9 @@ class Browser:
         profile = f"--user-data-dir={self.folder / f'profile{self.calls}'}"
         command = [str(CHROMIUM), *FLAGS, profile, *options, f"{page.as_uri()}#{look}"]
         environment = {**os.environ, "HOME": str(self.folder)}
-        return subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment).stdout
+        return subprocess.run(
+            command, capture_output=True, text=True, timeout=60, env=environment
+        ).stdout
 
     def state(self, page: Path, look: str = "") -> dict[str, Any]:
         """What the page says of itself: attributes of its root, with the points drawn by class."""

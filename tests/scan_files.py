@@ -38,7 +38,10 @@ def write_pcd(path: Path, points: np.ndarray, encoding: str) -> Path:
 
 
 def pcd_bytes(
-    table: np.ndarray, fields: Sequence[tuple[str, str, int]], height: int = 1, points: int | None = None
+    table: np.ndarray,
+    fields: Sequence[tuple[str, str, int]],
+    height: int = 1,
+    points: int | None = None,
 ) -> bytes:
     """A binary PCD of a structured table whose fields have these names, types ("F 4") and counts."""
     kinds = [kind.split() for _, kind, _ in fields]
@@ -74,17 +77,26 @@ def write_las(path: Path, points: np.ndarray, point_format: int = 3, version: st
     return path
 
 
-def cloud_message(store: Any, points: np.ndarray, padded: bool = False, big: bool = False, **changes: Any) -> Any:
+def cloud_message(
+    store: Any, points: np.ndarray, padded: bool = False, big: bool = False, **changes: Any
+) -> Any:
     """A PointCloud2 of (N, 4) points; a padded one is organised in two rows with gaps and has ring and time, too."""
     types, step = store.types, 32 if padded else 16
-    kinds = {name: (offset, "f4") for name, offset in zip(COLUMNS, (0, 4, 8, 16 if padded else 12), strict=True)}
+    kinds = {
+        name: (offset, "f4")
+        for name, offset in zip(COLUMNS, (0, 4, 8, 16 if padded else 12), strict=True)
+    }
     if padded:
         kinds |= {"ring": (20, "u2"), "time": (24, "f8")}
     numbers = {"f4": 7, "u2": 4, "f8": 8}
     order = ">" if big else "<"
-    formats, offsets = [order + kind for _, kind in kinds.values()], [offset for offset, _ in kinds.values()]
+    formats, offsets = (
+        [order + kind for _, kind in kinds.values()],
+        [offset for offset, _ in kinds.values()],
+    )
     table = np.zeros(
-        len(points), np.dtype({"names": list(kinds), "formats": formats, "offsets": offsets, "itemsize": step})
+        len(points),
+        np.dtype({"names": list(kinds), "formats": formats, "offsets": offsets, "itemsize": step}),
     )
     for i, name in enumerate(COLUMNS):
         table[name] = points[:, i]
@@ -96,7 +108,9 @@ def cloud_message(store: Any, points: np.ndarray, padded: bool = False, big: boo
     field, header = types["sensor_msgs/msg/PointField"], types["std_msgs/msg/Header"]
     stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
     made = {
-        "header": header(stamp=stamp, frame_id="lidar", **({"seq": 0} if "seq" in header.__annotations__ else {})),
+        "header": header(
+            stamp=stamp, frame_id="lidar", **({"seq": 0} if "seq" in header.__annotations__ else {})
+        ),
         "height": height,
         "width": width,
         "fields": [field(name, offset, numbers[kind], 1) for name, (offset, kind) in kinds.items()],
@@ -127,7 +141,11 @@ def write_bag1(path: Path, scans: Scans, compression: str | None = None, **messa
 
 
 def write_bag2(
-    folder: Path, scans: Scans, storage: StoragePlugin, compressed: CompressionMode | None = None, **message: Any
+    folder: Path,
+    scans: Scans,
+    storage: StoragePlugin,
+    compressed: CompressionMode | None = None,
+    **message: Any,
 ) -> Path:
     """The folder of a ROS 2 bag."""
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -177,5 +195,7 @@ WRITERS: dict[str, Callable[[Path, np.ndarray], object]] = {
     "lz4.bag": lambda path, points: write_bag1(path, {"/lidar": [points]}, "LZ4"),
     "bz2.bag": lambda path, points: write_bag1(path, {"/lidar": [points]}, "BZ2"),
     "lone.mcap": lambda path, points: _storage_file(path, {"/lidar": [points]}, StoragePlugin.MCAP),
-    "lone.db3": lambda path, points: _storage_file(path, {"/lidar": [points]}, StoragePlugin.SQLITE3),
+    "lone.db3": lambda path, points: _storage_file(
+        path, {"/lidar": [points]}, StoragePlugin.SQLITE3
+    ),
 }  # by a name for each

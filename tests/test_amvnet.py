@@ -13,7 +13,7 @@ from test_models import CASES
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config import (
+from amvnet.config.schema import (
     AssertionConfig,
     ModelConfig,
     PointHeadConfig,
@@ -22,13 +22,26 @@ from amvnet.config import (
     RangeNetConfig,
     RangeViewConfig,
 )
-from amvnet.models.amvnet import AMVNet, arithmetic_mean, build_amvnet, geometric_mean, maximum, merge
+from amvnet.models.amvnet import (
+    AMVNet,
+    arithmetic_mean,
+    build_amvnet,
+    geometric_mean,
+    maximum,
+    merge,
+)
 from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
 from amvnet.models.layers import fold_batch_norms
-from amvnet.models.point_head import PointHead, head_features, nearest_neighbours, only_asked, point_table
+from amvnet.models.point_head import (
+    PointHead,
+    head_features,
+    nearest_neighbours,
+    point_table,
+    select_used_points,
+)
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarGrid
 from amvnet.scan import Scan
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarGrid
 
 RandomScan = Callable[..., Scan]
 
@@ -37,7 +50,9 @@ GRID = PolarViewConfig(radial=9, angular=11, vertical=3, radius_min=0.0)
 TINY = ModelConfig(
     range_view=RangeViewConfig(height=7, width=21),
     polar_view=GRID,
-    range_net=RangeNetConfig(stem=4, widths=(4, 6, 6), blocks=(1, 2, 1), height_strides=(1, 1, 2), decoder=6, head=4),
+    range_net=RangeNetConfig(
+        stem=4, widths=(4, 6, 6), blocks=(1, 2, 1), height_strides=(1, 1, 2), decoder=6, head=4
+    ),
     polar_net=PolarNetConfig(point_widths=(6, 8), pillar=5, widths=(4, 6, 6)),
     point_head=PointHeadConfig(neighbours=3, hidden=(6, 5), fc=7),
 )
@@ -56,7 +71,10 @@ def test_the_papers_point_head_has_18500_parameters_and_costs_one_gmac_for_10000
     head, width = point_head(PointHeadConfig(), 19), 2 * 19 + 4
     assert sum(p.numel() for p in head.parameters()) == pytest.approx(18_500, abs=100)
     with torch.inference_mode(), FlopCounterMode(display=False) as counter:
-        assert head(torch.zeros(10_000, width), torch.zeros(10_000, 15, width)).shape == (10_000, 19)
+        assert head(torch.zeros(10_000, width), torch.zeros(10_000, 15, width)).shape == (
+            10_000,
+            19,
+        )
     assert counter.get_total_flops() / 2 == pytest.approx(1e9, rel=0.05)
 
 
@@ -108,8 +126,12 @@ def test_nearest_neighbours_equal_a_search_through_all_points() -> None:
 @pytest.mark.parametrize("n", [1, 3, 12])
 @pytest.mark.parametrize("places", [1, 4, 20])
 @pytest.mark.usefixtures("tree")
-def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(places: int, n: int) -> None:
-    points = torch.randn(places, 4, generator=torch.Generator().manual_seed(0))[torch.arange(40) % places]
+def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(
+    places: int, n: int
+) -> None:
+    points = torch.randn(places, 4, generator=torch.Generator().manual_seed(0))[
+        torch.arange(40) % places
+    ]
     for own, row in enumerate(nearest_neighbours(points, torch.arange(40), n).tolist()):
         assert own not in row
         assert len(set(row)) == n
@@ -120,7 +142,10 @@ def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(p
 @pytest.mark.usefixtures("tree")
 def test_with_fewer_points_than_neighbours_the_last_one_is_repeated() -> None:
     points = torch.tensor([[0.0, 0, 0, 9], [5, 0, 0, 9], [1, 0, 0, 9], [3, 0, 0, 9]])
-    assert nearest_neighbours(points, torch.tensor([0, 1]), 6).tolist() == [[2, 3, 1, 1, 1, 1], [3, 2, 0, 0, 0, 0]]
+    assert nearest_neighbours(points, torch.tensor([0, 1]), 6).tolist() == [
+        [2, 3, 1, 1, 1, 1],
+        [3, 2, 0, 0, 0, 0],
+    ]
 
 
 @pytest.mark.usefixtures("tree")
@@ -135,13 +160,18 @@ def test_without_an_uncertain_point_there_are_no_neighbours(points: int) -> None
     assert found.dtype == torch.long
 
 
-def head_features_by_loop(points: Tensor, f: Tensor, g: Tensor, own: int) -> tuple[list[float], list[list[float]]]:
+def head_features_by_loop(
+    points: Tensor, f: Tensor, g: Tensor, own: int
+) -> tuple[list[float], list[list[float]]]:
     """p_i and S_i of a point, with the neighbours of `TINY`."""
     x, y, z, intensity = here = points[own].tolist()
     scale = TINY.point_head.position_scale
     point = [*f[own].tolist(), *g[own].tolist(), x * scale, y * scale, z * scale, intensity]
     near = [i for _, i in neighbours_by_loop(points, own)[: TINY.point_head.neighbours]]
-    offsets = {k: [there - own_value for there, own_value in zip(points[k].tolist(), here, strict=True)] for k in near}
+    offsets = {
+        k: [there - own_value for there, own_value in zip(points[k].tolist(), here, strict=True)]
+        for k in near
+    }
     return point, [[*f[k].tolist(), *g[k].tolist(), *offsets[k]] for k in near]
 
 
@@ -181,7 +211,10 @@ def test_at_the_threshold_a_point_is_uncertain() -> None:
 
 def test_entropy_equals_a_loop_of_its_formula() -> None:
     f, g, points, _ = random_scores()
-    means = [[(x + y) / 2 for x, y in zip(a, b, strict=True)] for a, b in zip(f.tolist(), g.tolist(), strict=True)]
+    means = [
+        [(x + y) / 2 for x, y in zip(a, b, strict=True)]
+        for a, b in zip(f.tolist(), g.tolist(), strict=True)
+    ]
     expected = [-sum(p * math.log(p) for p in mean) >= 0.9 for mean in means]
     assert HighEntropy(0.9)(f, g, points).tolist() == expected
     assert set(expected) == {False, True}
@@ -271,7 +304,9 @@ def test_agreement_leaves_the_scores_alone(random_scan: RandomScan) -> None:
 
 @pytest.mark.parametrize("uncertain", [0, 1, 2500])
 @pytest.mark.parametrize("folded", [False, True])
-def test_scoring_points_from_the_table_equals_scoring_their_features(uncertain: int, folded: bool) -> None:
+def test_scoring_points_from_the_table_equals_scoring_their_features(
+    uncertain: int, folded: bool
+) -> None:
     head = point_head(PointHeadConfig(), 19)
     if folded:
         fold_batch_norms(head)
@@ -284,14 +319,16 @@ def test_scoring_points_from_the_table_equals_scoring_their_features(uncertain: 
 
 def test_only_the_points_that_are_asked_for_are_taken() -> None:
     a, b = torch.tensor([7, 3]), torch.tensor([[3, 9, 9], [0, 7, 3]])
-    asked, (of_a, of_b) = only_asked(12, a, b)
+    asked, (of_a, of_b) = select_used_points(12, a, b)
     assert asked.tolist() == [0, 3, 7, 9]
     assert torch.equal(asked[of_a], a)
     assert torch.equal(asked[of_b], b)
 
 
 @pytest.mark.parametrize("brightest", [0, 1, 5])
-def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(random_scan: RandomScan, brightest: int) -> None:
+def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(
+    random_scan: RandomScan, brightest: int
+) -> None:
     batch = PointBatch.of([random_scan(30)])
     model = whole_model(dull=batch.points[:, 3].sort(descending=True).values[brightest].item())
     found = model(batch)
@@ -304,14 +341,25 @@ def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(random_scan
         torch.testing.assert_close(found.merged[i], expected, rtol=1e-4, atol=1e-5)
 
 
-def test_the_networks_scores_are_those_of_each_points_pixel_and_voxel(random_scan: RandomScan) -> None:
+def test_the_networks_scores_are_those_of_each_points_pixel_and_voxel(
+    random_scan: RandomScan,
+) -> None:
     model, batch = whole_model(), PointBatch.of([random_scan(30)])
-    found, image, grid = model(batch), model.range_view.project(batch), model.polar_view.project(batch)
-    pixels, voxels = model.range_net(image.image)[0].flatten(1), grid.to_map(model.polar_net(grid))[0].flatten(1)
+    found, image, grid = (
+        model(batch),
+        model.range_view.project(batch),
+        model.polar_view.project(batch),
+    )
+    pixels, voxels = (
+        model.range_net(image.image)[0].flatten(1),
+        grid.to_map(model.polar_net(grid))[0].flatten(1),
+    )
     for i in range(30):
         torch.testing.assert_close(found.rv[i], pixels[:, image.pixel[i]].softmax(0))
         first = int(grid.voxel[i]) * K
-        torch.testing.assert_close(found.bev[i], voxels[first : first + K, grid.pillar[i]].softmax(0))
+        torch.testing.assert_close(
+            found.bev[i], voxels[first : first + K, grid.pillar[i]].softmax(0)
+        )
 
 
 def test_without_a_head_the_result_is_the_ensemble(random_scan: RandomScan) -> None:
@@ -325,7 +373,9 @@ def test_without_a_head_the_result_is_the_ensemble(random_scan: RandomScan) -> N
 
 
 @pytest.mark.parametrize("counts", [(40, 30), (40, 1), (2, 40), (40, 0, 3)])
-def test_a_batch_of_scans_equals_each_alone(random_scan: RandomScan, counts: tuple[int, ...]) -> None:
+def test_a_batch_of_scans_equals_each_alone(
+    random_scan: RandomScan, counts: tuple[int, ...]
+) -> None:
     model, scans = whole_model(), [random_scan(count, seed) for seed, count in enumerate(counts)]
     batch = PointBatch.of(scans)
     together = model(batch)
@@ -333,11 +383,15 @@ def test_a_batch_of_scans_equals_each_alone(random_scan: RandomScan, counts: tup
     for scan, where in zip(scans, batch.slices(), strict=True):
         alone = model(PointBatch.of([scan]))
         for name in ("rv", "bev", "merged", "uncertain"):
-            torch.testing.assert_close(getattr(together, name)[where], getattr(alone, name), rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(
+                getattr(together, name)[where], getattr(alone, name), rtol=1e-4, atol=1e-5
+            )
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
-def test_scans_with_fewer_points_than_neighbours_get_scores(random_scan: RandomScan, count: int) -> None:
+def test_scans_with_fewer_points_than_neighbours_get_scores(
+    random_scan: RandomScan, count: int
+) -> None:
     found = whole_model(dull=-1.0)(PointBatch.of([random_scan(count)]))
     assert found.uncertain.sum() == count
     torch.testing.assert_close(found.merged.sum(dim=1), torch.ones(count))

@@ -11,16 +11,26 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.image import imread
-from worlds import amvnet, files, fresh_weights, make_streets, street, without, write_recipe, write_scan
+from worlds import (
+    amvnet,
+    files,
+    fresh_weights,
+    make_streets,
+    street,
+    without,
+    write_recipe,
+    write_scan,
+)
 
-from amvnet import analysis, jobs
-from amvnet.analysis import BINS, SWEPT, analyze
-from amvnet.config import AssertionConfig
-from amvnet.data.catalog import open_dataset
-from amvnet.evaluation import confusion, metrics
+from amvnet.config.schema import AssertionConfig
+from amvnet.data.datasets.open import open_dataset
+from amvnet.evaluation import analysis
+from amvnet.evaluation import scoring as jobs
+from amvnet.evaluation.analysis import BINS, SWEPT, analyze
+from amvnet.evaluation.metrics import confusion, metrics
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import arithmetic_mean, maximum
-from amvnet.segmenter import Segmenter
-from amvnet.weights import Weights, load, save
+from amvnet.weights.file import Weights, load, save
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +51,9 @@ def weights(world: Path) -> Weights:
 
 
 def with_tau(weights: Weights, tau: float) -> Weights:
-    return replace(weights, model=replace(weights.model, assertion=AssertionConfig("disagreement", tau)))
+    return replace(
+        weights, model=replace(weights.model, assertion=AssertionConfig("disagreement", tau))
+    )
 
 
 def figures_of(world: Path, weights: Weights) -> tuple[float, dict[str, Any]]:
@@ -57,7 +69,9 @@ def figures_of(world: Path, weights: Weights) -> tuple[float, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("tau", [0.0, 0.31, 0.85, SWEPT / BINS])
-def test_a_swept_tau_gives_what_weights_with_that_tau_give(world: Path, weights: Weights, tau: float) -> None:
+def test_a_swept_tau_gives_what_weights_with_that_tau_give(
+    world: Path, weights: Weights, tau: float
+) -> None:
     dataset = open_dataset(f"semantickitti:{world / 'data'}")
     found = analyze(dataset, dataset.records(["08"]), Segmenter(weights))
     swept = found.sweep()[round(tau * BINS)]
@@ -70,19 +84,26 @@ def test_a_swept_tau_gives_what_weights_with_that_tau_give(world: Path, weights:
     assert swept.miou > 0.02
 
 
-def test_points_that_no_network_sees_count_as_evaluate_counts_them(weights: Weights, tmp_path: Path) -> None:
+def test_points_that_no_network_sees_count_as_evaluate_counts_them(
+    weights: Weights, tmp_path: Path
+) -> None:
     points, raw = street(1)
     points[::3, 0] = np.nan
     write_scan(tmp_path, "08", "000000", points, raw)
     dataset = open_dataset(f"semantickitti:{tmp_path}")
     segmenter, records = Segmenter(weights), dataset.records(["08"])
     found = analyze(dataset, records, segmenter)
-    expected = jobs.evaluate(dataset, records, jobs.by_weights(dataset, segmenter))
+    expected = jobs.evaluate(dataset, records, jobs.label_by_weights(dataset, segmenter))
     for name, stack in expected.matrices.items():
         np.testing.assert_array_equal(found.evaluation.matrices[name], stack)
-    assert (found.evaluation.points, found.evaluation.uncertain) == (expected.points, expected.uncertain)
+    assert (found.evaluation.points, found.evaluation.uncertain) == (
+        expected.points,
+        expected.uncertain,
+    )
     tau = round(weights.model.assertion.threshold * BINS)
-    assert found.sweep()[tau].uncertain == pytest.approx(expected.uncertain / expected.points, abs=0.005)
+    assert found.sweep()[tau].uncertain == pytest.approx(
+        expected.uncertain / expected.points, abs=0.005
+    )
 
 
 def test_a_tau_above_those_that_are_swept_is_analyzed(
@@ -105,17 +126,26 @@ def test_every_method_is_scored_as_by_the_segmenter(world: Path, weights: Weight
         scan = dataset.read(record)
         result = Segmenter(weights)(scan)
         f, g = torch.from_numpy(result.rv), torch.from_numpy(result.bev)
-        scores = {"rv": f, "bev": g, "ensemble": torch.sqrt(f * g), "amvnet": torch.from_numpy(result.scores)}
+        scores = {
+            "rv": f,
+            "bev": g,
+            "ensemble": torch.sqrt(f * g),
+            "amvnet": torch.from_numpy(result.scores),
+        }
         scores |= {"arithmetic": arithmetic_mean(f, g), "maximum": maximum(f, g)}
         for name, values in scores.items():
-            expected[name] = expected[name] + confusion(scan.labels, values.argmax(dim=1).numpy() + 1, 19)
+            expected[name] = expected[name] + confusion(
+                scan.labels, values.argmax(dim=1).numpy() + 1, 19
+            )
     for name, stack in matrices.items():
         np.testing.assert_array_equal(stack[0], expected[name])
 
 
 def test_analyze_writes_each_figure_as_picture_table_and_text(world: Path) -> None:
     out = world / "figures"
-    code, error = amvnet("analyze", world / "data", "--weights", world / "weights.safetensors", "--out", out)
+    code, error = amvnet(
+        "analyze", world / "data", "--weights", world / "weights.safetensors", "--out", out
+    )
     assert code == 0, error
     drawn = {"similarity", "distance", "tau"}
     assert files(out) == {f"{n}.{e}" for n in drawn for e in ("png", "csv", "md")} | {
@@ -136,7 +166,16 @@ def test_analyze_writes_each_figure_as_picture_table_and_text(world: Path) -> No
 
 def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
     out, weights = world / "swept", world / "weights.safetensors"
-    arguments = ("analyze", world / "data", "--weights", weights, "--out", out, "--neighbours", "2,5")
+    arguments = (
+        "analyze",
+        world / "data",
+        "--weights",
+        weights,
+        "--out",
+        out,
+        "--neighbours",
+        "2,5",
+    )
     arguments += ("--recipe", world / "recipe.yaml")
     code, error = amvnet(*arguments)
     assert code == 0, error
@@ -164,7 +203,16 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
 
 def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -> None:
     out = world / "ablation"
-    arguments = ("ablate", world / "recipe.yaml", "--data", world / "data", "--out", out, "--training.rv.epochs", 1)
+    arguments = (
+        "ablate",
+        world / "recipe.yaml",
+        "--data",
+        world / "data",
+        "--out",
+        out,
+        "--training.rv.epochs",
+        1,
+    )
     code, error = amvnet(*arguments)
     assert code == 0, error
     with (out / "ablation.csv").open() as file:
@@ -175,7 +223,9 @@ def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -
     assert len({row["accuracy %"] for row in rows}) > 1
     assert not load(out / "rv" / "weights.safetensors").model.range_net.gru
     assert load(out / "rv-gru-weights" / "weights.safetensors").model.range_net.gru
-    kept = {name: (out / name / "rv" / "last.safetensors").read_bytes() for name in ("rv", "rv-gru")}
+    kept = {
+        name: (out / name / "rv" / "last.safetensors").read_bytes() for name in ("rv", "rv-gru")
+    }
     table = (out / "ablation.md").read_text()
     (out / "rv-gru" / "rv" / "done").unlink()
     (out / "ablation.md").unlink()
@@ -191,7 +241,10 @@ def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -
 
 def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     save(without(fresh_weights(), "point_head"), world / "headless.safetensors")
-    entropy = replace(fresh_weights(), model=replace(fresh_weights().model, assertion=AssertionConfig("entropy", 0.7)))
+    entropy = replace(
+        fresh_weights(),
+        model=replace(fresh_weights().model, assertion=AssertionConfig("entropy", 0.7)),
+    )
     save(entropy, world / "entropy.safetensors")
     whole = world / "weights.safetensors"
     cases = [
@@ -205,7 +258,9 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
         (whole, ("--sequences", "77"), "77"),
     ]
     for weights, options, word in cases:
-        code, error = amvnet("analyze", world / "data", "--weights", weights, "--out", world / "none", *options)
+        code, error = amvnet(
+            "analyze", world / "data", "--weights", weights, "--out", world / "none", *options
+        )
         assert code == 2
         assert error.count("\n") == 1
         assert word in error

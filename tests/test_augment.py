@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from amvnet.config import AugmentConfig
-from amvnet.data.augment import augment, mix, rotation
+from amvnet.config.schema import AugmentConfig
 from amvnet.scan import Scan
+from amvnet.training.augment import augment, mix, rotation
 
 RandomScan = Callable[..., Scan]
 STILL = AugmentConfig(scale=0.0, flip=0.0, jitter=0.0, yaw=0.0)
@@ -82,7 +82,9 @@ def test_all_four_mirrorings_occur_and_none_else(random_scan: RandomScan) -> Non
     assert seen == {(1, 1, 1), (-1, 1, 1), (1, -1, 1), (-1, -1, 1)}
 
 
-def test_jitter_is_noise_of_its_standard_deviation_on_each_coordinate(random_scan: RandomScan) -> None:
+def test_jitter_is_noise_of_its_standard_deviation_on_each_coordinate(
+    random_scan: RandomScan,
+) -> None:
     scan = random_scan(5000)
     noise = (augmented(scan, replace(STILL, jitter=0.1)).points - scan.points)[:, :3]
     np.testing.assert_allclose(noise.std(axis=0), 0.1, rtol=0.05)
@@ -119,7 +121,9 @@ def test_lost_points_stay_lost_and_in_their_place(random_scan: RandomScan) -> No
 
 
 @pytest.mark.parametrize("flip", [0.0, 1.0])
-def test_mirroring_both_axes_or_none_keeps_the_winding(random_scan: RandomScan, flip: float) -> None:
+def test_mirroring_both_axes_or_none_keeps_the_winding(
+    random_scan: RandomScan, flip: float
+) -> None:
     scan = random_scan(2)
     changed = augmented(scan, replace(STILL, flip=flip, yaw=180.0))
     assert winding(changed) == pytest.approx(winding(scan), rel=1e-4)
@@ -142,7 +146,9 @@ def test_lost_points_take_their_labels_and_rings_with_them(random_scan: RandomSc
 
 
 def test_a_lone_point_is_never_lost(random_scan: RandomScan) -> None:
-    assert all(len(augmented(random_scan(1), replace(STILL, drop=0.99), seed)) == 1 for seed in range(50))
+    assert all(
+        len(augmented(random_scan(1), replace(STILL, drop=0.99), seed)) == 1 for seed in range(50)
+    )
 
 
 def test_a_lift_is_one_height_within_its_limits(random_scan: RandomScan) -> None:
@@ -162,7 +168,9 @@ def test_intensity_is_scaled_by_one_factor_and_stays_at_most_one(random_scan: Ra
         changed = augmented(scan, replace(STILL, intensity=0.5), seed).points
         assert np.array_equal(changed[:, :3], scan.points[:, :3])
         gain = changed[:, 3].min() / scan.points[:, 3].min()
-        np.testing.assert_allclose(changed[:, 3], np.minimum(scan.points[:, 3] * gain, 1), rtol=1e-5)
+        np.testing.assert_allclose(
+            changed[:, 3], np.minimum(scan.points[:, 3] * gain, 1), rtol=1e-5
+        )
         gains.append(gain)
     assert 0.5 <= min(gains) < 0.7
     assert 1.3 < max(gains) <= 1.5
@@ -170,12 +178,17 @@ def test_intensity_is_scaled_by_one_factor_and_stays_at_most_one(random_scan: Ra
 
 def test_some_scans_have_no_intensity(random_scan: RandomScan) -> None:
     scan = random_scan(50)
-    sums = [augmented(scan, replace(STILL, no_intensity=0.3), seed).points[:, 3].sum() for seed in range(100)]
+    sums = [
+        augmented(scan, replace(STILL, no_intensity=0.3), seed).points[:, 3].sum()
+        for seed in range(100)
+    ]
     assert set(np.round(sums, 3)) == {0, np.round(scan.points[:, 3].sum(), 3)}
     assert 15 < sums.count(0) < 45
 
 
-def test_a_mixed_scan_is_one_sector_of_another_and_the_rest_of_its_own(random_scan: RandomScan) -> None:
+def test_a_mixed_scan_is_one_sector_of_another_and_the_rest_of_its_own(
+    random_scan: RandomScan,
+) -> None:
     scan, other = random_scan(2000, 1), random_scan(1500, 2)
     where = {tuple(row): (s, i) for s in (scan, other) for i, row in enumerate(s.points.tolist())}
     widths = []

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from worlds import GOLDEN, amvnet, files, fresh_weights, make_streets, street, without, write_recipe
 
-from amvnet import runner
-from amvnet.cli import VERBS, main
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.segmenter import Segmenter
-from amvnet.weights import save
+from amvnet.cli.main import VERBS, main
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.inference.segmenter import Segmenter
+from amvnet.training import run as runner
+from amvnet.weights.file import save
 
 OVERALL = {"miou", "miou_present", "accuracy", "fwiou", "iou"}
 RAW_IDS = set(SEMANTICKITTI.train_to_raw[1:])
@@ -90,7 +90,8 @@ MISTAKES = {
     "wrong label count": "evaluate {w}/mislabelled --weights {w}/w.safetensors --json {out}/m.json",
     "learning what validates": TRAIN + " --train-sequences 00,08 --val-sequences 08",
     "head without networks": TRAIN + " --stage head",
-    "more folds than sequences": TRAIN + " --stage head --init {w}/w.safetensors --training.head.folds 3",
+    "more folds than sequences": TRAIN
+    + " --stage head --init {w}/w.safetensors --training.head.folds 3",
     "unknown recipe": "train best --data {w}/data --out {out}",
     "unknown key in a recipe": "train {w}/typo.yaml --data {w}/data --out {out}",
     "recipe that is no text": "train {w}/latin1.yaml --data {w}/data --out {out}",
@@ -121,7 +122,9 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_one_line_and_leaves_nothing(mistake: str, world: Path, tmp_path: Path) -> None:
+def test_a_mistake_is_one_line_and_leaves_nothing(
+    mistake: str, world: Path, tmp_path: Path
+) -> None:
     before = files(world)
     code, error = amvnet(*MISTAKES[mistake].format(w=world, out=tmp_path / "out").split())
     assert (code, error.count("\n")) == (2, 1), error
@@ -146,7 +149,9 @@ def test_a_run_with_wrong_labels_keeps_no_weights(world: Path, tmp_path: Path) -
 
 def test_a_broken_scan_leaves_the_others_whole(world: Path, tmp_path: Path) -> None:
     inputs = (world / "lone.bin", world / "truncated.bin")
-    assert amvnet("predict", *inputs, "--weights", world / "w.safetensors", "--out", tmp_path)[0] == 3
+    assert (
+        amvnet("predict", *inputs, "--weights", world / "w.safetensors", "--out", tmp_path)[0] == 3
+    )
     assert files(tmp_path) == {"lone.label"}
     assert len(np.fromfile(tmp_path / "lone.label", np.uint32)) == 300
 
@@ -167,14 +172,18 @@ def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> N
 
 
 @pytest.mark.parametrize(
-    "order", [lambda recipe, rest: [recipe, *rest], lambda recipe, rest: [*rest, recipe]], ids=["first", "last"]
+    "order",
+    [lambda recipe, rest: [recipe, *rest], lambda recipe, rest: [*rest, recipe]],
+    ids=["first", "last"],
 )
 def test_a_recipe_counts_wherever_it_stands(
     order: Callable[..., list[Any]], world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[runner.Run] = []
     monkeypatch.setattr(runner.Run, "stages", lambda self, *_: made.append(self) or tmp_path)
-    code, _ = amvnet("train", *order(world / "recipe.yaml", ["--data", world / "data", "--out", tmp_path]))
+    code, _ = amvnet(
+        "train", *order(world / "recipe.yaml", ["--data", world / "data", "--out", tmp_path])
+    )
     assert code in (0, 2)
     if code == 0:
         assert made[0].recipe.model.range_view.width == 64
@@ -185,8 +194,15 @@ def test_a_recipe_counts_wherever_it_stands(
 
 
 def test_a_data_set_is_segmented_into_the_benchmarks_layout(world: Path, tmp_path: Path) -> None:
-    assert amvnet("predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path)[0] == 0
-    scans = [f"sequences/{s}/predictions/{i:06d}.label" for s in ("00", "01", "08") for i in range(2)]
+    assert (
+        amvnet("predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path)[
+            0
+        ]
+        == 0
+    )
+    scans = [
+        f"sequences/{s}/predictions/{i:06d}.label" for s in ("00", "01", "08") for i in range(2)
+    ]
     assert files(tmp_path) == set(scans)
     for name in scans:
         raw = np.fromfile(tmp_path / name, np.uint32)
@@ -194,19 +210,40 @@ def test_a_data_set_is_segmented_into_the_benchmarks_layout(world: Path, tmp_pat
         assert set(raw.tolist()) <= RAW_IDS
 
 
-def test_lone_scans_are_segmented_by_name_as_the_segmenter_does(world: Path, tmp_path: Path) -> None:
-    assert amvnet("predict", world / "lone.bin", "--weights", world / "w.safetensors", "--out", tmp_path)[0] == 0
+def test_lone_scans_are_segmented_by_name_as_the_segmenter_does(
+    world: Path, tmp_path: Path
+) -> None:
+    assert (
+        amvnet(
+            "predict", world / "lone.bin", "--weights", world / "w.safetensors", "--out", tmp_path
+        )[0]
+        == 0
+    )
     assert files(tmp_path) == {"lone.label"}
     points = np.fromfile(world / "lone.bin", np.float32).reshape(-1, 4)
     labels = Segmenter(str(world / "w.safetensors"))(points).labels
-    assert np.array_equal(np.fromfile(tmp_path / "lone.label", np.uint32), SEMANTICKITTI.to_raw(labels))
+    assert np.array_equal(
+        np.fromfile(tmp_path / "lone.label", np.uint32), SEMANTICKITTI.to_raw(labels)
+    )
 
 
-def test_scores_are_both_networks_probabilities_in_half_precision(world: Path, tmp_path: Path) -> None:
-    options = ("--weights", world / "w.safetensors", "--out", tmp_path, "--scores", "--sequences", "08")
+def test_scores_are_both_networks_probabilities_in_half_precision(
+    world: Path, tmp_path: Path
+) -> None:
+    options = (
+        "--weights",
+        world / "w.safetensors",
+        "--out",
+        tmp_path,
+        "--scores",
+        "--sequences",
+        "08",
+    )
     assert amvnet("predict", world / "data", *options)[0] == 0
     folder = "sequences/08/predictions"
-    assert files(tmp_path) == {f"{folder}/{i:06d}.{end}" for i in range(2) for end in ("label", "npz")}
+    assert files(tmp_path) == {
+        f"{folder}/{i:06d}.{end}" for i in range(2) for end in ("label", "npz")
+    }
     points = np.fromfile(world / "data/sequences/08/velodyne/000000.bin", np.float32).reshape(-1, 4)
     result = Segmenter(str(world / "w.safetensors"))(points)
     with np.load(tmp_path / folder / "000000.npz", allow_pickle=False) as kept:
@@ -217,7 +254,9 @@ def test_scores_are_both_networks_probabilities_in_half_precision(world: Path, t
 
 
 @pytest.mark.parametrize("method", ["rv", "bev", "ensemble"])
-def test_weights_without_head_predict_by_the_other_methods(method: str, world: Path, tmp_path: Path) -> None:
+def test_weights_without_head_predict_by_the_other_methods(
+    method: str, world: Path, tmp_path: Path
+) -> None:
     options = ("--weights", world / "headless.safetensors", "--out", tmp_path, "--method", method)
     assert amvnet("predict", world / "lone.bin", *options)[0] == 0
     assert files(tmp_path) == {"lone.label"}
@@ -230,7 +269,14 @@ def test_weights_without_head_predict_by_the_other_methods(method: str, world: P
 def scored(world: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What `evaluate --weights --json --pictures` wrote."""
     out = tmp_path_factory.mktemp("scored")
-    options = ("--weights", world / "w.safetensors", "--json", out / "m.json", "--pictures", out / "pictures")
+    options = (
+        "--weights",
+        world / "w.safetensors",
+        "--json",
+        out / "m.json",
+        "--pictures",
+        out / "pictures",
+    )
     assert amvnet("evaluate", world / "data", *options)[0] == 0
     return out
 
@@ -245,7 +291,9 @@ def test_the_figures_have_the_contracts_structure(world: Path, scored: Path) -> 
         assert set(method) == OVERALL | {"by_distance"}
         assert list(method["iou"]) == list(SEMANTICKITTI.classes)
         assert all(0 <= method[key] <= 1 for key in OVERALL - {"iou"})
-        assert [(b["from_m"], b["to_m"]) for b in method["by_distance"]] == [(i, i + 10) for i in range(0, 50, 10)]
+        assert [(b["from_m"], b["to_m"]) for b in method["by_distance"]] == [
+            (i, i + 10) for i in range(0, 50, 10)
+        ]
         assert all(OVERALL | {"from_m", "to_m"} <= set(b) for b in method["by_distance"])
 
 
@@ -259,15 +307,31 @@ def test_predictions_score_as_the_weights_that_made_them(
     method: str, world: Path, scored: Path, tmp_path: Path
 ) -> None:
     weights = ("--weights", world / "w.safetensors", "--method", method)
-    assert amvnet("predict", world / "data", *weights, "--out", tmp_path, "--sequences", "08")[0] == 0
-    assert amvnet("evaluate", world / "data", "--predictions", tmp_path, "--json", tmp_path / "m.json")[0] == 0
+    assert (
+        amvnet("predict", world / "data", *weights, "--out", tmp_path, "--sequences", "08")[0] == 0
+    )
+    assert (
+        amvnet(
+            "evaluate", world / "data", "--predictions", tmp_path, "--json", tmp_path / "m.json"
+        )[0]
+        == 0
+    )
     figures = json.loads((tmp_path / "m.json").read_text())
     assert figures["uncertain_fraction"] is None
-    assert figures["methods"] == {"predictions": json.loads((scored / "m.json").read_text())["methods"][method]}
+    assert figures["methods"] == {
+        "predictions": json.loads((scored / "m.json").read_text())["methods"][method]
+    }
 
 
 def test_sequences_that_are_named_are_scored(world: Path, tmp_path: Path) -> None:
-    options = ("--weights", world / "headless.safetensors", "--sequences", "00,01", "--json", tmp_path / "m.json")
+    options = (
+        "--weights",
+        world / "headless.safetensors",
+        "--sequences",
+        "00,01",
+        "--json",
+        tmp_path / "m.json",
+    )
     assert amvnet("evaluate", world / "data", *options)[0] == 0
     figures = json.loads((tmp_path / "m.json").read_text())
     assert figures["scans"] == 4
@@ -275,12 +339,19 @@ def test_sequences_that_are_named_are_scored(world: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("name", "predictions"), [("semantickitti", "."), ("nuscenes", "results")])
-def test_the_golden_sets_score_as_the_official_tools_say(name: str, predictions: str, tmp_path: Path) -> None:
+def test_the_golden_sets_score_as_the_official_tools_say(
+    name: str, predictions: str, tmp_path: Path
+) -> None:
     data, out = GOLDEN / name, tmp_path / "m.json"
-    assert amvnet("evaluate", f"{name}:{data}", "--predictions", data / predictions, "--json", out)[0] == 0
+    assert (
+        amvnet("evaluate", f"{name}:{data}", "--predictions", data / predictions, "--json", out)[0]
+        == 0
+    )
     ours = json.loads(out.read_text())["methods"]["predictions"]
     said = json.loads((data / "expected.json").read_text())
-    expected = {"miou": said["miou"], "iou": said["iou_per_class"]} if name == "nuscenes" else said["all"]
+    expected = (
+        {"miou": said["miou"], "iou": said["iou_per_class"]} if name == "nuscenes" else said["all"]
+    )
     assert ours["miou"] == pytest.approx(expected["miou"], abs=1e-9)
     assert set(ours["iou"]) == set(expected["iou"]) - {"ignore"}
     for label, value in ours["iou"].items():
@@ -293,7 +364,15 @@ def test_the_golden_sets_score_as_the_official_tools_say(name: str, predictions:
 def test_info_says_what_the_weights_are(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(world / "w.safetensors")]) == 0
     shown = capsys.readouterr().out
-    words = ("19 of semantickitti", "16 x 64", "range_net", "polar_net", "point_head", "| 50.0 |", "amvnet.load")
+    words = (
+        "19 of semantickitti",
+        "16 x 64",
+        "range_net",
+        "polar_net",
+        "point_head",
+        "| 50.0 |",
+        "amvnet.load",
+    )
     assert all(word in shown for word in words)
 
 
@@ -307,18 +386,39 @@ def test_info_says_what_is_installed(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_bench_times_every_stage(world: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "--weights", f"{world}/w.safetensors", "--scan", f"{world}/lone.bin", "--runs", "1"]) == 0
+    assert (
+        main(
+            [
+                "bench",
+                "--weights",
+                f"{world}/w.safetensors",
+                "--scan",
+                f"{world}/lone.bin",
+                "--runs",
+                "1",
+            ]
+        )
+        == 0
+    )
     shown = " ".join(capsys.readouterr().out.split())
-    assert all(stage in shown for stage in ("300 points", "read", "RV", "BEV", "neighbours", "head", "fusion", "limit"))
+    assert all(
+        stage in shown
+        for stage in ("300 points", "read", "RV", "BEV", "neighbours", "head", "fusion", "limit")
+    )
 
 
 def test_benchs_figures_add_up(world: Path, tmp_path: Path) -> None:
-    command = f"bench --weights {world}/w.safetensors --scan {world}/lone.bin --runs 3 --uncertain 0.25"
+    command = (
+        f"bench --weights {world}/w.safetensors --scan {world}/lone.bin --runs 3 --uncertain 0.25"
+    )
     assert main([*command.split(), "--json", str(tmp_path / "b.json")]) == 0
     (found,) = json.loads((tmp_path / "b.json").read_text())
     assert (found["points"], found["uncertain"], found["runs"]) == (300, 75, 3)
     stages = {name: spread["median"] for name, spread in found["stages_ms"].items()}
-    assert all(spread["low"] <= spread["median"] <= spread["high"] for spread in found["stages_ms"].values())
+    assert all(
+        spread["low"] <= spread["median"] <= spread["high"]
+        for spread in found["stages_ms"].values()
+    )
     mean = stages.pop("mean")
     assert 0 < mean < sum(stages.values())
     assert sum(stages.values()) == pytest.approx(found["all_ms"]["median"], rel=0.5)
@@ -334,5 +434,18 @@ def test_benchs_figures_add_up(world: Path, tmp_path: Path) -> None:
 def test_bench_times_a_recipe_with_random_weights(
     tmp_path: Path, world: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["bench", "--recipe", f"{world}/recipe.yaml", "--scan", f"{world}/lone.bin", "--runs", "1"]) == 0
+    assert (
+        main(
+            [
+                "bench",
+                "--recipe",
+                f"{world}/recipe.yaml",
+                "--scan",
+                f"{world}/lone.bin",
+                "--runs",
+                "1",
+            ]
+        )
+        == 0
+    )
     assert "10.0% of them uncertain" in " ".join(capsys.readouterr().out.split())

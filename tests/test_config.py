@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 import yaml
 
-from amvnet.config import ModelConfig, Recipe
+from amvnet.config.nested import from_dict, merge_trees, to_dict
+from amvnet.config.recipes import load_recipe, recipe_names
+from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.errors import InputError
-from amvnet.recipes import load_recipe, recipe_names
-from amvnet.trees import from_dict, merge_trees, to_dict
 
 
 def write(folder: Path, text: str) -> str:
@@ -25,7 +25,11 @@ def write(folder: Path, text: str) -> str:
 def leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, value in tree.items():
-        flat |= leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        flat |= (
+            leaves(value, f"{prefix}{key}.")
+            if isinstance(value, dict)
+            else {f"{prefix}{key}": value}
+        )
     return flat
 
 
@@ -42,20 +46,40 @@ def test_a_recipe_survives_the_way_to_json_and_yaml_and_back(name: str) -> None:
 def test_every_builtin_recipe_is_there() -> None:
     names = {"semantickitti", "nuscenes", "simulated"}
     names |= {f"{name}-{part}" for name in names - {"simulated"} for part in ("polarnet", "no-rnn")}
-    assert set(recipe_names()) == names | {f"{name}-compact" for name in names} | {"simulated-hdl32e-compact"}
+    assert set(recipe_names()) == names | {f"{name}-compact" for name in names} | {
+        "simulated-hdl32e-compact"
+    }
 
 
 def test_the_recipes_hold_the_papers_numbers() -> None:
     kitti, nuscenes = load_recipe("semantickitti"), load_recipe("nuscenes")
     view, grid = kitti.model.range_view, kitti.model.polar_view
-    assert (view.rows, view.height, view.width, view.fov_up, view.fov_down) == ("elevation", 64, 4096, 3.0, -25.0)
+    assert (view.rows, view.height, view.width, view.fov_up, view.fov_down) == (
+        "elevation",
+        64,
+        4096,
+        3.0,
+        -25.0,
+    )
     assert (grid.radial, grid.angular, grid.vertical, grid.radius_max) == (480, 360, 32, 50.0)
     assert (grid.z_min, grid.z_max) == (-3.0, 1.5)
     assert (kitti.model.assertion.threshold, kitti.model.point_head.neighbours) == (0.85, 15)
-    assert [(s.epochs, s.batch) for s in (kitti.training.rv, kitti.training.bev)] == [(160, 32), (40, 8)]
+    assert [(s.epochs, s.batch) for s in (kitti.training.rv, kitti.training.bev)] == [
+        (160, 32),
+        (40, 8),
+    ]
     view, grid = nuscenes.model.range_view, nuscenes.model.polar_view
-    assert (view.rows, view.height, view.width, grid.z_min, grid.z_max) == ("ring", 32, 1920, -2.0, 4.0)
-    assert [(s.epochs, s.batch) for s in (nuscenes.training.rv, nuscenes.training.bev)] == [(400, 64), (40, 8)]
+    assert (view.rows, view.height, view.width, grid.z_min, grid.z_max) == (
+        "ring",
+        32,
+        1920,
+        -2.0,
+        4.0,
+    )
+    assert [(s.epochs, s.batch) for s in (nuscenes.training.rv, nuscenes.training.bev)] == [
+        (400, 64),
+        (40, 8),
+    ]
     assert nuscenes.taxonomy == "nuscenes"
 
 
@@ -92,7 +116,9 @@ def test_an_empty_tree_gives_the_defaults() -> None:
         ("7: seven", "7"),
     ],
 )
-def test_a_wrong_key_or_value_is_an_input_error_that_names_it(tmp_path: Path, text: str, named: str) -> None:
+def test_a_wrong_key_or_value_is_an_input_error_that_names_it(
+    tmp_path: Path, text: str, named: str
+) -> None:
     with pytest.raises(InputError, match=f"mine.yaml.*{named}") as caught:
         load_recipe(write(tmp_path, text))
     assert "\n" not in str(caught.value)
@@ -135,7 +161,10 @@ def test_a_list_of_booleans_is_no_list_of_numbers(tmp_path: Path) -> None:
 @pytest.mark.parametrize("base", ["nuscenes-compact", "semantickitti"])
 def test_a_users_file_overrides_just_what_it_states(tmp_path: Path, base: str) -> None:
     text = f"base: {base}\nmodel: {{range_view: {{width: 96}}}}\ntraining: {{rv: {{lr: 1}}, keep: last}}"
-    found, original = leaves(to_dict(load_recipe(write(tmp_path, text)))), leaves(to_dict(load_recipe(base)))
+    found, original = (
+        leaves(to_dict(load_recipe(write(tmp_path, text)))),
+        leaves(to_dict(load_recipe(base))),
+    )
     changed = {key: value for key, value in found.items() if value != original[key]}
     assert changed == {"model.range_view.width": 96, "training.rv.lr": 1.0, "training.keep": "last"}
     assert isinstance(found["training.rv.lr"], float)
@@ -148,12 +177,16 @@ def test_numbers_with_an_exponent_are_numbers(tmp_path: Path, text: str, value: 
 
 def test_a_users_file_without_a_base_builds_on_the_papers_sizes(tmp_path: Path) -> None:
     recipe = load_recipe(write(tmp_path, "training: {seed: 5}"))
-    assert recipe == dataclasses.replace(Recipe(), training=dataclasses.replace(Recipe().training, seed=5))
+    assert recipe == dataclasses.replace(
+        Recipe(), training=dataclasses.replace(Recipe().training, seed=5)
+    )
 
 
 def test_a_users_file_may_build_on_another_users_file(tmp_path: Path) -> None:
     (tmp_path / "first.yaml").write_text("base: nuscenes\ntraining: {seed: 5, workers: 2}")
-    training = load_recipe(write(tmp_path, f"base: {tmp_path / 'first.yaml'}\ntraining: {{seed: 6}}")).training
+    training = load_recipe(
+        write(tmp_path, f"base: {tmp_path / 'first.yaml'}\ntraining: {{seed: 6}}")
+    ).training
     assert (training.seed, training.workers, training.rv.epochs) == (6, 2, 400)
 
 
@@ -184,6 +217,8 @@ def test_merging_trees_leaves_both_as_they_were() -> None:
         "training: {augment: {flip: 1.5}}",
     ],
 )
-def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(tmp_path: Path, text: str) -> None:
+def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(
+    tmp_path: Path, text: str
+) -> None:
     with pytest.raises(InputError, match=r"mine\.yaml: .*expected .* found .*correct the value"):
         load_recipe(write(tmp_path, text))

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from worlds import fails
 
-from amvnet.data.catalog import Dataset, is_dataset, open_dataset
-from amvnet.data.labels import SEMANTICKITTI, Taxonomy
-from amvnet.data.nuscenes import MINI_TRAIN, MINI_VAL, VAL
+from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, VAL
+from amvnet.data.datasets.open import Dataset, is_dataset, open_dataset
+from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 
 COUNTS = (7, 5)  # points of the two scans of each sequence
 REAL = os.environ.get("AMVNET_REAL_DATA")
@@ -68,10 +68,17 @@ def make_nuscenes(root: Path) -> Layout:
     for scene in ("scene-0103", "scene-0061"):
         tables["scene"].append({"token": scene, "name": scene})
         for scan, count in enumerate(COUNTS):
-            token = f"{scene}-{9 - scan}"  # later scans sort first by token, so that the order shows
+            token = (
+                f"{scene}-{9 - scan}"  # later scans sort first by token, so that the order shows
+            )
             name = f"samples/LIDAR_TOP/{token}.pcd.bin"
             tables["sample"].append({"token": f"s{token}", "scene_token": scene})
-            data = {"token": token, "sample_token": f"s{token}", "timestamp": scan, "filename": name}
+            data = {
+                "token": token,
+                "sample_token": f"s{token}",
+                "timestamp": scan,
+                "filename": name,
+            }
             key = {**data, "is_key_frame": True, "calibrated_sensor_token": "cl"}
             sweep = {
                 **key,
@@ -87,8 +94,12 @@ def make_nuscenes(root: Path) -> Layout:
             }
             tables["sample_data"] += [camera, key, sweep]
             label = f"lidarseg/v1.0-mini/{token}_lidarseg.bin"
-            tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": label})
-            rows = np.array([[1 + i, 2, 3, 51 * (i % 6), i % 32] for i in range(count)], dtype=np.float32)
+            tables["lidarseg"].append(
+                {"token": token, "sample_data_token": token, "filename": label}
+            )
+            rows = np.array(
+                [[1 + i, 2, 3, 51 * (i % 6), i % 32] for i in range(count)], dtype=np.float32
+            )
             rows.tofile(root / name)
             np.resize(np.array([1, 2, 0, 3], dtype=np.uint8), count).tofile(root / label)
     for table, rows_ in tables.items():
@@ -103,7 +114,10 @@ def make_nuscenes(root: Path) -> Layout:
     )
 
 
-MAKERS: dict[str, Callable[[Path], Layout]] = {"semantickitti": make_semantickitti, "nuscenes": make_nuscenes}
+MAKERS: dict[str, Callable[[Path], Layout]] = {
+    "semantickitti": make_semantickitti,
+    "nuscenes": make_nuscenes,
+}
 
 
 @pytest.fixture(params=MAKERS)
@@ -170,7 +184,11 @@ def test_wrong_predictions_are_named(layout: Layout, tmp_path: Path) -> None:
     record = dataset.records(layout.sequences[:1])[0]
     out = tmp_path / "out" / record.prediction
     fails(lambda: dataset.read_prediction(record, tmp_path / "out"), out)
-    fails(lambda: dataset.write_prediction(record, tmp_path / "out", np.ones(6)), record.points_path, 7)
+    fails(
+        lambda: dataset.write_prediction(record, tmp_path / "out", np.ones(6)),
+        record.points_path,
+        7,
+    )
     fails(lambda: dataset.write_prediction(record, tmp_path / "out", np.full(7, 20)), "20")
     assert not out.exists()
     out.parent.mkdir(parents=True)
@@ -302,8 +320,18 @@ def test_catalog_names_what_it_looked_for(tmp_path: Path) -> None:
 
 def test_another_taxonomy_can_be_given(tmp_path: Path) -> None:
     layout = make_semantickitti(tmp_path)
-    other = Taxonomy("two", ("car", "rest"), ((0, 0, 0),) * 3, {252: 1, 40: 2, 99: 2, 81: 2}, (0, 252, 40), {}, True)
-    scan = open_dataset(layout.spec, other).read(open_dataset(layout.spec, other).records(["08"])[0])
+    other = Taxonomy(
+        "two",
+        ("car", "rest"),
+        ((0, 0, 0),) * 3,
+        {252: 1, 40: 2, 99: 2, 81: 2},
+        (0, 252, 40),
+        {},
+        True,
+    )
+    scan = open_dataset(layout.spec, other).read(
+        open_dataset(layout.spec, other).records(["08"])[0]
+    )
     assert scan.labels is not None
     assert scan.labels.tolist() == [1, 2, 2, 2, 1, 2, 2]
 
@@ -312,7 +340,9 @@ def test_another_taxonomy_can_be_given(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not REAL, reason="AMVNET_REAL_DATA does not name a folder")
-@pytest.mark.parametrize(("name", "sequence", "rings"), [("semantickitti", "07", 0), ("nuscenes", "scene-0523", 32)])
+@pytest.mark.parametrize(
+    ("name", "sequence", "rings"), [("semantickitti", "07", 0), ("nuscenes", "scene-0523", 32)]
+)
 def test_real_scans_open(name: str, sequence: str, rings: int) -> None:
     dataset = open_dataset(str(Path(REAL or "") / name))
     records = dataset.records([sequence])
@@ -320,5 +350,9 @@ def test_real_scans_open(name: str, sequence: str, rings: int) -> None:
     assert len(records) == 10
     assert len(scan) > 30_000
     assert 0 <= scan.points[:, 3].min() <= scan.points[:, 3].max() <= 1
-    assert (scan.ring is None) if not rings else (scan.ring is not None and scan.ring.max() == rings - 1)
+    assert (
+        (scan.ring is None)
+        if not rings
+        else (scan.ring is not None and scan.ring.max() == rings - 1)
+    )
     assert (scan.labels is None) == (records[0].labels_path is None)

@@ -13,17 +13,17 @@ from torch.nn import functional as F
 from worlds import fails, files, fresh_weights
 
 import amvnet
-from amvnet import engines
-from amvnet.data.catalog import open_dataset
-from amvnet.engines import cache_folder, engage, exported
+from amvnet.data.datasets.open import open_dataset
+from amvnet.export import engines
+from amvnet.export.engines import cache_folder, exported, use_engine
+from amvnet.inference.segmenter import Segmenter, expand_to_scan
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
 from amvnet.models.point_head import head_features, point_table
+from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter, in_place
 from amvnet.simulation import simulate
-from amvnet.views.points import PointBatch
-from amvnet.weights import Weights
+from amvnet.weights.file import Weights
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def check_equal(weights: object, engine: str) -> None:
     """Both networks' probabilities within 1e-4, labels on 99.99 % of the points."""
     before, after = Segmenter(weights), Segmenter(weights)
     untouched = after.model.range_net
-    assert engage(after, engine) == engine
+    assert use_engine(after, engine) == engine
     assert after.model.range_net is not untouched
     for seed in range(3):
         expected, found = before(scan(seed)), after(scan(seed))
@@ -66,7 +66,7 @@ def test_onnx_says_what_torch_says_and_exports_once(cache: Path) -> None:
     assert folder.is_relative_to(cache)
     written = {name: (folder / name).stat().st_mtime_ns for name in files(folder)}
     assert "amvnet.json" in written
-    engage(Segmenter(fresh_weights()), "onnx")
+    use_engine(Segmenter(fresh_weights()), "onnx")
     assert {name: (folder / name).stat().st_mtime_ns for name in files(folder)} == written
 
 
@@ -84,14 +84,14 @@ def test_onnx_runs_the_methods_of_one_network() -> None:
     for method in ("rv", "bev"):
         segmenter = Segmenter(fresh_weights(), method=method)
         expected = segmenter(scan(0)).scores
-        engage(segmenter, "onnx")
+        use_engine(segmenter, "onnx")
         np.testing.assert_allclose(segmenter(scan(0)).scores, expected, atol=1e-4)
 
 
 def test_onnx_takes_scans_one_by_one(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     segmenter = Segmenter(fresh_weights())
-    engage(segmenter, "onnx")
+    use_engine(segmenter, "onnx")
     fails(lambda: segmenter.model.range_net(torch.zeros(2, 6, 16, 64)), "one scan", "2")
 
 
@@ -108,20 +108,26 @@ def test_without_a_compiler_compile_is_one_line(monkeypatch: pytest.MonkeyPatch)
         return run
 
     monkeypatch.setattr(torch, "compile", broken)
-    fails(lambda: engage(Segmenter(fresh_weights()), "compile"), "no working C++ compiler", "engine torch")
+    fails(
+        lambda: use_engine(Segmenter(fresh_weights()), "compile"),
+        "no working C++ compiler",
+        "engine torch",
+    )
 
 
 def test_other_engines_and_missing_libraries_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    fails(lambda: engage(Segmenter(fresh_weights()), "tensorrt"), "tensorrt", "onnx")
+    fails(lambda: use_engine(Segmenter(fresh_weights()), "tensorrt"), "tensorrt", "onnx")
     fails(lambda: amvnet.load("sim-hdl64e", engine="tensorrt"), "tensorrt")
-    monkeypatch.setattr("amvnet.export.EXTRA", ("no_such_library",))
-    fails(lambda: engage(Segmenter(fresh_weights()), "onnx"), "no_such_library", "amvnet[export]")
+    monkeypatch.setattr("amvnet.export.onnx.EXTRA", ("no_such_library",))
+    fails(
+        lambda: use_engine(Segmenter(fresh_weights()), "onnx"), "no_such_library", "amvnet[export]"
+    )
 
 
 def test_auto_is_torch_as_it_is() -> None:
     segmenter = Segmenter(fresh_weights())
     before = segmenter.model.range_net
-    assert engage(segmenter, "auto") == engines.FASTEST == "torch"
+    assert use_engine(segmenter, "auto") == engines.FASTEST == "torch"
     assert segmenter.model.range_net is before
 
 
@@ -160,20 +166,25 @@ def plainly(weights: Weights, scan: Scan) -> np.ndarray:
     for i, n in zip(index.split(2000), near.split(2000), strict=True):
         rows = head_features(model.point_head.config, point_table(batch.points, f, g), i, n)
         merged[i] = model.point_head(*rows).softmax(dim=1)
-    return in_place(merged.argmax(dim=1) + 1, scan.valid)
+    return expand_to_scan(merged.argmax(dim=1) + 1, scan.valid)
 
 
 def nearest_by_scipy(xyz: np.ndarray, own: np.ndarray, n: int = 15) -> np.ndarray:
     """The n nearest others; where the point itself is not among the n + 1 nearest, others lie in its place."""
     found = cKDTree(xyz, balanced_tree=False, compact_nodes=False).query(xyz[own], k=n + 1)[1]
-    return np.array([[i for i in row if i != self][:n] for self, row in zip(own, found, strict=True)])
+    return np.array(
+        [[i for i in row if i != self][:n] for self, row in zip(own, found, strict=True)]
+    )
 
 
 def scans_to_compare() -> list[tuple[str, str]]:
     """Weights and data sets: simulated, and real ones where they are at hand."""
     found = [("sim-hdl64e", "simulated:hdl64e"), ("sim-hdl32e", "simulated:hdl32e")]
     if real := os.environ.get("AMVNET_REAL_DATA"):
-        found += [("sim-hdl64e", f"semantickitti:{real}/semantickitti"), ("sim-hdl32e", f"nuscenes:{real}/nuscenes")]
+        found += [
+            ("sim-hdl64e", f"semantickitti:{real}/semantickitti"),
+            ("sim-hdl32e", f"nuscenes:{real}/nuscenes"),
+        ]
     return found
 
 
@@ -188,9 +199,14 @@ def test_what_makes_it_fast_leaves_the_labels_as_they_are(
         data = ("semantickitti:" if place == "hdl64e" else "nuscenes:") + str(tmp_path)
     dataset, segmenter = open_dataset(data), Segmenter(weights)
     equal = []
-    for record in dataset.records(dataset.sequences("all"))[:: 20 if kind == "semantickitti" else 4][:4]:
+    for record in dataset.records(dataset.sequences("all"))[
+        :: 20 if kind == "semantickitti" else 4
+    ][:4]:
         scan = dataset.read(record, labels=False)
-        with torch.enable_grad(), monkeypatch.context() as patched:  # with gradients: the plain way of `joined`
+        with (
+            torch.enable_grad(),
+            monkeypatch.context() as patched,
+        ):  # with gradients: the plain way of `joined`
             patched.setattr(layers, "linear", F.linear)
             plain = plainly(segmenter.weights, scan)
         equal.append((plain == segmenter(scan).labels).mean())

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
-from amvnet.evaluation import Evaluation, confusion, metrics
+from amvnet.evaluation.metrics import Evaluation, confusion, metrics
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -55,11 +55,15 @@ def test_nuscenes_equals_the_official_tool() -> None:
     assert figures["fwiou"] == pytest.approx(expected["freq_weighted_iou"], abs=1e-9)
     for name, value in figures["iou"].items():
         assert value == (
-            None if expected["iou_per_class"][name] is None else pytest.approx(expected["iou_per_class"][name])
+            None
+            if expected["iou_per_class"][name] is None
+            else pytest.approx(expected["iou_per_class"][name])
         )
 
 
-def draw(seed: int, count: int = 500, size: int = 16) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def draw(
+    seed: int, count: int = 500, size: int = 16
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     points = rng.normal(0, 20, (count, 4)).astype(np.float32)
     truth, prediction = rng.integers(0, size + 1, (2, count)).astype(np.uint8)
@@ -136,8 +140,17 @@ def test_report_has_the_keys_of_the_contract() -> None:
     assert list(report) == ["dataset", "scans", "points", "uncertain_fraction", "methods"]
     assert (report["dataset"], report["scans"], report["points"]) == ("nuscenes:here", 1, 500)
     assert report["uncertain_fraction"] == pytest.approx(scan[3].mean())
-    assert set(report["methods"]["amvnet"]) == {"miou", "miou_present", "accuracy", "fwiou", "iou", "by_distance"}
-    assert {"from_m", "to_m", "miou", "accuracy", "points"} <= set(report["methods"]["rv"]["by_distance"][0])
+    assert set(report["methods"]["amvnet"]) == {
+        "miou",
+        "miou_present",
+        "accuracy",
+        "fwiou",
+        "iou",
+        "by_distance",
+    }
+    assert {"from_m", "to_m", "miou", "accuracy", "points"} <= set(
+        report["methods"]["rv"]["by_distance"][0]
+    )
     json.dumps(report, allow_nan=False)
 
 
@@ -149,11 +162,20 @@ def test_uncertain_fraction_is_null_where_nothing_says_so() -> None:
 
 
 def test_distance_bins_are_open_at_both_ends() -> None:
-    points = np.array([[0, 0, 0, 0], [0, 0, 1, 0], [10, 0, 0, 0], [0, 10.5, 0, 0], [60, 0, 0, 0]], dtype=np.float32)
+    points = np.array(
+        [[0, 0, 0, 0], [0, 0, 1, 0], [10, 0, 0, 0], [0, 10.5, 0, 0], [60, 0, 0, 0]],
+        dtype=np.float32,
+    )
     ids = np.ones(5, dtype=np.uint8)
     evaluation = Evaluation(NUSCENES)
     evaluation.add(points, ids, {"rv": ids})
-    assert [b["points"] for b in evaluation.report("x")["methods"]["rv"]["by_distance"]] == [1, 1, 0, 0, 0]
+    assert [b["points"] for b in evaluation.report("x")["methods"]["rv"]["by_distance"]] == [
+        1,
+        1,
+        0,
+        0,
+        0,
+    ]
 
 
 def test_what_does_not_fit_is_refused() -> None:

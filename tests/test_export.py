@@ -16,12 +16,13 @@ import pytest
 import torch
 from worlds import amvnet, commands_of, fails, files, fresh_weights, street, without
 
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.neighbours import nearest_others
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.inference.methods import Method
+from amvnet.inference.segmenter import Segmenter
+from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan
-from amvnet.segmenter import Method, Segmenter
-from amvnet.weights import Weights, save
+from amvnet.weights.file import Weights, save
 
 DOCS = Path(__file__).parents[1] / "docs"
 POINTS = 6000
@@ -32,7 +33,7 @@ TAXONOMIES = {"elevation": SEMANTICKITTI, "ring": NUSCENES}  # by what fresh_wei
 def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Weights, Path]]:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library)
-    from amvnet.export import export
+    from amvnet.export.onnx import export
 
     found = {}
     for rows, taxonomy in TAXONOMIES.items():
@@ -59,7 +60,9 @@ def scan_of(seed: int, count: int = POINTS) -> Scan:
 
 @pytest.mark.parametrize("rows", TAXONOMIES)
 @pytest.mark.parametrize("count", [6, 700, POINTS])
-def test_the_runner_says_what_torch_says(exported: dict[str, tuple[Weights, Path]], rows: str, count: int) -> None:
+def test_the_runner_says_what_torch_says(
+    exported: dict[str, tuple[Weights, Path]], rows: str, count: int
+) -> None:
     weights, folder = exported[rows]
     scan = scan_of(count, count)
     expected, found = Segmenter(weights)(scan), OnnxSegmenter(folder)(scan.points, scan.ring)
@@ -76,7 +79,9 @@ def test_the_runner_says_what_torch_says(exported: dict[str, tuple[Weights, Path
 
 
 @pytest.mark.parametrize("rows", TAXONOMIES)
-def test_the_networks_alone_say_what_torch_says(exported: dict[str, tuple[Weights, Path]], rows: str) -> None:
+def test_the_networks_alone_say_what_torch_says(
+    exported: dict[str, tuple[Weights, Path]], rows: str
+) -> None:
     weights, folder = exported[rows]
     scan, runner = scan_of(7), OnnxSegmenter(folder)
     expected, valid = Segmenter(weights)(scan), scan.valid
@@ -100,7 +105,9 @@ def test_other_methods_say_what_torch_says(
     assert (expected.uncertain == found.uncertain).mean() >= 0.9999
 
 
-def test_the_description_says_what_a_program_needs(exported: dict[str, tuple[Weights, Path]]) -> None:
+def test_the_description_says_what_a_program_needs(
+    exported: dict[str, tuple[Weights, Path]],
+) -> None:
     import onnx
 
     weights, folder = exported["ring"]
@@ -111,17 +118,28 @@ def test_the_description_says_what_a_program_needs(exported: dict[str, tuple[Wei
     assert said["range_view"]["rows"] == "ring"
     assert said["sensor"] == "tiny"
     assert said["assertion"]["threshold"] == weights.model.assertion.threshold
-    assert said["point_head"] == {"neighbours": 4, "position_scale": weights.model.point_head.position_scale}
+    assert said["point_head"] == {
+        "neighbours": 4,
+        "position_scale": weights.model.point_head.position_scale,
+    }
     assert len(said["polar_features"]) == 9
     assert len(said["range_channels"]) == 6
     for name, graph in said["graphs"].items():
         model = onnx.load(folder / graph["file"])
         assert {one.domain: one.version for one in model.opset_import}[""] == said["opset"], name
-        for ours, theirs in ((graph["inputs"], model.graph.input), (graph["outputs"], model.graph.output)):
-            shapes = [[d.dim_param or d.dim_value for d in one.type.tensor_type.shape.dim] for one in theirs]
+        for ours, theirs in (
+            (graph["inputs"], model.graph.input),
+            (graph["outputs"], model.graph.output),
+        ):
+            shapes = [
+                [d.dim_param or d.dim_value for d in one.type.tensor_type.shape.dim]
+                for one in theirs
+            ]
             assert [one["shape"] for one in ours] == shapes, name
             assert [one["name"] for one in ours] == [one.name for one in theirs], name
-    shapes = {name: [one["shape"] for one in graph["inputs"]] for name, graph in said["graphs"].items()}
+    shapes = {
+        name: [one["shape"] for one in graph["inputs"]] for name, graph in said["graphs"].items()
+    }
     assert shapes["point_head"] == [["uncertain", 36], ["uncertain", 4, 36]]
     assert said["graphs"]["polar_map"]["outputs"][0]["shape"][2:] == [12, 16]
     assert said["graphs"]["polar_scores"]["outputs"][0]["shape"] == ["pillars", 4 * 16]
@@ -134,7 +152,9 @@ def test_the_graphs_say_nothing_of_the_machine(exported: dict[str, tuple[Weights
             assert word.encode() not in data, path.name
 
 
-def test_the_runner_needs_no_torch(exported: dict[str, tuple[Weights, Path]], tmp_path: Path) -> None:
+def test_the_runner_needs_no_torch(
+    exported: dict[str, tuple[Weights, Path]], tmp_path: Path
+) -> None:
     weights, folder = exported["elevation"]
     scan = scan_of(5)
     np.save(tmp_path / "points.npy", scan.points)
@@ -156,7 +176,9 @@ def test_pooling_is_the_maximum_of_each_pillar() -> None:
     occupied, pooled = pool(pillar, features)
     assert occupied.tolist() == sorted(set(pillar.tolist()))
     for place, values in zip(occupied, pooled, strict=True):
-        assert values.tolist() == [max(features[i, c] for i in range(50) if pillar[i] == place) for c in range(3)]
+        assert values.tolist() == [
+            max(features[i, c] for i in range(50) if pillar[i] == place) for c in range(3)
+        ]
 
 
 def test_neighbours_are_the_nearest_of_all_others() -> None:
@@ -189,22 +211,35 @@ def _change(folder: Path, *keys: str, to: object) -> None:
         (lambda folder: _change(folder, "method", to=["rv"]), "method"),
         (lambda folder: _change(folder, "graphs", to=3), "range_net"),
         (lambda folder: _change(folder, "graphs", "polar_map", to={}), "polar_map"),
-        (lambda folder: _change(folder, "graphs", "polar_map", "inputs", to=[{"name": 1, "shape": 2}]), "polar_map"),
+        (
+            lambda folder: _change(
+                folder, "graphs", "polar_map", "inputs", to=[{"name": 1, "shape": 2}]
+            ),
+            "polar_map",
+        ),
         (lambda folder: _change(folder, "range_view", "height", to=-4), "height"),
         (lambda folder: _change(folder, "range_view", "width", to=32), "range_net"),
         (lambda folder: _change(folder, "point_head", "neighbours", to=3), "point_head"),
         (lambda folder: (folder / "point_head.onnx").unlink(), "point_head.onnx"),
         (_cut, "range_net.onnx"),
-        (lambda folder: shutil.copy(folder / "polar_map.onnx", folder / "range_net.onnx"), "range_net.onnx"),
+        (
+            lambda folder: shutil.copy(folder / "polar_map.onnx", folder / "range_net.onnx"),
+            "range_net.onnx",
+        ),
     ],
 )
-def test_a_broken_folder_is_one_line(folder: Path, breaks: Callable[[Path], object], word: str) -> None:
+def test_a_broken_folder_is_one_line(
+    folder: Path, breaks: Callable[[Path], object], word: str
+) -> None:
     breaks(folder)
     fails(lambda: OnnxSegmenter(folder), word, "export anew" if word != "height" else "height")
 
 
 def test_wrong_scans_are_one_line(exported: dict[str, tuple[Weights, Path]]) -> None:
-    by_ring, by_elevation = OnnxSegmenter(exported["ring"][1]), OnnxSegmenter(exported["elevation"][1])
+    by_ring, by_elevation = (
+        OnnxSegmenter(exported["ring"][1]),
+        OnnxSegmenter(exported["elevation"][1]),
+    )
     points = scan_of(0, 10).points[:4]
     fails(lambda: by_ring(points), "ring index")
     fails(lambda: by_ring(points, np.full(4, 99)), "0 to 31")
@@ -243,13 +278,17 @@ def test_the_verb_exports_and_its_mistakes_are_one_line(
 def test_a_graph_that_differs_leaves_no_files(
     exported: dict[str, tuple[Weights, Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from amvnet import export as module
+    from amvnet.export import onnx as module
 
     run = module._run
 
     def wrong(path: Path, graph: module.Graph) -> tuple[object, object, torch.Tensor]:
         inputs, outputs, found = run(path, graph)
-        return inputs, outputs, found + torch.linspace(0, 1, found.shape[1]).view(1, -1, *[1] * (found.ndim - 2))
+        return (
+            inputs,
+            outputs,
+            found + torch.linspace(0, 1, found.shape[1]).view(1, -1, *[1] * (found.ndim - 2)),
+        )
 
     monkeypatch.setattr(module, "_run", wrong)
     weights = without(exported["elevation"][0], "range_net", "point_head")
@@ -258,7 +297,9 @@ def test_a_graph_that_differs_leaves_no_files(
 
 
 @pytest.mark.parametrize("library", ["onnx", "onnxscript", "onnxruntime"])
-def test_without_the_extra_the_command_is_said(library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_the_command_is_said(
+    library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("onnx")
     monkeypatch.setitem(sys.modules, library, None)
     code, line = amvnet("export", "--weights", "sim-hdl64e", "--out", tmp_path / "out")
@@ -268,7 +309,9 @@ def test_without_the_extra_the_command_is_said(library: str, tmp_path: Path, mon
     assert not (tmp_path / "out").exists()
 
 
-def test_the_runner_without_its_runtime_says_the_command(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_runner_without_its_runtime_says_the_command(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     fails(lambda: OnnxSegmenter(folder), "pip install onnxruntime")
 
@@ -289,6 +332,8 @@ def test_the_page_runs(
         else:
             assert words[:2] == ["pip", "install"], shlex.join(words)
     scope: dict[str, object] = {}
-    for block in re.findall(r"(?s)```python\n(.*?)```", (DOCS / "export.md").read_text(encoding="utf-8")):
+    for block in re.findall(
+        r"(?s)```python\n(.*?)```", (DOCS / "export.md").read_text(encoding="utf-8")
+    ):
         exec(block, scope)
     assert len(scope["result"].labels) == POINTS  # type: ignore[attr-defined]

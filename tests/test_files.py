@@ -11,8 +11,9 @@ import pytest
 import yaml
 from worlds import fails, label_map
 
-from amvnet.data.files import find_scans, read_scan, whole_file, write_labels
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
+from amvnet.data.scan_files import find_scans, read_scan, write_labels
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
+from amvnet.files import atomic_write
 
 # --- lone files ---
 
@@ -26,7 +27,9 @@ def test_lone_scans_in_every_format_agree(tmp_path: Path, scale: float) -> None:
     raw.tofile(tmp_path / "a.bin")
     np.save(tmp_path / "b.npy", raw.astype(np.float64))
     np.save(tmp_path / "c.npy", np.hstack([raw, ring]))
-    np.hstack([points * np.array([1, 1, 1, 255], dtype=np.float32), ring]).tofile(tmp_path / "d.pcd.bin")
+    np.hstack([points * np.array([1, 1, 1, 255], dtype=np.float32), ring]).tofile(
+        tmp_path / "d.pcd.bin"
+    )
     found = find_scans(tmp_path)
     assert [path.name for path in found] == ["a.bin", "b.npy", "c.npy", "d.pcd.bin"]
     for path in found:
@@ -84,7 +87,7 @@ def test_files_appear_whole_or_not_at_all(tmp_path: Path) -> None:
     target = tmp_path / "deep" / "a.label"
 
     def stop_halfway() -> None:
-        with whole_file(target) as part:
+        with atomic_write(target) as part:
             part.write_bytes(b"half")
             raise RuntimeError
 
@@ -143,7 +146,10 @@ def test_incomplete_label_maps_are_named(tmp_path: Path) -> None:
     for key in label_map():
         path.write_text(yaml.safe_dump({k: v for k, v in label_map().items() if k != key}))
         fails(lambda: taxonomy_from_yaml(path), path, key)
-    wrong = [{**label_map(), "labels": {0: "unlabeled"}}, {**label_map(), "learning_map": {70_000: 1}}]
+    wrong = [
+        {**label_map(), "labels": {0: "unlabeled"}},
+        {**label_map(), "learning_map": {70_000: 1}},
+    ]
     for content in ("a: [", "[1]", *map(yaml.safe_dump, wrong)):
         path.write_text(content)
         fails(lambda: taxonomy_from_yaml(path), path)

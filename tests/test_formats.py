@@ -26,11 +26,11 @@ from scan_files import (
 )
 from worlds import fails
 
-from amvnet.data.clouds import MAX_POINTS
-from amvnet.data.files import find_scans, read_scan
-from amvnet.data.formats import named_scans, read_cloud, stem
-from amvnet.data.pcd import unpack_lzf
-from amvnet.data.pointcloud2 import read_message
+from amvnet.data.formats.cloud import MAX_POINTS
+from amvnet.data.formats.detect import read_cloud, scan_stem, scans_in_file
+from amvnet.data.formats.pcd import unpack_lzf
+from amvnet.data.formats.pointcloud2 import read_message
+from amvnet.data.scan_files import find_scans, read_scan
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 LAS_STEP = 0.0006  # LAS holds millimetres
@@ -62,7 +62,9 @@ def test_every_format_holds_the_same_scan(folder: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.parametrize("disguise", ["scan.bin", "scan.ply", "scan", "scan.txt", "scan.pcd"])
-def test_the_content_counts_where_the_name_lies(folder: Path, tmp_path: Path, name: str, disguise: str) -> None:
+def test_the_content_counts_where_the_name_lies(
+    folder: Path, tmp_path: Path, name: str, disguise: str
+) -> None:
     (tmp_path / disguise).write_bytes((folder / name).read_bytes())
     scan = read_scan(tmp_path / disguise)
     np.testing.assert_allclose(scan.points, some_points(), rtol=0, atol=LAS_STEP)
@@ -70,7 +72,7 @@ def test_the_content_counts_where_the_name_lies(folder: Path, tmp_path: Path, na
 
 def test_a_folder_lists_all_of_them(folder: Path) -> None:
     assert [path.name for path in find_scans(folder)] == sorted(WRITERS)
-    names = [scan.name for path in find_scans(folder) for scan in named_scans(path)]
+    names = [scan.name for path in find_scans(folder) for scan in scans_in_file(path)]
     assert "nuscenes" in names
     assert "plain/000000" in names
     assert "lone/000000" in names
@@ -87,7 +89,10 @@ def test_a_folder_s_hidden_files_and_scores_are_no_scans(tmp_path: Path) -> None
 def test_a_truncated_file_is_refused(folder: Path, tmp_path: Path, name: str) -> None:
     content = (folder / name).read_bytes()
     path = tmp_path / f"cut.{name}"
-    for kept in (len(content) - 25, len(content) // 2 + 1):  # no whole number of rows where there are but rows
+    for kept in (
+        len(content) - 25,
+        len(content) // 2 + 1,
+    ):  # no whole number of rows where there are but rows
         path.write_bytes(content[:kept])
         fails(lambda: read_scan(path), path)
 
@@ -96,7 +101,15 @@ def test_a_truncated_file_is_refused(folder: Path, tmp_path: Path, name: str) ->
 
 
 def _padded(points: np.ndarray, real: str) -> np.ndarray:
-    kinds = [("_a", "u1", 3), ("y", real), ("x", real), ("_b", "f4"), ("z", real), ("ring", "u2"), ("intensity", "u1")]
+    kinds = [
+        ("_a", "u1", 3),
+        ("y", real),
+        ("x", real),
+        ("_b", "f4"),
+        ("z", real),
+        ("ring", "u2"),
+        ("intensity", "u1"),
+    ]
     table = np.zeros(len(points), kinds)
     for i, name in enumerate("xyz"):
         table[name] = points[:, i]
@@ -108,7 +121,14 @@ def _padded(points: np.ndarray, real: str) -> np.ndarray:
 def test_columns_of_any_order_type_and_padding_are_read(tmp_path: Path, size: int) -> None:
     points, path = some_points(), tmp_path / "a.pcd"
     real = f"F {size}"
-    fields = [("_", "U 1", 3), ("y", real, 1), ("x", real, 1), ("_", "F 4", 1), ("z", real, 1), ("ring", "U 2", 1)]
+    fields = [
+        ("_", "U 1", 3),
+        ("y", real, 1),
+        ("x", real, 1),
+        ("_", "F 4", 1),
+        ("z", real, 1),
+        ("ring", "U 2", 1),
+    ]
     path.write_bytes(pcd_bytes(_padded(points, f"f{size}"), [*fields, ("intensity", "U 1", 1)]))
     scan = read_scan(path)
     np.testing.assert_array_equal(scan.points[:, :3], points[:, :3])
@@ -136,7 +156,9 @@ def test_lost_points_of_an_organised_cloud_keep_their_place(tmp_path: Path) -> N
     points[7] = 0
     points[9, 0] = np.inf
     table = points.view([(name, "f4") for name in ("x", "y", "z", "intensity")]).ravel()
-    path.write_bytes(pcd_bytes(table, [(name, "F 4", 1) for name in table.dtype.names or ()], height=4))
+    path.write_bytes(
+        pcd_bytes(table, [(name, "F 4", 1) for name in table.dtype.names or ()], height=4)
+    )
     scan = read_scan(path)
     assert np.flatnonzero(~scan.valid).tolist() == [3, 7, 9]
     np.testing.assert_array_equal(scan.points[scan.valid], points[scan.valid])
@@ -160,7 +182,11 @@ def test_compressed_columns_of_several_values_are_read_as_pcl_writes_them(tmp_pa
     data = b"".join(column.tobytes() for column in (normals, *points.T))
     head = "FIELDS normal x y z intensity\nSIZE 4 4 4 4 4\nTYPE F F F F F\nCOUNT 3 1 1 1 1\nPOINTS 60\n"
     packed = lzf.compress(data, 2 * len(data))
-    path.write_bytes(f"{head}DATA binary_compressed\n".encode() + struct.pack("<II", len(packed), len(data)) + packed)
+    path.write_bytes(
+        f"{head}DATA binary_compressed\n".encode()
+        + struct.pack("<II", len(packed), len(data))
+        + packed
+    )
     np.testing.assert_array_equal(read_scan(path).points, points)
 
 
@@ -168,7 +194,12 @@ def test_lzf_is_unpacked_as_its_own_library_does() -> None:
     import lzf
 
     rng = np.random.default_rng(0)
-    for data in (bytes(1000), b"ab" * 500, rng.bytes(300), b"".join(rng.bytes(5) * k for k in range(2, 60))):
+    for data in (
+        bytes(1000),
+        b"ab" * 500,
+        rng.bytes(300),
+        b"".join(rng.bytes(5) * k for k in range(2, 60)),
+    ):
         packed = lzf.compress(data, 2 * len(data) + 100)
         assert unpack_lzf(packed, len(data)) == data
         with pytest.raises((ValueError, IndexError)):
@@ -206,7 +237,12 @@ def test_messages_with_gaps_and_either_byte_order_are_read(padded: bool, big: bo
 
 def test_a_message_that_claims_more_than_it_has_is_refused() -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
-    for changes in ({"width": 61}, {"width": 2**32 - 1, "row_step": 0}, {"row_step": 10}, {"fields": []}):
+    for changes in (
+        {"width": 61},
+        {"width": 2**32 - 1, "row_step": 0},
+        {"row_step": 10},
+        {"fields": []},
+    ):
         message = cloud_message(store, some_points(), **changes)
         fails(lambda message=message: read_message(message, "here"), "here")  # type: ignore[misc]
 
@@ -244,7 +280,9 @@ def test_an_archive_with_no_clear_array_is_refused(tmp_path: Path) -> None:
     fails(lambda: read_scan(tmp_path / "a.npz"), "left", "points")
 
 
-@pytest.mark.parametrize(("most", "kind"), [(1, "f4"), (255, "f4"), (65535, "f8"), (255, "u1"), (65535, "u2")])
+@pytest.mark.parametrize(
+    ("most", "kind"), [(1, "f4"), (255, "f4"), (65535, "f8"), (255, "u1"), (65535, "u2")]
+)
 def test_intensities_are_scaled_by_their_range(tmp_path: Path, most: int, kind: str) -> None:
     points = some_points()
     table = np.zeros(60, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", kind)])
@@ -264,15 +302,19 @@ def test_map_coordinates_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("storage", STORAGES)
-@pytest.mark.parametrize("compressed", [None, CompressionMode.MESSAGE, CompressionMode.FILE, CompressionMode.STORAGE])
-def test_a_bag_is_its_scans_in_order(tmp_path: Path, storage: str, compressed: CompressionMode | None) -> None:
+@pytest.mark.parametrize(
+    "compressed", [None, CompressionMode.MESSAGE, CompressionMode.FILE, CompressionMode.STORAGE]
+)
+def test_a_bag_is_its_scans_in_order(
+    tmp_path: Path, storage: str, compressed: CompressionMode | None
+) -> None:
     if compressed is CompressionMode.STORAGE and storage != "mcap":
         pytest.skip("only mcap compresses inside")
     clouds = [some_points(60, seed) for seed in range(5)]
     write_bag2(tmp_path / "drive", {"/lidar": clouds}, STORAGES[storage], compressed)
     assert find_scans(tmp_path / "drive") == [tmp_path / "drive"]
     assert find_scans(tmp_path) == [tmp_path / "drive"]
-    scans = list(named_scans(tmp_path / "drive"))
+    scans = list(scans_in_file(tmp_path / "drive"))
     assert [scan.name for scan in scans] == [f"drive/{i:06d}" for i in range(5)]
     for i in (0, 1, 2, 3, 4, 2, 0, 4):  # in order, and not
         np.testing.assert_array_equal(scans[i].read().to_scan().points, clouds[i])
@@ -282,12 +324,12 @@ def test_a_bag_is_its_scans_in_order(tmp_path: Path, storage: str, compressed: C
 def test_the_topic_is_found_or_asked_for(tmp_path: Path) -> None:
     front, rear = [some_points(60, 1)], [some_points(60, 2), some_points(60, 3)]
     path = write_bag1(tmp_path / "two.bag", {"/front": front, "/rear": rear})
-    fails(lambda: list(named_scans(path)), "/front", "/rear", "--topic")
-    fails(lambda: list(named_scans(path, "/top")), "/front", "/rear", "/top")
-    found = list(named_scans(path, "/rear"))
+    fails(lambda: list(scans_in_file(path)), "/front", "/rear", "--topic")
+    fails(lambda: list(scans_in_file(path, "/top")), "/front", "/rear", "/top")
+    found = list(scans_in_file(path, "/rear"))
     assert len(found) == 2
     np.testing.assert_array_equal(found[1].read().to_scan().points, rear[1])
-    fails(lambda: list(named_scans(write_bag1(tmp_path / "none.bag", {}))), "none.bag")
+    fails(lambda: list(scans_in_file(write_bag1(tmp_path / "none.bag", {}))), "none.bag")
 
 
 def test_a_bag_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
@@ -295,9 +337,9 @@ def test_a_bag_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
     metadata = tmp_path / "drive" / "metadata.yaml"
     said = metadata.read_text()
     metadata.write_text(said.replace("message_count: 3", "message_count: 3000000000"))
-    fails(lambda: list(named_scans(tmp_path / "drive")), "3000000000")
+    fails(lambda: list(scans_in_file(tmp_path / "drive")), "3000000000")
     metadata.write_text(said.replace("message_count: 3", "message_count: 4"))
-    scans = list(named_scans(tmp_path / "drive"))
+    scans = list(scans_in_file(tmp_path / "drive"))
     assert len(scans) == 4
     fails(lambda: scans[3].read(), "drive", "3")
 
@@ -306,7 +348,7 @@ def test_a_bag_is_read_in_constant_memory(tmp_path: Path) -> None:
     points = some_points(50_000)  # 0.8 MB
     path = write_bag1(tmp_path / "long.bag", {"/lidar": [points] * 30})
     tracemalloc.start()
-    for scan in named_scans(path):
+    for scan in scans_in_file(path):
         scan.read()
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -316,8 +358,12 @@ def test_a_bag_is_read_in_constant_memory(tmp_path: Path) -> None:
 # --- what is not there, or too much
 
 
-@pytest.mark.parametrize(("missing", "name"), [("laspy", "old.las"), ("lazrs", "packed.laz"), ("rosbags", "plain.bag")])
-def test_a_missing_extra_is_named(folder: Path, name: str, missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("missing", "name"), [("laspy", "old.las"), ("lazrs", "packed.laz"), ("rosbags", "plain.bag")]
+)
+def test_a_missing_extra_is_named(
+    folder: Path, name: str, missing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for module in [m for m in sys.modules if m.split(".")[0] == missing]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, missing, None)
@@ -346,13 +392,17 @@ def _las(path: Path, **at: tuple[str, int, int]) -> bytes:
     return bytes(content)
 
 
-def test_headers_that_claim_billions_are_refused_before_memory_is_taken(folder: Path, tmp_path: Path) -> None:
+def test_headers_that_claim_billions_are_refused_before_memory_is_taken(
+    folder: Path, tmp_path: Path
+) -> None:
     many = 3_000_000_000
     lies = {
         "a.pcd": _pcd(many, "binary"),
         "b.pcd": _pcd(many, "ascii"),
         "c.pcd": _pcd(many, "binary_compressed", struct.pack("<II", 40, 2**32 - 1) + bytes(40)),
-        "d.pcd": _pcd(MAX_POINTS, "binary_compressed", struct.pack("<II", 40, MAX_POINTS * 12) + bytes(40)),
+        "d.pcd": _pcd(
+            MAX_POINTS, "binary_compressed", struct.pack("<II", 40, MAX_POINTS * 12) + bytes(40)
+        ),
         "e.pcd": _pcd(MAX_POINTS, "ascii"),
         "a.ply": _ply(many, "binary_little_endian"),
         "b.ply": _ply(MAX_POINTS, "ascii"),
@@ -388,8 +438,14 @@ def test_broken_compressed_files_end_in_one_line(
 
 
 def test_names_without_their_endings() -> None:
-    for name, expected in {"a.pcd.bin": "a", "b.PCD": "b", "c.d.las": "c.d", "e": "e", "f.txt": "f"}.items():
-        assert stem(Path(name)) == expected
+    for name, expected in {
+        "a.pcd.bin": "a",
+        "b.PCD": "b",
+        "c.d.las": "c.d",
+        "e": "e",
+        "f.txt": "f",
+    }.items():
+        assert scan_stem(Path(name)) == expected
 
 
 # --- real scans
@@ -419,7 +475,7 @@ def test_real_files_of_other_formats_are_read(name: str, count: int, scale: floa
 @pytest.mark.skipif(not REAL, reason="AMVNET_REAL_DATA does not name a folder")
 @pytest.mark.parametrize(("name", "count"), [("semantickitti", 80), ("nuscenes", 10)])
 def test_every_real_scan_is_read_by_itself_as_in_its_data_set(name: str, count: int) -> None:
-    from amvnet.data.catalog import open_dataset
+    from amvnet.data.datasets.open import open_dataset
 
     dataset: Any = open_dataset(str(Path(REAL or "") / name))
     records = dataset.records(dataset.sequences("all"))
@@ -435,5 +491,7 @@ def test_every_real_scan_is_read_by_itself_as_in_its_data_set(name: str, count: 
 def test_the_writers_agree_with_each_other(tmp_path: Path) -> None:
     points = some_points()
     table = points.view([(name, "f4") for name in ("x", "y", "z", "intensity")]).ravel()
-    (tmp_path / "a.pcd").write_bytes(pcd_bytes(table, [(name, "F 4", 1) for name in table.dtype.names or ()]))
+    (tmp_path / "a.pcd").write_bytes(
+        pcd_bytes(table, [(name, "F 4", 1) for name in table.dtype.names or ()])
+    )
     np.testing.assert_array_equal(PointCloud.from_path(tmp_path / "a.pcd").numpy(), points)

@@ -16,8 +16,8 @@ import yaml
 from worlds import amvnet, files, fresh_weights, make_streets, street, write_recipe
 
 from amvnet import fuse
-from amvnet.segmenter import Segmenter
-from amvnet.weights import load, save
+from amvnet.inference.segmenter import Segmenter
+from amvnet.weights.file import load, save
 
 DOCS = Path(__file__).parent.parent / "docs"
 PLACE = "sequences/08/predictions/000000"
@@ -37,7 +37,14 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def fused(world: Path, out: Path, *more: Any, data: str = "data", a: Path | None = None, b: Path | None = None) -> str:
+def fused(
+    world: Path,
+    out: Path,
+    *more: Any,
+    data: str = "data",
+    a: Path | None = None,
+    b: Path | None = None,
+) -> str:
     """Run `amvnet fuse` on the world's scores, or on others; returns its complaint."""
     scores = ("--scores-a", a or world / "amvnet", "--scores-b", b or world / "amvnet")
     code, error = amvnet("fuse", world / data, *scores, "--out", out, *more)
@@ -85,7 +92,9 @@ def test_the_head_and_tau_count(world: Path, tmp_path: Path) -> None:
     assert (labels(tmp_path / "all") != labels(tmp_path / "none")).mean() > 0.1
 
 
-def test_lone_scans_are_fused_and_points_that_are_lost_have_no_class(world: Path, tmp_path: Path) -> None:
+def test_lone_scans_are_fused_and_points_that_are_lost_have_no_class(
+    world: Path, tmp_path: Path
+) -> None:
     points = street(9, 300)[0]
     points[7] = np.nan
     points.tofile(tmp_path / "a.bin")
@@ -93,8 +102,18 @@ def test_lone_scans_are_fused_and_points_that_are_lost_have_no_class(world: Path
     for name, values in (("rv", result.rv), ("bev", result.bev)):
         (tmp_path / name).mkdir()
         np.save(tmp_path / name / "a.npy", values.astype(np.float64))
-    arguments = ("--scores-a", tmp_path / "rv", "--scores-b", tmp_path / "bev", "--out", tmp_path / "out")
-    assert amvnet("fuse", tmp_path / "a.bin", *arguments, "--head", world / "w.safetensors") == (0, "")
+    arguments = (
+        "--scores-a",
+        tmp_path / "rv",
+        "--scores-b",
+        tmp_path / "bev",
+        "--out",
+        tmp_path / "out",
+    )
+    assert amvnet("fuse", tmp_path / "a.bin", *arguments, "--head", world / "w.safetensors") == (
+        0,
+        "",
+    )
     found = labels(tmp_path / "out")
     assert found[7] == 0
     assert np.array_equal(found, fresh_weights().taxonomy.to_raw(result.labels))
@@ -134,13 +153,22 @@ def broken(world: Path, folder: Path) -> dict[str, tuple[Path, tuple[str, ...]]]
         "logits": (write_scores(folder / "1", np.log(good + 1e-3)), ("softmax", "--logits b")),
         "NaN": (write_scores(folder / "2", with_nan), ("finite",)),
         "one point less": (write_scores(folder / "3", good[1:]), ("(500, 19)", "(499, 19)")),
-        "a column more": (write_scores(folder / "4", np.pad(good, ((0, 0), (1, 0)))), ("(500, 20)", "drop the column")),
+        "a column more": (
+            write_scores(folder / "4", np.pad(good, ((0, 0), (1, 0)))),
+            ("(500, 20)", "drop the column"),
+        ),
         "integers": (write_scores(folder / "5", (good * 255).astype(np.uint8)), ("uint8",)),
         "objects": (write_scores(folder / "6", np.full((500, 19), None)), ("broken",)),
-        "two arrays": (write_scores(folder / "7", None, one=good, two=good), ("one, two", "--key-b")),
+        "two arrays": (
+            write_scores(folder / "7", None, one=good, two=good),
+            ("one, two", "--key-b"),
+        ),
         "a single number": (write_scores(folder / "8", np.float32(1)), ("()",)),
         "nothing": (folder, ("000000.npz", "predict --scores")),
-        "negative": (write_scores(folder / "9", np.tile(np.eye(19)[0] * 2 - np.eye(19)[1], (500, 1))), ("softmax",)),
+        "negative": (
+            write_scores(folder / "9", np.tile(np.eye(19)[0] * 2 - np.eye(19)[1], (500, 1))),
+            ("softmax",),
+        ),
     }
     short = write_scores(folder / "10", None, one=good) / f"{PLACE}.npz"
     short.write_bytes(short.read_bytes()[:-200])
@@ -162,11 +190,16 @@ def test_broken_scores_are_one_line_that_says_what_to_do(world: Path, tmp_path: 
 def test_wrong_options_are_one_line(world: Path, tmp_path: Path) -> None:
     assert "--key-a" in fused(world, tmp_path, "--key-a", "nose", "--key-b", "bev")
     assert "expected a folder" in fused(world, tmp_path, *OWN, a=tmp_path / "none")
-    assert "leave it out" in fused(world, tmp_path, *OWN, "--head", world / "w.safetensors", "--taxonomy", "nuscenes")
+    assert "leave it out" in fused(
+        world, tmp_path, *OWN, "--head", world / "w.safetensors", "--taxonomy", "nuscenes"
+    )
     assert "nuscenes" in fused(world, tmp_path, *OWN, "--taxonomy", "nuscenes")
     train = ("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run")
     scores = ("--scores-a", world / "amvnet", "--scores-b", world / "amvnet")
-    for more, word in (((*scores, *OWN), "--stage head"), ((*scores[:2], "--stage", "head"), "--scores-b")):
+    for more, word in (
+        ((*scores, *OWN), "--stage head"),
+        ((*scores[:2], "--stage", "head"), "--scores-b"),
+    ):
         code, error = amvnet(*train, *more)
         assert code == 2
         assert word in error
@@ -186,10 +219,22 @@ def run(world: Path) -> Path:
 
 def training(world: Path, out: Path) -> list[Any]:
     scores = ("--scores-a", world / "amvnet", "--scores-b", world / "amvnet", *OWN)
-    return ["train", world / "recipe.yaml", "--data", world / "data", "--stage", "head", "--out", out, *scores]
+    return [
+        "train",
+        world / "recipe.yaml",
+        "--data",
+        world / "data",
+        "--stage",
+        "head",
+        "--out",
+        out,
+        *scores,
+    ]
 
 
-def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(world: Path, run: Path, tmp_path: Path) -> None:
+def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
     # The networks alone: a head to begin with would be trained further.
     weights = fresh_weights()
     networks = {k: v for k, v in weights.tensors.items() if not k.startswith("point_head")}
@@ -199,11 +244,15 @@ def test_a_head_for_files_is_the_head_for_the_networks_that_wrote_them(world: Pa
     own, from_files = load(tmp_path / "run").part("point_head"), load(run).part("point_head")
     # A score that float16 puts on the other side of tau changes which points are drawn: alike, not equal.
     assert own.keys() == from_files.keys()
-    reached = [load(path).metrics["point_head"]["val/uncertain"] for path in (tmp_path / "run", run)]
+    reached = [
+        load(path).metrics["point_head"]["val/uncertain"] for path in (tmp_path / "run", run)
+    ]
     assert reached[0] == pytest.approx(reached[1], abs=0.005)
 
 
-def test_the_weights_hold_the_head_alone_and_fuse_takes_them(world: Path, run: Path, tmp_path: Path) -> None:
+def test_the_weights_hold_the_head_alone_and_fuse_takes_them(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
     weights = load(run)
     assert weights.parts == ("point_head",)
     assert weights.model.assertion == fresh_weights().model.assertion
@@ -212,10 +261,15 @@ def test_the_weights_hold_the_head_alone_and_fuse_takes_them(world: Path, run: P
     ids = fuse(points, arrays(world, "rv"), arrays(world, "bev"), head=run)
     own = np.fromfile(tmp_path / f"{PLACE}.label", np.uint32)
     assert np.array_equal(weights.taxonomy.to_raw(ids), own)
-    assert "range_net" in amvnet("predict", world / "data", "--weights", run, "--out", tmp_path / "x")[1]
+    assert (
+        "range_net"
+        in amvnet("predict", world / "data", "--weights", run, "--out", tmp_path / "x")[1]
+    )
 
 
-def test_the_run_says_its_scores_and_resumes_with_them_alone(world: Path, run: Path, tmp_path: Path) -> None:
+def test_the_run_says_its_scores_and_resumes_with_them_alone(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
     said = yaml.safe_load((run / "run.yaml").read_text())["head"]
     repeat = shlex.split(said["repeat"])[1:]
     assert amvnet(*repeat) == (0, "")
@@ -236,14 +290,22 @@ def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.chdir(tmp_path)
     shutil.copy(DOCS / "tiny_model.py", tmp_path)
     page = (DOCS / "fusing.md").read_text()
-    commands = [line for block in re.findall(r"```bash\n(.*?)```", page, re.S) for line in block.splitlines()]
+    commands = [
+        line
+        for block in re.findall(r"```bash\n(.*?)```", page, re.S)
+        for line in block.splitlines()
+    ]
     assert len(commands) >= 8
     for command in commands:
         words = shlex.split(command.replace("--scans 4", "--scans 1"))
         if words[0] == "python":
             subprocess.run([sys.executable, *words[1:]], check=True)
             continue
-        less = ("--training.head.epochs", 1, "--training.head.points", 3000) if words[1] == "train" else ()
+        less = (
+            ("--training.head.epochs", 1, "--training.head.points", 3000)
+            if words[1] == "train"
+            else ()
+        )
         assert words[0] == "amvnet"
         assert amvnet(*words[1:], *less) == (0, ""), command
     assert (labels(Path("again")) == labels(Path("both"))).mean() >= 0.999

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin
 from scan_files import WRITERS, some_points, write_bag2
 
-from amvnet.data.formats import named_scans
+from amvnet.data.formats.detect import scans_in_file
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -39,7 +39,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 def changes() -> st.SearchStrategy[list[tuple[float, bool, int, bytes]]]:
     """Where (as a share of the file, or of its beginning), how many bytes go there, and what comes in their place."""
-    telling = st.sampled_from([b"\x00", b"\xff", b"\x7f", b"9", b"-", b" ", b"\n", bytes(4), b"\xff" * 4, b"\xff" * 8])
+    telling = st.sampled_from(
+        [b"\x00", b"\xff", b"\x7f", b"9", b"-", b" ", b"\n", bytes(4), b"\xff" * 4, b"\xff" * 8]
+    )
     place = st.floats(0, 1, exclude_max=True)
     change = st.tuples(place, st.booleans(), st.integers(0, 9), telling | st.binary(max_size=9))
     return st.lists(change, min_size=1, max_size=6)
@@ -55,7 +57,9 @@ def changed(content: bytes, how: list[tuple[float, bool, int, bytes]], kept: flo
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_a_broken_file_ends_in_a_scan_or_in_one_line(name: str, whole: dict[str, bytes], tmp_path: Path) -> None:
+def test_a_broken_file_ends_in_a_scan_or_in_one_line(
+    name: str, whole: dict[str, bytes], tmp_path: Path
+) -> None:
     content, path = whole[name], tmp_path / ("drive" if name == METADATA else name)
     if name == METADATA:
         write_bag2(tmp_path / "drive", {"/lidar": [some_points()]}, StoragePlugin.MCAP)
@@ -67,8 +71,14 @@ def test_a_broken_file_ends_in_a_scan_or_in_one_line(name: str, whole: dict[str,
         database=None,
         suppress_health_check=list(HealthCheck),
     )
-    @given(how=changes(), kept=st.just(1.0) | st.floats(0, 1), random=st.none() | st.binary(max_size=300))
-    def breaks(how: list[tuple[float, bool, int, bytes]], kept: float, random: bytes | None) -> None:
+    @given(
+        how=changes(),
+        kept=st.just(1.0) | st.floats(0, 1),
+        random=st.none() | st.binary(max_size=300),
+    )
+    def breaks(
+        how: list[tuple[float, bool, int, bytes]], kept: float, random: bytes | None
+    ) -> None:
         (tmp_path / name).write_bytes(changed(content, how, kept) if random is None else random)
         ends_well(path)
 
@@ -88,7 +98,7 @@ def ends_well(path: Path) -> None:
 def refusal(path: Path) -> str:
     """What is said of a file that is refused; nothing where all of its scans are read."""
     try:
-        for scan in named_scans(path):
+        for scan in scans_in_file(path):
             assert isinstance(scan.read().to_scan(), Scan)
     except InputError as error:
         return str(error)

@@ -17,19 +17,22 @@ from torch import Tensor, nn
 from worlds import amvnet, commands_of, fails, files, fresh_weights, make_streets, street
 
 from amvnet import Scan, Segmenter, simulate
-from amvnet.data.files import read_scan
-from amvnet.models import block_search
+from amvnet.data.scan_files import read_scan
+from amvnet.inference.pipeline import AHEAD, Task, stream
+from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import merge
-from amvnet.models.block_search import nearest_others_by_blocks, split_into_blocks
+from amvnet.models.neighbours import nearest_others
+from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
+from amvnet.models.precision import InPrecision
 from amvnet.models.streams import SideBySide
-from amvnet.neighbours import nearest_others
-from amvnet.precision import InPrecision
-from amvnet.streaming import AHEAD, Task, stream
-from amvnet.views.points import PointBatch
-from amvnet.weights import save
+from amvnet.models.views.points import PointBatch
+from amvnet.weights.file import save
 
 N = 15
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"))]
+DEVICES = [
+    "cpu",
+    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")),
+]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +46,9 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 def clouds() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     random = rng.normal(0, (20, 20, 2), (5000, 3))
-    clusters = rng.normal(0, 100, (20, 3))[rng.integers(0, 20, 5000)] + rng.normal(0, 0.01, (5000, 3))
+    clusters = rng.normal(0, 100, (20, 3))[rng.integers(0, 20, 5000)] + rng.normal(
+        0, 0.01, (5000, 3)
+    )
     line = np.zeros((4000, 3))
     line[:, 1] = rng.random(4000) * 50
     sphere = random / np.linalg.norm(random, axis=1, keepdims=True)
@@ -58,7 +63,8 @@ def clouds() -> dict[str, np.ndarray]:
         "10 km apart": np.concatenate(
             [random[:2000], random[2000:4000] + np.array([9900, -9900, 0]), [[-9999, 9999, 9999]]]
         ),
-        "nearly in one place": 9000 + rng.normal(0, 0.004, (3000, 3)),  # where float32 knows a millimetre
+        "nearly in one place": 9000
+        + rng.normal(0, 0.004, (3000, 3)),  # where float32 knows a millimetre
         "hardly apart": rng.normal(0, 1e-22, (3000, 3)),  # whose squares are 0 in float32
         # Nearly as far from the centre, each of them: float32 does not know which are the nearest.
         "on a sphere": np.concatenate([np.zeros((10, 3)), sphere[:300], random[:2000] * 10]),
@@ -84,7 +90,9 @@ def check_nearest(xyz: Tensor, own: Tensor, n: int = N) -> None:
 @pytest.mark.parametrize("name", clouds())
 def test_neighbours_by_blocks_are_the_nearest_others(name: str, device: str) -> None:
     xyz = torch.from_numpy(clouds()[name].astype(np.float32)).to(device)
-    check_nearest(xyz, torch.randperm(len(xyz), generator=torch.Generator().manual_seed(0)).to(device)[:1000])
+    check_nearest(
+        xyz, torch.randperm(len(xyz), generator=torch.Generator().manual_seed(0)).to(device)[:1000]
+    )
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -96,14 +104,23 @@ def test_neighbours_by_blocks_of_any_number_of_points(points: int, device: str) 
 
 @pytest.mark.parametrize("n", [1, 40, 500, 2000])
 def test_any_number_of_neighbours_by_blocks(n: int) -> None:
-    check_nearest(torch.randn(1500, 3, generator=torch.Generator().manual_seed(0)), torch.arange(0, 1500, 50), n)
+    check_nearest(
+        torch.randn(1500, 3, generator=torch.Generator().manual_seed(0)),
+        torch.arange(0, 1500, 50),
+        n,
+    )
 
 
 def test_neighbours_by_blocks_keep_to_the_rules_for_few_points() -> None:
     line = torch.tensor([[0.0, 0, 0], [5, 0, 0], [1, 0, 0], [3, 0, 0]])
-    assert nearest_others_by_blocks(line, torch.tensor([0, 1]), 6).tolist() == [[2, 3, 1, 1, 1, 1], [3, 2, 0, 0, 0, 0]]
+    assert nearest_others_by_blocks(line, torch.tensor([0, 1]), 6).tolist() == [
+        [2, 3, 1, 1, 1, 1],
+        [3, 2, 0, 0, 0, 0],
+    ]
     assert nearest_others_by_blocks(torch.ones(1, 3), torch.tensor([0]), 3).tolist() == [[0, 0, 0]]
-    assert nearest_others_by_blocks(torch.randn(5, 3), torch.zeros(0, dtype=torch.long), 3).shape == (0, 3)
+    assert nearest_others_by_blocks(
+        torch.randn(5, 3), torch.zeros(0, dtype=torch.long), 3
+    ).shape == (0, 3)
 
 
 def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compared(
@@ -114,13 +131,21 @@ def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compa
     asked: list[int] = []
     search = block_search._among_all
     monkeypatch.setattr(
-        block_search, "_among_all", lambda xyz, own, n: (asked.append(len(own)), search(xyz, own, n))[1]
+        block_search,
+        "_among_all",
+        lambda xyz, own, n: (asked.append(len(own)), search(xyz, own, n))[1],
     )
     found = nearest_others_by_blocks(xyz, own, N)
-    equal = np.sort(found.numpy(), axis=1) == np.sort(nearest_others(xyz.numpy(), own.numpy(), N), axis=1)
+    equal = np.sort(found.numpy(), axis=1) == np.sort(
+        nearest_others(xyz.numpy(), own.numpy(), N), axis=1
+    )
     assert equal.all(axis=1).mean() > 0.999  # pykdtree rounds distances to float32
     blocks = split_into_blocks(xyz)
-    compared = len(blocks.index) + block_search.NEAREST * blocks.index.shape[1] + sum(asked) / len(own) * len(xyz)
+    compared = (
+        len(blocks.index)
+        + block_search.NEAREST * blocks.index.shape[1]
+        + sum(asked) / len(own) * len(xyz)
+    )
     assert compared < 0.03 * len(xyz)
 
 
@@ -151,9 +176,13 @@ class Streams:
         self.done: list[str] = []
         self.current = "main"
         monkeypatch.setattr(torch.cuda, "Stream", lambda device: Streams.One(self, "side"))
-        monkeypatch.setattr(torch.cuda, "current_stream", lambda device: Streams.One(self, self.current))
+        monkeypatch.setattr(
+            torch.cuda, "current_stream", lambda device: Streams.One(self, self.current)
+        )
         monkeypatch.setattr(torch.cuda, "stream", self.on)
-        monkeypatch.setattr(Tensor, "record_stream", lambda _, stream: self.done.append(f"kept for {stream.name}"))
+        monkeypatch.setattr(
+            Tensor, "record_stream", lambda _, stream: self.done.append(f"kept for {stream.name}")
+        )
 
     class One:
         def __init__(self, streams: Streams, name: str) -> None:
@@ -176,7 +205,9 @@ def test_side_by_side_waits_before_and_after(monkeypatch: pytest.MonkeyPatch) ->
     for name in ("score_range_view", "score_polar_view"):
         score = getattr(model, name)
         monkeypatch.setattr(
-            model, name, lambda b, s=score, n=name: (streams.done.append(f"{n} on {streams.current}"), s(b))[1]
+            model,
+            name,
+            lambda b, s=score, n=name: (streams.done.append(f"{n} on {streams.current}"), s(b))[1],
         )
     model.run = SideBySide("cuda")
     after = model(batch)
@@ -201,7 +232,10 @@ def test_the_merge_of_a_gpu_is_that_of_a_cpu(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points(scan: Scan) -> None:
-    exact, lower = Segmenter("sim-hdl64e")(scan), Segmenter("sim-hdl64e", precision="bfloat16")(scan)
+    exact, lower = (
+        Segmenter("sim-hdl64e")(scan),
+        Segmenter("sim-hdl64e", precision="bfloat16")(scan),
+    )
     for name in ("scores", "rv", "bev"):
         assert getattr(lower, name).dtype == np.float32
         assert not np.array_equal(getattr(lower, name), getattr(exact, name))
@@ -217,8 +251,12 @@ class Seen(nn.Module):
         return x @ x
 
 
-@pytest.mark.parametrize(("precision", "kind"), [("float32", torch.float32), ("bfloat16", torch.bfloat16)])
-def test_a_network_multiplies_in_its_precision_and_scores_in_float32(precision: str, kind: torch.dtype) -> None:
+@pytest.mark.parametrize(
+    ("precision", "kind"), [("float32", torch.float32), ("bfloat16", torch.bfloat16)]
+)
+def test_a_network_multiplies_in_its_precision_and_scores_in_float32(
+    precision: str, kind: torch.dtype
+) -> None:
     net = Seen()
     assert InPrecision(net, "cpu", precision)(torch.ones(2, 2)).dtype == torch.float32
     assert net.kind == kind
@@ -227,7 +265,11 @@ def test_a_network_multiplies_in_its_precision_and_scores_in_float32(precision: 
 
 @pytest.mark.parametrize(("asked", "allowed"), [("highest", False), ("high", True)])
 def test_tf32_is_used_only_where_it_was_asked_for(asked: str, allowed: bool) -> None:
-    net, before, convolutions = Seen(), torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+    net, before, convolutions = (
+        Seen(),
+        torch.get_float32_matmul_precision(),
+        torch.backends.cudnn.allow_tf32,
+    )
     torch.set_float32_matmul_precision(asked)
     try:
         InPrecision(net, "cpu", "float32")(torch.ones(2, 2))
@@ -264,7 +306,9 @@ def test_several_scans_at_a_time_are_segmented_as_each_alone() -> None:
         assert np.array_equal(together.labels == 0, alone.labels == 0)
         near(together.rv, alone.rv)
         near(together.bev, alone.bev)
-        assert np.array_equal(together.labels[together.labels > 0], together.scores.argmax(1)[together.labels > 0] + 1)
+        assert np.array_equal(
+            together.labels[together.labels > 0], together.scores.argmax(1)[together.labels > 0] + 1
+        )
 
 
 @pytest.fixture(scope="module")
@@ -281,7 +325,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-@pytest.mark.parametrize(("inputs", "code", "written"), [(("data", "scans"), 3, 11), (("data",), 0, 6)])
+@pytest.mark.parametrize(
+    ("inputs", "code", "written"), [(("data", "scans"), 3, 11), (("data",), 0, 6)]
+)
 def test_predicting_three_at_a_time_writes_what_one_at_a_time_does(
     world: Path, tmp_path: Path, inputs: tuple[str, ...], code: int, written: int
 ) -> None:
@@ -312,14 +358,14 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
     arguments = ("predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path)
     assert amvnet(*arguments) == (0, "")
     whole = {name: (tmp_path / name).read_bytes() for name in files(tmp_path)}
-    from amvnet.journal import Journal
-    from amvnet.prediction import Fitting
+    from amvnet.inference.journal import Journal
+    from amvnet.inference.predict import ScanAdapter
 
     weights = Segmenter(world / "w.safetensors").weights
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(Fitting(weights).given),
+        "sensor": repr(ScanAdapter(weights).given),
         "scores": False,
         "uncertain": False,
         "format": "label",
@@ -335,7 +381,14 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
 @pytest.mark.parametrize("batch", [0, -1])
 def test_a_batch_of_no_scans_is_refused(world: Path, tmp_path: Path, batch: int) -> None:
     code, error = amvnet(
-        "predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path, "--batch", batch
+        "predict",
+        world / "data",
+        "--weights",
+        world / "w.safetensors",
+        "--out",
+        tmp_path,
+        "--batch",
+        batch,
     )
     assert (code, error.count("\n")) == (2, 1)
     assert not files(tmp_path)
@@ -347,7 +400,9 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
     held, most, sizes = set(), [], []
     segmenter = Segmenter(fresh_weights())
     many = Segmenter.many
-    monkeypatch.setattr(Segmenter, "many", lambda self, scans: (sizes.append(len(scans)), many(self, scans))[1])
+    monkeypatch.setattr(
+        Segmenter, "many", lambda self, scans: (sizes.append(len(scans)), many(self, scans))[1]
+    )
 
     def task(place: int) -> Task:
         def read() -> Scan:
@@ -357,7 +412,11 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
 
         return Task(str(place), read, segmenter, lambda _: (held.remove(place), Path())[1], Path())
 
-    done = [one.name for one, fault in stream([task(place) for place in range(23)], False, False, 4) if not fault]
+    done = [
+        one.name
+        for one, fault in stream([task(place) for place in range(23)], False, False, 4)
+        if not fault
+    ]
     assert done == [str(place) for place in range(23)]
     assert sizes == [4, 4, 4, 4, 4, 3]
     assert max(most) <= 2 * 4 + AHEAD + 2
@@ -371,10 +430,14 @@ def test_every_verb_that_segments_takes_a_precision(world: Path, tmp_path: Path,
         "evaluate": (world / "data",),
         "bench": ("--runs", 1, "--scan", world / "scans/000000.bin"),
     }
-    assert amvnet(verb, *inputs[verb], "--weights", world / "w.safetensors", "--precision", "bfloat16") == (0, "")
+    assert amvnet(
+        verb, *inputs[verb], "--weights", world / "w.safetensors", "--precision", "bfloat16"
+    ) == (0, "")
 
 
-def test_the_commands_of_the_page_run(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commands_of_the_page_run(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On a CPU; the benchmark, which is for other places, in its smallest size."""
     monkeypatch.chdir(world)
     stand_ins = {
@@ -389,7 +452,9 @@ def test_the_commands_of_the_page_run(world: Path, tmp_path: Path, monkeypatch: 
         assert amvnet(*[stand_ins.get(word, word) for word in words[1:]]) == (0, "")
     script = Path(__file__).parents[1] / smallest[1]
     less = ["--batch", "1,2", "--part", "1", "--scan", "scans/000000.bin"]
-    done = subprocess.run([sys.executable, script, *smallest[2:], *less], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, script, *smallest[2:], *less], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert [line.split()[0] for line in done.stdout.splitlines()].count("training") == 2
 
@@ -399,4 +464,6 @@ def test_the_commands_of_the_page_run(world: Path, tmp_path: Path, monkeypatch: 
 def test_a_gpu_gives_the_labels_of_a_cpu(scan: Scan, precision: str) -> None:
     expected = Segmenter("sim-hdl64e")(scan)
     for found in Segmenter("sim-hdl64e", "cuda", precision=precision).many([scan, scan]):  # type: ignore[arg-type]
-        assert (found.labels == expected.labels).mean() > (0.999 if precision == "float32" else 0.98)
+        assert (found.labels == expected.labels).mean() > (
+            0.999 if precision == "float32" else 0.98
+        )

@@ -32,7 +32,11 @@ class Plain:
 
 
 def scanned(
-    mesh: Mesh, sensor: Sensor = EXACT, pose: np.ndarray | None = None, speed: float = 0.0, seed: int = 0
+    mesh: Mesh,
+    sensor: Sensor = EXACT,
+    pose: np.ndarray | None = None,
+    speed: float = 0.0,
+    seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     hits = trace([RayScene(mesh)], sensor, np.eye(4) if pose is None else pose, Plain(), rng, speed)
@@ -42,7 +46,9 @@ def scanned(
 def wall(x: float, y: tuple[float, float] = (-30, 30), surface: Surface = Surface.PLASTER) -> Mesh:
     """A wall across the sensor's axis, 20 m high."""
     a, b = y
-    corners = np.array([[[x, a, -10], [x, b, -10], [x, b, 10]], [[x, a, -10], [x, b, 10], [x, a, 10]]])
+    corners = np.array(
+        [[[x, a, -10], [x, b, -10], [x, b, 10]], [[x, a, -10], [x, b, 10], [x, a, 10]]]
+    )
     return part(corners, surface, Label.BUILDING)
 
 
@@ -50,10 +56,15 @@ def wall(x: float, y: tuple[float, float] = (-30, 30), surface: Surface = Surfac
 def ground() -> tuple[np.ndarray, np.ndarray]:
     """Points and rings of a plane below the sensor."""
     far = 500.0
-    corners = [[[-far, -far, 0], [far, -far, 0], [far, far, 0]], [[-far, -far, 0], [far, far, 0], [-far, far, 0]]]
+    corners = [
+        [[-far, -far, 0], [far, -far, 0], [far, far, 0]],
+        [[-far, -far, 0], [far, far, 0], [-far, far, 0]],
+    ]
     pose = np.eye(4)
     pose[:3, 3] = (3.0, -2.0, HDL64E.height)
-    points, labels, ring = scanned(part(np.array(corners), Surface.GRASS, 0), replace(HDL64E, turn=0.0), pose)
+    points, labels, ring = scanned(
+        part(np.array(corners), Surface.GRASS, 0), replace(HDL64E, turn=0.0), pose
+    )
     assert (labels == Label.ROAD).all()
     return points, ring
 
@@ -67,12 +78,16 @@ def test_flat_ground_has_the_ranges_of_the_textbook(ground: tuple[np.ndarray, np
     assert error.std() == pytest.approx(HDL64E.range_noise, rel=0.05)
 
 
-def test_every_point_lies_on_its_beam_and_beams_are_in_firing_order(ground: tuple[np.ndarray, np.ndarray]) -> None:
+def test_every_point_lies_on_its_beam_and_beams_are_in_firing_order(
+    ground: tuple[np.ndarray, np.ndarray],
+) -> None:
     points, ring = ground
     beams = np.array(HDL64E.elevations)
     assert len(beams) == 64
     assert (np.diff(beams) < 0).all()
-    elevation = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points[:, :3].astype(float), axis=1)))
+    elevation = np.degrees(
+        np.arcsin(points[:, 2] / np.linalg.norm(points[:, :3].astype(float), axis=1))
+    )
     assert np.abs(elevation - beams[::-1][ring]).max() < 0.01
     azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
     step = np.diff(ring.astype(int))
@@ -91,7 +106,9 @@ def test_the_own_car_hides_what_is_behind_its_parts(ground: tuple[np.ndarray, np
 def test_some_returns_at_edges_lie_in_between() -> None:
     found = []
     for mixed in (0.0, 0.5):
-        points, _, _ = scanned(join([wall(10, (1, 9)), wall(12, (-9, 9))]), replace(EXACT, mixed=mixed))
+        points, _, _ = scanned(
+            join([wall(10, (1, 9)), wall(12, (-9, 9))]), replace(EXACT, mixed=mixed)
+        )
         found.append(np.count_nonzero((points[:, 0] > 10.05) & (points[:, 0] < 11.95)))
     assert found[0] == 0
     assert found[1] > 10
@@ -127,7 +144,9 @@ def reached(scene: Mesh) -> float:
 
 def test_where_clumps_overlap_foliage_goes_on() -> None:
     """Their union is 4 m deep, and not the 2 m until the first of them ends."""
-    assert reached(join([slab(14, 16, 1), slab(15, 18, 1), wall(22)])) == pytest.approx(np.exp(-4), rel=0.2)
+    assert reached(join([slab(14, 16, 1), slab(15, 18, 1), wall(22)])) == pytest.approx(
+        np.exp(-4), rel=0.2
+    )
 
 
 def test_many_clumps_can_be_passed() -> None:
@@ -150,17 +169,24 @@ def test_a_hull_is_closed_and_looks_outwards() -> None:
     for seed in range(20):
         triangles = hull(np.random.default_rng(seed), (1, 2, 3), (2, 1, 4), taper=0.7, square=0.6)
         edges = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)]).round(6)
-        there, back = ({e.tobytes() for e in edges + 0.0}, {e.tobytes() for e in edges[:, ::-1] + 0.0})
+        there, back = (
+            {e.tobytes() for e in edges + 0.0},
+            {e.tobytes() for e in edges[:, ::-1] + 0.0},
+        )
         assert there == back  # each edge is passed once in each direction
         outward = np.einsum(
-            "ti,ti->t", triangles[:, 0] - (1, 2, 3), np.cross(*np.diff(triangles, axis=1).swapaxes(0, 1))
+            "ti,ti->t",
+            triangles[:, 0] - (1, 2, 3),
+            np.cross(*np.diff(triangles, axis=1).swapaxes(0, 1)),
         )
         assert (outward > 0).mean() > 0.99  # a bump of a thin tip may hang over
 
 
 @pytest.mark.parametrize("counter_clockwise", [True, False])
 @pytest.mark.parametrize("corrected", [True, False])
-def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(corrected: bool, counter_clockwise: bool) -> None:
+def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(
+    corrected: bool, counter_clockwise: bool
+) -> None:
     """Ahead at the middle of the turn: what is on the left is seen a quarter of a turn later, or earlier."""
     sensor = replace(EXACT, turn=0.1, corrected=corrected, counter_clockwise=counter_clockwise)
     left = part(wall(10).triangles[..., [1, 0, 2]], Surface.PLASTER, Label.BUILDING)

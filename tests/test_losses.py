@@ -10,7 +10,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from amvnet.losses import FREQUENCY_FLOOR, class_weights, dice, lovasz_softmax, polar_view_loss, range_view_loss
+from amvnet.training.losses import (
+    FREQUENCY_FLOOR,
+    class_weights,
+    dice,
+    lovasz_softmax,
+    polar_view_loss,
+    range_view_loss,
+)
 
 K = 5
 LOSSES = pytest.mark.parametrize("loss", [range_view_loss, polar_view_loss])
@@ -66,14 +73,22 @@ def lovasz_by_sets(probabilities: list[list[float]], target: list[int]) -> float
 
 @LOSSES
 @pytest.mark.parametrize("weights", [None, [1.0, 0.2, 3.0, 0.7, 2.0]])
-def test_without_the_region_part_a_loss_is_weighted_cross_entropy(loss: Loss, weights: list[float] | None) -> None:
+def test_without_the_region_part_a_loss_is_weighted_cross_entropy(
+    loss: Loss, weights: list[float] | None
+) -> None:
     logits, labels = example()
     found = loss(logits, labels, None if weights is None else torch.tensor(weights), 0.0)
-    assert found.item() == pytest.approx(cross_entropy_by_loop(logits, labels, weights or [1.0] * K), rel=1e-5)
+    assert found.item() == pytest.approx(
+        cross_entropy_by_loop(logits, labels, weights or [1.0] * K), rel=1e-5
+    )
 
 
-@pytest.mark.parametrize(("loss", "region_loss"), [(range_view_loss, dice), (polar_view_loss, lovasz_softmax)])
-def test_a_loss_is_cross_entropy_plus_its_region_part(loss: Loss, region_loss: Callable[..., Tensor]) -> None:
+@pytest.mark.parametrize(
+    ("loss", "region_loss"), [(range_view_loss, dice), (polar_view_loss, lovasz_softmax)]
+)
+def test_a_loss_is_cross_entropy_plus_its_region_part(
+    loss: Loss, region_loss: Callable[..., Tensor]
+) -> None:
     logits, labels = example()
     kept = labels > 0
     region = region_loss(logits[kept].softmax(dim=1), labels[kept] - 1)
@@ -149,7 +164,9 @@ def test_where_every_point_is_ignored_loss_and_gradient_are_zero(loss: Loss, poi
 
 @LOSSES
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_for_extreme_scores_the_loss_is_in_float32_and_its_gradient_finite(loss: Loss, dtype: torch.dtype) -> None:
+def test_for_extreme_scores_the_loss_is_in_float32_and_its_gradient_finite(
+    loss: Loss, dtype: torch.dtype
+) -> None:
     logits, labels = example()
     logits = (logits * 1000).to(dtype).requires_grad_()
     found = loss(logits, labels.to(torch.uint8), None, 1.0)

@@ -12,24 +12,37 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config import (
+from amvnet.config.schema import (
     PolarNetConfig,
     PolarViewConfig,
     RangeNetConfig,
 )
-from amvnet.models.joined import convolve_joined
-from amvnet.models.layers import AzimuthGRU, PointLinear, RingConv2d, fold_batch_norms, upsample, wrap_width
+from amvnet.models.layers import (
+    AzimuthGRU,
+    PointLinear,
+    RingConv2d,
+    fold_batch_norms,
+    upsample,
+    wrap_width,
+)
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
+from amvnet.models.upsampled_conv import convolve_joined
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarView
 from amvnet.scan import Scan
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarView
 
 RandomScan = Callable[..., Scan]
 
 K = 4
 RANGE_NET = RangeNetConfig(
-    stem=4, widths=(4, 6, 6), blocks=(1, 2, 1), height_strides=(1, 1, 2), decoder=6, head=4, gru=False
+    stem=4,
+    widths=(4, 6, 6),
+    blocks=(1, 2, 1),
+    height_strides=(1, 1, 2),
+    decoder=6,
+    head=4,
+    gru=False,
 )
 POLAR_NET = PolarNetConfig(point_widths=(6, 8), pillar=5, widths=(4, 6, 6), dropblock_size=3)
 GRID = PolarViewConfig(radial=9, angular=11, vertical=3, radius_min=0.0)
@@ -115,7 +128,9 @@ def test_a_point_linear_layer_is_a_linear_layer(rows: int, sizes: tuple[int, int
     layer, x = PointLinear(*sizes), torch.randn(rows, sizes[0], requires_grad=True)
     found, expected = layer(x), F.linear(x, layer.weight, layer.bias)
     torch.testing.assert_close(found, expected)
-    torch.testing.assert_close(*(torch.autograd.grad(y.square().sum(), x)[0] for y in (found, expected)))
+    torch.testing.assert_close(
+        *(torch.autograd.grad(y.square().sum(), x)[0] for y in (found, expected))
+    )
 
 
 def test_a_network_is_deterministic_in_eval(case: Case) -> None:
@@ -133,30 +148,48 @@ def test_a_batch_of_two_equals_each_alone_in_eval(case: Case) -> None:
 @pytest.mark.parametrize("steps", [8, -16])
 def test_range_net_without_gru_is_equivariant_to_a_shift_by_its_stride(steps: int) -> None:
     net, image = CASES["range"].in_eval(), torch.randn(1, 6, 7, 40)
-    torch.testing.assert_close(net(image.roll(steps, 3)), net(image).roll(steps, 3), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        net(image.roll(steps, 3)), net(image).roll(steps, 3), rtol=1e-4, atol=1e-5
+    )
     assert not torch.allclose(net(image), net(image).roll(steps, 3))
 
 
 def test_the_unet_of_polar_net_is_equivariant_to_a_shift_by_its_stride() -> None:
     net, pillars = CASES["polar"].in_eval(), torch.randn(1, 5, 9, 20)
-    torch.testing.assert_close(net.unet(pillars.roll(4, 3)), net.unet(pillars).roll(4, 3), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        net.unet(pillars.roll(4, 3)), net.unet(pillars).roll(4, 3), rtol=1e-4, atol=1e-5
+    )
 
 
-@pytest.mark.parametrize("sizes", [(3, 4, 3, 4), (3, 4, 6, 8), (5, 3, 5, 12), (1, 1, 2, 4), (2, 5, 6, 5), (3, 4, 5, 8)])
+@pytest.mark.parametrize(
+    "sizes", [(3, 4, 3, 4), (3, 4, 6, 8), (5, 3, 5, 12), (1, 1, 2, 4), (2, 5, 6, 5), (3, 4, 5, 8)]
+)
 @pytest.mark.parametrize("bias", [False, True])
-def test_a_joined_convolution_equals_one_over_the_upsampled_map(sizes: tuple[int, int, int, int], bias: bool) -> None:
+def test_a_joined_convolution_equals_one_over_the_upsampled_map(
+    sizes: tuple[int, int, int, int], bias: bool
+) -> None:
     h, w, full_h, full_w = sizes
-    convolution, coarse, fine = RingConv2d(5, 4), torch.randn(2, 3, h, w), torch.randn(2, 2, full_h, full_w)
+    convolution, coarse, fine = (
+        RingConv2d(5, 4),
+        torch.randn(2, 3, h, w),
+        torch.randn(2, 2, full_h, full_w),
+    )
     convolution.bias = nn.Parameter(torch.randn(4)) if bias else None
     together = torch.cat([upsample(coarse, fine), fine], dim=1)
     expected = convolution(together)
     with torch.inference_mode():
-        torch.testing.assert_close(convolve_joined(convolution, coarse, fine), expected, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(
+            convolve_joined(convolution, coarse, fine), expected, rtol=1e-4, atol=1e-5
+        )
     assert torch.equal(convolve_joined(convolution, coarse, fine), expected)
 
 
 def test_a_joined_convolution_costs_less() -> None:
-    convolution, coarse, fine = RingConv2d(96, 32), torch.randn(1, 64, 40, 60), torch.randn(1, 32, 80, 120)
+    convolution, coarse, fine = (
+        RingConv2d(96, 32),
+        torch.randn(1, 64, 40, 60),
+        torch.randn(1, 32, 80, 120),
+    )
     costs = []
     for gradients in (True, False):
         with torch.set_grad_enabled(gradients), FlopCounterMode(display=False) as counter:
@@ -177,15 +210,23 @@ def test_the_paper_size_range_net_costs_500_gflops_and_decodes_the_strides_4_to_
     net, image = RangeNet(RangeNetConfig(), 19).eval(), torch.zeros(1, 6, 64, 4096)
     seen: list[int] = []
     for lateral in net.lateral:
-        lateral.register_forward_hook(lambda _, inputs, __: seen.append(4096 // inputs[0].shape[-1]))
-    with FlopCounterMode(display=False) as counter:  # with gradients, and so the plain way of `joined`
+        lateral.register_forward_hook(
+            lambda _, inputs, __: seen.append(4096 // inputs[0].shape[-1])
+        )
+    with FlopCounterMode(
+        display=False
+    ) as counter:  # with gradients, and so the plain way of `joined`
         assert net(image).shape == (1, 19, 64, 4096)
     assert sorted(seen) == [4, 8, 16, 32, 64, 128]
     assert counter.get_total_flops() == pytest.approx(500e9, rel=0.1)
 
 
-@pytest.mark.parametrize(("width", "left", "right"), [(5, 1, 1), (4, 0, 2), (4, 3, 0), (3, 3, 3), (3, 7, 4), (1, 2, 5)])
-def test_wrap_width_continues_circularly_and_has_its_gradient(width: int, left: int, right: int) -> None:
+@pytest.mark.parametrize(
+    ("width", "left", "right"), [(5, 1, 1), (4, 0, 2), (4, 3, 0), (3, 3, 3), (3, 7, 4), (1, 2, 5)]
+)
+def test_wrap_width_continues_circularly_and_has_its_gradient(
+    width: int, left: int, right: int
+) -> None:
     x = torch.randn(2, 2, 3, width, dtype=torch.double, requires_grad=True)
     columns = [x[..., (column - left) % width] for column in range(left + width + right)]
     assert torch.equal(wrap_width(x, left, right), torch.stack(columns, dim=-1))
@@ -211,7 +252,9 @@ def gru_by_cells(layer: AzimuthGRU, x: Tensor, padding: int) -> Tensor:
     """One cell after the other: column by column, from top to bottom, the padding's columns first."""
     _, channels, height, width = x.shape
     cell = nn.GRUCell(channels, channels)
-    cell.load_state_dict({name.removesuffix("_l0"): value for name, value in layer.gru.state_dict().items()})
+    cell.load_state_dict(
+        {name.removesuffix("_l0"): value for name, value in layer.gru.state_dict().items()}
+    )
     hidden, out = torch.zeros(len(x), channels), torch.zeros_like(x)
     for column in range(-padding, width):
         for row in range(height):
@@ -236,14 +279,20 @@ def test_the_gru_has_seen_the_other_end_if_padded(share: float, seen: bool) -> N
     assert not torch.equal(layer(x)[..., -1], layer(changed)[..., -1])
 
 
-@pytest.mark.parametrize(("height", "width", "factor"), [(5, 7, 2), (6, 8, 2), (1, 1, 2), (4, 12, 4)])
-def test_upsample_gives_each_value_to_the_cells_it_stands_for(height: int, width: int, factor: int) -> None:
+@pytest.mark.parametrize(
+    ("height", "width", "factor"), [(5, 7, 2), (6, 8, 2), (1, 1, 2), (4, 12, 4)]
+)
+def test_upsample_gives_each_value_to_the_cells_it_stands_for(
+    height: int, width: int, factor: int
+) -> None:
     coarse = torch.randn(1, 2, math.ceil(height / factor), math.ceil(width / factor))
     found = upsample(coarse, torch.zeros(1, 9, height, width))
     assert found.shape == (1, 2, height, width)
     for row in range(height):
         for column in range(width):
-            assert torch.equal(found[:, :, row, column], coarse[:, :, row // factor, column // factor])
+            assert torch.equal(
+                found[:, :, row, column], coarse[:, :, row // factor, column // factor]
+            )
 
 
 def norms_of(net: nn.Module) -> int:
@@ -287,7 +336,9 @@ def test_dropblock_drops_squares() -> None:
     dropped = (DropBlock(0.02, 5).train()(torch.ones(1, 1, 60, 60)) == 0)[0, 0]
     assert dropped.any()
     covered = torch.zeros_like(dropped)
-    for row, column in dropped[2:-2, 2:-2].nonzero().tolist():  # a square of nothing but dropped cells around it
+    for row, column in (
+        dropped[2:-2, 2:-2].nonzero().tolist()
+    ):  # a square of nothing but dropped cells around it
         if dropped[row : row + 5, column : column + 5].all():
             covered[row : row + 5, column : column + 5] = True
     assert torch.equal(covered[5:-5, 5:-5], dropped[5:-5, 5:-5])

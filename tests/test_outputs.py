@@ -17,12 +17,12 @@ from pypcd4 import PointCloud
 from scan_files import some_points, write_bag1, write_pcd
 from worlds import amvnet, fails, files, fresh_weights, make_streets, without
 
-from amvnet import verbs
-from amvnet.data.formats import read_cloud
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.data.outputs import KINDS, write_scan_labels
-from amvnet.segmenter import Segmenter
-from amvnet.weights import save
+from amvnet.cli.commands import predict as verbs
+from amvnet.data.formats.detect import read_cloud
+from amvnet.data.label_files import KINDS, write_scan_labels
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.inference.segmenter import Segmenter
+from amvnet.weights.file import save
 
 COUNT = 60
 LOST = 7  # the place of a point with NaN
@@ -43,10 +43,18 @@ def read_ply(path: Path) -> Read:
     file = plyfile.PlyData.read(path)
     assert (file.text, file.byte_order) == (False, "<")
     vertex = file["vertex"].data
-    names, columns = vertex.dtype.names, {name: np.asarray(vertex[name]) for name in vertex.dtype.names}
+    names, columns = (
+        vertex.dtype.names,
+        {name: np.asarray(vertex[name]) for name in vertex.dtype.names},
+    )
     assert [vertex.dtype[name].str for name in ("red", "class")] == ["|u1", "<i4"]
-    xyz, colors = (np.stack([columns[n] for n in some], 1) for some in (("x", "y", "z"), ("red", "green", "blue")))
-    return Read(columns["class"], xyz, colors, columns["uncertain"] if "uncertain" in names else None)
+    xyz, colors = (
+        np.stack([columns[n] for n in some], 1)
+        for some in (("x", "y", "z"), ("red", "green", "blue"))
+    )
+    return Read(
+        columns["class"], xyz, colors, columns["uncertain"] if "uncertain" in names else None
+    )
 
 
 def read_pcd(path: Path) -> Read:
@@ -80,7 +88,9 @@ READERS: dict[str, Callable[[Path], Read]] = {
 }
 
 
-def a_scan(dtype: type = np.float32, offset: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def a_scan(
+    dtype: type = np.float32, offset: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(N, 3) coordinates, (N,) train ids with every class, (N,) bool; one point is lost."""
     xyz = some_points(COUNT)[:, :3].astype(dtype) + dtype(offset)
     ids = np.random.default_rng(1).permutation(COUNT) % (SEMANTICKITTI.size + 1)
@@ -104,7 +114,9 @@ def test_every_kind_is_read_back_here_and_offered_by_the_command_line() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_other_libraries_read_what_was_written(kind: str, known: bool, tmp_path: Path) -> None:
     xyz, ids, uncertain = a_scan()
-    path = write_scan_labels(tmp_path / "a.b", kind, xyz, ids, SEMANTICKITTI, uncertain if known else None)
+    path = write_scan_labels(
+        tmp_path / "a.b", kind, xyz, ids, SEMANTICKITTI, uncertain if known else None
+    )
     assert path == tmp_path / f"a.b.{kind}"
     assert files(tmp_path) == {path.name}
     found = READERS[kind](path)
@@ -112,8 +124,12 @@ def test_other_libraries_read_what_was_written(kind: str, known: bool, tmp_path:
     if kind in WITH_POINTS:
         assert found.xyz is not None
         assert found.colors is not None
-        np.testing.assert_allclose(found.xyz, where_lost(kind, xyz), rtol=0, atol=1e-4 if kind == "las" else 0)
-        assert [tuple(color) for color in found.colors.tolist()] == [SEMANTICKITTI.colors[i] for i in ids]
+        np.testing.assert_allclose(
+            found.xyz, where_lost(kind, xyz), rtol=0, atol=1e-4 if kind == "las" else 0
+        )
+        assert [tuple(color) for color in found.colors.tolist()] == [
+            SEMANTICKITTI.colors[i] for i in ids
+        ]
         assert (found.uncertain is None) == (not known)
         if found.uncertain is not None:
             assert found.uncertain.tolist() == uncertain.tolist()
@@ -154,7 +170,9 @@ def test_points_that_las_cannot_hold_keep_their_places_and_move_no_others(tmp_pa
 @pytest.mark.parametrize("raw", [0, 260, 65535])
 def test_raw_ids_of_more_than_a_byte_survive(kind: str, raw: int, tmp_path: Path) -> None:
     taxonomy = replace(NUSCENES, train_to_raw=(0, raw, *range(2, 17)))
-    found = READERS[kind](write_scan_labels(tmp_path / "a", kind, np.zeros((2, 3)), np.array([1, 2]), taxonomy))
+    found = READERS[kind](
+        write_scan_labels(tmp_path / "a", kind, np.zeros((2, 3)), np.array([1, 2]), taxonomy)
+    )
     assert found.raw.tolist() == [raw, 2]
 
 
@@ -162,7 +180,10 @@ def test_raw_ids_of_more_than_a_byte_survive(kind: str, raw: int, tmp_path: Path
 def test_a_scan_without_a_finite_point_or_any(kind: str, tmp_path: Path) -> None:
     for count in (0, 3):
         xyz, ids = np.full((count, 3), np.nan, np.float32), np.zeros(count, np.uint8)
-        assert len(READERS[kind](write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)).raw) == count
+        assert (
+            len(READERS[kind](write_scan_labels(tmp_path / "a", kind, xyz, ids, SEMANTICKITTI)).raw)
+            == count
+        )
 
 
 @pytest.mark.parametrize("kind", WITH_POINTS)
@@ -196,10 +217,16 @@ def test_an_existing_file_survives_a_write_that_fails(
 
 
 def test_an_unknown_format_is_named() -> None:
-    fails(lambda: write_scan_labels(Path("a"), "xyz", np.zeros((1, 3)), np.zeros(1), SEMANTICKITTI), "xyz", "ply")
+    fails(
+        lambda: write_scan_labels(Path("a"), "xyz", np.zeros((1, 3)), np.zeros(1), SEMANTICKITTI),
+        "xyz",
+        "ply",
+    )
 
 
-def test_a_missing_extra_is_named(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_extra_is_named(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "laspy", None)
     code, message = predict(world, tmp_path, world / "scans/a.bin", "--format", "las")
     assert (code, message.count("\n")) == (2, 1)
@@ -238,15 +265,22 @@ def test_predict_writes_the_files_own_points_though_the_network_sees_others(
     inputs = (world / "scans", world / "drive.bag", "--axes", "y-forward", "--height", "0.5")
     assert predict(world, tmp_path / "label", *inputs)[0] == 0
     assert predict(world, tmp_path / "out", *inputs, "--format", kind)[0] == 0
-    sources = {"a": read_cloud(world / "scans/a.bin").xyz, "b": read_cloud(world / "scans/b.pcd").xyz}
+    sources = {
+        "a": read_cloud(world / "scans/a.bin").xyz,
+        "b": read_cloud(world / "scans/b.pcd").xyz,
+    }
     sources |= {"drive/000000": sources["b"], "drive/000001": sources["b"][::-1]}
     assert files(tmp_path / "out") == {f"{name}.{kind}" for name in sources}
     for name, xyz in sources.items():
         found = READERS[kind](tmp_path / "out" / f"{name}.{kind}")
-        assert np.array_equal(found.raw, np.fromfile(tmp_path / "label" / f"{name}.label", np.uint32))
+        assert np.array_equal(
+            found.raw, np.fromfile(tmp_path / "label" / f"{name}.label", np.uint32)
+        )
         if found.xyz is not None:
             assert found.uncertain is not None
-            np.testing.assert_allclose(found.xyz, where_lost(kind, xyz), rtol=0, atol=1e-4 if kind == "las" else 0)
+            np.testing.assert_allclose(
+                found.xyz, where_lost(kind, xyz), rtol=0, atol=1e-4 if kind == "las" else 0
+            )
 
 
 def test_uncertain_points_are_those_of_the_segmenter(world: Path, tmp_path: Path) -> None:
@@ -254,7 +288,10 @@ def test_uncertain_points_are_those_of_the_segmenter(world: Path, tmp_path: Path
     assert predict(world, tmp_path, world / "data", world / "scans", *options)[0] == 0
     folder = "sequences/08/predictions"
     names = {f"{folder}/{i:06d}" for i in range(2)}
-    expected = {f"{name}.label" for name in names} | {"a.ply", "b.ply"}  # a data set keeps its layout
+    expected = {f"{name}.label" for name in names} | {
+        "a.ply",
+        "b.ply",
+    }  # a data set keeps its layout
     assert files(tmp_path) == expected | {f"{name}.uncertain.npy" for name in (*names, "a", "b")}
     points = np.fromfile(world / "data/sequences/08/velodyne/000000.bin", np.float32).reshape(-1, 4)
     found = np.load(tmp_path / folder / "000000.uncertain.npy", allow_pickle=False)
@@ -276,9 +313,12 @@ def test_one_network_alone_is_never_said_to_be_certain(world: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("scan", "options"), [("b.pcd", ("--format", "pcd")), ("a.bin", ("--format", "ply")), ("c.npz", ("--scores",))]
+    ("scan", "options"),
+    [("b.pcd", ("--format", "pcd")), ("a.bin", ("--format", "ply")), ("c.npz", ("--scores",))],
 )
-def test_scans_are_never_written_over(scan: str, options: tuple[str, ...], world: Path, tmp_path: Path) -> None:
+def test_scans_are_never_written_over(
+    scan: str, options: tuple[str, ...], world: Path, tmp_path: Path
+) -> None:
     points = some_points(400)
     for name, content in (("a.bin", points.tobytes()), ("a.ply", b"another scan of mine")):
         (tmp_path / name).write_bytes(content)

@@ -12,7 +12,7 @@ import pytest
 from scan_files import write_bag1, write_pcd
 from test_sensors import LASERS, place
 
-from amvnet.cli import main
+from amvnet.cli.main import main
 
 DOCS = Path(__file__).parent.parent / "docs"
 PAGES = ("own_scans.md", "own_sensor.md")
@@ -64,7 +64,10 @@ def test_every_command_runs(
 def test_the_promised_files_are_there(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     inputs = ["scan.bin", "more_scans/", "drive.bag", "--topic", "/lidar/top"]
-    assert main(["predict", *inputs, "--weights", "sim-hdl64e", "--method", "rv", "--out", "promised"]) == 0
+    assert (
+        main(["predict", *inputs, "--weights", "sim-hdl64e", "--method", "rv", "--out", "promised"])
+        == 0
+    )
     names = {str(path.relative_to("promised")) for path in Path("promised").rglob("*.label")}
     assert names == {"scan.label", "000000.label", "000001.label", "drive/000000.label"}
 
@@ -81,16 +84,32 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
-    assert main(["predict", "cloud.pcd", "--weights", "sim-hdl64e", "--method", "bev", "--out", "labels"]) == 0
+    assert (
+        main(
+            [
+                "predict",
+                "cloud.pcd",
+                "--weights",
+                "sim-hdl64e",
+                "--method",
+                "bev",
+                "--out",
+                "labels",
+            ]
+        )
+        == 0
+    )
     said = capsys.readouterr().out.splitlines()[0]
     text = (DOCS / "own_scans.md").read_text(encoding="utf-8")
     shown = " ".join(re.findall(r"    (cloud\.pcd: .*)\n    (.*)\n", text)[0])
-    heights = r"\d\.\d\d m over the ground \(moved by -\d\.\d\d m"  # which differ by some millimetres
+    heights = (
+        r"\d\.\d\d m over the ground \(moved by -\d\.\d\d m"  # which differ by some millimetres
+    )
     assert re.sub(heights, "", said) == re.sub(heights, "", shown)
 
 
 def test_the_names_of_sensors_are_those_that_are_known() -> None:
-    from amvnet.sensors import SENSORS
+    from amvnet.sensors.lidars import SENSORS
 
     text = (DOCS / "own_sensor.md").read_text(encoding="utf-8")
     listed = re.findall(r"(?s)A name states lasers and field of view: (.*?)\. Where", text)[0]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from amvnet.data.labels import NUSCENES
+from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
-from amvnet.pictures import UNCERTAIN, WRONG, draw_scan
+from amvnet.evaluation.top_view import UNCERTAIN, WRONG, draw_scan
 
 PATCH = 400  # points of one class in one block, dense enough to fill pixels
 
@@ -31,7 +31,13 @@ def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
     points, truth = blocks([4, 11, 16])
     wrong = np.where(np.arange(len(truth)) < PATCH, 3, truth)
     path = draw_scan(
-        tmp_path / "a" / "b.png", points, NUSCENES, {"RV": wrong, "AMVNet": truth}, truth, truth == 4, "title"
+        tmp_path / "a" / "b.png",
+        points,
+        NUSCENES,
+        {"RV": wrong, "AMVNet": truth},
+        truth,
+        truth == 4,
+        "title",
     )
     image = imread(path)
     for class_id in (3, 4, 11, 16):
@@ -48,7 +54,9 @@ def test_every_part_is_optional(tmp_path: Path, with_truth: bool, with_uncertain
     points, ids = blocks([1, 0])
     points[0] = np.nan
     uncertain = ids > 0 if with_uncertain else None
-    assert draw_scan(tmp_path / "a.png", points, NUSCENES, {"p": ids}, ids if with_truth else None, uncertain).is_file()
+    assert draw_scan(
+        tmp_path / "a.png", points, NUSCENES, {"p": ids}, ids if with_truth else None, uncertain
+    ).is_file()
 
 
 def test_truth_alone_is_enough(tmp_path: Path) -> None:

@@ -14,13 +14,13 @@ import pytest
 import torch
 from worlds import amvnet, files, fresh_weights, make_streets, street
 
-from amvnet import prediction
-from amvnet.data.files import whole_file
-from amvnet.journal import Journal
+from amvnet.files import atomic_write
+from amvnet.inference import predict as prediction
+from amvnet.inference.journal import Journal
+from amvnet.inference.pipeline import AHEAD, Task, stream
+from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmentation, Segmenter
-from amvnet.streaming import AHEAD, Task, stream
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 WEIGHTS = "w.safetensors"
 
@@ -42,7 +42,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def whole(world: Path) -> Path:
     """What an undisturbed run writes."""
-    assert amvnet("predict", world / "scans", "--weights", world / WEIGHTS, "--out", world / "whole") == (0, "")
+    assert amvnet(
+        "predict", world / "scans", "--weights", world / WEIGHTS, "--out", world / "whole"
+    ) == (0, "")
     return world / "whole"
 
 
@@ -52,7 +54,9 @@ def same(a: Path, b: Path) -> None:
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
 
 
-def test_broken_scans_are_listed_and_the_others_are_segmented(world: Path, whole: Path, tmp_path: Path) -> None:
+def test_broken_scans_are_listed_and_the_others_are_segmented(
+    world: Path, whole: Path, tmp_path: Path
+) -> None:
     scans = tmp_path / "scans"
     scans.mkdir()
     for path in (world / "scans").iterdir():
@@ -62,7 +66,9 @@ def test_broken_scans_are_listed_and_the_others_are_segmented(world: Path, whole
     code, error = amvnet("predict", scans, "--weights", world / WEIGHTS, "--out", tmp_path / "out")
     assert code == 3
     *faults, last = error.splitlines()
-    assert [name in line for name, line in zip(("000003.bin", "000007.bin"), faults, strict=True)] == [True, True]
+    assert [
+        name in line for name, line in zip(("000003.bin", "000007.bin"), faults, strict=True)
+    ] == [True, True]
     assert "10 of 12" in last
     assert files(tmp_path / "out") == files(whole) - {"000003.label", "000007.label"}
 
@@ -71,22 +77,36 @@ def test_only_broken_scans_are_one_line(world: Path, tmp_path: Path) -> None:
     for name in ("a.bin", "b.bin"):
         (tmp_path / name).write_bytes(b"123")
     inputs = (tmp_path / "a.bin", tmp_path / "b.bin")
-    code, error = amvnet("predict", *inputs, "--weights", world / WEIGHTS, "--out", tmp_path / "out")
+    code, error = amvnet(
+        "predict", *inputs, "--weights", world / WEIGHTS, "--out", tmp_path / "out"
+    )
     assert (code, error.count("\n")) == (2, 1)
     assert "a.bin" in error
     assert not files(tmp_path / "out")
 
 
 @pytest.mark.parametrize("kills", [1, 2])
-def test_a_killed_run_goes_on_where_it_stopped(world: Path, whole: Path, tmp_path: Path, kills: int) -> None:
+def test_a_killed_run_goes_on_where_it_stopped(
+    world: Path, whole: Path, tmp_path: Path, kills: int
+) -> None:
     """SIGKILL in the midst of it, once or twice; what is done is not done again, and the end is the same."""
     out = tmp_path / "out"
     slow = "import time; from amvnet import streaming, cli; write = streaming._write\n"
     slow += "streaming._write = lambda *a: (time.sleep(0.1), write(*a))\nimport sys; sys.exit(cli.main())"
-    arguments = ["predict", str(world / "scans"), "--weights", str(world / WEIGHTS), "--out", str(out), "--resume"]
+    arguments = [
+        "predict",
+        str(world / "scans"),
+        "--weights",
+        str(world / WEIGHTS),
+        "--out",
+        str(out),
+        "--resume",
+    ]
     times: dict[str, int] = {}
     for kill in range(1, kills + 1):
-        process = subprocess.Popen([sys.executable, "-c", slow, *arguments], stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            [sys.executable, "-c", slow, *arguments], stdout=subprocess.DEVNULL
+        )
         while len(list(out.glob("*.label"))) < 3 * kill and process.poll() is None:
             time.sleep(0.005)
         process.kill()
@@ -94,15 +114,27 @@ def test_a_killed_run_goes_on_where_it_stopped(world: Path, whole: Path, tmp_pat
         assert list(out.glob(".unfinished-*")), "the run was over before it was killed"
         written = {path.name: path.stat().st_mtime_ns for path in out.glob("*.label")}
         kept = {name for name in times if written.get(name) == times[name]}
-        assert len(kept) >= len(times) - 1  # the last one may have been written, and not yet written down
+        assert (
+            len(kept) >= len(times) - 1
+        )  # the last one may have been written, and not yet written down
         times = written
     assert amvnet(*arguments) == (0, "")
     same(out, whole)
-    assert sum((out / name).stat().st_mtime_ns == at for name, at in times.items()) >= len(times) - 1
+    assert (
+        sum((out / name).stat().st_mtime_ns == at for name, at in times.items()) >= len(times) - 1
+    )
 
 
 def test_an_interrupted_run_is_not_gone_on_with_by_others(world: Path, tmp_path: Path) -> None:
-    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--resume")
+    arguments = (
+        "predict",
+        world / "scans",
+        "--weights",
+        world / WEIGHTS,
+        "--out",
+        tmp_path,
+        "--resume",
+    )
     Journal(tmp_path, {**settings_of(world), "method": "rv"})
     code, error = amvnet(*arguments)
     assert (code, error.count("\n")) == (2, 1)
@@ -111,8 +143,18 @@ def test_an_interrupted_run_is_not_gone_on_with_by_others(world: Path, tmp_path:
     assert len(files(tmp_path)) == 12
 
 
-def test_a_finished_run_is_not_taken_for_an_interrupted_one(world: Path, whole: Path, tmp_path: Path) -> None:
-    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--resume")
+def test_a_finished_run_is_not_taken_for_an_interrupted_one(
+    world: Path, whole: Path, tmp_path: Path
+) -> None:
+    arguments = (
+        "predict",
+        world / "scans",
+        "--weights",
+        world / WEIGHTS,
+        "--out",
+        tmp_path,
+        "--resume",
+    )
     assert amvnet(*arguments) == (0, "")
     (tmp_path / "000005.label").write_bytes(b"other")
     assert amvnet(*arguments) == (0, "")
@@ -125,17 +167,31 @@ def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, end: str) -
     journal = Journal(tmp_path, {"x": 1})
     with journal.path.open("a") as file:
         file.write(end)
-    assert Journal(tmp_path, {"x": 1}, resume=True).done == ({"a", "b"} if end.count('"b"\n') else {"a"})
-    kept = [json.loads(line) for line in (tmp_path / ".unfinished-0.jsonl").read_text().splitlines()]
+    assert Journal(tmp_path, {"x": 1}, resume=True).done == (
+        {"a", "b"} if end.count('"b"\n') else {"a"}
+    )
+    kept = [
+        json.loads(line) for line in (tmp_path / ".unfinished-0.jsonl").read_text().splitlines()
+    ]
     assert kept[0] == {"x": 1}
 
 
-def test_a_part_of_a_folder_is_labelled_as_in_the_whole(world: Path, whole: Path, tmp_path: Path) -> None:
+def test_a_part_of_a_folder_is_labelled_as_in_the_whole(
+    world: Path, whole: Path, tmp_path: Path
+) -> None:
     """What is measured of a sensor comes of a folder's first scans, whichever are left to segment."""
     journal = Journal(tmp_path, settings_of(world))
     for place in range(9):
         journal.add(f"{place:06d}.npz")
-    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--resume")
+    arguments = (
+        "predict",
+        world / "scans",
+        "--weights",
+        world / WEIGHTS,
+        "--out",
+        tmp_path,
+        "--resume",
+    )
     assert amvnet(*arguments) == (0, "")
     assert files(tmp_path) == {f"{place:06d}.label" for place in (9, 10, 11)}
     for name in files(tmp_path):
@@ -145,7 +201,7 @@ def test_a_part_of_a_folder_is_labelled_as_in_the_whole(world: Path, whole: Path
 def settings_of(world: Path) -> dict[str, object]:
     weights = Segmenter(str(world / WEIGHTS)).weights
     parts = {part: weights.digest(part) for part in weights.parts}
-    sensor = repr(prediction.Fitting(weights).given)
+    sensor = repr(prediction.ScanAdapter(weights).given)
     kept = {"scores": False, "uncertain": False, "format": "label"}
     return {"weights": parts, "method": "amvnet", "sensor": sensor, **kept}
 
@@ -176,9 +232,11 @@ def test_few_scans_are_in_memory_however_many_there_are(world: Path, at_once: in
     assert not held
 
 
-def test_what_a_killed_run_left_half_written_is_taken_away(world: Path, whole: Path, tmp_path: Path) -> None:
+def test_what_a_killed_run_left_half_written_is_taken_away(
+    world: Path, whole: Path, tmp_path: Path
+) -> None:
     (tmp_path / ".notes.part").write_text("of somebody else")
-    with whole_file(tmp_path / "000000.label") as part:
+    with atomic_write(tmp_path / "000000.label") as part:
         part.write_bytes(b"whole")
     part.write_bytes(b"half")  # under the name that it has until it is whole
     arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path)
@@ -191,7 +249,16 @@ def test_what_a_killed_run_left_half_written_is_taken_away(world: Path, whole: P
 def test_scans_side_by_side_get_the_labels_they_get_one_by_one(
     world: Path, whole: Path, tmp_path: Path, at_once: int
 ) -> None:
-    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path, "--at-once", at_once)
+    arguments = (
+        "predict",
+        world / "scans",
+        "--weights",
+        world / WEIGHTS,
+        "--out",
+        tmp_path,
+        "--at-once",
+        at_once,
+    )
     threads = torch.get_num_threads()
     assert amvnet(*arguments) == (0, "")
     same(tmp_path, whole)
@@ -207,6 +274,7 @@ def test_scans_side_by_side_really_run_at_the_same_time() -> None:
         return Segmentation(*np.zeros((3, len(scan))))
 
     tasks = [
-        Task(str(n), lambda: Scan(np.zeros((5, 4), np.float32)), segment, lambda _: Path(), Path()) for n in (0, 1)
+        Task(str(n), lambda: Scan(np.zeros((5, 4), np.float32)), segment, lambda _: Path(), Path())
+        for n in (0, 1)
     ]
     assert [fault for _, fault in stream(tasks, False, False, at_once=2)] == [None, None]

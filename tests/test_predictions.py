@@ -73,7 +73,10 @@ WRONG: dict[str, tuple[Callable[[np.ndarray], np.ndarray | None], str]] = {
     "uint16": (lambda ids: ids.astype("<u2"), "ids of 16 bits"),
     "a point too few": (lambda ids: ids[:-1], "one per point"),
     "two scans in one": (lambda ids: np.tile(ids, 3), "one per point"),
-    "255 and -1 for no class": (lambda ids: np.full_like(ids, -1, dtype=ids.dtype.str.replace("u", "i")), "raw ids"),
+    "255 and -1 for no class": (
+        lambda ids: np.full_like(ids, -1, dtype=ids.dtype.str.replace("u", "i")),
+        "raw ids",
+    ),
     "fine categories": (
         lambda ids: np.resize(np.array([23, 24, 31], ids.dtype), len(ids)),
         "found 23, 24",
@@ -95,7 +98,9 @@ MISTAKES = [("semantickitti", mistake) for mistake in WRONG | WRONG_KITTI] + [
 
 
 @pytest.mark.parametrize(("given", "mistake"), MISTAKES, indirect=["given"])
-def test_what_is_no_prediction_is_one_line(mistake: str, given: tuple[str, Path, str], tmp_path: Path) -> None:
+def test_what_is_no_prediction_is_one_line(
+    mistake: str, given: tuple[str, Path, str], tmp_path: Path
+) -> None:
     spec, folder, dtype = given
     path = first(folder)
     change, words = (WRONG | WRONG_KITTI)[mistake]

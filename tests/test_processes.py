@@ -14,9 +14,10 @@ import torch
 from torch import nn
 from worlds import amvnet, files, make_streets, without, write_recipe
 
-from amvnet.loading import EpochSampler
-from amvnet.processes import Processes, SyncedBatchNorm, synced
-from amvnet.weights import Weights, load, save
+from amvnet.distributed import Processes
+from amvnet.training.loaders import EpochSampler
+from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
+from amvnet.weights.file import Weights, load, save
 
 # DropBlock draws for each process anew, and so as no single process does. In double precision, as AdamW divides each
 # gradient by its size, so that of one that is next to nothing the rounding decides.
@@ -31,7 +32,14 @@ TRAINING = {
 
 def torchrun(*arguments: object, count: int = 2) -> subprocess.CompletedProcess[str]:
     """The command line on some processes of this machine."""
-    launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count)]
+    launcher = [
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        str(count),
+    ]
     command = [*launcher, "-m", "amvnet", *map(str, arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
@@ -39,7 +47,9 @@ def torchrun(*arguments: object, count: int = 2) -> subprocess.CompletedProcess[
 
 def largest_difference(a: Weights, b: Weights) -> float:
     assert set(a.tensors) == set(b.tensors)
-    return max(float((a.tensors[k].double() - b.tensors[k].double()).abs().max()) for k in a.tensors)
+    return max(
+        float((a.tensors[k].double() - b.tensors[k].double()).abs().max()) for k in a.tensors
+    )
 
 
 @pytest.fixture(scope="module")
@@ -48,21 +58,35 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("world")
     make_streets(root / "data", scans=4)
     write_recipe(root / "recipe.yaml", model=STILL, training=TRAINING)
-    assert amvnet("train", root / "recipe.yaml", "--data", root / "data", "--out", root / "run") == (0, "")
+    assert amvnet(
+        "train", root / "recipe.yaml", "--data", root / "data", "--out", root / "run"
+    ) == (0, "")
     save(without(load(root / "run"), "point_head"), root / "networks.safetensors")
     return root
 
 
 def arguments_of(world: Path, out: Path, stage: str) -> list[object]:
     init = ["--init", world / "networks.safetensors"] if stage == "head" else []
-    return ["train", world / "recipe.yaml", "--data", world / "data", "--out", out, "--stage", stage, *init]
+    return [
+        "train",
+        world / "recipe.yaml",
+        "--data",
+        world / "data",
+        "--out",
+        out,
+        "--stage",
+        stage,
+        *init,
+    ]
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev", "head"])
 def test_two_processes_train_the_weights_of_one(world: Path, tmp_path: Path, stage: str) -> None:
     done = torchrun(*arguments_of(world, tmp_path / "two", stage))
     assert done.returncode == 0, done.stderr
-    found, expected = (load(run / stage / "last.safetensors") for run in (tmp_path / "two", world / "run"))
+    found, expected = (
+        load(run / stage / "last.safetensors") for run in (tmp_path / "two", world / "run")
+    )
     assert largest_difference(found, expected) < 1e-5
     part = found.parts[0]
     assert found.metrics[part] == pytest.approx(expected.metrics[part])
@@ -76,36 +100,70 @@ def test_processes_that_slurm_has_started_find_each_other(world: Path, tmp_path:
     job = {"SLURM_JOB_ID": "4711", "SLURM_JOB_NAME": "amvnet", "SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "2",
            "SLURM_NNODES": "1", "SLURM_NODEID": "0", "SLURM_NODELIST": "127.0.0.1", "SLURM_STEP_ID": "0",
            "MASTER_PORT": str(port), "OMP_NUM_THREADS": "1"}  # fmt: skip
-    command = [sys.executable, "-m", "amvnet", *map(str, arguments_of(world, tmp_path / "two", "rv"))]
-    ranks = [{**os.environ, **job, "SLURM_PROCID": str(rank), "SLURM_LOCALID": str(rank)} for rank in range(2)]
-    started = [subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) for env in ranks]
+    command = [
+        sys.executable,
+        "-m",
+        "amvnet",
+        *map(str, arguments_of(world, tmp_path / "two", "rv")),
+    ]
+    ranks = [
+        {**os.environ, **job, "SLURM_PROCID": str(rank), "SLURM_LOCALID": str(rank)}
+        for rank in range(2)
+    ]
+    started = [
+        subprocess.Popen(command, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        for env in ranks
+    ]
     said = [process.communicate()[0].decode() for process in started]
     assert [process.returncode for process in started] == [0, 0], said
-    found, expected = (load(run / "rv/last.safetensors") for run in (tmp_path / "two", world / "run"))
+    found, expected = (
+        load(run / "rv/last.safetensors") for run in (tmp_path / "two", world / "run")
+    )
     assert largest_difference(found, expected) < 1e-5
     assert said[1] == ""
 
 
 def test_processes_share_the_scans_of_predict_and_evaluate(world: Path, tmp_path: Path) -> None:
-    for name, run in (("one", lambda *a: amvnet(*a)[0]), ("two", lambda *a: torchrun(*a).returncode)):
+    for name, run in (
+        ("one", lambda *a: amvnet(*a)[0]),
+        ("two", lambda *a: torchrun(*a).returncode),
+    ):
         out = tmp_path / name
         weights = ("--weights", world / "run")
         assert (
-            run("predict", world / "data", *weights, "--out", out / "labels", "--scores", "--sequences", "00,08") == 0
+            run(
+                "predict",
+                world / "data",
+                *weights,
+                "--out",
+                out / "labels",
+                "--scores",
+                "--sequences",
+                "00,08",
+            )
+            == 0
         )
         options = ("--split", "all", "--json", out / "all.json", "--pictures", out / "pictures")
         assert run("evaluate", world / "data", *weights, *options) == 0
     assert files(tmp_path / "one") == files(tmp_path / "two")
     assert len(files(tmp_path / "one/labels")) == 16
     for name in files(tmp_path / "one"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes(), name
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes(), (
+            name
+        )
 
 
-@pytest.mark.parametrize(("verb", "options"), [("train", ("--training.rv.batch", 3)), ("analyze", ())])
+@pytest.mark.parametrize(
+    ("verb", "options"), [("train", ("--training.rv.batch", 3)), ("analyze", ())]
+)
 def test_what_cannot_be_shared_is_refused_in_one_line(
     world: Path, tmp_path: Path, verb: str, options: tuple[object, ...]
 ) -> None:
-    first = [verb, world / "recipe.yaml"] if verb == "train" else [verb, "--weights", world / "run", world / "data"]
+    first = (
+        [verb, world / "recipe.yaml"]
+        if verb == "train"
+        else [verb, "--weights", world / "run", world / "data"]
+    )
     data = ["--data", world / "data"] if verb == "train" else []
     done = torchrun(*first, *data, "--out", tmp_path / "out", *options)
     assert done.returncode != 0
@@ -125,7 +183,9 @@ def test_the_parts_of_a_batch_are_those_of_one_process(size: int, count: int) ->
     assert together[:size] == alone
     assert set(together[size:]) <= set(alone)
     assert len(together) - size < count
-    validated = [key for rank in range(count) for key in EpochSampler(size, 3, False, Processes(rank, count))]
+    validated = [
+        key for rank in range(count) for key in EpochSampler(size, 3, False, Processes(rank, count))
+    ]
     assert sorted(validated) == [(0, place) for place in range(size)]
 
 
@@ -133,7 +193,7 @@ def _norms_of_a_process(rank: int, port: int, folder: str) -> None:
     torch.distributed.init_process_group("gloo", f"tcp://127.0.0.1:{port}", rank=rank, world_size=2)
     x = torch.load(f"{folder}/x.pt", weights_only=True)
     mine = (x[:3] if rank == 0 else x[3:]).clone().requires_grad_()
-    norm = synced(_norm(), cuda=False)
+    norm = synchronise_batch_norms(_norm(), cuda=False)
     (norm(mine) ** 3).sum().backward()
     torch.save({"x": mine.grad, **norm.state_dict()}, f"{folder}/{rank}.pt")
     torch.distributed.destroy_process_group()
@@ -149,7 +209,10 @@ def _norm() -> nn.Sequential:
 
 def test_a_synced_batch_norm_is_that_of_the_whole_batch(tmp_path: Path) -> None:
     """Of unequal parts: outputs' gradients and running statistics are those of torch's own over all."""
-    x = torch.randn(5, 4, 6, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 3 + 100
+    x = (
+        torch.randn(5, 4, 6, 7, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) * 3
+        + 100
+    )
     torch.save(x, tmp_path / "x.pt")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -168,7 +231,7 @@ def test_a_synced_batch_norm_is_used_as_the_one_it_stands_for() -> None:
     net, x = nn.Sequential(nn.Linear(3, 4), nn.BatchNorm1d(4)), torch.randn(8, 3)
     net(x)
     expected = net.eval()(x)
-    copied = synced(net, cuda=False)
+    copied = synchronise_batch_norms(net, cuda=False)
     assert isinstance(copied[1], SyncedBatchNorm)
     assert torch.equal(copied.eval()(x), expected)
     assert np.all([k in copied.state_dict() for k in ("1.weight", "1.running_mean")])

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from worlds import amvnet, fails, files, fresh_weights, street, without
 
-from amvnet.data.labels import NUSCENES
+from amvnet.data.taxonomy import NUSCENES
 from amvnet.onnx_runner import OnnxSegmenter
-from amvnet.weights import Weights, save
+from amvnet.weights.file import Weights, save
 
 POINTS = 3000
 QUANTISED = ("range_net", "polar_map")
@@ -37,11 +37,17 @@ def scans(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def exported(weights: Weights, scans: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def exported(
+    weights: Weights, scans: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Path]:
     """The same graphs as they were before, in float32, and in int8."""
-    from amvnet import export as module
+    from amvnet.export import onnx as module
 
-    float32, int8, quantise = tmp_path_factory.mktemp("a") / "float32", tmp_path_factory.mktemp("b"), module.quantise
+    float32, int8, quantise = (
+        tmp_path_factory.mktemp("a") / "float32",
+        tmp_path_factory.mktemp("b"),
+        module.quantise,
+    )
 
     def kept(folder: Path, *rest: Any) -> Any:
         shutil.copytree(folder, float32)
@@ -76,10 +82,14 @@ def kernels(model: Any) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
 
 
 @pytest.mark.parametrize("name", QUANTISED)
-def test_convolutions_hold_integers_nearest_to_their_weights(exported: tuple[Path, Path], name: str) -> None:
+def test_convolutions_hold_integers_nearest_to_their_weights(
+    exported: tuple[Path, Path], name: str
+) -> None:
     before, after = (kernels(model_of(folder, name)) for folder in exported)
     assert set(before) == set(after)
-    assert [key for key, (_, scale) in after.items() if scale is None] == {"range_net": ["stem.0.weight"]}.get(name, [])
+    assert [key for key, (_, scale) in after.items() if scale is None] == {
+        "range_net": ["stem.0.weight"]
+    }.get(name, [])
     for key, (integers, scale) in after.items():
         if scale is not None:
             weight = before[key][0]
@@ -98,7 +108,9 @@ def test_the_gru_stays_in_float32(exported: tuple[Path, Path]) -> None:
     assert all(made.get(name) != "DequantizeLinear" for one in layers for name in one.input[1:3])
 
 
-def test_the_description_says_which_graphs_are_in_int8(exported: tuple[Path, Path], scans: Path) -> None:
+def test_the_description_says_which_graphs_are_in_int8(
+    exported: tuple[Path, Path], scans: Path
+) -> None:
     import hashlib
 
     said = json.loads((exported[1] / "amvnet.json").read_text())["graphs"]
@@ -110,7 +122,10 @@ def test_the_description_says_which_graphs_are_in_int8(exported: tuple[Path, Pat
     runners = [OnnxSegmenter(folder) for folder in exported]
     held = [np.fromfile(scans / f"{seed:06d}.bin", np.float32).reshape(-1, 4) for seed in (0, 5)]
     for name, score in (("range_net", "score_range_view"), ("polar_map", "score_polar_view")):
-        labels = [np.concatenate([getattr(one, score)(points).argmax(axis=1) for points in held]) for one in runners]
+        labels = [
+            np.concatenate([getattr(one, score)(points).argmax(axis=1) for points in held])
+            for one in runners
+        ]
         assert said[name]["agreement"] == pytest.approx((labels[0] == labels[1]).mean(), abs=1e-3)
         assert said[name]["agreement"] >= 0.9
 
@@ -126,17 +141,24 @@ def test_the_graphs_say_nothing_of_the_machine(exported: tuple[Path, Path]) -> N
 def test_one_scan_and_rows_by_ring_do(scans: Path, tmp_path: Path) -> None:
     weights = replace(without(fresh_weights(NUSCENES), "polar_net", "point_head"), sensor="hdl32e")
     path = save(weights, tmp_path / "w.safetensors")
-    assert amvnet("export", "--weights", path, "--out", tmp_path / "out", "--int8", scans / "000003.bin")[0] == 0
+    assert (
+        amvnet(
+            "export", "--weights", path, "--out", tmp_path / "out", "--int8", scans / "000003.bin"
+        )[0]
+        == 0
+    )
     points = np.fromfile(scans / "000003.bin", np.float32).reshape(-1, 4)
     assert OnnxSegmenter(tmp_path / "out")(points, np.arange(POINTS) % 16).labels.all()
 
 
-@pytest.mark.parametrize("case", ["none", "empty", "broken", "lost", "other sensor", "other labels"])
+@pytest.mark.parametrize(
+    "case", ["none", "empty", "broken", "lost", "other sensor", "other labels"]
+)
 def test_mistakes_are_one_line_and_leave_no_files(
     case: str, weights: Weights, scans: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from amvnet import quantising
-    from amvnet.export import export
+    from amvnet.export import int8 as quantising
+    from amvnet.export.onnx import export
 
     given, word = tmp_path / "given", "expected"
     if case not in ("none", "other sensor"):

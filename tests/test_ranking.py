@@ -17,11 +17,11 @@ import torch
 from worlds import amvnet, files, fresh_weights, make_streets, without
 
 from amvnet import Scan, Segmenter
-from amvnet.clusters import CELL, cluster
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.ranking import clusters_of, doubts_of, rank
-from amvnet.weights import save
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.ranking.clusters import CELL, cluster
+from amvnet.ranking.rank import find_clusters, find_doubts, rank
+from amvnet.weights.file import save
 
 DOCS = Path(__file__).parent.parent / "docs"
 WEIGHTS = fresh_weights()
@@ -45,7 +45,9 @@ def by_flooding(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
                 continue
             found[one] = number
             ahead += [
-                c for c in set(cells) if c[3] == one[3] and max(abs(a - b) for a, b in zip(c, one, strict=True)) <= 1
+                c
+                for c in set(cells)
+                if c[3] == one[3] and max(abs(a - b) for a, b in zip(c, one, strict=True)) <= 1
             ]
     return np.array([found[c] for c in cells])
 
@@ -74,9 +76,13 @@ class Said(Segmenter):
         super().__init__(WEIGHTS)
         self.said = [torch.from_numpy(one.astype(np.float32)) for one in (f, g)]
 
-    def scores_by_method(self, scan: Scan, methods: Sequence[str] = ()) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+    def scores_by_method(
+        self, scan: Scan, methods: Sequence[str] = ()
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
         f, g = (one[torch.from_numpy(scan.valid)] for one in self.said)
-        return {"rv": f, "bev": g}, self.model.assertion(f, g, torch.from_numpy(scan.points[scan.valid]))
+        return {"rv": f, "bev": g}, self.model.assertion(
+            f, g, torch.from_numpy(scan.points[scan.valid])
+        )
 
 
 def sure(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
@@ -98,14 +104,14 @@ def test_the_vehicle_that_carries_the_sensor_is_not_doubted() -> None:
     points, thing = things()
     points[thing == 0, :3] *= (1, 0.1, 1)  # to half a metre from the sensor
     f, g = (sure(np.full(301, kind)) for kind in (CAR, PERSON))
-    _, of = clusters_of(doubts_of(Scan(points), Said(f, g), "disagreement"))
+    _, of = find_clusters(find_doubts(Scan(points), Said(f, g), "disagreement"))
     assert np.array_equal(of >= 0, (thing == 1) | (thing == 2))
 
 
 def test_a_disagreement_is_one_cluster_where_it_is() -> None:
     points, thing = things()
     f, g = (sure(np.where(thing == 1, kind, ROAD)) for kind in (CAR, PERSON))
-    rows, of = clusters_of(doubts_of(Scan(points), Said(f, g), "disagreement"))
+    rows, of = find_clusters(find_doubts(Scan(points), Said(f, g), "disagreement"))
     assert len(rows) == 1
     assert np.array_equal(of >= 0, thing == 1)
     assert (rows["rv"], rows["bev"], rows["label"], rows["points"]) == (CAR, PERSON, 0, 100)
@@ -115,10 +121,12 @@ def test_a_disagreement_is_one_cluster_where_it_is() -> None:
 
 def test_a_label_is_doubted_only_where_both_views_contradict_it() -> None:
     points, thing = things()
-    labels = np.where(thing == 0, WALL, np.where(thing == 1, ROAD, 0)).astype(np.uint8)  # wrong, half wrong, none
+    labels = np.where(thing == 0, WALL, np.where(thing == 1, ROAD, 0)).astype(
+        np.uint8
+    )  # wrong, half wrong, none
     f, g = sure(np.full(301, CAR)), sure(np.where(thing == 1, ROAD, CAR))
-    doubts = doubts_of(Scan(points, labels), Said(f, g), "labels")
-    rows, of = clusters_of(doubts)
+    doubts = find_doubts(Scan(points, labels), Said(f, g), "labels")
+    rows, of = find_clusters(doubts)
     assert np.array_equal(of >= 0, thing == 0)
     assert (rows["rv"], rows["bev"], rows["label"]) == (CAR, CAR, WALL)
     assert np.allclose(doubts.doubt[thing == 0], 0.9, atol=1e-5)
@@ -129,7 +137,9 @@ def test_a_whole_thing_is_more_doubtful_than_the_edge_of_one_and_many_points_tha
     labels = np.full(301, WALL, np.uint8)
     said = np.where((thing == 0) | ((thing == 1) & (points[:, 0] > 10.3)), CAR, WALL)
     said[np.flatnonzero(thing == 2)[:1]] = CAR
-    rows, _ = clusters_of(doubts_of(Scan(points, labels), Said(sure(said), sure(said)), "labels"))
+    rows, _ = find_clusters(
+        find_doubts(Scan(points, labels), Said(sure(said), sure(said)), "labels")
+    )
     order = np.argsort(-rows["score"])
     assert rows["points"][order][0] == 100
     assert rows["points"][order][-1] == 1
@@ -150,7 +160,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for by in ("disagreement", "labels"):
         out = ("--out", root / f"{by}.csv", "--by", by)
         drawn = ("--pictures", root / by) if by == "labels" else ()
-        assert amvnet("rank", root / "data", "--weights", root / "w.safetensors", *out, *drawn) == (0, "")
+        assert amvnet("rank", root / "data", "--weights", root / "w.safetensors", *out, *drawn) == (
+            0,
+            "",
+        )
     return root
 
 
@@ -195,7 +208,11 @@ def test_scans_without_labels_are_ranked_alike(world: Path, tmp_path: Path) -> N
 
 
 def test_wrong_input_is_one_line_and_leaves_nothing(world: Path, tmp_path: Path) -> None:
-    for weights, word in (("rv", "both networks"), ("nuscenes", "classes"), ("none", "weights file")):
+    for weights, word in (
+        ("rv", "both networks"),
+        ("nuscenes", "classes"),
+        ("none", "weights file"),
+    ):
         arguments = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path / "next.csv")
         code, error = amvnet("rank", world / "data", *arguments)
         assert (code, error.count("\n")) == (2, 1)
@@ -207,7 +224,13 @@ def test_a_scan_is_read_when_it_is_its_turn(world: Path, monkeypatch: pytest.Mon
     dataset, turns = open_dataset(str(world / "data")), []
     read = type(dataset).read
     monkeypatch.setattr(type(dataset), "read", lambda *args: turns.append("read") or read(*args))
-    rank(dataset, dataset.records(["00", "01"]), Segmenter(WEIGHTS), "labels", lambda done, total: turns.append("turn"))
+    rank(
+        dataset,
+        dataset.records(["00", "01"]),
+        Segmenter(WEIGHTS),
+        "labels",
+        lambda done, total: turns.append("turn"),
+    )
     assert turns == ["turn", "read"] * 4 + ["turn"]
 
 
@@ -221,7 +244,11 @@ def test_every_command_of_the_page_runs_and_finds_most(
     monkeypatch.chdir(tmp_path)
     shutil.copy(DOCS / "mislabel.py", tmp_path)
     page = (DOCS / "ranking.md").read_text()
-    commands = [line for block in re.findall(r"```bash\n(.*?)```", page, re.S) for line in block.splitlines()]
+    commands = [
+        line
+        for block in re.findall(r"```bash\n(.*?)```", page, re.S)
+        for line in block.splitlines()
+    ]
     assert len(commands) == 5
     for command in commands:
         words = shlex.split(command.replace("--sequences 10 --scans 2", "--sequences 3 --scans 1"))

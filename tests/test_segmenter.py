@@ -12,9 +12,9 @@ from worlds import THRESHOLD, fails, fresh_weights, street, without
 
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
-from amvnet.data.labels import NUSCENES
-from amvnet.segmenter import METHODS
-from amvnet.weights import save
+from amvnet.data.taxonomy import NUSCENES
+from amvnet.inference.methods import METHODS
+from amvnet.weights.file import save
 
 K = 19
 POINTS = street(5, 600)[0]
@@ -64,7 +64,15 @@ def test_certain_points_have_the_geometric_mean(result: Segmentation) -> None:
 def lost(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The points with rows of lost returns among them, and where these are."""
     places = np.array([0, 7, 7, 100, len(points)])
-    rows = np.array([[np.nan, 1, 1, 0.5], [1, np.inf, 1, 0.5], [1, 1, -np.inf, 0.5], [1, 1, 1, np.nan], [np.nan] * 4])
+    rows = np.array(
+        [
+            [np.nan, 1, 1, 0.5],
+            [1, np.inf, 1, 0.5],
+            [1, 1, -np.inf, 0.5],
+            [1, 1, 1, np.nan],
+            [np.nan] * 4,
+        ]
+    )
     mask = np.insert(np.zeros(len(points), bool), places, True)
     return np.insert(points, places, rows.astype(np.float32), axis=0), mask
 
@@ -77,11 +85,19 @@ def test_lost_points_stay_in_place_and_change_nothing(method: str) -> None:
     assert np.array_equal(with_lost.labels[~gone], without_lost.labels)
     assert np.array_equal(with_lost.scores[~gone], without_lost.scores)
     assert np.array_equal(with_lost.uncertain[~gone], without_lost.uncertain)
-    for values in (with_lost.labels, with_lost.uncertain, with_lost.scores, with_lost.rv, with_lost.bev):
+    for values in (
+        with_lost.labels,
+        with_lost.uncertain,
+        with_lost.scores,
+        with_lost.rv,
+        with_lost.bev,
+    ):
         assert values is None or not values[gone].any()
 
 
-@pytest.mark.parametrize(("method", "asked"), [("rv", {"rv"}), ("bev", {"bev"}), ("ensemble", {"rv", "bev"})])
+@pytest.mark.parametrize(
+    ("method", "asked"), [("rv", {"rv"}), ("bev", {"bev"}), ("ensemble", {"rv", "bev"})]
+)
 def test_only_the_networks_that_were_asked_have_scores(method: str, asked: set[str]) -> None:
     result = Segmenter(WEIGHTS, method=method)(POINTS)
     assert {name for name in ("rv", "bev") if getattr(result, name) is not None} == asked
@@ -139,7 +155,9 @@ def test_permuted_points_have_permuted_labels(segmenter: Segmenter, result: Segm
     assert (permuted.labels == result.labels[order]).mean() > 0.995
 
 
-def test_the_same_points_have_the_same_labels_again(segmenter: Segmenter, result: Segmentation) -> None:
+def test_the_same_points_have_the_same_labels_again(
+    segmenter: Segmenter, result: Segmentation
+) -> None:
     assert np.array_equal(segmenter(POINTS.copy()).scores, result.scores)
 
 
@@ -158,7 +176,9 @@ def test_a_lone_point_is_segmented(segmenter: Segmenter) -> None:
     assert segmenter(POINTS[:1]).labels.shape == (1,)
 
 
-@pytest.mark.parametrize("points", [np.zeros((0, 4)), np.full((5, 4), np.nan)], ids=["empty", "NaN"])
+@pytest.mark.parametrize(
+    "points", [np.zeros((0, 4)), np.full((5, 4), np.nan)], ids=["empty", "NaN"]
+)
 @pytest.mark.parametrize("method", METHODS)
 def test_a_scan_without_points_is_refused(points: np.ndarray, method: str) -> None:
     with pytest.raises(InputError):
@@ -205,7 +225,9 @@ def test_weights_without_head_are_an_ensemble_and_no_more() -> None:
     assert np.array_equal(ensemble.labels, Segmenter(WEIGHTS, method="ensemble")(POINTS).labels)
 
 
-@pytest.mark.parametrize(("option", "value"), [("method", "vote"), ("device", "abacus"), ("device", "cuda:99")])
+@pytest.mark.parametrize(
+    ("option", "value"), [("method", "vote"), ("device", "abacus"), ("device", "cuda:99")]
+)
 def test_an_unknown_method_or_device_is_refused(option: str, value: str) -> None:
     with pytest.raises(InputError):
         Segmenter(WEIGHTS, **{option: value})
@@ -220,13 +242,19 @@ def test_rows_by_ring_need_a_ring() -> None:
 
 
 @pytest.mark.parametrize("points", [POINTS, lost(POINTS)[0]], ids=["whole", "with lost points"])
-def test_fusing_the_networks_scores_gives_the_segmenters_labels(segmenter: Segmenter, points: np.ndarray) -> None:
+def test_fusing_the_networks_scores_gives_the_segmenters_labels(
+    segmenter: Segmenter, points: np.ndarray
+) -> None:
     own = segmenter(points)
-    assert np.array_equal(fuse(points, own.rv, own.bev, segmenter.model.point_head, tau=THRESHOLD), own.labels)
+    assert np.array_equal(
+        fuse(points, own.rv, own.bev, segmenter.model.point_head, tau=THRESHOLD), own.labels
+    )
     assert np.array_equal(fuse(points, own.rv, own.bev, WEIGHTS, tau=THRESHOLD), own.labels)
 
 
-def test_fusing_with_weights_takes_their_own_threshold(segmenter: Segmenter, result: Segmentation) -> None:
+def test_fusing_with_weights_takes_their_own_threshold(
+    segmenter: Segmenter, result: Segmentation
+) -> None:
     assert np.array_equal(fuse(POINTS, result.rv, result.bev, head=WEIGHTS), result.labels)
 
 
@@ -262,7 +290,7 @@ def test_fusing_with_weights_without_a_head_is_refused(result: Segmentation) -> 
 
 
 def test_importing_the_package_does_not_import_torch() -> None:
-    code = "import sys, amvnet, amvnet.cli; print({'torch', 'lightning', 'matplotlib', 'scipy'} & set(sys.modules))"
+    code = "import sys, amvnet, amvnet.cli.main; print({'torch', 'lightning', 'matplotlib', 'scipy'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

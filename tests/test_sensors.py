@@ -15,20 +15,36 @@ from hypothesis import strategies as st
 from scan_files import pcd_bytes, write_bag1
 from worlds import amvnet, fails, files, fresh_weights, make_streets
 
-from amvnet.cli import main
-from amvnet.data.clouds import Cloud
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.cli.main import main
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.fitting import MEASURED, Fitting
-from amvnet.measuring import ground_height, measure
+from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
-from amvnet.segmenter import Segmenter
-from amvnet.sensors import AXES, HEIGHTS, SENSORS, Sensor, describe, rotation
+from amvnet.sensors.adapt import MEASURED, ScanAdapter
+from amvnet.sensors.lidars import AXES, HEIGHTS, SENSORS, Sensor, make_sensor, rotation
+from amvnet.sensors.measure import ground_height, measure
 from amvnet.simulation.sensors import HDL32E, HDL64E
-from amvnet.weights import save
+from amvnet.weights.file import save
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
-VLP32C = (-25, -15.6, -11.3, -8.8, -7.3, -6.1, -5.3, -4.7, *np.linspace(-4, 1.667, 18), 2.3, 3.3, 4.7, 7, 10.3, 15)
+VLP32C = (
+    -25,
+    -15.6,
+    -11.3,
+    -8.8,
+    -7.3,
+    -6.1,
+    -5.3,
+    -4.7,
+    *np.linspace(-4, 1.667, 18),
+    2.3,
+    3.3,
+    4.7,
+    7,
+    10.3,
+    15,
+)
 LASERS: dict[str, Any] = {
     "vlp16": np.linspace(-15, 15, 16),
     "vlp32c": VLP32C,
@@ -50,7 +66,9 @@ def place(
     with np.errstate(divide="ignore"):
         flat = np.minimum(np.where(down < 0, -height / down, np.inf), wall)
     flat *= 1 + rng.normal(0, 0.001, len(flat))
-    xyz = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), flat * np.tan(elevation)], axis=1)
+    xyz = np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), flat * np.tan(elevation)], axis=1
+    )
     return np.column_stack([xyz, rng.random(len(xyz))]).astype(np.float32), laser
 
 
@@ -98,11 +116,14 @@ def test_a_firing_order_and_chance_are_no_order_of_lasers() -> None:
 @pytest.mark.skipif(not REAL, reason="AMVNET_REAL_DATA does not name a folder")
 @pytest.mark.parametrize(("name", "beams"), [("semantickitti", 64), ("nuscenes", 32)])
 def test_real_sensors_stand_where_they_do(name: str, beams: int) -> None:
-    from amvnet.data.catalog import open_dataset
+    from amvnet.data.datasets.open import open_dataset
 
     dataset = open_dataset(str(Path(REAL or "") / name))
     records = dataset.records(dataset.sequences("all"))[::5]
-    found = [measure(scan.points[scan.valid], scan.ring) for scan in (dataset.read(r, labels=False) for r in records)]
+    found = [
+        measure(scan.points[scan.valid], scan.ring)
+        for scan in (dataset.read(r, labels=False) for r in records)
+    ]
     expected = HEIGHTS[f"hdl{beams}e"]
     heights = [m.height for m in found if m.height is not None]
     assert len(heights) == len(records)
@@ -114,10 +135,12 @@ def test_real_sensors_stand_where_they_do(name: str, beams: int) -> None:
 # --- fitting
 
 
-def _fitting(given: Sensor | None = None, sensor: str = "hdl64e", nuscenes: bool = False) -> tuple[Fitting, list[str]]:
+def _fitting(
+    given: Sensor | None = None, sensor: str = "hdl64e", nuscenes: bool = False
+) -> tuple[ScanAdapter, list[str]]:
     said: list[str] = []
     weights = replace(fresh_weights(NUSCENES if nuscenes else SEMANTICKITTI), sensor=sensor)
-    return Fitting(weights, given, said.append), said
+    return ScanAdapter(weights, given, said.append), said
 
 
 def _cloud(points: np.ndarray, ring: np.ndarray | None = None) -> Cloud:
@@ -151,7 +174,9 @@ def test_a_given_height_counts_whatever_the_ground_says() -> None:
 
 @pytest.mark.parametrize("axes", AXES)
 @pytest.mark.parametrize("turn", [(0, 0, 0), (90, 0, 0), (30, 10, -5)])
-def test_any_frame_that_is_described_gives_the_same_scan(axes: str, turn: tuple[float, float, float]) -> None:
+def test_any_frame_that_is_described_gives_the_same_scan(
+    axes: str, turn: tuple[float, float, float]
+) -> None:
     points, _ = place(LASERS["os1-64"], 1.2)
     points[5] = 0
     expected = _fitting()[0](_cloud(points), "a")
@@ -165,9 +190,15 @@ def test_any_frame_that_is_described_gives_the_same_scan(axes: str, turn: tuple[
 
 
 def test_rotations_are_yaw_pitch_and_roll() -> None:
-    np.testing.assert_allclose(rotation(90, 0, 0) @ [1, 0, 0], [0, 1, 0], atol=1e-12)  # ahead comes to the left
-    np.testing.assert_allclose(rotation(0, 90, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-12)  # ahead comes down
-    np.testing.assert_allclose(rotation(0, 0, 90) @ [0, 1, 0], [0, 0, 1], atol=1e-12)  # left comes up
+    np.testing.assert_allclose(
+        rotation(90, 0, 0) @ [1, 0, 0], [0, 1, 0], atol=1e-12
+    )  # ahead comes to the left
+    np.testing.assert_allclose(
+        rotation(0, 90, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-12
+    )  # ahead comes down
+    np.testing.assert_allclose(
+        rotation(0, 0, 90) @ [0, 1, 0], [0, 0, 1], atol=1e-12
+    )  # left comes up
     for axes in AXES.values():
         assert np.linalg.det(np.array(axes)) == pytest.approx(1)  # no mirror
 
@@ -176,7 +207,7 @@ def test_rows_are_those_of_the_weights_where_the_sensor_is_theirs() -> None:
     points, _ = place(HDL64E.elevations, 1.73)
     weights = replace(fresh_weights(), sensor="hdl64e")
     segmenter = Segmenter(weights)
-    fitted = Fitting(weights)(_cloud(points), "a")
+    fitted = ScanAdapter(weights)(_cloud(points), "a")
     np.testing.assert_array_equal(fitted.points, points)
     np.testing.assert_array_equal(segmenter.by_ring()(fitted).labels, segmenter(points).labels)
     np.testing.assert_array_equal(segmenter.by_ring()(fitted).rv, segmenter(points).rv)
@@ -185,7 +216,7 @@ def test_rows_are_those_of_the_weights_where_the_sensor_is_theirs() -> None:
 def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None:
     points, laser = place(LASERS["os1-64"], 0.8)
     weights = replace(fresh_weights(), sensor="hdl64e")
-    ring = Fitting(weights)(_cloud(points), "a").ring
+    ring = ScanAdapter(weights)(_cloud(points), "a").ring
     assert ring is not None
     of_laser = [np.unique(ring[laser == k]) for k in range(64)]
     assert all(len(rows) == 1 for rows in of_laser)
@@ -218,7 +249,12 @@ def test_what_was_assumed_is_said_once_for_a_source() -> None:
     points[:, 3] *= 255
     fit, said = _fitting()
     for seed in range(3):
-        fit(_cloud(place(LASERS["vlp16"], 0.9, seed=seed)[0] * np.array([1, 1, 1, 255], np.float32)), "drive")
+        fit(
+            _cloud(
+                place(LASERS["vlp16"], 0.9, seed=seed)[0] * np.array([1, 1, 1, 255], np.float32)
+            ),
+            "drive",
+        )
     assert len(said) == 1
     for word in (
         "a.pcd",
@@ -260,7 +296,11 @@ def test_a_scan_whose_origin_is_on_the_ground_or_below_is_moved(up: float) -> No
     _equal(_fitting()[0](_cloud(on_ground), "a"), _fitting()[0](_cloud(points), "a"), atol=0.05)
 
 
-coordinate = st.floats(width=32) | st.floats(-50, 50, width=32) | st.sampled_from([0.0, 1.0, -1.7, 1e4, 3e38])
+coordinate = (
+    st.floats(width=32)
+    | st.floats(-50, 50, width=32)
+    | st.sampled_from([0.0, 1.0, -1.7, 1e4, 3e38])
+)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True, database=None)
@@ -270,10 +310,17 @@ coordinate = st.floats(width=32) | st.floats(-50, 50, width=32) | st.sampled_fro
     ring=st.booleans(),
     sensor=st.sampled_from(["hdl64e", "hdl32e", "homemade"]),
     nuscenes=st.booleans(),
-    given_sensor=st.sampled_from([None, Sensor(fov_up=-40), SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]),
+    given_sensor=st.sampled_from(
+        [None, Sensor(fov_up=-40), SENSORS["vlp16"], Sensor(height=1, rotate=(1, 2, 3))]
+    ),
 )
 def test_any_numbers_end_in_a_scan_or_one_line(
-    rows: list[Any], repeated: int, ring: bool, sensor: str, nuscenes: bool, given_sensor: Sensor | None
+    rows: list[Any],
+    repeated: int,
+    ring: bool,
+    sensor: str,
+    nuscenes: bool,
+    given_sensor: Sensor | None,
 ) -> None:
     points = np.array(rows * repeated, np.float32).reshape(-1, 4)
     cloud = _cloud(points, np.arange(len(points)) % 40 if ring else None)
@@ -291,12 +338,16 @@ def test_any_numbers_end_in_a_scan_or_one_line(
 
 def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
-    path.write_text("beams: 16\nfov_up: 15\nfov_down: -15\nheight: 0.4\naxes: z-forward\nrotate: [0, -5, 0]\n")
-    assert describe(str(path)) == Sensor("robot", 16, 15, -15, 0.4, None, "z-forward", (0, -5, 0))
-    assert describe(str(path), height=0.5, offset="0,0,1e-1").height == 0.5
-    assert describe(None, rotate="90, 0,0").rotate == (90, 0, 0)
-    assert describe("vlp16") is not None
-    assert describe() == Sensor()
+    path.write_text(
+        "beams: 16\nfov_up: 15\nfov_down: -15\nheight: 0.4\naxes: z-forward\nrotate: [0, -5, 0]\n"
+    )
+    assert make_sensor(str(path)) == Sensor(
+        "robot", 16, 15, -15, 0.4, None, "z-forward", (0, -5, 0)
+    )
+    assert make_sensor(str(path), height=0.5, offset="0,0,1e-1").height == 0.5
+    assert make_sensor(None, rotate="90, 0,0").rotate == (90, 0, 0)
+    assert make_sensor("vlp16") is not None
+    assert make_sensor() == Sensor()
 
 
 @pytest.mark.parametrize(
@@ -320,14 +371,14 @@ def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
 def test_a_wrong_description_is_named(tmp_path: Path, text: str, words: list[str]) -> None:
     path = tmp_path / "robot.yaml"
     path.write_text(text)
-    fails(lambda: describe(str(path)), path, *words)
+    fails(lambda: make_sensor(str(path)), path, *words)
 
 
 def test_wrong_options_are_named(tmp_path: Path) -> None:
-    fails(lambda: describe("eye"), "eye", "vlp16")
-    fails(lambda: describe(str(tmp_path / "no.yaml")), "no.yaml")
-    fails(lambda: describe(rotate="1,2"), "--rotate", "90,0,0")
-    fails(lambda: describe(intensity_scale="much"), "--intensity-scale")
+    fails(lambda: make_sensor("eye"), "eye", "vlp16")
+    fails(lambda: make_sensor(str(tmp_path / "no.yaml")), "no.yaml")
+    fails(lambda: make_sensor(rotate="1,2"), "--rotate", "90,0,0")
+    fails(lambda: make_sensor(intensity_scale="much"), "--intensity-scale")
 
 
 def test_known_sensors_are_those_that_are_simulated() -> None:
@@ -365,28 +416,62 @@ def test_labels_stand_at_the_lines_of_their_points(world: Path, tmp_path: Path) 
     for weights in ("w", "ring"):
         out = tmp_path / weights
         assert (
-            amvnet("predict", tmp_path / "a.pcd", "--weights", world / f"{weights}.safetensors", "--out", out)[0] == 0
+            amvnet(
+                "predict",
+                tmp_path / "a.pcd",
+                "--weights",
+                world / f"{weights}.safetensors",
+                "--out",
+                out,
+            )[0]
+            == 0
         )
         labels = np.fromfile(out / "a.label", np.uint32)
         assert len(labels) == len(points)
         assert np.array_equal(labels == 0, lost)
 
 
-def test_a_bag_is_segmented_scan_by_scan(world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ("--weights", world / "w.safetensors", "--out", tmp_path, "--topic", "/top", "--scores")
+def test_a_bag_is_segmented_scan_by_scan(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = (
+        "--weights",
+        world / "w.safetensors",
+        "--out",
+        tmp_path,
+        "--topic",
+        "/top",
+        "--scores",
+    )
     assert main(["predict", str(world / "drive.bag"), *map(str, options)]) == 0
     shown = capsys.readouterr().out
     assert files(tmp_path) == {f"drive/{i:06d}.{end}" for i in range(3) for end in ("label", "npz")}
     assert shown.count("assumed") == 1
-    assert amvnet("predict", world / "robot.bin", "--weights", world / "w.safetensors", "--out", tmp_path)[0] == 0
+    assert (
+        amvnet(
+            "predict", world / "robot.bin", "--weights", world / "w.safetensors", "--out", tmp_path
+        )[0]
+        == 0
+    )
     expected = (tmp_path / "robot.label").read_bytes()
     assert {path.read_bytes() for path in (tmp_path / "drive").glob("*.label")} == {expected}
 
 
 def test_options_override_what_is_measured(world: Path, tmp_path: Path) -> None:
     labels = {}
-    for name, options in {"measured": (), "stated": ("--height", 0.9), "other": ("--height", 2.9)}.items():
-        call = ("predict", world / "robot.bin", "--weights", world / "w.safetensors", "--out", tmp_path / name)
+    for name, options in {
+        "measured": (),
+        "stated": ("--height", 0.9),
+        "other": ("--height", 2.9),
+    }.items():
+        call = (
+            "predict",
+            world / "robot.bin",
+            "--weights",
+            world / "w.safetensors",
+            "--out",
+            tmp_path / name,
+        )
         assert amvnet(*call, *options)[0] == 0
         labels[name] = np.fromfile(tmp_path / name / "robot.label", np.uint32)
     assert np.mean(labels["measured"] == labels["stated"]) > 0.95

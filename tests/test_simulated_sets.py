@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from worlds import fails
 
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 from amvnet.simulation import simulate, writing
 from amvnet.simulation.layouts import NuScenesLayout
 
@@ -22,12 +22,18 @@ SCENES = ("simulated-0000", "simulated-0001")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 @pytest.fixture(scope="module")
 def nuscenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return simulate(tmp_path_factory.mktemp("nuscenes"), sensor="hdl32e", sequences=2, scans=3, seed=2)
+    return simulate(
+        tmp_path_factory.mktemp("nuscenes"), sensor="hdl32e", sequences=2, scans=3, seed=2
+    )
 
 
 def table(folder: Path, name: str) -> list[dict[str, Any]]:
@@ -55,19 +61,31 @@ def test_a_stopped_simulation_goes_on_to_the_same_bytes(
         simulate(tmp_path, sensor="hdl32e", sequences=2, scans=3, seed=2)
     monkeypatch.undo()
     done: list[int] = []
-    simulate(tmp_path, sensor="hdl32e", sequences=2, scans=3, seed=2, progress=lambda n, _: done.append(n))
+    simulate(
+        tmp_path,
+        sensor="hdl32e",
+        sequences=2,
+        scans=3,
+        seed=2,
+        progress=lambda n, _: done.append(n),
+    )
     assert done == [4, 5, 6]  # the first scene was whole
     assert contents(tmp_path) == contents(nuscenes)
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="asks Linux which processes there are")
+@pytest.mark.skipif(
+    not Path("/proc/self/stat").exists(), reason="asks Linux which processes there are"
+)
 def test_no_process_outlives_one_that_was_killed(tmp_path: Path) -> None:
     command = ["simulate", str(tmp_path), "--sequences", "2", "--scans", "1000", "--processes", "2"]
-    parent = subprocess.Popen([sys.executable, "-m", "amvnet.cli", *command], stderr=subprocess.DEVNULL)
+    parent = subprocess.Popen([sys.executable, "-m", "amvnet", *command], stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
     while not list(tmp_path.rglob("*.bin")) and time.monotonic() < deadline:
         time.sleep(0.1)
-    children = [int(pid) for pid in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()]
+    children = [
+        int(pid)
+        for pid in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+    ]
     assert len(children) >= 2
     parent.kill()
     parent.wait()
@@ -81,7 +99,9 @@ def _runs(pid: int) -> bool:
     return stat.exists() and stat.read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
-def test_a_finished_simulation_is_left_as_it_is(nuscenes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_simulation_is_left_as_it_is(
+    nuscenes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(writing, "drive_street", lambda *_: pytest.fail("was simulated again"))
     before = contents(nuscenes)
     simulate(nuscenes, sensor="hdl32e", sequences=2, scans=3, seed=2)
@@ -90,7 +110,11 @@ def test_a_finished_simulation_is_left_as_it_is(nuscenes: Path, monkeypatch: pyt
 
 @pytest.mark.parametrize("other", [{"seed": 3}, {"scans": 4}, {"sensor": "hdl64e"}])
 def test_a_folder_of_another_simulation_is_refused(nuscenes: Path, other: dict[str, Any]) -> None:
-    fails(lambda: simulate(nuscenes, **({"sensor": "hdl32e", "scans": 3, "seed": 2} | other)), nuscenes, "another")
+    fails(
+        lambda: simulate(nuscenes, **({"sensor": "hdl32e", "scans": 3, "seed": 2} | other)),
+        nuscenes,
+        "another",
+    )
 
 
 def test_simulated_nuscenes_is_read_as_the_real_one(nuscenes: Path) -> None:
@@ -109,7 +133,14 @@ def test_simulated_nuscenes_is_read_as_the_real_one(nuscenes: Path) -> None:
         assert (scan.labels[near] == 0).all()
         assert (np.bincount(scan.ring) == 1084).all()  # a row for each shot, as nuScenes has it
         seen |= set(scan.labels.tolist())
-    assert {4, 11, 13, 14, 15, 16} <= seen  # car, driveable surface, sidewalk, terrain, manmade, vegetation
+    assert {
+        4,
+        11,
+        13,
+        14,
+        15,
+        16,
+    } <= seen  # car, driveable surface, sidewalk, terrain, manmade, vegetation
 
 
 def test_simulated_nuscenes_drives_forward_along_y(nuscenes: Path) -> None:
@@ -161,6 +192,8 @@ def test_scans_are_linked_in_the_order_of_time(nuscenes: Path, name: str, links:
 def test_the_files_that_the_tables_name_are_there(nuscenes: Path) -> None:
     for name in ("sample_data", "lidarseg", "map"):
         assert all((nuscenes / row["filename"]).is_file() for row in table(nuscenes, name))
-    labels = [np.fromfile(nuscenes / row["filename"], np.uint8) for row in table(nuscenes, "lidarseg")]
+    labels = [
+        np.fromfile(nuscenes / row["filename"], np.uint8) for row in table(nuscenes, "lidarseg")
+    ]
     assert all(len(one) == 32 * 1084 for one in labels)
     assert max(one.max() for one in labels) < len(table(nuscenes, "category"))

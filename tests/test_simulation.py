@@ -12,27 +12,58 @@ from amvnet.errors import InputError
 from amvnet.simulation import SENSORS, Drive, drive_street, simulate
 from amvnet.simulation.layouts import semantickitti_ids
 
-RAW_IDS = {10, 11, 13, 15, 18, 20, 30, 31, 32, 40, 44, 48, 49, 50, 51, 52, 60, 70, 71, 72, 80, 81, 99}
+RAW_IDS = {
+    10,
+    11,
+    13,
+    15,
+    18,
+    20,
+    30,
+    31,
+    32,
+    40,
+    44,
+    48,
+    49,
+    50,
+    51,
+    52,
+    60,
+    70,
+    71,
+    72,
+    80,
+    81,
+    99,
+}
 MOVING_IDS = {252, 253, 254, 255, 257, 258, 259}
 HDL64E = SENSORS["hdl64e"]
 
 
 def digests(folder: Path) -> dict[str, str]:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+    }
 
 
 @pytest.fixture(scope="module")
 def street(tmp_path_factory):
     pytest.importorskip("embreex")
-    return simulate(tmp_path_factory.mktemp("street"), sequences=2, scans=2, seed=3, first_sequence=4)
+    return simulate(
+        tmp_path_factory.mktemp("street"), sequences=2, scans=2, seed=3, first_sequence=4
+    )
 
 
 @pytest.fixture(scope="module")
 def scans():
     """Two scans of each of four streets."""
     pytest.importorskip("embreex")
-    return [scan for seed in range(4) for scan in drive_street(HDL64E, 2, np.random.SeedSequence(seed))]
+    return [
+        scan for seed in range(4) for scan in drive_street(HDL64E, 2, np.random.SeedSequence(seed))
+    ]
 
 
 def test_same_seed_same_bytes(street, tmp_path):
@@ -73,7 +104,9 @@ def test_layout_is_that_of_semantickitti(street):
 def test_progress_counts_every_scan(tmp_path):
     pytest.importorskip("embreex")
     calls = []
-    simulate(tmp_path, sequences=2, scans=1, progress=lambda done, total: calls.append((done, total)))
+    simulate(
+        tmp_path, sequences=2, scans=1, progress=lambda done, total: calls.append((done, total))
+    )
     assert calls == [(1, 2), (2, 2)]
 
 
@@ -87,7 +120,9 @@ def test_values_are_in_range(scans):
         assert scan.points[:, 3].min() >= 0
         assert scan.points[:, 3].max() <= 1
         distance = np.linalg.norm(scan.points[:, :3], axis=1)
-        moved = Drive().speed[1] * HDL64E.turn / 2  # by so much at most, from where the scan is corrected to
+        moved = (
+            Drive().speed[1] * HDL64E.turn / 2
+        )  # by so much at most, from where the scan is corrected to
         assert distance.min() > HDL64E.min_range - 0.1 - moved
         assert distance.max() < HDL64E.max_range + 0.1 + moved
 
@@ -133,7 +168,9 @@ def test_a_car_is_as_small_as_a_car(scans):
     for scan in scans:
         for one in np.unique(scan.labels[np.isin(scan.labels & 0xFFFF, [10, 252])]):
             # Without the few returns that mix with what is behind.
-            extent = np.ptp(np.quantile(scan.points[scan.labels == one, :3], (0.04, 0.96), axis=0), axis=0)
+            extent = np.ptp(
+                np.quantile(scan.points[scan.labels == one, :3], (0.04, 0.96), axis=0), axis=0
+            )
             assert np.linalg.norm(extent[:2]) < 6.5
             assert extent[2] < 2.5
 
@@ -162,7 +199,9 @@ def test_a_long_sequence_goes_on_in_another_street():
     assert np.allclose(places, [0, drive.spacing, 2 * drive.spacing])
 
 
-@pytest.mark.parametrize("wrong", [{"sensor": "hdl65"}, {"scans": 0}, {"sequences": 0}, {"seed": -1}])
+@pytest.mark.parametrize(
+    "wrong", [{"sensor": "hdl65"}, {"scans": 0}, {"sequences": 0}, {"seed": -1}]
+)
 def test_wrong_input_is_one_line_that_says_what_was_expected(wrong, tmp_path):
     with pytest.raises(InputError, match=r"^[^\n]*expected [^\n]*found [^\n]*$"):
         simulate(tmp_path, **wrong)

@@ -13,11 +13,11 @@ from submissions import TEST, Case, measured, write_files
 from test_data import make_nuscenes
 from worlds import GOLDEN, amvnet, commands_of, fails, files, fresh_weights, street, write_scan
 
-from amvnet import submission
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.submission_rules import TEST_SCANS, rules_for
-from amvnet.weights import save
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.submission import pack as submission
+from amvnet.submission.rules import TEST_SCANS, rules_for
+from amvnet.weights.file import save
 
 # ---- good archives
 
@@ -50,15 +50,23 @@ def test_the_same_predictions_give_the_same_bytes(case: Case, tmp_path: Path) ->
     write_files(copy, dict(reversed(case.good.items())))
     (copy / "notes.txt").write_text("stays out")
     for folder, name in ((case.predictions, "a.zip"), (copy, "b.zip")):
-        assert amvnet("submit", case.spec, "--predictions", folder, "--out", tmp_path / name)[0] == 0
+        assert (
+            amvnet("submit", case.spec, "--predictions", folder, "--out", tmp_path / name)[0] == 0
+        )
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
     with zipfile.ZipFile(tmp_path / "a.zip") as archive:
-        assert {entry.date_time for entry in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}  # tomorrow's bytes, too
+        assert {entry.date_time for entry in archive.infolist()} == {
+            (1980, 1, 1, 0, 0, 0)
+        }  # tomorrow's bytes, too
 
 
 def test_a_description_goes_along(cases: dict[str, Case], tmp_path: Path) -> None:
     case = cases["semantickitti"]
-    described = {**case.good, "description.txt": b"method name: none", "sequences/11/predictions/000000.npz": b"scores"}
+    described = {
+        **case.good,
+        "description.txt": b"method name: none",
+        "sequences/11/predictions/000000.npz": b"scores",
+    }
     write_files(tmp_path / "p", described)
     out = tmp_path / "s.zip"
     assert amvnet("submit", case.spec, "--predictions", tmp_path / "p", "--out", out)[0] == 0
@@ -73,7 +81,12 @@ def test_the_flags_say_what_the_method_was_given(cases: dict[str, Case], tmp_pat
         ((), {"use_lidar"}),
         (("--use-camera", "--no-use-lidar", "--use-map"), {"use_camera", "use_map"}),
     ):
-        assert amvnet("submit", case.spec, "--predictions", case.predictions, "--out", out, *options)[0] == 0
+        assert (
+            amvnet("submit", case.spec, "--predictions", case.predictions, "--out", out, *options)[
+                0
+            ]
+            == 0
+        )
         assert case.official(out, case.data) == []
         with zipfile.ZipFile(out) as archive:
             meta = json.loads(archive.read("test/submission.json"))["meta"]
@@ -97,7 +110,11 @@ def test_memory_does_not_grow_with_the_scans(tmp_path: Path) -> None:
         root, name = tmp_path / str(scans), "sequences/08/predictions/{:06d}.label"
         for scan in range(scans):
             write_scan(root, "08", f"{scan:06d}", points, None)
-        raw = np.random.default_rng(0).choice(SEMANTICKITTI.train_to_raw, len(points)).astype(np.uint32)
+        raw = (
+            np.random.default_rng(0)
+            .choice(SEMANTICKITTI.train_to_raw, len(points))
+            .astype(np.uint32)
+        )
         write_files(root, {name.format(scan): raw.tobytes() for scan in range(scans)})
         rules = rules_for(open_dataset(str(root)), "val")
         peaks.append([
@@ -155,11 +172,15 @@ def test_flags_are_for_nuscenes(cases: dict[str, Case], tmp_path: Path) -> None:
 
 
 def test_the_scenes_of_an_archive_are_of_one_split(tmp_path: Path) -> None:
-    dataset = open_dataset(make_nuscenes(tmp_path).spec)  # a scene of mini_val and one of mini_train
+    dataset = open_dataset(
+        make_nuscenes(tmp_path).spec
+    )  # a scene of mini_val and one of mini_train
     fails(lambda: rules_for(dataset, "test"), "test", "--split")
     fails(lambda: rules_for(dataset, "val", ["scene-0061", "scene-0103"]), "mini_train, mini_val")
     for split in ("train", "val"):
-        assert {name.split("/")[1] for name in rules_for(dataset, split).points} == {f"mini_{split}"}
+        assert {name.split("/")[1] for name in rules_for(dataset, split).points} == {
+            f"mini_{split}"
+        }
 
 
 def test_scans_that_are_not_on_disk_are_wanted_all_the_same(tmp_path: Path) -> None:
@@ -182,7 +203,11 @@ def test_sequences_that_are_not_on_disk_must_be_predicted_all_the_same(tmp_path:
     assert len(rules.required) == 10 + TEST_SCANS["21"]
     assert rules.official == len(rules.points) == 20351
     good = {name: np.full(5, 40, "<u4").tobytes() for name in rules.required}
-    fails(lambda: submission.write(rules, tmp_path, tmp_path / "s.zip"), f"{len(good)} scans", f"{len(good) - 1} more")
+    fails(
+        lambda: submission.write(rules, tmp_path, tmp_path / "s.zip"),
+        f"{len(good)} scans",
+        f"{len(good) - 1} more",
+    )
     write_files(tmp_path, good)
     found = submission.write(rules, tmp_path, tmp_path / "s.zip")
     assert (found.predictions, found.unmatched) == (len(good), TEST_SCANS["21"])
@@ -200,7 +225,9 @@ def test_from_scans_without_labels_to_an_archive(tmp_path: Path) -> None:
     assert amvnet("predict", spec, *named, *weights, "--out", predictions, "--scores") == (0, "")
     assert amvnet("submit", spec, *named, "--predictions", predictions, "--out", out) == (0, "")
     assert amvnet("submit", spec, *named, "--check", out) == (0, "")
-    assert amvnet("submit", spec, "--predictions", predictions, "--out", out)[0] == 2  # nine sequences are missing
+    assert (
+        amvnet("submit", spec, "--predictions", predictions, "--out", out)[0] == 2
+    )  # nine sequences are missing
     with zipfile.ZipFile(out) as archive:
         packed = [name for name in archive.namelist() if not name.endswith("/")]
         assert packed == [f"sequences/{s}/predictions/000000.label" for s in ("11", "12")]
@@ -225,6 +252,15 @@ def test_every_command_of_the_page_runs(
     for command in commands:
         words = [word.replace("/data/", f"{tmp_path}/data/") for word in command]
         if "val" in words:
-            amvnet("predict", words[2], "--sequences", "08", "--weights", "runs/kitti", "--out", "predictions")
+            amvnet(
+                "predict",
+                words[2],
+                "--sequences",
+                "08",
+                "--weights",
+                "runs/kitti",
+                "--out",
+                "predictions",
+            )
         assert words[0] == "amvnet"
         assert amvnet(*words[1:]) == (0, ""), command

@@ -14,10 +14,10 @@ import pytest
 from submissions import Case, Entries, measured
 from worlds import amvnet
 
-from amvnet import submission
-from amvnet.data.catalog import open_dataset
+from amvnet.data.datasets.open import open_dataset
 from amvnet.errors import InputError
-from amvnet.submission_rules import rules_for
+from amvnet.submission import pack as submission
+from amvnet.submission.rules import rules_for
 
 # ---- archives that break a rule
 
@@ -52,14 +52,20 @@ def ids(*raw: int) -> Callable[[Case], Entries]:
 
 
 def meta(**values: object) -> Callable[..., Entries]:
-    flags = {f"use_{kind}": False for kind in ("camera", "lidar", "radar", "map", "external")} | values
+    flags = {
+        f"use_{kind}": False for kind in ("camera", "lidar", "radar", "map", "external")
+    } | values
     kept = {key: value for key, value in flags.items() if value is not None}
     return change(lambda _: json.dumps({"meta": kept}).encode(), META)
 
 
 BOTH: dict[str, Fault] = {
     "nothing in it": (lambda case: {}, "", True),
-    "all in a folder": (lambda case: {f"mine/{k}": v for k, v in case.good.items()}, "below 'mine'", True),
+    "all in a folder": (
+        lambda case: {f"mine/{k}": v for k, v in case.good.items()},
+        "below 'mine'",
+        True,
+    ),
     "a prediction missing": (without(), "found no", True),
     "rubbish of an operating system": (added("__MACOSX/._x", b""), "found __MACOSX/._x;", False),
     "absolute name": (added("/etc/passwd", b"x"), "'/etc/passwd'", False),
@@ -70,9 +76,21 @@ BOTH: dict[str, Fault] = {
     "a point too few": (change(lambda d: d[:-4]), "one per point", True),
 }
 KITTI: dict[str, Fault] = {
-    "no folders": (lambda case: {k: v for k, v in case.good.items() if k[-1] != "/"}, "sequences/ ", True),
-    "one folder without entry": (without("sequences/21/predictions/"), "sequences/21/predictions/", True),
-    "a prediction too many": (added("sequences/08/predictions/000000.label"), "predictions alone", False),
+    "no folders": (
+        lambda case: {k: v for k, v in case.good.items() if k[-1] != "/"},
+        "sequences/ ",
+        True,
+    ),
+    "one folder without entry": (
+        without("sequences/21/predictions/"),
+        "sequences/21/predictions/",
+        True,
+    ),
+    "a prediction too many": (
+        added("sequences/08/predictions/000000.label"),
+        "predictions alone",
+        False,
+    ),
     "uint8": (as_type("<u1"), "of 8 bits; write the ids as uint32", True),
     "uint16": (as_type("<u2"), "of 16 bits; write the ids as uint32", True),
     "int64": (as_type("<u8"), "of 64 bits; write the ids as uint32", True),
@@ -81,10 +99,26 @@ KITTI: dict[str, Fault] = {
     "train ids": (ids(*range(20)), "train ids", False),
     "unknown id": (ids(40, 400), "400", False),
     "a description without end": (added("description.txt", bytes(2_000_000)), "2000000", False),
-    "scan off disk, empty": (added("sequences/11/predictions/000900.label", b""), "found 0 bytes", False),
-    "scan off disk, odd": (added("sequences/11/predictions/000900.label", b"123"), "found 3 bytes", False),
-    "scan off disk, huge": (added("sequences/11/predictions/000900.label", bytes(5_000_000)), "000000 ids", False),
-    "scan past the last": (added("sequences/11/predictions/000921.label"), "predictions alone", False),
+    "scan off disk, empty": (
+        added("sequences/11/predictions/000900.label", b""),
+        "found 0 bytes",
+        False,
+    ),
+    "scan off disk, odd": (
+        added("sequences/11/predictions/000900.label", b"123"),
+        "found 3 bytes",
+        False,
+    ),
+    "scan off disk, huge": (
+        added("sequences/11/predictions/000900.label", bytes(5_000_000)),
+        "000000 ids",
+        False,
+    ),
+    "scan past the last": (
+        added("sequences/11/predictions/000921.label"),
+        "predictions alone",
+        False,
+    ),
 }
 LIDARSEG: dict[str, Fault] = {
     "another split": (lambda case: {k.replace("test/", "val/"): v for k, v in case.good.items()}, "--split", True),
@@ -109,7 +143,9 @@ BROKEN = [(name, fault) for name, faults in FAULTS.items() for fault in faults]
 
 
 @pytest.mark.parametrize(("name", "fault"), BROKEN)
-def test_a_broken_rule_is_named_in_one_line(name: str, fault: str, cases: dict[str, Case], tmp_path: Path) -> None:
+def test_a_broken_rule_is_named_in_one_line(
+    name: str, fault: str, cases: dict[str, Case], tmp_path: Path
+) -> None:
     case, (make, words, refused) = cases[name], FAULTS[name][fault]
     path = case.pack(tmp_path / "s.zip", make(case))
     error = line_of(case, path)
@@ -122,12 +158,16 @@ def test_a_broken_rule_is_named_in_one_line(name: str, fault: str, cases: dict[s
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_kinds_of_faults_have_messages_of_their_own(name: str, cases: dict[str, Case], tmp_path: Path) -> None:
+def test_kinds_of_faults_have_messages_of_their_own(
+    name: str, cases: dict[str, Case], tmp_path: Path
+) -> None:
     lines = [
         line_of(cases[name], cases[name].pack(tmp_path / "s.zip", make(cases[name])))
         for make, *_ in FAULTS[name].values()
     ]
-    assert len({re.sub(r"\d+|'[^']*'|\S*/\S*", "#", line) for line in lines}) >= 12  # less numbers and names
+    assert (
+        len({re.sub(r"\d+|'[^']*'|\S*/\S*", "#", line) for line in lines}) >= 12
+    )  # less numbers and names
 
 
 def line_of(case: Case, path: Path) -> str:
@@ -160,12 +200,17 @@ RUINS: dict[str, tuple[Callable[[Case, Path], object], str]] = {
     "another ending": (lambda c, p: c.pack(p).rename(p.with_suffix(".tar")), "no file"),
     "encrypted": (lambda c, p: patched(c.pack(p), last_entry(8), lambda b: b | 1), "password"),
     "flipped bit": (
-        lambda c, p: patched(c.pack(p, method=0), lambda d: d.index(c.good[c.first]) + 5, lambda b: b ^ 16),
+        lambda c, p: patched(
+            c.pack(p, method=0), lambda d: d.index(c.good[c.first]) + 5, lambda b: b ^ 16
+        ),
         "broken",
     ),
     "deflate64": (lambda c, p: patched(c.pack(p), last_entry(10), lambda b: 9), "method 9"),
     "bzip2": (lambda c, p: c.pack(p, method=zipfile.ZIP_BZIP2), "method 12"),
-    "stored size that is a lie": (lambda c, p: patched(c.pack(p, method=0), last_entry(24), lambda b: b + 1), ""),
+    "stored size that is a lie": (
+        lambda c, p: patched(c.pack(p, method=0), last_entry(24), lambda b: b + 1),
+        "",
+    ),
     "size that is a lie": (lambda c, p: patched(c.pack(p), last_entry(24), lambda b: b ^ 4), ""),
 }
 
@@ -203,8 +248,13 @@ def test_a_name_twice_is_found(case: Case, tmp_path: Path) -> None:
 @pytest.mark.parametrize("place", ["description.txt", None])
 def test_a_bomb_is_not_unpacked(place: str | None, cases: dict[str, Case], tmp_path: Path) -> None:
     case, size = cases["semantickitti"], 100_000_000
-    path = case.pack(tmp_path / "s.zip", {k: v for k, v in case.good.items() if k != (place or case.first)})
-    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive, archive.open(place or case.first, "w") as file:
+    path = case.pack(
+        tmp_path / "s.zip", {k: v for k, v in case.good.items() if k != (place or case.first)}
+    )
+    with (
+        zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive,
+        archive.open(place or case.first, "w") as file,
+    ):
         for _ in range(size // 1_000_000):
             file.write(bytes(1_000_000))
     assert path.stat().st_size < size / 100

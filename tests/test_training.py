@@ -19,9 +19,9 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from worlds import GOLDEN, amvnet, files, label_map, make_streets, write_recipe
 
-from amvnet import runner
-from amvnet.callbacks import KeepWeights
-from amvnet.weights import PARTS, Weights, load
+from amvnet.training import run as runner
+from amvnet.training.callbacks import KeepWeights
+from amvnet.weights.file import PARTS, Weights, load
 
 STILL = ("--training.augment.yaw", 0, "--training.augment.scale", 0, "--training.augment.flip", 0)
 SURE = ("--model.polar_net.dropblock", 0)  # a compiled network draws other numbers
@@ -30,7 +30,9 @@ FOLDERS = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 
 def train(world: Path, out: Path, *options: object) -> Weights:
     """The weights of a run that must succeed."""
-    code, error = amvnet("train", world / "recipe.yaml", "--data", world / "data", "--out", out, *options)
+    code, error = amvnet(
+        "train", world / "recipe.yaml", "--data", world / "data", "--out", out, *options
+    )
     assert code == 0, error
     return load(out / "weights.safetensors")
 
@@ -38,7 +40,11 @@ def train(world: Path, out: Path, *options: object) -> Weights:
 def differing(a: Weights, b: Weights) -> set[str]:
     """The parts that are not bitwise equal."""
     assert set(a.tensors) == set(b.tensors)
-    return {name.split(".")[0] for name in a.tensors if not torch.equal(a.tensors[name], b.tensors[name])}
+    return {
+        name.split(".")[0]
+        for name in a.tensors
+        if not torch.equal(a.tensors[name], b.tensors[name])
+    }
 
 
 def column(run: Path, stage: str, name: str) -> list[float]:
@@ -81,12 +87,23 @@ def test_the_best_weights_are_those_of_the_highest_validation_miou(run: Path, st
     assert reached["val/miou"] == pytest.approx(max(values), abs=1e-6)
 
 
-def test_class_counts_kept_beside_the_run_are_those_of_the_training_scans(world: Path, run: Path) -> None:
+def test_class_counts_kept_beside_the_run_are_those_of_the_training_scans(
+    world: Path, run: Path
+) -> None:
     with np.load(run / "class_counts.npz") as kept:
         counts = kept["counts"]
         assert kept["scans"].tolist() == ["00/000000", "00/000001", "01/000000", "01/000001"]
-    raw = [np.fromfile(p, np.uint32) for s in ("00", "01") for p in world.glob(f"data/sequences/{s}/labels/*.label")]
-    classes = {0: 10, 8: 40, 10: 48, 12: 50}  # score column -> raw id: car, road, sidewalk, building
+    raw = [
+        np.fromfile(p, np.uint32)
+        for s in ("00", "01")
+        for p in world.glob(f"data/sequences/{s}/labels/*.label")
+    ]
+    classes = {
+        0: 10,
+        8: 40,
+        10: 48,
+        12: 50,
+    }  # score column -> raw id: car, road, sidewalk, building
     for c, count in enumerate(counts):
         assert count == np.count_nonzero(np.concatenate(raw) == classes.get(c, -1))
 
@@ -105,13 +122,24 @@ def test_a_run_leaves_no_temporary_files(run: Path) -> None:
 
 
 def test_values_on_the_command_line_override_the_recipe(world: Path, tmp_path: Path) -> None:
-    options = ("--stage", "rv", "--training.rv.epochs", 1, "--model.range_net.decoder", 24, "--training.seed", 7)
+    options = (
+        "--stage",
+        "rv",
+        "--training.rv.epochs",
+        1,
+        "--model.range_net.decoder",
+        24,
+        "--training.seed",
+        7,
+    )
     weights = train(world, tmp_path / "run", *options)
     said = weights.training["range_net"]
     assert (said["rv"]["epochs"], said["seed"], said["rv"]["lr"]) == (1, 7, 0.02)
     assert weights.model.range_net.decoder == 24
     assert weights.parts == ("range_net",)
-    assert yaml.safe_load((tmp_path / "run/recipe.yaml").read_text())["training"]["rv"]["epochs"] == 1
+    assert (
+        yaml.safe_load((tmp_path / "run/recipe.yaml").read_text())["training"]["rv"]["epochs"] == 1
+    )
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
@@ -127,7 +155,9 @@ def test_the_same_seed_gives_the_same_weights(world: Path, run: Path, tmp_path: 
 
 
 def test_another_seed_gives_other_weights(world: Path, run: Path, tmp_path: Path) -> None:
-    assert differing(train(world, tmp_path / "other", "--training.seed", 1), load(run)) == set(PARTS)
+    assert differing(train(world, tmp_path / "other", "--training.seed", 1), load(run)) == set(
+        PARTS
+    )
 
 
 def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: object) -> None:
@@ -163,7 +193,9 @@ def test_processes_that_read_beside_the_training_change_nothing_resumed_or_not(
     options = ("--stage", "rv", "--training.workers", 1)
     train_interrupted("rv", 2, world, tmp_path / "run", *options)
     before, all_along = (load(folder / "rv/last.safetensors") for folder in (tmp_path / "run", run))
-    assert before.metrics["range_net"]["val/acc"] == pytest.approx(column(run, "rv", "val/acc")[1], abs=1e-6)
+    assert before.metrics["range_net"]["val/acc"] == pytest.approx(
+        column(run, "rv", "val/acc")[1], abs=1e-6
+    )
     train(world, tmp_path / "run", *options, "--resume")
     assert not differing(load(tmp_path / "run/rv/last.safetensors"), all_along)
 
@@ -176,16 +208,24 @@ def test_a_resumed_run_keeps_the_curves_of_its_earlier_epochs(world: Path, tmp_p
 
 def test_a_refused_run_leaves_the_recipe_of_the_run_that_is_there(world: Path, run: Path) -> None:
     before = (run / "recipe.yaml").read_bytes()
-    code, _ = amvnet("train", world / "recipe.yaml", "--data", world / "data", "--out", run, "--training.seed", 9)
+    code, _ = amvnet(
+        "train", world / "recipe.yaml", "--data", world / "data", "--out", run, "--training.seed", 9
+    )
     assert code == 2
     assert (run / "recipe.yaml").read_bytes() == before
 
 
 @pytest.mark.parametrize(
-    "other", [("--training.rv.epochs", 5), ("--model.range_net.decoder", 24), ("--training.seed", 4)]
+    "other",
+    [("--training.rv.epochs", 5), ("--model.range_net.decoder", 24), ("--training.seed", 4)],
 )
-def test_a_run_is_not_resumed_with_other_values(world: Path, run: Path, other: tuple[str, object]) -> None:
-    before = {name: (run / name).read_bytes() for name in ("recipe.yaml", "run.yaml", "weights.safetensors")}
+def test_a_run_is_not_resumed_with_other_values(
+    world: Path, run: Path, other: tuple[str, object]
+) -> None:
+    before = {
+        name: (run / name).read_bytes()
+        for name in ("recipe.yaml", "run.yaml", "weights.safetensors")
+    }
     arguments = ("--data", world / "data", "--out", run, "--resume", *other)
     code, error = amvnet("train", world / "recipe.yaml", *arguments)
     assert (code, error.count("\n")) == (2, 1)
@@ -206,17 +246,28 @@ def test_a_broken_checkpoint_is_named(world: Path, tmp_path: Path) -> None:
 def test_broken_class_counts_are_counted_anew(world: Path, run: Path, tmp_path: Path) -> None:
     (tmp_path / "class_counts.npz").write_bytes((run / "class_counts.npz").read_bytes()[:100])
     train(world, tmp_path, "--stage", "rv", "--training.rv.epochs", 1)
-    with np.load(tmp_path / "class_counts.npz") as found, np.load(run / "class_counts.npz") as expected:
+    with (
+        np.load(tmp_path / "class_counts.npz") as found,
+        np.load(run / "class_counts.npz") as expected,
+    ):
         assert np.array_equal(found["counts"], expected["counts"])
 
 
-def test_a_broken_label_file_is_one_line_from_a_reading_process_too(world: Path, tmp_path: Path) -> None:
+def test_a_broken_label_file_is_one_line_from_a_reading_process_too(
+    world: Path, tmp_path: Path
+) -> None:
     shutil.copytree(world / "data", tmp_path / "data")
     label = tmp_path / "data/sequences/00/labels/000001.label"
     np.full(500, 10, np.uint32)[:499].tofile(label)
     options = ("--stage", "rv", "--training.rv.class_weights", "false", "--training.workers", 1)
     code, error = amvnet(
-        "train", world / "recipe.yaml", "--data", tmp_path / "data", "--out", tmp_path / "run", *options
+        "train",
+        world / "recipe.yaml",
+        "--data",
+        tmp_path / "data",
+        "--out",
+        tmp_path / "run",
+        *options,
     )
     assert (code, error.count("\n")) == (2, 1), error
     assert "499" in error
@@ -236,10 +287,15 @@ def test_an_existing_run_is_not_overwritten_without_resume(world: Path, run: Pat
     code, error = amvnet("train", world / "recipe.yaml", "--data", world / "data", "--out", run)
     assert (code, error.count("\n")) == (2, 1)
     assert "--resume" in error
-    assert before == ((run / "weights.safetensors").read_bytes(), (run / "rv/last.safetensors").read_bytes())
+    assert before == (
+        (run / "weights.safetensors").read_bytes(),
+        (run / "rv/last.safetensors").read_bytes(),
+    )
 
 
-def test_the_head_stage_leaves_the_networks_bitwise_unchanged(world: Path, run: Path, tmp_path: Path) -> None:
+def test_the_head_stage_leaves_the_networks_bitwise_unchanged(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
     before = load(run)
     after = train(world, tmp_path / "head", "--stage", "head", "--init", run, "--training.seed", 5)
     assert differing(before, after) == {"point_head"}
@@ -273,7 +329,9 @@ def test_folds_score_no_sequence_that_they_learnt_from(
     scored = []
     for source in gathered[0]:
         for part in ("range_net", "polar_net"):
-            assert not set(source.weights.training[part]["sequences"]) & {one.sequence for one in source.records}
+            assert not set(source.weights.training[part]["sequences"]) & {
+                one.sequence for one in source.records
+            }
         scored += [record.name for record in source.records]
     assert sorted(scored) == ["00/000000", "00/000001", "01/000000", "01/000001"]
     assert weights.training["point_head"]["head"]["folds"] == 2
@@ -286,8 +344,13 @@ def test_nuscenes_trains_predicts_and_is_scored(tmp_path: Path) -> None:
     scenes = ("--train-sequences", "scene-0103", "--val-sequences", "scene-0916")
     assert amvnet("train", recipe, "--data", data, "--out", run, *scenes)[0] == 0
     assert load(run).model.range_view.rows == "ring"
-    assert amvnet("predict", data, "--weights", run, "--out", out, "--sequences", "scene-0916")[0] == 0
-    labels = [np.fromfile(path, np.uint8) for path in sorted((out / "lidarseg/mini_val").glob("*_lidarseg.bin"))]
+    assert (
+        amvnet("predict", data, "--weights", run, "--out", out, "--sequences", "scene-0916")[0] == 0
+    )
+    labels = [
+        np.fromfile(path, np.uint8)
+        for path in sorted((out / "lidarseg/mini_val").glob("*_lidarseg.bin"))
+    ]
     assert sorted(map(len, labels)) == [2622, 2683]
     assert all(1 <= ids.min() <= ids.max() <= 16 for ids in labels)
     assert amvnet("evaluate", data, "--predictions", out, "--sequences", "scene-0916")[0] == 0
@@ -303,27 +366,58 @@ def test_a_label_map_of_ones_own_is_learnt(world: Path, tmp_path: Path) -> None:
     assert (taxonomy.name, taxonomy.size) == ("mine", 18)
     predicted = tmp_path / "predicted"
     weights = ("--weights", tmp_path / "run", "--method", "rv")
-    assert amvnet("predict", world / "data", *weights, "--out", predicted, "--sequences", "08") == (0, "")
+    assert amvnet("predict", world / "data", *weights, "--out", predicted, "--sequences", "08") == (
+        0,
+        "",
+    )
     assert amvnet("evaluate", world / "data", "--weights", tmp_path / "run")[0] == 0
 
 
-def test_where_the_networks_agree_everywhere_the_head_learns_from_all_points(world: Path, tmp_path: Path) -> None:
+def test_where_the_networks_agree_everywhere_the_head_learns_from_all_points(
+    world: Path, tmp_path: Path
+) -> None:
     weights = train(world, tmp_path / "run", "--model.assertion.threshold=-1")
     assert weights.parts == PARTS
     assert max(column(tmp_path / "run", "head", "val/acc")) > 0.5
 
 
 def test_the_head_learns_where_the_loss_is_high(world: Path, run: Path, tmp_path: Path) -> None:
-    options = ("--stage", "head", "--init", run, "--model.assertion.name", "loss", "--model.assertion.threshold", 0.5)
+    options = (
+        "--stage",
+        "head",
+        "--init",
+        run,
+        "--model.assertion.name",
+        "loss",
+        "--model.assertion.threshold",
+        0.5,
+    )
     weights = train(world, tmp_path / "run", *options)
     assert weights.model.assertion.name == "loss"
     assert differing(load(run), weights) == {"point_head"}
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
-def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(world: Path, tmp_path: Path, stage: str) -> None:
-    options = ("--stage", stage, f"--training.{stage}.lr", "1e38", f"--training.{stage}.clip", "1e38")
-    code, error = amvnet("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run", *options)
+def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(
+    world: Path, tmp_path: Path, stage: str
+) -> None:
+    options = (
+        "--stage",
+        stage,
+        f"--training.{stage}.lr",
+        "1e38",
+        f"--training.{stage}.clip",
+        "1e38",
+    )
+    code, error = amvnet(
+        "train",
+        world / "recipe.yaml",
+        "--data",
+        world / "data",
+        "--out",
+        tmp_path / "run",
+        *options,
+    )
     assert code == 2
     assert error.count("\n") == 1
     assert "finite" in error
@@ -349,7 +443,9 @@ def test_a_run_of_several_calls_says_how_to_repeat_each(world: Path, tmp_path: P
     out = tmp_path / "run"
     train(world, out, "--stage", "rv", "--train-sequences", "00", "--val-sequences", "08")
     train(world, out, "--stage", "bev", "--train-sequences", "01", "--val-sequences", "08")
-    expected = train(world, out, "--stage", "head", "--train-sequences", "00,01", "--val-sequences", "08")
+    expected = train(
+        world, out, "--stage", "head", "--train-sequences", "00,01", "--val-sequences", "08"
+    )
     calls = yaml.safe_load((out / "run.yaml").read_text())
     assert list(calls) == ["rv", "bev", "head"]
     for call in calls.values():
@@ -360,14 +456,16 @@ def test_a_run_of_several_calls_says_how_to_repeat_each(world: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("stage", FOLDERS)
-def test_a_killed_run_resumes_to_the_same_weights(world: Path, run: Path, tmp_path: Path, stage: str) -> None:
+def test_a_killed_run_resumes_to_the_same_weights(
+    world: Path, run: Path, tmp_path: Path, stage: str
+) -> None:
     """SIGKILL in the middle of an epoch, after one that was finished."""
     out = tmp_path / "run"
     if stage == "head":
         for earlier in ("rv", "bev"):
             shutil.copytree(run / earlier, out / earlier)
     arguments = [world / "recipe.yaml", "--data", world / "data", "--out", out, "--stage", stage]
-    command = [sys.executable, "-m", "amvnet.cli", "train", *map(str, arguments)]
+    command = [sys.executable, "-m", "amvnet", "train", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while not (out / stage / "last.ckpt").exists() and process.poll() is None:
         time.sleep(0.002)
@@ -382,11 +480,13 @@ def test_a_killed_run_resumes_to_the_same_weights(world: Path, run: Path, tmp_pa
 
 
 @pytest.mark.parametrize("room", [1_000, 40_000])
-def test_a_full_disk_stops_with_a_line_and_the_last_good_state(world: Path, tmp_path: Path, room: int) -> None:
+def test_a_full_disk_stops_with_a_line_and_the_last_good_state(
+    world: Path, tmp_path: Path, room: int
+) -> None:
     """No file may grow beyond some bytes, which is what a full disk looks like to a program."""
     out = tmp_path / "run"
     arguments = [world / "recipe.yaml", "--data", world / "data", "--out", out, "--stage", "rv"]
-    command = [sys.executable, "-m", "amvnet.cli", "train", *map(str, arguments)]
+    command = [sys.executable, "-m", "amvnet", "train", *map(str, arguments)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     while not (out / "rv" / "last.ckpt").exists() and process.poll() is None:
         time.sleep(0.002)
@@ -410,9 +510,11 @@ def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_p
     """The libraries' own notes stay out of stderr, and what is trained is not lost."""
     shutil.copytree(world / "data", tmp_path / "data")
     arguments = [world / "recipe.yaml", "--data", tmp_path / "data", "--out", tmp_path / "run"]
-    command = [sys.executable, "-m", "amvnet.cli", "train", *map(str, arguments)]
+    command = [sys.executable, "-m", "amvnet", "train", *map(str, arguments)]
     subprocess.run([*command, "--stage", "rv"], capture_output=True, check=True)
-    (tmp_path / "data/sequences/08/labels/000001.label").write_bytes(b"1234")  # is met after an epoch of training
+    (tmp_path / "data/sequences/08/labels/000001.label").write_bytes(
+        b"1234"
+    )  # is met after an epoch of training
     done = subprocess.run([*command, "--stage", "bev"], capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert "000001.label" in done.stderr
@@ -421,7 +523,9 @@ def test_in_a_shell_a_run_that_cannot_end_says_so_in_one_line(world: Path, tmp_p
 
 
 @pytest.mark.parametrize(("baseline", "stage"), [("polarnet", "bev"), ("no-rnn", "rv")])
-def test_a_baseline_is_trained_and_scored_by_its_name(world: Path, tmp_path: Path, baseline: str, stage: str) -> None:
+def test_a_baseline_is_trained_and_scored_by_its_name(
+    world: Path, tmp_path: Path, baseline: str, stage: str
+) -> None:
     recipe = write_recipe(tmp_path / "recipe.yaml", f"semantickitti-{baseline}-compact")
     data, run = world / "data", tmp_path / "run"
     assert amvnet("train", recipe, "--data", data, "--out", run) == (0, "")
@@ -438,11 +542,15 @@ def test_the_scans_of_validation_can_be_learnt_too(world: Path, tmp_path: Path) 
     for part, stage in zip(PARTS, FOLDERS, strict=True):
         assert weights.training[part]["sequences"] == ["00", "01", "08"]
         assert weights.training[part]["validated_on"] == []
-        best, last = (load(tmp_path / "run" / stage / f"{kept}.safetensors") for kept in ("best", "last"))
+        best, last = (
+            load(tmp_path / "run" / stage / f"{kept}.safetensors") for kept in ("best", "last")
+        )
         assert not differing(best, last)
         assert len(column(tmp_path / "run", stage, "epoch")) == (2 if stage == "head" else 3)
         assert not column(tmp_path / "run", stage, "val/miou")
-    command = shlex.split(yaml.safe_load((tmp_path / "run" / "run.yaml").read_text())["all"]["repeat"])
+    command = shlex.split(
+        yaml.safe_load((tmp_path / "run" / "run.yaml").read_text())["all"]["repeat"]
+    )
     assert amvnet(*command[1:]) == (0, "")
     assert not differing(load(f"{tmp_path}/run-again"), weights)
 
@@ -476,17 +584,26 @@ def test_a_stage_can_be_followed_in_tensorboard(run: Path, stage: str) -> None:
     assert drawn[0][0].encoded_image_string != drawn[1][0].encoded_image_string
 
 
-def test_the_share_of_uncertain_points_is_that_of_the_networks(world: Path, run: Path, tmp_path: Path) -> None:
-    assert amvnet("evaluate", world / "data", "--weights", run, "--json", tmp_path / "m.json") == (0, "")
+def test_the_share_of_uncertain_points_is_that_of_the_networks(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    assert amvnet("evaluate", world / "data", "--weights", run, "--json", tmp_path / "m.json") == (
+        0,
+        "",
+    )
     scored = json.loads((tmp_path / "m.json").read_text())["uncertain_fraction"]
-    labelled = column(run, "head", "val/uncertain")[0]  # the other counts unlabelled points, too: two in a hundred
+    labelled = column(run, "head", "val/uncertain")[
+        0
+    ]  # the other counts unlabelled points, too: two in a hundred
     assert labelled == pytest.approx(scored, abs=0.02)
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler on a CPU")
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 @pytest.mark.slow
-def test_a_compiled_training_is_the_same_within_rounding(world: Path, run: Path, tmp_path: Path, stage: str) -> None:
+def test_a_compiled_training_is_the_same_within_rounding(
+    world: Path, run: Path, tmp_path: Path, stage: str
+) -> None:
     """Of one step, as later ones amplify what rounding there is."""
     one = ("--stage", stage, f"--training.{stage}.epochs", 1, f"--training.{stage}.batch", 4, *SURE)
     plain = train(world, tmp_path / "plain", *one)
@@ -506,4 +623,7 @@ for _ in range(100):
     image = torch.randn(2, 32, 64, 8).permute(0, 3, 1, 2).requires_grad_()
     block(image).sum().backward()
 """
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode
+        == 0
+    )

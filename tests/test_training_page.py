@@ -12,8 +12,8 @@ from zipfile import ZipFile
 import pytest
 from worlds import GOLDEN, amvnet, commands_of, files, make_streets, write_recipe
 
-from amvnet.recipes import recipe_names
-from amvnet.weights import load
+from amvnet.config.recipes import recipe_names
+from amvnet.weights.file import load
 
 TEST = tuple(str(sequence) for sequence in range(11, 22))
 ONCE = {name: {"epochs": 1} for name in ("rv", "bev", "head")}
@@ -42,12 +42,20 @@ def downloads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def run(words: list[str], folder: Path) -> None:
     """One command of a page, with tiny recipes, the test's folder for /data, and two processes for eight."""
     words = [word.replace("/data/", f"{folder}/data/") for word in words]
-    words = [f"{word}.tiny.yaml" if word in recipe_names() and "amvnet" in words else word for word in words]
+    words = [
+        f"{word}.tiny.yaml" if word in recipe_names() and "amvnet" in words else word
+        for word in words
+    ]
     if words[0] == "amvnet":
         assert amvnet(*words[1:]) == (0, ""), words
         return
     if words[0] == "torchrun":
-        words = [sys.executable, "-m", "torch.distributed.run", *("2" if word == "8" else word for word in words[1:])]
+        words = [
+            sys.executable,
+            "-m",
+            "torch.distributed.run",
+            *("2" if word == "8" else word for word in words[1:]),
+        ]
         words = ["cpu" if word == "cuda" else word for word in words]
     else:
         words[0] = {"python": sys.executable}[words[0]]

@@ -16,15 +16,15 @@ import pytest
 from pages import Browser, Page, browser, places, read_page
 from worlds import GOLDEN, amvnet, commands_of, files, fresh_weights, make_streets, street, without
 
-from amvnet import page as pages
-from amvnet import view
-from amvnet.data.catalog import open_dataset
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
-from amvnet.data.nuscenes import NuScenes
-from amvnet.data.semantickitti import SemanticKitti
-from amvnet.frames import RIGHT, WRONG, Frame
-from amvnet.segmenter import Segmenter
-from amvnet.weights import save
+from amvnet.data.datasets.nuscenes import NuScenes
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.inference.segmenter import Segmenter
+from amvnet.viewing import page as pages
+from amvnet.viewing import rerun_log as view
+from amvnet.viewing.frames import RIGHT, WRONG, Frame
+from amvnet.weights.file import save
 
 __all__ = ["browser"]
 
@@ -39,7 +39,16 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_streets(root / "data")
     save(fresh_weights(), root / "w.safetensors")
     street(7, 300)[0].tofile(root / "lone.bin")
-    made = amvnet("view", root / "data", "--weights", root / "w.safetensors", "--scans", 9, "--html", root / "p.html")
+    made = amvnet(
+        "view",
+        root / "data",
+        "--weights",
+        root / "w.safetensors",
+        "--scans",
+        9,
+        "--html",
+        root / "p.html",
+    )
     assert made == (0, "")
     return root
 
@@ -71,7 +80,10 @@ def test_every_scan_is_in_the_page_as_it_is(world: Path, dataset: SemanticKitti)
         step = np.asarray(page.about["scans"][place]["step"])
         assert (step < 0.001).all()
         assert (np.abs(xyz - scan.points[:, :3]) <= 0.51 * step + 1e-5).all()
-        assert np.abs(planes["intensity"] / 255 - np.clip(scan.points[:, 3], 0, 1)).max() <= 0.5 / 255 + 1e-6
+        assert (
+            np.abs(planes["intensity"] / 255 - np.clip(scan.points[:, 3], 0, 1)).max()
+            <= 0.5 / 255 + 1e-6
+        )
         assert scan.labels is not None
         np.testing.assert_array_equal(planes["truth"], scan.labels)
         labels, uncertain = segmenter.by_method(scan)
@@ -96,7 +108,13 @@ def test_the_page_names_classes_and_colours_officially(world: Path) -> None:
     about = read_page(world / "p.html").about
     assert about["classes"][1:] == list(SEMANTICKITTI.classes)
     assert [tuple(color) for color in about["colors"][1:]] == list(SEMANTICKITTI.colors[1:])
-    assert [source["key"] for source in about["sources"]] == ["truth", "rv", "bev", "ensemble", "amvnet"]
+    assert [source["key"] for source in about["sources"]] == [
+        "truth",
+        "rv",
+        "bev",
+        "ensemble",
+        "amvnet",
+    ]
 
 
 def test_points_without_a_place_are_left_out_and_counted(tmp_path: Path) -> None:
@@ -113,7 +131,10 @@ def test_points_without_a_place_are_left_out_and_counted(tmp_path: Path) -> None
 def test_positions_are_within_half_a_step(tmp_path: Path, extent: float) -> None:
     points = np.random.default_rng(0).uniform(-extent, extent, (1000, 4))
     page = written(tmp_path / "p.html", frame(points))
-    assert np.abs(page.scan(0)[0] - points[:, :3].astype(np.float32)).max() <= max(extent, 1e-3) / 65_534 * 1.01
+    assert (
+        np.abs(page.scan(0)[0] - points[:, :3].astype(np.float32)).max()
+        <= max(extent, 1e-3) / 65_534 * 1.01
+    )
 
 
 def test_a_huge_scan_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +149,10 @@ def test_a_scan_of_120_thousand_points_takes_under_two_megabytes(tmp_path: Path)
     points, raw = street(0, 120_000)  # in no order, so that they deflate worse than a sensor's do
     ids, rng = SEMANTICKITTI.to_train(raw), np.random.default_rng(0)
     doubt = rng.random(len(points)) ** 8
-    some = {name: np.where(rng.random(len(points)) < 0.1, 13, ids) for name in ("rv", "bev", "ensemble", "amvnet")}
+    some = {
+        name: np.where(rng.random(len(points)) < 0.1, 13, ids)
+        for name in ("rv", "bev", "ensemble", "amvnet")
+    }
     whole = replace(frame(points, truth=ids, **some), uncertain=doubt > 0.1, disagreement=doubt)
     path = pages.write_page(tmp_path / "p.html", [whole], SEMANTICKITTI, "")
     assert path.stat().st_size < 2e6
@@ -137,7 +161,9 @@ def test_a_scan_of_120_thousand_points_takes_under_two_megabytes(tmp_path: Path)
 def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
     points, raw = street(3)
     texts = [
-        pages.write_page(tmp_path / name, [frame(points, labels=SEMANTICKITTI.to_train(raw))], SEMANTICKITTI, "t")
+        pages.write_page(
+            tmp_path / name, [frame(points, labels=SEMANTICKITTI.to_train(raw))], SEMANTICKITTI, "t"
+        )
         for name in ("a.html", "b.html")
     ]
     assert texts[0].read_bytes() == texts[1].read_bytes()
@@ -149,7 +175,9 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
 def test_nothing_is_fetched(world: Path) -> None:
     page = read_page(world / "p.html")
     text = (world / "p.html").read_text()
-    assert not re.search(r"https?:|\bimport\b\s*[({'\"]|@import|url\(|fetch\(|XMLHttpRequest|WebSocket", text)
+    assert not re.search(
+        r"https?:|\bimport\b\s*[({'\"]|@import|url\(|fetch\(|XMLHttpRequest|WebSocket", text
+    )
     for _, attributes in page.elements:
         assert not {"src", "srcset", "action", "ping"} & set(attributes)
         assert attributes.get("href") in (None, "data:,")
@@ -157,7 +185,10 @@ def test_nothing_is_fetched(world: Path) -> None:
 
 def test_no_script_runs_but_the_package_s_own(world: Path) -> None:
     page = read_page(world / "p.html")
-    policy = next(a["content"] for tag, a in page.elements if tag == "meta" and a.get("http-equiv")) or ""
+    policy = (
+        next(a["content"] for tag, a in page.elements if tag == "meta" and a.get("http-equiv"))
+        or ""
+    )
     said = dict(part.strip().split(" ", 1) for part in policy.split(";"))
     assert said["default-src"] == "'none'"
     for tag in ("script", "style"):
@@ -170,7 +201,9 @@ def hostile_page(path: Path) -> Page:
     points, raw = street(5)
     classes = (HOSTILE, *SEMANTICKITTI.classes[1:])
     some = replace(frame(points, labels=SEMANTICKITTI.to_train(raw)), name=HOSTILE)
-    return read_page(pages.write_page(path, [some], replace(SEMANTICKITTI, classes=classes), HOSTILE))
+    return read_page(
+        pages.write_page(path, [some], replace(SEMANTICKITTI, classes=classes), HOSTILE)
+    )
 
 
 def test_names_stay_names(tmp_path: Path) -> None:
@@ -178,11 +211,18 @@ def test_names_stay_names(tmp_path: Path) -> None:
     harmless = written(tmp_path / "q.html", frame(street(5)[0]))
     assert [tag for tag, _ in page.elements] == [tag for tag, _ in harmless.elements]
     assert page.texts["<title>"] == HOSTILE
-    assert page.about["title"] == page.about["classes"][1] == page.about["scans"][0]["name"] == HOSTILE
+    assert (
+        page.about["title"] == page.about["classes"][1] == page.about["scans"][0]["name"] == HOSTILE
+    )
 
 
 def test_a_name_that_is_no_unicode_is_written(tmp_path: Path) -> None:
-    assert written(tmp_path / "p.html", frame(street(5)[0]), title=os.fsdecode(b"caf\xe9")).texts["<title>"] == "caf?"
+    assert (
+        written(tmp_path / "p.html", frame(street(5)[0]), title=os.fsdecode(b"caf\xe9")).texts[
+            "<title>"
+        ]
+        == "caf?"
+    )
 
 
 # ---- what is shown of which input
@@ -210,8 +250,12 @@ def test_labels_that_predict_wrote_are_shown(world: Path, tmp_path: Path) -> Non
         assert list(found) == ["intensity", "truth", "labels"]
         np.testing.assert_array_equal(found["labels"], expected.scan(place)[1]["amvnet"])
     by_folder = view_page(tmp_path, world / "lone.bin", "--labels", tmp_path / "labels").scan(0)[1]
-    by_file = view_page(tmp_path, world / "lone.bin", "--labels", tmp_path / "labels/lone.label").scan(0)[1]
-    by_weights = view_page(tmp_path, world / "lone.bin", "--weights", world / "w.safetensors").scan(0)[1]
+    by_file = view_page(
+        tmp_path, world / "lone.bin", "--labels", tmp_path / "labels/lone.label"
+    ).scan(0)[1]
+    by_weights = view_page(tmp_path, world / "lone.bin", "--weights", world / "w.safetensors").scan(
+        0
+    )[1]
     np.testing.assert_array_equal(by_folder["labels"], by_weights["amvnet"])
     np.testing.assert_array_equal(by_file["labels"], by_weights["amvnet"])
 
@@ -241,7 +285,9 @@ def test_nuscenes_is_shown_with_its_truth(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("count", "chosen"), [(1, ["00/000000"]), (2, ["00/000000", "08/000001"])])
-def test_scans_are_chosen_evenly(world: Path, tmp_path: Path, count: int, chosen: list[str]) -> None:
+def test_scans_are_chosen_evenly(
+    world: Path, tmp_path: Path, count: int, chosen: list[str]
+) -> None:
     page = view_page(tmp_path, world / "data", "--scans", count)
     assert [scan["name"] for scan in page.about["scans"]] == chosen
 
@@ -288,7 +334,10 @@ def test_without_rerun_the_line_says_what_to_install(
 
 
 def drawn(
-    planes: dict[str, np.ndarray], labels: str, keep: np.ndarray | None = None, hide: tuple[int, ...] = ()
+    planes: dict[str, np.ndarray],
+    labels: str,
+    keep: np.ndarray | None = None,
+    hide: tuple[int, ...] = (),
 ) -> list[int]:
     """The points that are to be drawn, by class."""
     ids = planes[labels] if keep is None else planes[labels][keep]
@@ -305,12 +354,15 @@ def test_the_browser_draws_the_points_that_are_asked_for(world: Path, browser: B
     state = browser.state(page, f"color=error&labels=rv&hide={hidden}")
     assert (state["data-color"], state["drawn"]) == ("error", drawn(planes, "rv", hide=tuple(ids)))
     wrong = (planes["truth"] > 0) & (planes["bev"] != planes["truth"])
-    assert browser.state(page, "only=wrong&labels=bev&hide=99&size=nan&color=none")["drawn"] == drawn(
-        planes, "bev", wrong
-    )
+    assert browser.state(page, "only=wrong&labels=bev&hide=99&size=nan&color=none")[
+        "drawn"
+    ] == drawn(planes, "bev", wrong)
     other = read_page(page).scan(3)[1]
     state = browser.state(page, "scan=4&labels=truth&only=uncertain&color=height")
-    assert (state["data-scan"], state["drawn"]) == ("3", drawn(other, "truth", other["uncertain"] > 0))
+    assert (state["data-scan"], state["drawn"]) == (
+        "3",
+        drawn(other, "truth", other["uncertain"] > 0),
+    )
 
 
 def test_a_click_on_a_class_hides_it(world: Path, tmp_path: Path, browser: Browser) -> None:
@@ -320,7 +372,9 @@ def test_a_click_on_a_class_hides_it(world: Path, tmp_path: Path, browser: Brows
     click = f"<script>setTimeout(() => document.querySelector('#classes [data-id=\"{road}\"]').click(), 500)</script>"
     text = re.sub(r"<meta http-equiv[^>]*>", "", (world / "p.html").read_text())
     (tmp_path / "p.html").write_text(text.replace("</body>", click + "</body>"))
-    assert browser.state(tmp_path / "p.html", "labels=truth")["drawn"] == drawn(planes, "truth", hide=(road,))
+    assert browser.state(tmp_path / "p.html", "labels=truth")["drawn"] == drawn(
+        planes, "truth", hide=(road,)
+    )
 
 
 def test_the_picture_shows_what_is_asked_for_where_it_is(tmp_path: Path, browser: Browser) -> None:
@@ -354,13 +408,22 @@ def test_a_hostile_name_is_shown_and_not_run(tmp_path: Path, browser: Browser) -
 
 def test_a_recording_reads_back(world: Path, tmp_path: Path, dataset: SemanticKitti) -> None:
     reader = pytest.importorskip("rerun.chunk").RrdReader
-    options = ("--weights", world / "w.safetensors", "--sequences", "08", "--save", tmp_path / "r.rrd")
+    options = (
+        "--weights",
+        world / "w.safetensors",
+        "--sequences",
+        "08",
+        "--save",
+        tmp_path / "r.rrd",
+    )
     assert amvnet("view", world / "data", *options)[0] == 0
     found: dict[str, list[dict[str, list[object]]]] = {}
     for chunk in reader(tmp_path / "r.rrd").stream():
         batch = chunk.to_record_batch()
         columns = [name for name in batch.schema.names if name == "scan" or ":" in name]
-        found.setdefault(chunk.entity_path, []).append({name: batch.column(name).to_pylist() for name in columns})
+        found.setdefault(chunk.entity_path, []).append(
+            {name: batch.column(name).to_pylist() for name in columns}
+        )
     segmenter = Segmenter(world / "w.safetensors")
     for step, record in enumerate(dataset.records(["08"])):
         scan = dataset.read(record)
@@ -373,7 +436,9 @@ def test_a_recording_reads_back(world: Path, tmp_path: Path, dataset: SemanticKi
             assert column(found[f"/labels/{method}"], step, "class_ids") == ids.tolist()
         places = np.asarray(column(found["/errors/rv"], step, "positions"))
         np.testing.assert_array_equal(places, scan.points[wrong, :3])
-        np.testing.assert_array_equal(column(found["/uncertain"], step, "positions"), scan.points[uncertain, :3])
+        np.testing.assert_array_equal(
+            column(found["/uncertain"], step, "positions"), scan.points[uncertain, :3]
+        )
         share = 100 * wrong.sum() / (scan.labels > 0).sum()
         assert column(found["/percent/wrong/rv"], step, "scalars") == pytest.approx([share])
 
@@ -400,7 +465,9 @@ def test_five_real_scans_take_a_few_megabytes(tmp_path: Path) -> None:
     assert (tmp_path / "out.html").stat().st_size < 5e6
 
 
-def test_the_commands_of_the_documentation_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commands_of_the_documentation_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("embreex")
     opened: list[int] = []
     monkeypatch.setattr(view, "check_window", lambda: None)
@@ -412,6 +479,10 @@ def test_the_commands_of_the_documentation_run(tmp_path: Path, monkeypatch: pyte
         if "--save" in command and find_spec("rerun") is None:
             continue
         assert amvnet(*command) == (0, ""), command
-        made = [command[command.index(option) + 1] for option in ("--html", "--save") if option in command]
+        made = [
+            command[command.index(option) + 1]
+            for option in ("--html", "--save")
+            if option in command
+        ]
         assert all((tmp_path / name).stat().st_size for name in made)
     assert opened

@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 import torch
 
-from amvnet.config import PolarViewConfig, RangeViewConfig
+from amvnet.config.schema import PolarViewConfig, RangeViewConfig
 from amvnet.errors import InputError
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarGrid, PolarView
+from amvnet.models.views.range_view import RangeImage, RangeView
 from amvnet.scan import Scan
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarGrid, PolarView
-from amvnet.views.range_view import RangeImage, RangeView
 
 RandomScan = Callable[..., Scan]
 
 SPHERICAL = RangeViewConfig(height=16, width=250, fov_up=10.0, fov_down=-20.0)
 BY_RING = replace(SPHERICAL, rows="ring")
-POLAR = PolarViewConfig(radial=13, angular=17, vertical=5, radius_min=2.0, radius_max=40.0, z_min=-3.0, z_max=2.0)
+POLAR = PolarViewConfig(
+    radial=13, angular=17, vertical=5, radius_min=2.0, radius_max=40.0, z_min=-3.0, z_max=2.0
+)
 
 
 def scan_of(*rows: tuple[float, float, float], ring: int = 0) -> Scan:
@@ -72,7 +74,9 @@ def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[
     return pixels, nearest, image
 
 
-def polar_view_by_loop(scan: Scan, c: PolarViewConfig) -> tuple[list[tuple[int, int, int]], list[list[float]]]:
+def polar_view_by_loop(
+    scan: Scan, c: PolarViewConfig
+) -> tuple[list[tuple[int, int, int]], list[list[float]]]:
     """(P,) cells (radius, angle, height) and (P, 9) features."""
     cells, features = [], []
     for x, y, z, intensity in scan.points.tolist():
@@ -80,7 +84,9 @@ def polar_view_by_loop(scan: Scan, c: PolarViewConfig) -> tuple[list[tuple[int, 
         low, high = (c.radius_min, -math.pi, c.z_min), (c.radius_max, math.pi, c.z_max)
         counts = (c.radial, c.angular, c.vertical)
         sizes = [(b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
-        cell = tuple(part((p - a) / (b - a), n) for p, a, b, n in zip(polar, low, high, counts, strict=True))
+        cell = tuple(
+            part((p - a) / (b - a), n) for p, a, b, n in zip(polar, low, high, counts, strict=True)
+        )
         offset = [p - a - (k + 0.5) * s for p, a, k, s in zip(polar, low, cell, sizes, strict=True)]
         cells.append(cell)
         features.append([*offset, *polar, x, y, intensity])
@@ -140,17 +146,30 @@ def test_points_outside_the_field_of_view_get_the_border_rows() -> None:
 
 
 def test_azimuth_runs_from_behind_over_left_front_and_right() -> None:
-    columns = range_image(scan_of((-5, 1e-3, 0), (0, 5, 0), (5, -1e-3, 0), (0, -5, 0), (-5, -1e-3, 0))).pixel % 250
+    columns = (
+        range_image(
+            scan_of((-5, 1e-3, 0), (0, 5, 0), (5, -1e-3, 0), (0, -5, 0), (-5, -1e-3, 0))
+        ).pixel
+        % 250
+    )
     assert columns.tolist() == [0, 62, 125, 187, 249]
 
 
 def test_ring_zero_is_the_last_row() -> None:
-    rows = [int(range_image(scan_of((5, 0, 0), ring=r), BY_RING).pixel // BY_RING.width) for r in (0, 15)]
+    rows = [
+        int(range_image(scan_of((5, 0, 0), ring=r), BY_RING).pixel // BY_RING.width)
+        for r in (0, 15)
+    ]
     assert rows == [15, 0]
 
 
 def test_a_batch_of_range_images_equals_one_by_one(random_scan: RandomScan) -> None:
-    scans = [random_scan(400, 1), degenerate_scans()["no point"], random_scan(250, 2), scan_of((1, 2, 3))]
+    scans = [
+        random_scan(400, 1),
+        degenerate_scans()["no point"],
+        random_scan(250, 2),
+        scan_of((1, 2, 3)),
+    ]
     batch = PointBatch.of(scans)
     together = RangeView(BY_RING).project(batch)
     pixels = BY_RING.height * BY_RING.width
@@ -186,7 +205,10 @@ def test_every_point_gets_the_scores_of_its_pixel(random_scan: RandomScan) -> No
     scores = torch.randn(2, 3, 16, 250)
     found = view.to_points(scores)
     assert found.shape == (500, 3)
-    rows, columns = RangeView(SPHERICAL).rows(batch).tolist(), RangeView(SPHERICAL).columns(batch).tolist()
+    rows, columns = (
+        RangeView(SPHERICAL).rows(batch).tolist(),
+        RangeView(SPHERICAL).columns(batch).tolist(),
+    )
     for i, (b, row, column) in enumerate(zip(batch.scan.tolist(), rows, columns, strict=True)):
         assert torch.equal(found[i], scores[b, :, row, column])
 
@@ -205,14 +227,20 @@ def test_rows_by_ring_without_a_ring_is_an_input_error() -> None:
 def assert_polar_equals_the_loop(scan: Scan) -> None:
     grid = polar_grid(scan)
     cells, features = polar_view_by_loop(scan, POLAR)
-    assert [(p // 17, p % 17, v) for p, v in zip(grid.pillar.tolist(), grid.voxel.tolist(), strict=True)] == cells
-    np.testing.assert_allclose(grid.features.numpy(), np.reshape(features, (-1, 9)), rtol=1e-6, atol=1e-5)
+    assert [
+        (p // 17, p % 17, v) for p, v in zip(grid.pillar.tolist(), grid.voxel.tolist(), strict=True)
+    ] == cells
+    np.testing.assert_allclose(
+        grid.features.numpy(), np.reshape(features, (-1, 9)), rtol=1e-6, atol=1e-5
+    )
     assert grid.occupied.tolist() == sorted({r * 17 + a for r, a, _ in cells})
     assert grid.occupied[grid.slot].tolist() == grid.pillar.tolist()
 
 
 @pytest.mark.parametrize(("count", "seed"), [(20_000, 0), (300, 1), (300, 2)])
-def test_polar_view_equals_a_loop_over_the_points(random_scan: RandomScan, count: int, seed: int) -> None:
+def test_polar_view_equals_a_loop_over_the_points(
+    random_scan: RandomScan, count: int, seed: int
+) -> None:
     assert_polar_equals_the_loop(random_scan(count, seed))
 
 
@@ -240,10 +268,15 @@ def test_pool_is_the_maximum_over_each_pillar(random_scan: RandomScan) -> None:
 @pytest.mark.parametrize("part", [1, 100, 1000])
 def test_pooling_by_parts_is_pooling_of_all(random_scan: RandomScan, part: int) -> None:
     grid = polar_grid(random_scan(400, 1), random_scan(300, 2))
-    assert torch.equal(grid.pool_by_parts(lambda x: 2 * x[:, :5] - 30, part), grid.pool(2 * grid.features[:, :5] - 30))
+    assert torch.equal(
+        grid.pool_by_parts(lambda x: 2 * x[:, :5] - 30, part),
+        grid.pool(2 * grid.features[:, :5] - 30),
+    )
 
 
-def test_maps_hold_the_pillars_where_they_belong_and_zero_elsewhere(random_scan: RandomScan) -> None:
+def test_maps_hold_the_pillars_where_they_belong_and_zero_elsewhere(
+    random_scan: RandomScan,
+) -> None:
     grid = polar_grid(random_scan(100, 1), random_scan(100, 2))
     pillars = torch.randn(len(grid.occupied), 3)
     expected = torch.zeros(2, 3, 13, 17)

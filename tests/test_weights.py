@@ -14,11 +14,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from worlds import fresh_weights, street, without
 
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI
+from amvnet.config.nested import to_dict
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.segmenter import Segmenter
-from amvnet.trees import to_dict
-from amvnet.weights import PARTS, Weights, load, save
+from amvnet.inference.segmenter import Segmenter
+from amvnet.weights.file import PARTS, Weights, load, save
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,9 @@ def test_the_description_is_read_without_our_code(weights: Weights, path: Path) 
     )
 
 
-def test_half_is_half_the_size_and_nearly_the_same(weights: Weights, path: Path, tmp_path: Path) -> None:
+def test_half_is_half_the_size_and_nearly_the_same(
+    weights: Weights, path: Path, tmp_path: Path
+) -> None:
     half = save(weights, tmp_path / "half.safetensors", half=True)
     count = sum(v.numel() for v in weights.tensors.values() if v.ndim > 1)
     assert path.stat().st_size - half.stat().st_size == pytest.approx(2 * count, abs=2000)
@@ -82,7 +84,9 @@ def test_replacing_a_part_changes_that_part_alone(weights: Weights, part: str) -
         source = other if name == part else weights
         assert mixed.training[name] == source.training[name]
         assert all(torch.equal(v, source.part(name)[k]) for k, v in mixed.part(name).items())
-    assert not np.array_equal(Segmenter(mixed)(street(9)[0]).scores, Segmenter(weights)(street(9)[0]).scores)
+    assert not np.array_equal(
+        Segmenter(mixed)(street(9)[0]).scores, Segmenter(weights)(street(9)[0]).scores
+    )
 
 
 def test_all_parts_replaced_are_the_other_weights(weights: Weights) -> None:
@@ -104,7 +108,9 @@ def test_parts_add_up(weights: Weights) -> None:
     networks, head = without(weights, "point_head"), without(weights, "range_net", "polar_net")
     assert (networks.parts, head.parts) == (PARTS[:2], PARTS[2:])
     whole = networks.replace_part("point_head", head)
-    assert np.array_equal(Segmenter(whole)(street(9)[0]).scores, Segmenter(weights)(street(9)[0]).scores)
+    assert np.array_equal(
+        Segmenter(whole)(street(9)[0]).scores, Segmenter(weights)(street(9)[0]).scores
+    )
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -151,7 +157,9 @@ def said(good: bytes) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", BROKEN)
-def test_what_is_not_a_weights_file_is_refused_in_one_line(kind: str, path: Path, tmp_path: Path) -> None:
+def test_what_is_not_a_weights_file_is_refused_in_one_line(
+    kind: str, path: Path, tmp_path: Path
+) -> None:
     bad = tmp_path / "bad.safetensors"
     BROKEN[kind](bad, path.read_bytes())
     with pytest.raises(InputError) as error:

@@ -16,13 +16,13 @@ import pytest
 import torch
 import yaml
 
-from amvnet.cli import main
-from amvnet.config import ModelConfig
-from amvnet.data.labels import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.cli.main import main
+from amvnet.config.nested import from_dict, merge_trees
+from amvnet.config.schema import ModelConfig
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.models.amvnet import build_amvnet
-from amvnet.trees import from_dict, merge_trees
-from amvnet.weights import Weights, state_of
+from amvnet.weights.file import Weights, part_state
 
 GOLDEN = Path(__file__).parent / "golden"
 CAR, ROAD, SIDEWALK, BUILDING, UNLABELLED = 10, 40, 48, 50, 0  # raw ids of SemanticKITTI
@@ -45,7 +45,12 @@ TRAINING: dict[str, Any] = {
 }
 NUSCENES_MODEL: dict[str, Any] = {
     "range_view": {"height": 32, "width": 64},
-    "range_net": {**MODEL["range_net"], "widths": [16] * 6, "blocks": [1] * 6, "height_strides": [1, 1, 1, 2, 2, 2]},
+    "range_net": {
+        **MODEL["range_net"],
+        "widths": [16] * 6,
+        "blocks": [1] * 6,
+        "height_strides": [1, 1, 1, 2, 2, 2],
+    },
 }
 
 
@@ -55,17 +60,25 @@ def street(seed: int, count: int = 500) -> tuple[np.ndarray, np.ndarray]:
     azimuth, elevation = rng.uniform(-np.pi, np.pi, count), np.radians(rng.uniform(-25, 3, count))
     ground = elevation < np.radians(-6)
     car = np.abs(azimuth - rng.uniform(-2, 2)) < 0.3
-    distance = np.where(car, 6.0, np.where(ground, 1.7 / np.sin(np.where(ground, -elevation, 1)), 20.0))
+    distance = np.where(
+        car, 6.0, np.where(ground, 1.7 / np.sin(np.where(ground, -elevation, 1)), 20.0)
+    )
     flat = distance * np.cos(elevation)
-    points = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+    points = np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)], axis=1
+    )
     raw = np.where(ground, np.where(np.abs(points[:, 1]) < 4, ROAD, SIDEWALK), BUILDING)
     raw = np.where(car, CAR, raw)
     raw[rng.random(count) < 0.02] = UNLABELLED
     intensity = (raw % 7) / 7 + rng.uniform(0, 0.1, count)
-    return np.column_stack([points + rng.normal(0, 0.02, points.shape), intensity]).astype(np.float32), raw
+    return np.column_stack([points + rng.normal(0, 0.02, points.shape), intensity]).astype(
+        np.float32
+    ), raw
 
 
-def write_scan(root: Path, sequence: str, name: str, points: np.ndarray, raw: np.ndarray | None) -> Path:
+def write_scan(
+    root: Path, sequence: str, name: str, points: np.ndarray, raw: np.ndarray | None
+) -> Path:
     """One scan in SemanticKITTI's layout; returns the file of its points."""
     path = root / "sequences" / sequence / "velodyne" / f"{name}.bin"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +90,9 @@ def write_scan(root: Path, sequence: str, name: str, points: np.ndarray, raw: np
     return path
 
 
-def make_streets(root: Path, sequences: tuple[str, ...] = ("00", "01", "08"), scans: int = 2) -> Path:
+def make_streets(
+    root: Path, sequences: tuple[str, ...] = ("00", "01", "08"), scans: int = 2
+) -> Path:
     """A data set in SemanticKITTI's layout; every sequence has other streets."""
     for place, sequence in enumerate(sequences):
         for scan in range(scans):
@@ -96,7 +111,9 @@ def write_recipe(path: Path, base: str = "semantickitti-compact", **over: Any) -
 def fresh_weights(taxonomy: Taxonomy = SEMANTICKITTI, seed: int = 0) -> Weights:
     """All three parts untrained, but sure of themselves: their last layers are scaled up."""
     torch.manual_seed(seed)
-    config = from_dict(ModelConfig, merge_trees(MODEL, NUSCENES_MODEL) if taxonomy is NUSCENES else MODEL)
+    config = from_dict(
+        ModelConfig, merge_trees(MODEL, NUSCENES_MODEL) if taxonomy is NUSCENES else MODEL
+    )
     if taxonomy is NUSCENES:
         config = replace(config, range_view=replace(config.range_view, rows="ring"))
     model = build_amvnet(config, taxonomy.size)
@@ -104,15 +121,25 @@ def fresh_weights(taxonomy: Taxonomy = SEMANTICKITTI, seed: int = 0) -> Weights:
     with torch.no_grad():
         for last in (model.range_net.scores, model.polar_net.scores, model.point_head.fc[-1]):
             last.weight.mul_(10)
-    parts = {"range_net": model.range_net, "polar_net": model.polar_net, "point_head": model.point_head}
-    tensors = {key: value for name, part in parts.items() for key, value in state_of(name, part).items()}
+    parts = {
+        "range_net": model.range_net,
+        "polar_net": model.polar_net,
+        "point_head": model.point_head,
+    }
+    tensors = {
+        key: value for name, part in parts.items() for key, value in part_state(name, part).items()
+    }
     said = {name: {"seed": seed} for name in parts}
-    return Weights(config, taxonomy, "tiny", tensors, training=said, metrics={"range_net": {"val/miou": 0.5}})
+    return Weights(
+        config, taxonomy, "tiny", tensors, training=said, metrics={"range_net": {"val/miou": 0.5}}
+    )
 
 
 def without(weights: Weights, *parts: str) -> Weights:
     """The weights less some parts."""
-    return replace(weights, tensors={k: v for k, v in weights.tensors.items() if k.split(".")[0] not in parts})
+    return replace(
+        weights, tensors={k: v for k, v in weights.tensors.items() if k.split(".")[0] not in parts}
+    )
 
 
 def amvnet(*arguments: object) -> tuple[int, str]:
@@ -150,7 +177,9 @@ def label_map() -> dict[str, Any]:
     """SEMANTICKITTI in the format of the benchmark's own YAML file (colours are BGR there)."""
     raws, forward = SEMANTICKITTI.train_to_raw, SEMANTICKITTI.raw_to_train
     names = ("unlabeled", *SEMANTICKITTI.classes)
-    train = {ours: [int(s) for s in SEMANTICKITTI.splits[ours]] for ours in ("train", "val", "test")}
+    train = {
+        ours: [int(s) for s in SEMANTICKITTI.splits[ours]] for ours in ("train", "val", "test")
+    }
     return {
         "labels": {raw: names[t] for raw, t in forward.items()},
         "color_map": {raw: list(SEMANTICKITTI.colors[t])[::-1] for raw, t in forward.items()},

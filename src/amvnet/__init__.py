@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from amvnet.errors import InputError
-    from amvnet.fusion import fuse
+    from amvnet.inference.fusion import fuse
+    from amvnet.inference.segmenter import Segmentation, Segmenter
     from amvnet.scan import Scan
-    from amvnet.segmenter import Segmentation, Segmenter
-    from amvnet.sharing import push
     from amvnet.simulation import simulate
+    from amvnet.weights.push import push
 
 __all__ = ["InputError", "Scan", "Segmentation", "Segmenter", "fuse", "load", "push", "simulate"]
 __version__ = version("amvnet")
@@ -26,25 +26,31 @@ __version__ = version("amvnet")
 _HOMES = {
     "InputError": "amvnet.errors",
     "Scan": "amvnet.scan",
-    "Segmentation": "amvnet.segmenter",
-    "Segmenter": "amvnet.segmenter",
-    "fuse": "amvnet.fusion",
-    "push": "amvnet.sharing",
+    "Segmentation": "amvnet.inference.segmenter",
+    "Segmenter": "amvnet.inference.segmenter",
+    "fuse": "amvnet.inference.fusion",
+    "push": "amvnet.weights.push",
     "simulate": "amvnet.simulation",
 }
 
 
 def load(
-    weights: str, device: str = "cpu", method: str = "amvnet", precision: str = "float32", engine: str = "torch"
+    weights: str,
+    device: str = "cpu",
+    method: str = "amvnet",
+    precision: str = "float32",
+    engine: str = "torch",
 ) -> Segmenter:
     """A segmenter from a weights file, the name of built-in weights (`sim-hdl64e`), or the hub (`hf-hub:OWNER/NAME`).
 
     Raises:
         InputError: where there are no such weights, or they lack a part that the method needs, or the engine a library.
     """
-    segmenter = import_module("amvnet.segmenter").Segmenter(weights, device, method, precision)
+    segmenter = import_module("amvnet.inference.segmenter").Segmenter(
+        weights, device, method, precision
+    )
     if engine != "torch":
-        import_module("amvnet.engines").engage(segmenter, engine)
+        import_module("amvnet.export.engines").use_engine(segmenter, engine)
     return segmenter
 
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from amvnet.cli import main
+from amvnet.cli.main import main
 
 sys.exit(main())

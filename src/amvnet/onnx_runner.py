@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.config import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
+from amvnet.config.nested import from_dict
+from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
 from amvnet.errors import InputError
-from amvnet.neighbours import nearest_others
+from amvnet.models.neighbours import nearest_others
 from amvnet.scan import Scan
-from amvnet.trees import from_dict
 
 DESCRIPTION = "amvnet.json"  # beside the graphs
 FORMAT = 2
@@ -57,7 +57,9 @@ class OnnxSegmenter:
         InputError: where the folder is not whole, or ONNX Runtime is not installed.
     """
 
-    def __init__(self, folder: Path | str, providers: Sequence[str] = ("CPUExecutionProvider",)) -> None:
+    def __init__(
+        self, folder: Path | str, providers: Sequence[str] = ("CPUExecutionProvider",)
+    ) -> None:
         folder = Path(folder)
         self.description = said = _description(folder)
         self.method: str = said["method"]
@@ -65,7 +67,9 @@ class OnnxSegmenter:
         self.polar_view = from_dict(PolarViewConfig, said.get("polar_view", {}), str(folder))
         self.assertion = from_dict(AssertionConfig, said.get("assertion", {}), str(folder))
         self.head = from_dict(PointHeadConfig, said.get("point_head", {}), str(folder))
-        self._graphs = {name: _session(folder, said["graphs"][name], providers) for name in GRAPHS[self.method]}
+        self._graphs = {
+            name: _session(folder, said["graphs"][name], providers) for name in GRAPHS[self.method]
+        }
         self._check_sizes(folder, len(said["classes"]) - 1)
 
     def __call__(self, points: np.ndarray, ring: np.ndarray | None = None) -> OnnxSegmentation:
@@ -78,13 +82,21 @@ class OnnxSegmenter:
         Raises:
             InputError: where there is no finite point, the shapes do not fit, or rings are missing or out of range.
         """
-        scan = Scan(np.asarray(points, dtype=np.float32), ring=None if ring is None else np.asarray(ring))
+        scan = Scan(
+            np.asarray(points, dtype=np.float32), ring=None if ring is None else np.asarray(ring)
+        )
         valid = scan.valid
         if not valid.any():
-            raise InputError("expected points to segment, found none that is finite; leave the scan out")
-        scores, uncertain = self._scores(scan.points[valid], None if scan.ring is None else scan.ring[valid])
+            raise InputError(
+                "expected points to segment, found none that is finite; leave the scan out"
+            )
+        scores, uncertain = self._scores(
+            scan.points[valid], None if scan.ring is None else scan.ring[valid]
+        )
         labels = scores.argmax(axis=1).astype(np.uint8) + 1
-        return OnnxSegmentation(*(_in_place(values, valid) for values in (labels, uncertain, scores)))
+        return OnnxSegmentation(
+            *(_in_place(values, valid) for values in (labels, uncertain, scores))
+        )
 
     def _check_sizes(self, folder: Path, k: int) -> None:
         """Raises InputError where the graphs have other sizes than the description."""
@@ -97,9 +109,13 @@ class OnnxSegmenter:
         }
         for name in set(last) & set(self._graphs):
             graph = self._graphs[name]
-            shape = (graph.get_inputs()[1] if name == "point_head" else graph.get_outputs()[0]).shape
+            shape = (
+                graph.get_inputs()[1] if name == "point_head" else graph.get_outputs()[0]
+            ).shape
             if (found := shape[-len(last[name]) :]) != last[name]:
-                raise InputError(f"{folder}: expected {name} of size {last[name]}, found {found}; export anew")
+                raise InputError(
+                    f"{folder}: expected {name} of size {last[name]}, found {found}; export anew"
+                )
 
     def _scores(self, points: np.ndarray, ring: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """(P, K) scores and (P,) uncertain of the valid points."""
@@ -129,12 +145,16 @@ class OnnxSegmenter:
         plane = np.zeros((c.radial * c.angular, pillars.shape[1]), dtype=np.float32)
         plane[occupied] = pillars
         image = np.ascontiguousarray(plane.T).reshape(1, -1, c.radial, c.angular)
-        decoded = self._run("polar_map", image)[0].reshape(-1, c.radial * c.angular)[:, occupied]  # (C', M)
+        decoded = self._run("polar_map", image)[0].reshape(-1, c.radial * c.angular)[
+            :, occupied
+        ]  # (C', M)
         scores = self._run("polar_scores", np.ascontiguousarray(decoded.T))  # (M, Z * K)
         slot = np.searchsorted(occupied, pillar)
         return softmax(scores.reshape(len(occupied), c.vertical, -1)[slot, voxel])
 
-    def _settle(self, points: np.ndarray, f: np.ndarray, g: np.ndarray, uncertain: np.ndarray) -> np.ndarray:
+    def _settle(
+        self, points: np.ndarray, f: np.ndarray, g: np.ndarray, uncertain: np.ndarray
+    ) -> np.ndarray:
         """(U, K) class probabilities of the uncertain points, from themselves and their neighbours."""
         index = np.flatnonzero(uncertain)
         near = nearest_others(points[:, :3], index, self.head.neighbours)
@@ -143,7 +163,9 @@ class OnnxSegmenter:
         for start in range(0, len(index), PART):
             part = slice(start, start + PART)
             point, rows = table[index[part]], table[near[part]]
-            rows[..., -4:] -= point[:, None, -4:]  # the neighbours' x, y, z, intensity less the point's own
+            rows[..., -4:] -= point[
+                :, None, -4:
+            ]  # the neighbours' x, y, z, intensity less the point's own
             point[:, -4:-1] *= np.float32(self.head.position_scale)
             found.append(self._run("point_head", point, rows))
         return softmax(np.concatenate(found))
@@ -178,7 +200,9 @@ def range_image(
     return np.ascontiguousarray(image.T).reshape(1, CHANNELS, view.height, view.width), pixel
 
 
-def polar_features(view: PolarViewConfig, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def polar_features(
+    view: PolarViewConfig, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The 9 features (P, 9) float32 of points (P, 4), and each one's pillar (P,) and voxel in it (P,)."""
     x, y, z = points[:, :3].astype(np.float64).T
     polar = np.stack([np.sqrt(x * x + y * y), np.arctan2(y, x), z], axis=1)
@@ -187,7 +211,9 @@ def polar_features(view: PolarViewConfig, points: np.ndarray) -> tuple[np.ndarra
     cells = np.array([view.radial, view.angular, view.vertical])
     cell = np.clip(np.floor((polar - low) / (high - low) * cells), 0, cells - 1)
     centre = low + (cell + 0.5) * (high - low) / cells
-    features = np.concatenate([polar - centre, polar, points[:, [0, 1, 3]]], axis=1, dtype=np.float32)
+    features = np.concatenate(
+        [polar - centre, polar, points[:, [0, 1, 3]]], axis=1, dtype=np.float32
+    )
     radius, angle, voxel = cell.astype(np.int64).T
     return features, radius * view.angular + angle, voxel
 
@@ -221,10 +247,14 @@ def _cell(share: np.ndarray, cells: int) -> np.ndarray:
 
 def _rings(ring: np.ndarray | None, height: int) -> np.ndarray:
     if ring is None:
-        raise InputError("expected a scan with a ring index, found none; use a model with rows by elevation")
+        raise InputError(
+            "expected a scan with a ring index, found none; use a model with rows by elevation"
+        )
     if not 0 <= ring.min() <= ring.max() < height:
         found = f"{ring.min()} to {ring.max()}"
-        raise InputError(f"expected ring indices from 0 to {height - 1}, found {found}; use a model for this sensor")
+        raise InputError(
+            f"expected ring indices from 0 to {height - 1}, found {found}; use a model for this sensor"
+        )
     return ring.astype(np.int64)
 
 
@@ -239,13 +269,23 @@ def _description(folder: Path) -> dict[str, Any]:
     try:
         said = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
-        raise InputError(f"{folder}: expected {DESCRIPTION} of amvnet export, found none; export anew") from None
-    if not isinstance(said, dict) or said.get("format") != FORMAT or said.get("method") not in list(GRAPHS):
-        raise InputError(f"{folder / DESCRIPTION}: expected format {FORMAT} and a method, found others; export anew")
+        raise InputError(
+            f"{folder}: expected {DESCRIPTION} of amvnet export, found none; export anew"
+        ) from None
+    if (
+        not isinstance(said, dict)
+        or said.get("format") != FORMAT
+        or said.get("method") not in list(GRAPHS)
+    ):
+        raise InputError(
+            f"{folder / DESCRIPTION}: expected format {FORMAT} and a method, found others; export anew"
+        )
     graphs = said.get("graphs")
     for name in GRAPHS[said["method"]]:
         if not isinstance(graphs, dict) or not _complete(graphs.get(name)):
-            raise InputError(f"{folder / DESCRIPTION}: expected the graph {name}, found no such; export anew")
+            raise InputError(
+                f"{folder / DESCRIPTION}: expected the graph {name}, found no such; export anew"
+            )
     if not isinstance(said.get("classes"), list):
         raise InputError(f"{folder / DESCRIPTION}: expected classes, found none; export anew")
     return said
@@ -264,7 +304,9 @@ def _session(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -
     try:
         import onnxruntime
     except ImportError:
-        raise InputError("expected onnxruntime to run the graphs, found none; pip install onnxruntime") from None
+        raise InputError(
+            "expected onnxruntime to run the graphs, found none; pip install onnxruntime"
+        ) from None
     path = folder / graph["file"]
     if not path.is_file():
         raise InputError(f"{path}: expected a graph of amvnet export, found no file; export anew")
@@ -272,7 +314,9 @@ def _session(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -
         session = onnxruntime.InferenceSession(str(path), providers=list(providers))
     except Exception as error:  # of a dozen classes that the runtime does not share with others
         said = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: expected a graph of amvnet export, found: {said}; export anew") from None
+        raise InputError(
+            f"{path}: expected a graph of amvnet export, found: {said}; export anew"
+        ) from None
     found = [(one.name, one.shape) for one in session.get_inputs()]
     expected = [(one.get("name"), one.get("shape")) for one in graph["inputs"]]
     if found != expected:

@@ -1,1 +1,0 @@
-"""The three networks, the assertions and AMVNet itself."""

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from amvnet.config import ModelConfig
+from amvnet.config.schema import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
-from amvnet.models.point_head import PointHead, nearest_neighbours, only_asked, point_table
+from amvnet.models.point_head import PointHead, nearest_neighbours, point_table, select_used_points
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.streams import Arrangement, in_turn
-from amvnet.views.points import PointBatch
-from amvnet.views.polar_view import PolarView
-from amvnet.views.range_view import RangeView
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarView
+from amvnet.models.views.range_view import RangeView
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,10 @@ class AMVNet(nn.Module):
         """h: (U, K) class probabilities of the uncertain points by the point head; None without one."""
         if self.point_head is None:
             return None
-        parts = [refine(self.point_head, batch.points[s], f[s], g[s], uncertain[s]) for s in batch.slices()]
+        parts = [
+            refine(self.point_head, batch.points[s], f[s], g[s], uncertain[s])
+            for s in batch.slices()
+        ]
         return torch.cat(parts)
 
 
@@ -77,9 +80,11 @@ def refine(head: PointHead, points: Tensor, f: Tensor, g: Tensor, uncertain: Ten
     return settle(head, points, f, g, index, near)
 
 
-def settle(head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
+def settle(
+    head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor
+) -> Tensor:
     """h: (U, K) of the points with these indices (U,), whose neighbours are (U, n)."""
-    asked, (index, near) = only_asked(len(points), index, near)
+    asked, (index, near) = select_used_points(len(points), index, near)
     table = point_table(*(values.index_select(0, asked) for values in (points, f, g)))
     return head.score(table, index, near).softmax(dim=1)
 

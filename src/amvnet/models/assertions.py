@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from amvnet.config import AssertionConfig
+from amvnet.config.schema import AssertionConfig
 
 TINY = 1e-12  # keeps the logarithm of a probability finite
 
@@ -20,7 +20,9 @@ class Assertion(Protocol):
     Returns (P,) bool: True where a point is uncertain.
     """
 
-    def __call__(self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor: ...
+    def __call__(
+        self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None
+    ) -> Tensor: ...
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,9 @@ class Disagreement:
 
     tau: float = 0.85
 
-    def __call__(self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
+    def __call__(
+        self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None
+    ) -> Tensor:
         return cosine_similarity(f, g) <= self.tau
 
 
@@ -45,7 +49,9 @@ class HighEntropy:
 
     nats: float = 0.7
 
-    def __call__(self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
+    def __call__(
+        self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None
+    ) -> Tensor:
         mean = (f + g) / 2
         return -(mean * mean.clamp_min(TINY).log()).sum(dim=1) >= self.nats
 
@@ -56,9 +62,13 @@ class HighLoss:
 
     nats: float = 0.7
 
-    def __call__(self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
+    def __call__(
+        self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None
+    ) -> Tensor:
         if labels is None:
-            raise ValueError("expected labels for the loss assertion, found none; it is for training")
+            raise ValueError(
+                "expected labels for the loss assertion, found none; it is for training"
+            )
         column = (labels.long() - 1).clamp_min(0)[:, None]
         worst = torch.minimum(f.gather(1, column), g.gather(1, column))[:, 0]
         return (-worst.clamp_min(TINY).log() >= self.nats) & (labels > 0)

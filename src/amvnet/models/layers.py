@@ -16,7 +16,9 @@ class RingConv2d(nn.Conv2d):
     Input (B, C, H, W), output (B, C', ceil(H / stride), ceil(W / stride)).
     """
 
-    def __init__(self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)) -> None:
+    def __init__(
+        self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)
+    ) -> None:
         super().__init__(channels, out, kernel, stride, padding=(kernel // 2, 0), bias=False)
         self.wrap = kernel // 2
 
@@ -69,16 +71,22 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     torch multiplies matrices on a CPU by MKL, which leaves half and more of an AMD processor's float32 unused. Its
     convolutions, by oneDNN, do not.
     """
-    if torch.compiler.is_compiling() or not x.is_cpu or not len(x):  # there is no convolution of nothing
+    if (
+        torch.compiler.is_compiling() or not x.is_cpu or not len(x)
+    ):  # there is no convolution of nothing
         return F.linear(x, weight, bias)
-    image = x.reshape(1, len(x), 1, x.shape[1]).permute(0, 3, 1, 2)  # (1, C, N, 1), its channels last
+    image = x.reshape(1, len(x), 1, x.shape[1]).permute(
+        0, 3, 1, 2
+    )  # (1, C, N, 1), its channels last
     return F.conv2d(image, weight[:, :, None, None], bias).permute(0, 2, 3, 1).flatten(0, 2)
 
 
 class ConvBlock(nn.Sequential):
     """Ring convolution, batch norm, leaky ReLU."""
 
-    def __init__(self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)) -> None:
+    def __init__(
+        self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)
+    ) -> None:
         norm, activation = nn.BatchNorm2d(out), nn.LeakyReLU(0.01, inplace=True)
         super().__init__(RingConv2d(channels, out, kernel, stride), norm, activation)
 
@@ -119,7 +127,9 @@ class AzimuthGRU(nn.Module):
         b, c, h, w = x.shape
         padding = round(self.padding * w)
         columns = wrap_width(x, padding, 0).permute(0, 3, 2, 1)  # (B, padding + W, H, C)
-        with torch.autocast(x.device.type, enabled=False):  # a recurrence in bfloat16 loses its state
+        with torch.autocast(
+            x.device.type, enabled=False
+        ):  # a recurrence in bfloat16 loses its state
             outputs, _ = self.gru(columns.reshape(b, -1, c).to(next(self.gru.parameters()).dtype))
         return outputs.view(b, -1, h, c)[:, padding:].permute(0, 3, 2, 1)  # (B, C, H, W)
 

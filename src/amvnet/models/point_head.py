@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from amvnet.config import PointHeadConfig
-from amvnet.models.block_search import nearest_others_by_blocks
+from amvnet.config.schema import PointHeadConfig
 from amvnet.models.layers import PointLinear
-from amvnet.neighbours import nearest_others
-from amvnet.views.points import occurring
+from amvnet.models.neighbours import nearest_others
+from amvnet.models.neighbours_gpu import nearest_others_by_blocks
+from amvnet.models.views.points import occurring
 
 POINT_VALUES = 4  # x, y, z, intensity
 # Uncertain points that are scored at a time: what a processor's cache holds; what keeps a GPU busy.
@@ -30,11 +30,15 @@ class PointHead(nn.Module):
         self.config = config
         width = 2 * classes + POINT_VALUES
         self.mlp = _mlp((width, *config.hidden))
-        self.fc = nn.Sequential(_mlp((width + config.hidden[-1], config.fc)), PointLinear(config.fc, classes))
+        self.fc = nn.Sequential(
+            _mlp((width + config.hidden[-1], config.fc)), PointLinear(config.fc, classes)
+        )
 
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
-        pooled = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1]).amax(dim=1)  # (U, hidden)
+        pooled = (
+            self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1]).amax(dim=1)
+        )  # (U, hidden)
         return self.fc(torch.cat([pooled, point], dim=1))
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
@@ -48,7 +52,9 @@ class PointHead(nn.Module):
         for index, k in zip(uncertain.split(part), near.split(part), strict=True):
             point = table.index_select(0, index)
             shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
-            rows = done.index_select(0, k.flatten()).unflatten(0, k.shape).sub_(shift[:, None])  # (part, n, hidden[0])
+            rows = (
+                done.index_select(0, k.flatten()).unflatten(0, k.shape).sub_(shift[:, None])
+            )  # (part, n, hidden[0])
             # The last ReLU leaves the order as it is: a fifteenth of the work after the maximum.
             pooled = last(middle(rows.flatten(0, 1)).unflatten(0, k.shape).amax(dim=1))
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
@@ -61,7 +67,7 @@ def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
     return torch.cat([f, g, points], dim=1)
 
 
-def only_asked(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
+def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     """The points, of so many, that occur in some tensors of indices: (M,), and the tensors as places among these.
 
     On a GPU all of them: it would be waited for to count them.
@@ -71,7 +77,9 @@ def only_asked(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     return occurring(count, *indices)
 
 
-def head_features(config: PointHeadConfig, table: Tensor, uncertain: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
+def head_features(
+    config: PointHeadConfig, table: Tensor, uncertain: Tensor, near: Tensor
+) -> tuple[Tensor, Tensor]:
     """p_i = [f_i, g_i, x_i] of the uncertain points, and the rows [f_k, g_k, x_k - x_i] of their S_i.
 
     Args:

@@ -6,12 +6,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from amvnet.config import PolarNetConfig
-from amvnet.models.joined import joined
+from amvnet.config.schema import PolarNetConfig
 from amvnet.models.layers import ConvBlock, PointLinear, linear
-from amvnet.views.polar_view import FEATURES, PolarGrid
+from amvnet.models.upsampled_conv import joined
+from amvnet.models.views.polar_view import FEATURES, PolarGrid
 
-PART, PART_ON_GPU = 2048, 2**18  # points that are encoded at a time: what a cache holds; what keeps a GPU busy
+PART, PART_ON_GPU = (
+    2048,
+    2**18,
+)  # points that are encoded at a time: what a cache holds; what keeps a GPU busy
 
 
 class PolarNet(nn.Module):
@@ -21,11 +24,15 @@ class PolarNet(nn.Module):
         super().__init__()
         c = config
         self.point_mlp = _point_mlp(c.point_widths)
-        self.compress = nn.Sequential(PointLinear(c.point_widths[-1], c.pillar), nn.ReLU(inplace=True))
+        self.compress = nn.Sequential(
+            PointLinear(c.point_widths[-1], c.pillar), nn.ReLU(inplace=True)
+        )
         self.first = _double(c.pillar, c.widths[0])
         downs = zip(c.widths[:-1], c.widths[1:], strict=True)
         self.down = nn.ModuleList(_double(fine, coarse) for fine, coarse in downs)
-        ups = [(coarse + fine, fine) for fine, coarse in zip(c.widths[:-1], c.widths[1:], strict=True)]
+        ups = [
+            (coarse + fine, fine) for fine, coarse in zip(c.widths[:-1], c.widths[1:], strict=True)
+        ]
         self.up = nn.ModuleList(_double(channels, fine) for channels, fine in reversed(ups))
         self.drop = DropBlock(c.dropblock, c.dropblock_size)
         self.scores = nn.Conv2d(c.widths[0], vertical * classes, 1)
@@ -71,7 +78,9 @@ class DropBlock(nn.Module):
         rate = 1 - (1 - self.probability) ** (1 / size**2)
         centres = (torch.rand(x.shape[0], 1, *x.shape[-2:], device=x.device) < rate).to(x.dtype)
         kept = 1 - F.max_pool2d(centres, size, stride=1, padding=size // 2)
-        share = kept.mean(dtype=torch.float32).clamp_min(1 / kept.numel())  # a sum would overflow half precision
+        share = kept.mean(dtype=torch.float32).clamp_min(
+            1 / kept.numel()
+        )  # a sum would overflow half precision
         return x * (kept / share).to(x.dtype)
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from amvnet.config import RangeNetConfig
-from amvnet.models.joined import joined
+from amvnet.config.schema import RangeNetConfig
 from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
-from amvnet.views.range_view import CHANNELS
+from amvnet.models.upsampled_conv import joined
+from amvnet.models.views.range_view import CHANNELS
 
 FIRST_DECODED = 1  # the decoder takes the stages from the second on: width stride 4
 RECURRENT = 2  # so many of the last stages are followed by a GRU
@@ -23,7 +23,9 @@ class RangeNet(nn.Module):
         self.input_norm = nn.BatchNorm2d(CHANNELS)
         self.stem = ConvBlock(CHANNELS, c.stem)
         self.stages = nn.ModuleList(_stages(c))
-        self.recurrent = nn.ModuleList(AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT:] if c.gru)
+        self.recurrent = nn.ModuleList(
+            AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT:] if c.gru
+        )
         decoded = c.widths[FIRST_DECODED:]
         self.lateral = nn.ModuleList(ConvBlock(w, c.decoder, 1) for w in decoded)
         self.decoder = nn.ModuleList(ConvBlock(c.decoder, c.decoder) for _ in decoded)

@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from amvnet.views.points import PointBatch
+from amvnet.models.views.points import PointBatch
 
 Score = Callable[[PointBatch], Tensor]
 
@@ -44,6 +44,10 @@ class SideBySide:
         with torch.cuda.stream(self.side):
             f = first(batch)
         g = second(batch)
-        here.wait_stream(self.side)  # from here on, so that the points' memory is free for others only after both
-        f.record_stream(here)  # its memory is of the other stream, which must not use it again before this one is done
+        here.wait_stream(
+            self.side
+        )  # from here on, so that the points' memory is free for others only after both
+        f.record_stream(
+            here
+        )  # its memory is of the other stream, which must not use it again before this one is done
         return f, g

@@ -5,4 +5,12 @@ from amvnet.simulation.layouts import SimulatedScan
 from amvnet.simulation.sensors import SENSORS, Sensor
 from amvnet.simulation.writing import simulate, simulate_scan
 
-__all__ = ["SENSORS", "Drive", "Sensor", "SimulatedScan", "drive_street", "simulate", "simulate_scan"]
+__all__ = [
+    "SENSORS",
+    "Drive",
+    "Sensor",
+    "SimulatedScan",
+    "drive_street",
+    "simulate",
+    "simulate_scan",
+]

@@ -65,11 +65,17 @@ def _drive_block(
     for index in range(scans):
         x, time = drive.margin + index * drive.spacing, index * drive.spacing / speed
         moving = join(
-            [mover.at(ground, time) for mover in site.movers if _near(mover.x + mover.speed * time, x, ground)]
+            [
+                mover.at(ground, time)
+                for mover in site.movers
+                if _near(mover.x + mover.speed * time, x, ground)
+            ]
         )
         scenes = [standing, RayScene(moving)] if len(moving) else [standing]
         pose = _pose(ground, sensor, x, -style.road / 4 + sway * np.sin(index * 0.7), rng)
-        points, labels, ring = receive(trace(scenes, sensor, pose, ground, rng, speed), sensor, gains, rng)
+        points, labels, ring = receive(
+            trace(scenes, sensor, pose, ground, rng, speed), sensor, gains, rng
+        )
         first = pose if first is None else first
         yield SimulatedScan(points, labels, ring, np.linalg.inv(first) @ pose, time)
 
@@ -79,12 +85,16 @@ def _near(x: float, ego: float, ground: Ground, reach: float = 90.0) -> bool:
     return abs(x % ground.length - ego) < reach
 
 
-def _pose(ground: Ground, sensor: Sensor, x: float, t: float, rng: np.random.Generator) -> np.ndarray:
+def _pose(
+    ground: Ground, sensor: Sensor, x: float, t: float, rng: np.random.Generator
+) -> np.ndarray:
     """The sensor above the road at a place, tilted as the road and the springs tilt it. (4, 4)."""
     px, py, yaw = ground.at(x, t)
     yaw += rng.normal(scale=0.02)
     forward = np.array([np.cos(yaw), np.sin(yaw)])
-    ahead, behind = (float(ground.height(*(np.array([px, py]) + s * 1.4 * forward))) for s in (1, -1))
+    ahead, behind = (
+        float(ground.height(*(np.array([px, py]) + s * 1.4 * forward))) for s in (1, -1)
+    )
     pitch = np.arctan2(ahead - behind, 2.8) + rng.normal(scale=0.004)
     roll = rng.normal(scale=0.006)
     x_axis = np.array([forward[0] * np.cos(pitch), forward[1] * np.cos(pitch), np.sin(pitch)])

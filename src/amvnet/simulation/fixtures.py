@@ -21,7 +21,9 @@ def _openings(rng: np.random.Generator, width: float, depth: float, height: floa
     return np.concatenate(panes) if panes else np.zeros((0, 3, 3))
 
 
-def _roof(rng: np.random.Generator, width: float, depth: float, height: float, flat: bool) -> np.ndarray:
+def _roof(
+    rng: np.random.Generator, width: float, depth: float, height: float, flat: bool
+) -> np.ndarray:
     """A flat roof with a rim, or a hipped or gabled one."""
     if flat:
         return box((width + 0.3, depth + 0.3, 0.5), (0, 0, height - 0.2))
@@ -30,30 +32,42 @@ def _roof(rng: np.random.Generator, width: float, depth: float, height: float, f
     return box((width + 0.6, depth + 0.8, rise), (0, 0, height), (hip, 0.02))
 
 
-def _extras(rng: np.random.Generator, width: float, depth: float, height: float) -> list[np.ndarray]:
+def _extras(
+    rng: np.random.Generator, width: float, depth: float, height: float
+) -> list[np.ndarray]:
     """Porch, bay, balcony, chimney, down pipe: what breaks a wall's plane. Walls facing -y and +y alike."""
     found = []
     x = rng.uniform(-width * 0.35, width * 0.35)
     for side in (-1, 1):
         wall = side * depth / 2
         if rng.random() < 0.4:
-            found.append(box((rng.uniform(1.5, 3), 1.2, rng.uniform(2.2, height)), (x, wall + side * 0.6, 0)))
+            found.append(
+                box((rng.uniform(1.5, 3), 1.2, rng.uniform(2.2, height)), (x, wall + side * 0.6, 0))
+            )
         if height > 5 and rng.random() < 0.4:
             found.append(box((2.5, 1.2, 1.0), (-x, wall + side * 0.6, 2.7)))
         found.append(
-            tube((width / 2 - 0.3, wall + side * 0.08, 0), (width / 2 - 0.3, wall + side * 0.08, height), 0.06)
+            tube(
+                (width / 2 - 0.3, wall + side * 0.08, 0),
+                (width / 2 - 0.3, wall + side * 0.08, height),
+                0.06,
+            )
         )
     found.append(box((0.7, 0.7, 1.4), (x * 0.5, 0.5, height + depth * 0.2)))
     return found
 
 
-def building(rng: np.random.Generator, width: float, depth: float, height: float, flat: bool) -> Mesh:
+def building(
+    rng: np.random.Generator, width: float, depth: float, height: float, flat: bool
+) -> Mesh:
     """A house `width` along x and `depth` along y, standing a little in the ground so that slopes leave no gap."""
     wall = Surface.PLASTER if rng.random() < 0.6 else Surface.BRICK
     walls = [box((width, depth, height + 1.5), (0, 0, -1.5)), *_extras(rng, width, depth, height)]
     if rng.random() < 0.35:
         wing = rng.uniform(0.4, 0.7)
-        walls.append(box((width * 0.5, depth * 0.6, height * wing + 1.5), (width * 0.3, -depth * 0.5, -1.5)))
+        walls.append(
+            box((width * 0.5, depth * 0.6, height * wing + 1.5), (width * 0.3, -depth * 0.5, -1.5))
+        )
     return join(
         [
             part(np.concatenate(walls), wall, Label.BUILDING),
@@ -75,10 +89,15 @@ def shed(rng: np.random.Generator) -> Mesh:
 def board_fence(length: float, height: float, gap: float) -> Mesh:
     """Upright boards on two rails; `gap` is the open share between the boards."""
     pitch = 0.16
-    boards = [box((pitch * (1 - gap), 0.03, height), (x, 0, 0)) for x in np.arange(-length / 2, length / 2, pitch)]
+    boards = [
+        box((pitch * (1 - gap), 0.03, height), (x, 0, 0))
+        for x in np.arange(-length / 2, length / 2, pitch)
+    ]
     rails = [box((length, 0.05, 0.09), (0, 0.03, height * z)) for z in (0.2, 0.75)]
     return part(
-        np.concatenate([*boards, *rails, box((0.1, 0.1, height + 0.5), (0, 0, -0.4))]), Surface.WOOD, Label.FENCE
+        np.concatenate([*boards, *rails, box((0.1, 0.1, height + 0.5), (0, 0, -0.4))]),
+        Surface.WOOD,
+        Label.FENCE,
     )
 
 
@@ -92,18 +111,33 @@ def rail_fence(length: float, height: float) -> Mesh:
 def wall(length: float, height: float) -> Mesh:
     """A garden wall; SemanticKITTI counts it as fence."""
     top = box((length, 0.36, 0.08), (0, 0, height))
-    return part(np.concatenate([box((length, 0.28, height + 0.5), (0, 0, -0.5)), top]), Surface.BRICK, Label.FENCE)
+    return part(
+        np.concatenate([box((length, 0.28, height + 0.5), (0, 0, -0.5)), top]),
+        Surface.BRICK,
+        Label.FENCE,
+    )
 
 
 def guard_rail(length: float) -> Mesh:
     """A crash barrier beside a fast road."""
     beam = box((length, 0.08, 0.31), (0, 0, 0.44))
-    return part(np.concatenate([beam, box((0.12, 0.12, 0.7), (0, 0.08, 0))]), Surface.METAL, Label.FENCE)
+    return part(
+        np.concatenate([beam, box((0.12, 0.12, 0.7), (0, 0.08, 0))]), Surface.METAL, Label.FENCE
+    )
 
 
 def barrier(length: float) -> Mesh:
     """A segment of the concrete wall that closes off a work zone."""
-    half = [(-0.3, 0), (0.3, 0), (0.3, 0.08), (0.12, 0.35), (0.08, 0.8), (-0.08, 0.8), (-0.12, 0.35), (-0.3, 0.08)]
+    half = [
+        (-0.3, 0),
+        (0.3, 0),
+        (0.3, 0.08),
+        (0.12, 0.35),
+        (0.08, 0.8),
+        (-0.08, 0.8),
+        (-0.12, 0.35),
+        (-0.3, 0.08),
+    ]
     across = prism(half, length)[..., [1, 0, 2]]  # its side view is across the street
     return part(across, Surface.PLASTER, Label.BARRIER)
 
@@ -158,7 +192,10 @@ def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
     fork = (lean[0], lean[1], clear)
     boughs, crown, clumps = [], [], int(rng.integers(3, 8)) if fine else 2
     for _ in range(clumps):
-        spot = (*(lean + rng.normal(scale=wide * 0.45, size=2)), rng.uniform(clear * 1.1 + wide * 0.4, height * 0.85))
+        spot = (
+            *(lean + rng.normal(scale=wide * 0.45, size=2)),
+            rng.uniform(clear * 1.1 + wide * 0.4, height * 0.85),
+        )
         boughs.append(tube(fork, spot, thick * 0.6, 0.03, sides=5))
         share = rng.uniform(0.45, 0.75)
         crown.append(hull(rng, spot, (wide * share, wide * share, wide * share * 0.9), fine=fine))
@@ -174,7 +211,9 @@ def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
 
 def conifer(rng: np.random.Generator, height: float) -> Mesh:
     """A fir: narrower upwards, nearly down to the ground."""
-    trunk = part(tube((0, 0, -0.5), (0, 0, height * 0.5), 0.018 * height, 0.03), Surface.BARK, Label.TRUNK)
+    trunk = part(
+        tube((0, 0, -0.5), (0, 0, height * 0.5), 0.018 * height, 0.03), Surface.BARK, Label.TRUNK
+    )
     wide = height * rng.uniform(0.13, 0.2)
     body = hull(rng, (0, 0, height * 0.55), (wide, wide, height * 0.47), taper=0.75)
     return join([trunk, _leaves([body], rng.uniform(0.05, 0.25))])
@@ -183,7 +222,12 @@ def conifer(rng: np.random.Generator, height: float) -> Mesh:
 def copse(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """The edge of a wood, seen from far away."""
     crowns = [
-        hull(rng, (x, rng.normal(scale=2), height * 0.45), (3.5, 3.0, height * rng.uniform(0.4, 0.6)), fine=False)
+        hull(
+            rng,
+            (x, rng.normal(scale=2), height * 0.45),
+            (3.5, 3.0, height * rng.uniform(0.4, 0.6)),
+            fine=False,
+        )
         for x in np.arange(-length / 2, length / 2, 4.5)
     ]
     return _leaves(crowns, rng.uniform(0.2, 0.6))
@@ -194,19 +238,31 @@ def lamp(rng: np.random.Generator) -> Mesh:
     height, arm = rng.uniform(4, 9), rng.uniform(0.3, 2.0)
     mast = tube((0, 0, -0.3), (0, 0, height), rng.uniform(0.07, 0.13), 0.05)
     bough = tube((0, 0, height), (0, arm, height + 0.2), 0.04)
-    return part(np.concatenate([mast, bough, box((0.3, 0.7, 0.15), (0, arm, height + 0.1))]), Surface.METAL, Label.POLE)
+    return part(
+        np.concatenate([mast, bough, box((0.3, 0.7, 0.15), (0, arm, height + 0.1))]),
+        Surface.METAL,
+        Label.POLE,
+    )
 
 
 def post(rng: np.random.Generator) -> Mesh:
     """A bollard or a thin post."""
-    return part(tube((0, 0, -0.2), (0, 0, rng.uniform(0.8, 1.2)), rng.uniform(0.05, 0.1)), Surface.METAL, Label.POLE)
+    return part(
+        tube((0, 0, -0.2), (0, 0, rng.uniform(0.8, 1.2)), rng.uniform(0.05, 0.1)),
+        Surface.METAL,
+        Label.POLE,
+    )
 
 
 def utility_pole(rng: np.random.Generator) -> Mesh:
     """A wooden pole that carries lines."""
     height = rng.uniform(7, 9)
     mast = tube((0, 0, -0.5), (0, 0, height), 0.15, 0.11)
-    return part(np.concatenate([mast, box((0.12, 1.8, 0.12), (0, 0, height - 0.8))]), Surface.WOOD, Label.POLE)
+    return part(
+        np.concatenate([mast, box((0.12, 1.8, 0.12), (0, 0, height - 0.8))]),
+        Surface.WOOD,
+        Label.POLE,
+    )
 
 
 def sign(rng: np.random.Generator) -> Mesh:
@@ -222,14 +278,20 @@ def sign(rng: np.random.Generator) -> Mesh:
         face = box((0.02, rng.uniform(0.4, 0.7), 0.6), (-0.05, 0, height))
     else:
         face = box((0.03, rng.uniform(1.2, 2.5), rng.uniform(0.5, 1.2)), (-0.05, 0, height - 0.5))
-    return join([part(mast, Surface.METAL, Label.POLE), part(face, Surface.SIGN_FACE, Label.TRAFFIC_SIGN)])
+    return join(
+        [part(mast, Surface.METAL, Label.POLE), part(face, Surface.SIGN_FACE, Label.TRAFFIC_SIGN)]
+    )
 
 
 def traffic_light(rng: np.random.Generator) -> Mesh:
     """A mast with its lamps' housing; SemanticKITTI counts the housing as traffic sign."""
     mast = tube((0, 0, -0.3), (0, 0, 3.4), 0.07)
-    housing = np.concatenate([box((0.25, 0.3, 0.9), (0, 0.1, 2.4)), box((0.02, 0.5, 1.1), (0.1, 0.1, 2.3))])
-    return join([part(mast, Surface.METAL, Label.POLE), part(housing, Surface.PLASTIC, Label.TRAFFIC_SIGN)])
+    housing = np.concatenate(
+        [box((0.25, 0.3, 0.9), (0, 0.1, 2.4)), box((0.02, 0.5, 1.1), (0.1, 0.1, 2.3))]
+    )
+    return join(
+        [part(mast, Surface.METAL, Label.POLE), part(housing, Surface.PLASTIC, Label.TRAFFIC_SIGN)]
+    )
 
 
 def clutter(rng: np.random.Generator) -> Mesh:
@@ -241,7 +303,11 @@ def clutter(rng: np.random.Generator) -> Mesh:
         solid = box((rng.uniform(0.6, 1.4), 0.4, rng.uniform(0.9, 1.4)))
     else:
         solid = np.concatenate(
-            [box((1.7, 0.45, 0.08), (0, 0, 0.42)), box((1.7, 0.08, 0.4), (0, 0.2, 0.5)), box((0.1, 0.4, 0.4))]
+            [
+                box((1.7, 0.45, 0.08), (0, 0, 0.42)),
+                box((1.7, 0.08, 0.4), (0, 0.2, 0.5)),
+                box((0.1, 0.4, 0.4)),
+            ]
         )
     return part(solid, Surface.PLASTIC, Label.OTHER_OBJECT)
 
@@ -249,9 +315,15 @@ def clutter(rng: np.random.Generator) -> Mesh:
 def shelter(rng: np.random.Generator) -> Mesh:
     """A bus stop's shelter, open towards -y."""
     length = rng.uniform(2.5, 4.5)
-    frame = [box((0.1, 0.1, 2.3), (x, y, 0)) for x in (-length / 2, length / 2) for y in (-0.6, 0.6)]
+    frame = [
+        box((0.1, 0.1, 2.3), (x, y, 0)) for x in (-length / 2, length / 2) for y in (-0.6, 0.6)
+    ]
     solid = np.concatenate(
-        [*frame, box((length + 0.3, 1.6, 0.12), (0, 0, 2.3)), box((length, 0.4, 0.1), (0, 0.4, 0.5))]
+        [
+            *frame,
+            box((length + 0.3, 1.6, 0.12), (0, 0, 2.3)),
+            box((length, 0.4, 0.1), (0, 0.4, 0.5)),
+        ]
     )
     panes = part(box((length, 0.03, 1.9), (0, 0.6, 0.3)), Surface.GLASS, Label.OTHER_STRUCTURE)
     return join([part(solid, Surface.METAL, Label.OTHER_STRUCTURE), panes])
@@ -260,12 +332,21 @@ def shelter(rng: np.random.Generator) -> Mesh:
 def steps(rng: np.random.Generator) -> Mesh:
     """A stair before a door, or a low ramp."""
     rows = int(rng.integers(2, 6))
-    solid = [box((1.6, 0.3 * (rows - row), 0.17), (0, -0.15 * (rows - row), 0.17 * row)) for row in range(rows)]
+    solid = [
+        box((1.6, 0.3 * (rows - row), 0.17), (0, -0.15 * (rows - row), 0.17 * row))
+        for row in range(rows)
+    ]
     return part(np.concatenate(solid), Surface.PAVING, Label.OTHER_STRUCTURE)
 
 
 def gable_barn(rng: np.random.Generator, width: float, depth: float, height: float) -> Mesh:
     """A long hall whose gable faces along y."""
     half = width / 2
-    view = [(-half, -1.5), (half, -1.5), (half, height), (0, height + width * rng.uniform(0.15, 0.3)), (-half, height)]
+    view = [
+        (-half, -1.5),
+        (half, -1.5),
+        (half, height),
+        (0, height + width * rng.uniform(0.15, 0.3)),
+        (-half, height),
+    ]
     return part(prism(view, depth), Surface.PLASTER, Label.BUILDING)

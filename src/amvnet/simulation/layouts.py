@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from amvnet.data.files import whole_file
+from amvnet.files import atomic_write
 from amvnet.simulation.materials import MOVING, NUSCENES_CATEGORIES, SEMANTICKITTI_IDS
 
 Row = dict[str, Any]
@@ -112,7 +112,15 @@ class NuScenesLayout:
         labels = f"lidarseg/{VERSION}/{token}_lidarseg.bin"
         _write(self.out / file, columns.astype("<f4").tobytes())
         _write(self.out / labels, nuscenes_indices(scan.labels).tobytes())
-        self.rows.append({"token": token, "time": time, "file": file, "labels": labels, "pose": scan.pose.tolist()})
+        self.rows.append(
+            {
+                "token": token,
+                "time": time,
+                "file": file,
+                "labels": labels,
+                "pose": scan.pose.tolist(),
+            }
+        )
 
     def finish(self) -> Row:
         """The scene's rows."""
@@ -179,7 +187,9 @@ def _add_scene(tables: dict[str, list[Row]], sequence: Row, mounted: str, log: s
     chain = _links(samples), _links([scan["token"] for scan in scans])
     for scan, sample, sample_links, scan_links in zip(scans, samples, *chain, strict=True):
         token, time, pose = scan["token"], scan["time"], np.array(scan["pose"])
-        tables["sample"].append({"token": sample, "timestamp": time, "scene_token": scene, **sample_links})
+        tables["sample"].append(
+            {"token": sample, "timestamp": time, "scene_token": scene, **sample_links}
+        )
         tables["sample_data"].append(
             {"token": token, "sample_token": sample, "ego_pose_token": token, "calibrated_sensor_token": mounted,
              "timestamp": time, "fileformat": "pcd", "is_key_frame": True, "height": 0, "width": 0,
@@ -187,11 +197,15 @@ def _add_scene(tables: dict[str, list[Row]], sequence: Row, mounted: str, log: s
         )  # fmt: skip
         tables["ego_pose"].append({"token": token, "timestamp": time, "rotation": _quaternion(pose[:3, :3]),
                                    "translation": pose[:3, 3].tolist()})  # fmt: skip
-        tables["lidarseg"].append({"token": token, "sample_data_token": token, "filename": scan["labels"]})
+        tables["lidarseg"].append(
+            {"token": token, "sample_data_token": token, "filename": scan["labels"]}
+        )
 
 
 def _links(tokens: list[str]) -> list[Row]:
-    return [{"prev": a, "next": b} for a, b in zip(["", *tokens[:-1]], [*tokens[1:], ""], strict=True)]
+    return [
+        {"prev": a, "next": b} for a, b in zip(["", *tokens[:-1]], [*tokens[1:], ""], strict=True)
+    ]
 
 
 def _quaternion(turn: np.ndarray) -> list[float]:
@@ -210,7 +224,7 @@ def _write_empty_map(path: Path) -> None:
     """nuScenes' tools want a picture of the map; ours shows nothing."""
     from matplotlib.image import imsave
 
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         imsave(part, np.zeros((8, 8, 3), dtype=np.uint8))
 
 
@@ -219,5 +233,5 @@ def _row(matrix: np.ndarray) -> str:
 
 
 def _write(path: Path, content: bytes) -> None:
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_bytes(content)

@@ -117,11 +117,17 @@ def fired(sensor: Sensor) -> Rays:
     skew = ((np.arange(len(elevation)) * 0.618) % 1.0)[:, None]
     turned = (np.arange(sensor.azimuth_steps) + skew) / sensor.azimuth_steps
     azimuth, level = 2 * np.pi * turned, np.cos(elevation)
-    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1)
+    rays = np.stack(
+        [level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation) + 0 * azimuth], axis=-1
+    )
     ring = np.repeat(np.arange(len(sensor.elevations), dtype=np.uint8)[::-1], sensor.azimuth_steps)
     time = sensor.turn * ((turned + 0.5) % 1 - 0.5) * (1 if sensor.counter_clockwise else -1)
     free = ~_hidden(sensor)
-    columns = rays.reshape(-1, 3)[free].astype(np.float32), ring[free], time.ravel()[free].astype(np.float32)
+    columns = (
+        rays.reshape(-1, 3)[free].astype(np.float32),
+        ring[free],
+        time.ravel()[free].astype(np.float32),
+    )
     for array in columns:
         array.flags.writeable = False
     return Rays(*columns)
@@ -148,7 +154,9 @@ class _Front:
         surface, label, instance, depth, tint: (R,) as in `Mesh`, of what was hit.
     """
 
-    def __init__(self, scenes: Sequence[RayScene], origin: np.ndarray, direction: np.ndarray) -> None:
+    def __init__(
+        self, scenes: Sequence[RayScene], origin: np.ndarray, direction: np.ndarray
+    ) -> None:
         self.distance = np.full(len(direction), np.inf, dtype=np.float32)
         self.facing = np.zeros(len(direction), dtype=np.float32)
         self.depth, self.tint = np.zeros((2, len(direction)), dtype=np.float32)
@@ -200,18 +208,33 @@ def trace(
     front = _Front(scenes, origin, direction)
     _enter_foliage(front, scenes, origin, direction, rng)
     seen = np.flatnonzero(np.isfinite(front.distance))
-    distance, label, surface, tint = (x[seen] for x in (front.distance, front.label, front.surface, front.tint))
+    distance, label, surface, tint = (
+        x[seen] for x in (front.distance, front.label, front.surface, front.tint)
+    )
     bare = np.flatnonzero(label == 0)
     x, y = (origin[seen[bare], :2] + direction[seen[bare], :2] * distance[bare, None]).T
     label[bare] = ground.label(x, y)
     surface[bare], tint[bare] = ground_surface_table()[label[bare]], ground.tint(x, y, label[bare])
     cosine = np.where(front.depth[seen] > 0, LEAF_COSINE, np.abs(front.facing[seen]))
-    kept = rays.direction[seen], distance, cosine, surface, tint, label, front.instance[seen], rays.ring[seen]
+    kept = (
+        rays.direction[seen],
+        distance,
+        cosine,
+        surface,
+        tint,
+        label,
+        front.instance[seen],
+        rays.ring[seen],
+    )
     return Hits(*kept, shift[seen])
 
 
 def _enter_foliage(
-    front: _Front, scenes: Sequence[RayScene], origin: np.ndarray, direction: np.ndarray, rng: np.random.Generator
+    front: _Front,
+    scenes: Sequence[RayScene],
+    origin: np.ndarray,
+    direction: np.ndarray,
+    rng: np.random.Generator,
 ) -> None:
     """Move rays that hit foliage on to the leaf that they end at, or through to what is behind it."""
     index = np.flatnonzero(front.depth > 0)

@@ -153,8 +153,12 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.SIGN_FACE: Reflection(0.42, spread=0.20, shade=0.40),
     Surface.CLOTH: Reflection(0.46, spread=0.20, shade=0.25, rough=0.006),
     Surface.SKIN: Reflection(0.45, spread=0.20, shade=0.10, dark=0.03),
-    Surface.DARK_PAINT: Reflection(0.04, spread=0.50, shade=0.90, dark=0.30, drop=0.12, rough=0.002),
-    Surface.LIGHT_PAINT: Reflection(0.26, spread=0.30, shade=0.45, dark=0.08, drop=0.05, rough=0.002),
+    Surface.DARK_PAINT: Reflection(
+        0.04, spread=0.50, shade=0.90, dark=0.30, drop=0.12, rough=0.002
+    ),
+    Surface.LIGHT_PAINT: Reflection(
+        0.26, spread=0.30, shade=0.45, dark=0.08, drop=0.05, rough=0.002
+    ),
     Surface.RUBBER: Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.10),
     Surface.PLATE: Reflection(0.95, spread=0.10, shade=0.10, dark=0.0),
     Surface.PLASTIC: Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03),

@@ -102,7 +102,9 @@ def relabelled(mesh: Mesh, labels: dict[Label, int]) -> Mesh:
     return replace(mesh, label=label)
 
 
-def box(size: Vector, at: Vector = (0, 0, 0), top: tuple[float, float] = (1, 1), shift: float = 0) -> np.ndarray:
+def box(
+    size: Vector, at: Vector = (0, 0, 0), top: tuple[float, float] = (1, 1), shift: float = 0
+) -> np.ndarray:
     """A box standing on `at`; `top` narrows its upper face in x and y, `shift` moves that face along x. (12, 3, 3)."""
     corners = _BOX_CORNERS * np.array(size)
     corners[4:, :2] *= np.array(top)
@@ -110,22 +112,33 @@ def box(size: Vector, at: Vector = (0, 0, 0), top: tuple[float, float] = (1, 1),
     return (corners + np.array(at))[_BOX_FACES]
 
 
-def tube(start: Vector, end: Vector, radius: float, end_radius: float | None = None, sides: int = 8) -> np.ndarray:
+def tube(
+    start: Vector, end: Vector, radius: float, end_radius: float | None = None, sides: int = 8
+) -> np.ndarray:
     """A closed round bar from one point to another, with another radius at its end if given. (4 sides, 3, 3)."""
     a, b = np.array(start, dtype=float), np.array(end, dtype=float)
     axis = (b - a) / np.linalg.norm(b - a)
     across = np.cross(axis, (1.0, 0, 0) if abs(axis[0]) < 0.9 else (0, 1.0, 0))
     across /= np.linalg.norm(across)
     angle = np.arange(sides) * 2 * np.pi / sides
-    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)  # (sides, 3)
+    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(
+        axis, across
+    )  # (sides, 3)
     low, high = a + circle * radius, b + circle * (radius if end_radius is None else end_radius)
     next_low, next_high = np.roll(low, -1, axis=0), np.roll(high, -1, axis=0)
     starts, ends = np.broadcast_to(a, low.shape), np.broadcast_to(b, low.shape)
-    quads = [(low, next_low, next_high), (low, next_high, high), (starts, next_low, low), (ends, high, next_high)]
+    quads = [
+        (low, next_low, next_high),
+        (low, next_high, high),
+        (starts, next_low, low),
+        (ends, high, next_high),
+    ]
     return np.concatenate([np.stack(corners, axis=1) for corners in quads])
 
 
-def prism(profile: Sequence[tuple[float, float]], width: float, top_width: float | None = None) -> np.ndarray:
+def prism(
+    profile: Sequence[tuple[float, float]], width: float, top_width: float | None = None
+) -> np.ndarray:
     """A side view (x, z), convex or nearly so, drawn out across y; narrower towards its top if given. (4 n, 3, 3)."""
     xz = np.array(profile, dtype=float)
     rise = (xz[:, 1] - xz[:, 1].min()) / np.ptp(xz[:, 1])
@@ -159,7 +172,12 @@ def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def hull(
-    rng: np.random.Generator, centre: Vector, radii: Vector, taper: float = 0, square: float = 1, fine: bool = True
+    rng: np.random.Generator,
+    centre: Vector,
+    radii: Vector,
+    taper: float = 0,
+    square: float = 1,
+    fine: bool = True,
 ) -> np.ndarray:
     """The bumpy, closed hull of a clump of leaves; counter-clockwise seen from outside. (T, 3, 3).
 
@@ -172,7 +190,9 @@ def hull(
         fine: 320 triangles instead of 80.
     """
     corners, faces = _sphere(2 if fine else 1)
-    waves = np.sin(corners @ rng.normal(scale=3.0, size=(3, 3)) + rng.uniform(0, 6.3, size=3)).sum(axis=1)
+    waves = np.sin(corners @ rng.normal(scale=3.0, size=(3, 3)) + rng.uniform(0, 6.3, size=3)).sum(
+        axis=1
+    )
     swell = 1 + 0.09 * waves + rng.normal(scale=0.11, size=len(corners))
     shape = np.sign(corners) * np.abs(corners) ** square * swell[:, None]
     shape[:, :2] *= np.maximum(1 - taper * shape[:, 2:], 0.05)  # a tip stays a tip

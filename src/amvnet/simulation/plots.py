@@ -33,7 +33,9 @@ def _house(site: Site, side: int, x: float, width: float) -> None:
     setback = rng.uniform(*style.setback)
     middle = x + width / 2 + rng.uniform(-1, 1)
     body = fixtures.building(rng, wide, deep, rng.uniform(*style.storeys), rng.random() < 0.15)
-    site.put(body, middle, side * (front + setback + deep / 2), rng.normal(scale=0.03), margin=wide * 0.5)
+    site.put(
+        body, middle, side * (front + setback + deep / 2), rng.normal(scale=0.03), margin=wide * 0.5
+    )
     drive = x + 0.3 if rng.random() < 0.5 else x + width - 3.3
     _drive(site, side, drive, setback + 5.0)
     if rng.random() < style.fenced:
@@ -56,7 +58,14 @@ def _drive(site: Site, side: int, x: float, depth: float) -> None:
     near, far = sorted((side * front, side * (front + depth)))
     site.ground.patches.append(Patch((x, x + 3.0), (near, far), label))
     if rng.random() < 0.4:
-        site.put(vehicles.car(rng), x + 1.5, side * (front + min(3.0, depth / 2)), side * np.pi / 2, True, 3.0)
+        site.put(
+            vehicles.car(rng),
+            x + 1.5,
+            side * (front + min(3.0, depth / 2)),
+            side * np.pi / 2,
+            True,
+            3.0,
+        )
     if rng.random() < 0.4:
         site.put(fixtures.shed(rng), x + 1.5, side * (front + depth + 3.0), margin=4.0)
 
@@ -84,7 +93,9 @@ def _fence_between(site: Site, side: int, x: float, deep: float) -> None:
         return
     leafy, height = rng.random() < 0.4, rng.uniform(1.0, 1.9)
     for t in np.arange(site.ground.front(side) + 1.8, deep + 8, 2.5):
-        segment = fixtures.hedge(rng, 2.5, height) if leafy else fixtures.board_fence(2.5, height, 0.15)
+        segment = (
+            fixtures.hedge(rng, 2.5, height) if leafy else fixtures.board_fence(2.5, height, 0.15)
+        )
         site.put(segment, x, side * t, np.pi / 2, margin=2.0)
 
 
@@ -109,7 +120,11 @@ def _wood(site: Site, side: int, x: float, width: float) -> None:
     rng, front = site.rng, site.ground.front(side)
     deep, density = rng.uniform(12, 28), rng.uniform(0.006, 0.022)
     for _ in range(rng.poisson(density * width * deep)):
-        site.put(any_tree(rng, rng.uniform(4, 13)), x + rng.uniform(0, width), side * (front + rng.uniform(1.5, deep)))
+        site.put(
+            any_tree(rng, rng.uniform(4, 13)),
+            x + rng.uniform(0, width),
+            side * (front + rng.uniform(1.5, deep)),
+        )
     _bushes(site, side, x, width, rng.poisson(density * width * 14), deep)
     if rng.random() < 0.75:
         thickets(site, side, x, width, front + rng.uniform(1.5, 10))
@@ -125,7 +140,12 @@ def thickets(site: Site, side: int, x: float, width: float, t: float) -> None:
     for spot in np.arange(x + 2, x + width, 4.0):
         height = float(np.clip(height + rng.normal(scale=0.5), 0.8, 6.0))
         if rng.random() < 0.9:
-            site.put(fixtures.thicket(rng, 4.0, height), spot, side * (t + rng.normal(scale=0.5)), margin=2.5)
+            site.put(
+                fixtures.thicket(rng, 4.0, height),
+                spot,
+                side * (t + rng.normal(scale=0.5)),
+                margin=2.5,
+            )
 
 
 def _field(site: Site, side: int, x: float, width: float) -> None:
@@ -143,7 +163,11 @@ def _field(site: Site, side: int, x: float, width: float) -> None:
         barn = fixtures.gable_barn(rng, rng.uniform(8, 14), rng.uniform(10, 16), rng.uniform(3, 5))
         site.put(barn, x + width / 2, side * (front + 22), margin=9.0)
     if rng.random() < 0.3:
-        site.put(fixtures.tree(rng, rng.uniform(6, 12)), x + width * 0.7, side * (front + rng.uniform(3, 10)))
+        site.put(
+            fixtures.tree(rng, rng.uniform(6, 12)),
+            x + width * 0.7,
+            side * (front + rng.uniform(3, 10)),
+        )
 
 
 def _car_park(site: Site, side: int, x: float, width: float) -> None:

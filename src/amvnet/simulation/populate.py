@@ -55,10 +55,20 @@ def _roadside(site: Site, side: int) -> None:
     if np.isfinite(style.trees):
         for spot in np.arange(rng.uniform(0, style.trees), ground.length, style.trees):
             site.put(any_tree(rng, rng.uniform(4, 9)), spot + rng.normal(), back, margin=2.0)
-    makers = ((fixtures.sign, 3.0), (fixtures.post, 0.5), (fixtures.clutter, 1.6), (fixtures.shelter, 0.15))
+    makers = (
+        (fixtures.sign, 3.0),
+        (fixtures.post, 0.5),
+        (fixtures.clutter, 1.6),
+        (fixtures.shelter, 0.15),
+    )
     for make, per_100 in makers:
         for _ in range(rng.poisson(per_100 * ground.length / 100)):
-            site.put(make(rng), rng.uniform(0, ground.length), kerb if make is fixtures.sign else back, turn)
+            site.put(
+                make(rng),
+                rng.uniform(0, ground.length),
+                kerb if make is fixtures.sign else back,
+                turn,
+            )
     if style.kind == "fast" and rng.random() < 0.7:
         for spot in np.arange(0, ground.length, 4.0):
             site.put(fixtures.guard_rail(4.1), spot, side * (style.road / 2 + 0.7), turn)
@@ -73,7 +83,13 @@ def _background(site: Site, side: int) -> None:
             thickets(site, side, x, 14.0, ground.front(side) + rng.uniform(24, 34))
         if rng.random() < 0.35 and ground.style.kind in ("residential", "urban"):
             size = rng.uniform(9, 16), rng.uniform(8, 12), rng.uniform(*ground.style.storeys)
-            site.put(fixtures.building(rng, *size, rng.random() < 0.2), x, t, rng.normal(scale=0.3), margin=6.0)
+            site.put(
+                fixtures.building(rng, *size, rng.random() < 0.2),
+                x,
+                t,
+                rng.normal(scale=0.3),
+                margin=6.0,
+            )
         else:
             site.put(any_tree(rng, rng.uniform(6, 14), fine=False), x, t)
         far = side * (ground.front(side) + rng.uniform(42, 66))
@@ -129,7 +145,13 @@ def _people(site: Site) -> None:
     for _ in range(rng.poisson(0.8 * style.people * ground.length / 100)):
         side = int(rng.choice([-1, 1]))
         body = vehicles.bicycle(rng) if rng.random() < 0.7 else vehicles.motorcycle(rng)
-        site.put(body, rng.uniform(0, ground.length), side * (ground.front(side) - 0.4), rng.normal(scale=0.2), True)
+        site.put(
+            body,
+            rng.uniform(0, ground.length),
+            side * (ground.front(side) - 0.4),
+            rng.normal(scale=0.2),
+            True,
+        )
 
 
 def _works(site: Site) -> None:
@@ -143,4 +165,11 @@ def _works(site: Site) -> None:
             site.put(fixtures.barrier(2.0) if barriers else fixtures.traffic_cone(rng), spot, edge)
         if rng.random() < 0.5:
             middle = side * (ground.front(side) + 2.5)
-            site.put(vehicles.excavator(rng), start + length / 2, middle, rng.uniform(0, 6.3), True, margin=3.0)
+            site.put(
+                vehicles.excavator(rng),
+                start + length / 2,
+                middle,
+                rng.uniform(0, 6.3),
+                True,
+                margin=3.0,
+            )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from amvnet.sensors import HEIGHTS
+from amvnet.sensors.lidars import HEIGHTS
 
 
 @dataclass(frozen=True)

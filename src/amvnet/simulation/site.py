@@ -30,7 +30,9 @@ class Mover:
     def at(self, ground: Ground, time: float) -> Mesh:
         """The body where it is at a time."""
         x, y, yaw = ground.at((self.x + self.speed * time) % ground.length, self.t)
-        return place(self.mesh, x, y, float(ground.height(x, y)), yaw + (np.pi if self.speed < 0 else 0))
+        return place(
+            self.mesh, x, y, float(ground.height(x, y)), yaw + (np.pi if self.speed < 0 else 0)
+        )
 
 
 @dataclass
@@ -46,14 +48,26 @@ class Site:
     def free(self, x: float, t: float, margin: float) -> bool:
         """True where no side road is within the margin."""
         px, py, _ = self.ground.at(x, t)
-        return bool(self.ground.beside_crossing(np.array([px]), np.array([py]), np.array([t]))[0] > margin)
+        return bool(
+            self.ground.beside_crossing(np.array([px]), np.array([py]), np.array([t]))[0] > margin
+        )
 
-    def put(self, mesh: Mesh, x: float, t: float, yaw: float = 0.0, thing: bool = False, margin: float = 0.8) -> None:
+    def put(
+        self,
+        mesh: Mesh,
+        x: float,
+        t: float,
+        yaw: float = 0.0,
+        thing: bool = False,
+        margin: float = 0.8,
+    ) -> None:
         """Stands a body on the ground, turned relative to the street; left out where a side road runs."""
         if not self.free(x, t, margin):
             return
         px, py, heading = self.ground.at(x, t)
-        body = place(tinted(mesh, self.rng), px, py, float(self.ground.height(px, py)), heading + yaw)
+        body = place(
+            tinted(mesh, self.rng), px, py, float(self.ground.height(px, py)), heading + yaw
+        )
         self.fixed.append(named(body, self.next_instance()) if thing else body)
 
     def next_instance(self) -> int:

@@ -44,11 +44,15 @@ class Ground:
         self.patches: list[Patch] = []
         bend = 0.0 if rng.random() < 0.35 else rng.uniform(0.1, 0.42)
         waves = rng.uniform(180, 500, size=2)
-        self._bends = np.column_stack([bend * 0.6 * waves / (2 * np.pi), waves, rng.uniform(0, 6.3, size=2)])
+        self._bends = np.column_stack(
+            [bend * 0.6 * waves / (2 * np.pi), waves, rng.uniform(0, 6.3, size=2)]
+        )
         hills = np.array([rng.uniform(200, 400), rng.uniform(80, 160), rng.uniform(25, 60)])
         rises = np.array([1.0, 0.35, 0.07]) * rng.uniform(0.1, 1.4, size=3)
         turn = rng.uniform(0, np.pi, size=3)
-        self._hills = np.column_stack([rises, 6.28 / hills * np.cos(turn), 6.28 / hills * np.sin(turn), turn * 5])
+        self._hills = np.column_stack(
+            [rises, 6.28 / hills * np.cos(turn), 6.28 / hills * np.sin(turn), turn * 5]
+        )
         self._bumps = rng.uniform(0.02, 0.08) * rng.uniform(0.5, 1.0, size=3)
         self.crossings = self._draw_crossings(rng)
         self._tints = rng.standard_normal(256)
@@ -65,12 +69,15 @@ class Ground:
 
     def middle(self, x: np.ndarray | float) -> np.ndarray:
         """y of the street's middle line."""
-        return sum(a * np.sin(6.283185 / wave * np.asarray(x) + phase) for a, wave, phase in self._bends)
+        return sum(
+            a * np.sin(6.283185 / wave * np.asarray(x) + phase) for a, wave, phase in self._bends
+        )
 
     def yaw(self, x: np.ndarray | float) -> np.ndarray:
         """Direction of the street."""
         slope = sum(
-            a * 6.283185 / wave * np.cos(6.283185 / wave * np.asarray(x) + phase) for a, wave, phase in self._bends
+            a * 6.283185 / wave * np.cos(6.283185 / wave * np.asarray(x) + phase)
+            for a, wave, phase in self._bends
         )
         return np.arctan(slope)
 
@@ -82,7 +89,9 @@ class Ground:
     def along(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Street coordinates of places: x of the nearest point of the middle line, and t."""
         yaw = self.yaw(x)
-        near = x + (y - self.middle(x)) * np.sin(yaw) * np.cos(yaw)  # one step towards the foot of the perpendicular
+        near = x + (y - self.middle(x)) * np.sin(yaw) * np.cos(
+            yaw
+        )  # one step towards the foot of the perpendicular
         yaw = self.yaw(near)
         return near, (y - self.middle(near)) * np.cos(yaw) - (x - near) * np.sin(yaw)
 
@@ -123,7 +132,11 @@ class Ground:
         plot = np.clip(np.minimum(road, kerb) - pavement, 0, 25)
         z = z + plot * self._of_side(self.style.bank, t)
         a, b, c = self._bumps
-        bumps = a * np.sin(1.9 * x + 0.7 * y) + b * np.sin(0.6 * x - 1.3 * y) + c * np.sin(3.7 * y + 2.9 * x)
+        bumps = (
+            a * np.sin(1.9 * x + 0.7 * y)
+            + b * np.sin(0.6 * x - 1.3 * y)
+            + c * np.sin(3.7 * y + 2.9 * x)
+        )
         return z + np.clip(plot / 2, 0, 1) * bumps
 
     def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -144,14 +157,18 @@ class Ground:
 
     def tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
         """How much brighter the ground is than others of its class, as in `Mesh`; it changes from place to place."""
-        return 0.8 * self._tints[label] + 0.8 * np.sin(0.21 * x + 1.3 * np.sin(0.13 * y)) * np.sin(0.33 * y + 0.05 * x)
+        return 0.8 * self._tints[label] + 0.8 * np.sin(0.21 * x + 1.3 * np.sin(0.13 * y)) * np.sin(
+            0.33 * y + 0.05 * x
+        )
 
     @staticmethod
     def _painted(x: np.ndarray, t: np.ndarray, road: np.ndarray) -> np.ndarray:
         """True on the dashed middle line and on the lines at both edges."""
         return ((np.abs(t) < 0.07) & (x % 9 < 4)) | (np.abs(road + 0.3) < 0.07)
 
-    def mesh(self, fine: float = 0.5, near: float = 32.0, coarse: float = 4.0, far: float = 110.0) -> Mesh:
+    def mesh(
+        self, fine: float = 0.5, near: float = 32.0, coarse: float = 4.0, far: float = 110.0
+    ) -> Mesh:
         """The ground as triangles of class 0: a fine grid beside the road, a coarse one a little lower around it."""
         sheets = [self._sheet(fine, near, 0.0), self._sheet(coarse, far, 0.3)]
         return join([part(sheet, Surface.GRASS, 0) for sheet in sheets])
@@ -164,4 +181,6 @@ class Ground:
         grid = np.stack([x, y, self.height(x, y) - below], axis=-1).astype(np.float32)
         a, b, c, d = grid[:-1, :-1], grid[1:, :-1], grid[1:, 1:], grid[:-1, 1:]
         kept = np.abs(self.along(x[:-1, :-1], y[:-1, :-1])[1]) < reach
-        return np.concatenate([np.stack(corners, axis=2)[kept] for corners in ((a, b, c), (a, c, d))])
+        return np.concatenate(
+            [np.stack(corners, axis=2)[kept] for corners in ((a, b, c), (a, c, d))]
+        )

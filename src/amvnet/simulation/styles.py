@@ -149,7 +149,9 @@ KINDS = {
 
 def _pair(rng: np.random.Generator, low: float, high: float, chance: float) -> tuple[float, float]:
     """A value for each side of the road, 0 where the chance fails."""
-    right, left = (float(rng.uniform(low, high)) if rng.random() < chance else 0.0 for _ in range(2))
+    right, left = (
+        float(rng.uniform(low, high)) if rng.random() < chance else 0.0 for _ in range(2)
+    )
     return right, left
 
 

@@ -39,9 +39,15 @@ CAR_SHAPES = (
 _SHAPE_SHARES = np.array([0.27, 0.20, 0.18, 0.14, 0.10, 0.03, 0.08])
 
 
-def _wheels(label: Label, length: float, width: float, radius: float, axles: tuple[float, ...]) -> list[Mesh]:
+def _wheels(
+    label: Label, length: float, width: float, radius: float, axles: tuple[float, ...]
+) -> list[Mesh]:
     bars = [
-        tube((x * length, side * (width / 2 - 0.2), radius), (x * length, side * (width / 2 + 0.01), radius), radius)
+        tube(
+            (x * length, side * (width / 2 - 0.2), radius),
+            (x * length, side * (width / 2 + 0.01), radius),
+            radius,
+        )
         for x in axles
         for side in (-1, 1)
     ]
@@ -71,16 +77,27 @@ def car(rng: np.random.Generator) -> Mesh:
     paint = Surface.LIGHT_PAINT if rng.random() < 0.45 else Surface.DARK_PAINT
     pane = shape.height - shape.belt - 0.06
     lean = cabin * (1 - shape.roof) * rng.uniform(-0.35, 0.0)
-    window = box((cabin, shape.width * 0.94, pane), (rear + cabin / 2, 0, shape.belt), (shape.roof, 0.84), lean)
+    window = box(
+        (cabin, shape.width * 0.94, pane),
+        (rear + cabin / 2, 0, shape.belt),
+        (shape.roof, 0.84),
+        lean,
+    )
     roof_size = (cabin * shape.roof, shape.width * 0.80, 0.07)
     roof = box(roof_size, (rear + cabin / 2 + lean, 0, shape.belt + pane), (0.9, 0.9))
     pillars = [
-        tube((rear + cabin * x, side * shape.width * 0.46, shape.belt), _pillar_top(rear, cabin, x, shape, side), 0.05)
+        tube(
+            (rear + cabin * x, side * shape.width * 0.46, shape.belt),
+            _pillar_top(rear, cabin, x, shape, side),
+            0.05,
+        )
         for x in (0.03, 0.5, 0.97)
         for side in (-1, 1)
     ]
     plates = [box((0.04, 0.5, 0.11), (end * (half + 0.01), 0, 0.5)) for end in (-1, 1)]
-    painted = np.concatenate([prism(_lower_body(shape, half), shape.width, shape.width * 0.95), roof, *pillars])
+    painted = np.concatenate(
+        [prism(_lower_body(shape, half), shape.width, shape.width * 0.95), roof, *pillars]
+    )
     pieces = [part(painted, paint, Label.CAR), part(window, Surface.GLASS, Label.CAR)]
     pieces += [part(np.concatenate(plates), Surface.PLATE, Label.CAR)]
     pieces += _wheels(Label.CAR, shape.length, shape.width, 0.32, (-0.31, 0.31))
@@ -89,7 +106,11 @@ def car(rng: np.random.Generator) -> Mesh:
 
 def _pillar_top(rear: float, cabin: float, x: float, shape: CarShape, side: int) -> Vector:
     """Where a pillar meets the roof: towards the middle of the cabin."""
-    return (rear + cabin * (0.5 + (x - 0.5) * shape.roof), side * shape.width * 0.39, shape.height - 0.06)
+    return (
+        rear + cabin * (0.5 + (x - 0.5) * shape.roof),
+        side * shape.width * 0.39,
+        shape.height - 0.06,
+    )
 
 
 def _scaled(mesh: Mesh, factor: float) -> Mesh:
@@ -117,8 +138,13 @@ def truck(rng: np.random.Generator) -> Mesh:
 def bus(rng: np.random.Generator) -> Mesh:
     """A city bus with a band of windows."""
     length, width = rng.uniform(9, 13), 2.5
-    hull = np.concatenate([box((length, width, 1.0), (0, 0, 0.3)), box((length, width, 0.6), (0, 0, 2.4))])
-    posts = [box((0.25, width, 1.1), (x, 0, 1.3)) for x in np.linspace(-length / 2 + 0.2, length / 2 - 0.2, 7)]
+    hull = np.concatenate(
+        [box((length, width, 1.0), (0, 0, 0.3)), box((length, width, 0.6), (0, 0, 2.4))]
+    )
+    posts = [
+        box((0.25, width, 1.1), (x, 0, 1.3))
+        for x in np.linspace(-length / 2 + 0.2, length / 2 - 0.2, 7)
+    ]
     panes = box((length * 0.98, width * 0.98, 1.1), (0, 0, 1.3))
     pieces = [
         part(np.concatenate([hull, *posts]), Surface.LIGHT_PAINT, Label.BUS),
@@ -142,25 +168,47 @@ def excavator(rng: np.random.Generator) -> Mesh:
     tracks = [box((3.4, 0.5, 0.8), (0, side * 1.1, 0)) for side in (-1, 1)]
     elbow = (1.2 + reach * 0.5, turn * reach * 0.5, rng.uniform(2.8, 4.0))
     hand = (1.2 + reach, turn * reach, rng.uniform(0.3, 1.5))
-    arm = [tube((0.9, 0.3, 1.4), elbow, 0.22), tube(elbow, hand, 0.16), box((0.7, 0.9, 0.5), (hand[0], hand[1], 0.2))]
+    arm = [
+        tube((0.9, 0.3, 1.4), elbow, 0.22),
+        tube(elbow, hand, 0.16),
+        box((0.7, 0.9, 0.5), (hand[0], hand[1], 0.2)),
+    ]
     solid = np.concatenate([*tracks, box((2.8, 2.3, 1.0), (-0.5, 0, 0.9)), *arm])
     cab = box((1.4, 1.0, 1.5), (0.3, 0.6, 1.5), (0.9, 0.9))
     pieces = [(solid, Surface.LIGHT_PAINT), (cab, Surface.GLASS)]
-    return join([part(triangles, surface, Label.CONSTRUCTION_VEHICLE) for triangles, surface in pieces])
+    return join(
+        [part(triangles, surface, Label.CONSTRUCTION_VEHICLE) for triangles, surface in pieces]
+    )
 
 
-def _figure(rng: np.random.Generator, label: Label, hip: Vector, feet: tuple[Vector, Vector], lean: float) -> Mesh:
+def _figure(
+    rng: np.random.Generator, label: Label, hip: Vector, feet: tuple[Vector, Vector], lean: float
+) -> Mesh:
     """A human from hips and feet upwards; `lean` moves the shoulders forward."""
     shoulder = (hip[0] + lean, 0.0, hip[2] + 0.55)
-    legs = [tube((hip[0], 0.09 * side, hip[2]), foot, 0.09, 0.06) for side, foot in zip((-1, 1), feet, strict=True)]
+    legs = [
+        tube((hip[0], 0.09 * side, hip[2]), foot, 0.09, 0.06)
+        for side, foot in zip((-1, 1), feet, strict=True)
+    ]
     torso = tube((hip[0], 0, hip[2] - 0.05), shoulder, 0.17, 0.21)
     reach = rng.uniform(-0.1, 0.3) + lean
     arms = [
-        tube((shoulder[0], 0.23 * side, shoulder[2] - 0.05), (hip[0] + reach, 0.28 * side, hip[2] + 0.05), 0.055)
+        tube(
+            (shoulder[0], 0.23 * side, shoulder[2] - 0.05),
+            (hip[0] + reach, 0.28 * side, hip[2] + 0.05),
+            0.055,
+        )
         for side in (-1, 1)
     ]
-    head = tube((shoulder[0], 0, shoulder[2]), (shoulder[0] + 0.05, 0, shoulder[2] + 0.32), 0.10, 0.09)
-    return join([part(np.concatenate([torso, *legs, *arms]), Surface.CLOTH, label), part(head, Surface.SKIN, label)])
+    head = tube(
+        (shoulder[0], 0, shoulder[2]), (shoulder[0] + 0.05, 0, shoulder[2] + 0.32), 0.10, 0.09
+    )
+    return join(
+        [
+            part(np.concatenate([torso, *legs, *arms]), Surface.CLOTH, label),
+            part(head, Surface.SKIN, label),
+        ]
+    )
 
 
 def person(rng: np.random.Generator) -> Mesh:

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.files import whole_file
 from amvnet.errors import InputError
+from amvnet.files import atomic_write
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan
 from amvnet.simulation.lidar import require_embree
@@ -24,7 +24,9 @@ from amvnet.simulation.sensors import SENSORS, Sensor
 
 Progress = Callable[[int, int], None]  # scans done, in all
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-DONE = ".simulation"  # folder of a file for each sequence that is written: what made it, and its rows
+DONE = (
+    ".simulation"  # folder of a file for each sequence that is written: what made it, and its rows
+)
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,9 @@ def _is_written(sequence: Sequence) -> bool:
     """Whether an earlier call has written the sequence; raises where it was made otherwise."""
     if not sequence.done.is_file():
         return False
-    found = {key: value for key, value in json.loads(sequence.done.read_text()).items() if key != "rows"}
+    found = {
+        key: value for key, value in json.loads(sequence.done.read_text()).items() if key != "rows"
+    }
     if found != sequence.made:
         raise InputError(
             f"{sequence.out}: expected sequence {sequence.number} of {sequence.made}, found one of {found}; "
@@ -125,7 +129,9 @@ def _written(sequences: list[Sequence], processes: int) -> Iterator[int]:
     context = multiprocessing.get_context("spawn")
     with _one_thread_each(), ProcessPoolExecutor(processes, context, _end_with_parent) as pool:
         try:
-            for written in as_completed([pool.submit(_write_all, sequence) for sequence in sequences]):
+            for written in as_completed(
+                [pool.submit(_write_all, sequence) for sequence in sequences]
+            ):
                 yield written.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -171,17 +177,21 @@ def _write(sequence: Sequence) -> Iterator[int]:
         layout.scan(index, scan)
         yield 1
     rows = layout.finish()
-    with whole_file(sequence.done) as part:
+    with atomic_write(sequence.done) as part:
         part.write_text(json.dumps({**sequence.made, "rows": rows}))
 
 
 def _at_least(least: int, **numbers: int) -> None:
     for name, value in numbers.items():
         if value < least:
-            raise InputError(f"simulate: expected {name} of {least} or more, found {value}; give a larger number")
+            raise InputError(
+                f"simulate: expected {name} of {least} or more, found {value}; give a larger number"
+            )
 
 
 def _sensor(name: str) -> Sensor:
     if name not in SENSORS:
-        raise InputError(f"sensor: expected one of {', '.join(SENSORS)}, found {name!r}; name one of these")
+        raise InputError(
+            f"sensor: expected one of {', '.join(SENSORS)}, found {name!r}; name one of these"
+        )
     return SENSORS[name]

@@ -1,0 +1,44 @@
+"""The verb `simulate`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from amvnet.cli.console import progress, say
+
+
+def simulate(
+    out: Path,
+    sensor: str = "hdl64e",
+    sequences: int = 1,
+    scans: int = 10,
+    seed: int = 0,
+    first_sequence: int = 0,
+    processes: int | None = None,
+) -> None:
+    """Write labelled scans of simulated streets; what an earlier call has written stays, and it goes on from there.
+
+    Args:
+        out: folder to write to.
+        sensor: the LiDAR: hdl64e writes SemanticKITTI's layout, hdl32e that of nuScenes-lidarseg.
+        sequences: number of sequences; each is another street.
+        scans: number of scans in each sequence.
+        seed: of all randomness; the same seed gives the same bytes.
+        first_sequence: number of the first sequence.
+        processes: sequences that are simulated side by side; by default, one a processor.
+    """
+    from amvnet.simulation import simulate as write
+
+    with progress("simulating") as step:
+        write(
+            out,
+            sensor=sensor,
+            sequences=sequences,
+            scans=scans,
+            seed=seed,
+            first_sequence=first_sequence,
+            processes=(os.cpu_count() or 1) if processes is None else processes,
+            progress=step,
+        )
+    say(f"{sequences * scans} scans in {out}")

@@ -1,0 +1,64 @@
+"""The verb `submit`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from amvnet.cli.console import progress, say
+from amvnet.cli.options import open_data, parse_names
+from amvnet.errors import InputError
+
+
+def submit(
+    data: str,
+    predictions: Path | None = None,
+    out: Path | None = None,
+    check: Path | None = None,
+    split: Literal["train", "val", "test"] = "test",
+    sequences: str | None = None,
+    use_camera: bool = False,
+    use_lidar: bool = True,
+    use_radar: bool = False,
+    use_map: bool = False,
+    use_external: bool = False,
+) -> None:
+    """Pack predictions for the benchmark's server after checking them, or check an archive of any tool.
+
+    Args:
+        data: the data set, whose scans are the reference.
+        predictions: a folder of predictions in the benchmark's layout.
+        out: the archive to write, NAME.zip.
+        check: an archive to check instead.
+        split: the official split; the servers score test, the others are for trials.
+        sequences: sequences or scenes instead, with commas, for trials.
+        use_camera: nuScenes: the method was given images.
+        use_lidar: nuScenes: the method was given LiDAR scans.
+        use_radar: nuScenes: the method was given radar.
+        use_map: nuScenes: the method was given the semantic map.
+        use_external: nuScenes: the method was given data that are not of nuScenes.
+    """
+    from amvnet.submission import pack as submission
+    from amvnet.submission.rules import Sources, rules_for
+
+    sources = Sources(use_camera, use_lidar, use_radar, use_map, use_external)
+    rules = rules_for(open_data(data, None), split, parse_names(sequences))
+    if sources != Sources() and (check is not None or rules.meta is None):
+        raise InputError(
+            "expected no --use-... but to write an archive for nuScenes, found one; leave it out"
+        )
+    if check is not None and predictions is None and out is None:
+        with progress("checking") as step:
+            found = submission.check(rules, check, step)
+    elif predictions is not None and out is not None and check is None:
+        with progress("packing") as step:
+            found = submission.write(rules, predictions, out, sources, step)
+    else:
+        raise InputError(
+            "expected either --predictions and --out, or --check, found others; give one or the other"
+        )
+    say(
+        f"{check or out}: {found.predictions} predictions of {rules.what} keep to the rules of {rules.taxonomy.name}"
+    )
+    for note in found.notes:
+        say(f"note: {note}")

@@ -1,0 +1,1 @@
+"""The numbers of a model and of a training: schema, bounds and recipes."""

@@ -1,0 +1,1 @@
+"""The benchmarks' datasets, read in their official layouts."""

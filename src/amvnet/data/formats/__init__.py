@@ -1,0 +1,1 @@
+"""Readers of single scans and bags in many file formats."""

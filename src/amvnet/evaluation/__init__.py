@@ -1,0 +1,1 @@
+"""The official metrics, the paper's figures and drawings from above."""

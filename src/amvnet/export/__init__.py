@@ -1,0 +1,1 @@
+"""Networks for other runtimes: ONNX, int8 and engines."""

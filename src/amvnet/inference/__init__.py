@@ -1,0 +1,1 @@
+"""From scans to labels: the segmenter, the late fusion and the commands' pipeline."""

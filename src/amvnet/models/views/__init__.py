@@ -1,0 +1,1 @@
+"""Projections of a scan, and the way of the scores back to its points."""

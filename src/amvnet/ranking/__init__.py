@@ -1,0 +1,1 @@
+"""Which scans to look at next."""

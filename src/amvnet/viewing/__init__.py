@@ -1,0 +1,1 @@
+"""Scans in 3D: a page for the browser, or Rerun."""

@@ -1,1 +1,0 @@
-"""Projections of a scan and the way of the scores back to its points."""
