@@ -6,9 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from submissions import MAKERS, Case
 
 from amvnet.scan import Scan
+
+from fixtures.submissions import MAKERS, Case
 
 LASERS = 16
 

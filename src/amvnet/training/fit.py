@@ -20,7 +20,7 @@ from amvnet.distributed import ALONE, Processes, device_of, environment
 from amvnet.errors import InputError
 from amvnet.training.callbacks import Bar, Curves, EpochLines, SeedBatches, Speed
 from amvnet.training.stages import Stage
-from amvnet.training.sync_batch_norm import synced
+from amvnet.training.sync_batch_norm import synchronise_batch_norms
 
 LOGGED_EVERY = 10  # batches, of the loss
 
@@ -76,7 +76,7 @@ def fit(
     """
     on_cuda = device_of(course.training.accelerator) == "cuda"
     if course.processes.size > 1:
-        synced(stage.trained, on_cuda)
+        synchronise_batch_norms(stage.trained, on_cuda)
     if course.training.precision == DOUBLE:
         stage.double()
     if course.training.compile:

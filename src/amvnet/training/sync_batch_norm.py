@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     pass
 
 
-def synced(net: nn.Module, cuda: bool) -> nn.Module:
+def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
     """The network with batch norms whose statistics are over the batches of all processes."""
     if cuda:
         return nn.SyncBatchNorm.convert_sync_batchnorm(net)
@@ -21,7 +21,9 @@ def synced(net: nn.Module, cuda: bool) -> nn.Module:
         setattr(
             net,
             name,
-            SyncedBatchNorm.of(child) if isinstance(child, _BatchNorm) else synced(child, cuda),
+            SyncedBatchNorm.of(child)
+            if isinstance(child, _BatchNorm)
+            else synchronise_batch_norms(child, cuda),
         )
     return net
 

@@ -1,0 +1,293 @@
+"""Both networks pass one suite; their layers equal plain loops over their formulas."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.utils.flop_counter import FlopCounterMode
+
+from amvnet.config.schema import (
+    RangeNetConfig,
+)
+from amvnet.models.layers import (
+    AzimuthGRU,
+    PointLinear,
+    RingConv2d,
+    fold_batch_norms,
+    upsample,
+    wrap_width,
+)
+from amvnet.models.polar_net import DropBlock
+from amvnet.models.range_net import RangeNet
+from amvnet.models.upsampled_conv import convolve_joined
+from amvnet.scan import Scan
+
+from fixtures.networks import CASES, Case
+
+RandomScan = Callable[..., Scan]
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> Case:
+    return CASES[request.param]
+
+
+def test_a_network_keeps_the_shape_of_odd_sizes(case: Case) -> None:
+    assert case.run(case.in_eval(), 1, 2).shape == (2, *case.shape)
+
+
+def test_a_network_loads_its_state_to_equal_outputs(case: Case) -> None:
+    net, other = case.in_eval(), case.in_eval(seed=1)
+    assert not torch.equal(case.run(net, 3), case.run(other, 3))
+    other.load_state_dict(net.state_dict())
+    assert torch.equal(case.run(net, 3), case.run(other, 3))
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_the_gradient_reaches_every_parameter_of_a_network(case: Case, training: bool) -> None:
+    net = case.in_eval().train(training)
+    scores = case.run(net, 3, 4)
+    (scores * torch.randn_like(scores)).sum().backward()
+    for name, parameter in net.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        # A bias before a norm has a gradient only where the norm's statistics are fixed.
+        assert parameter.grad.any() or (training and name.endswith("bias")), name
+
+
+def test_a_network_gives_the_same_with_gradients_and_without(case: Case) -> None:
+    net = case.in_eval()
+    expected = case.run(net, 3)
+    with torch.inference_mode():
+        torch.testing.assert_close(case.run(net, 3), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 500])
+@pytest.mark.parametrize("sizes", [(1, 1), (9, 32), (42, 64)])
+def test_a_point_linear_layer_is_a_linear_layer(rows: int, sizes: tuple[int, int]) -> None:
+    layer, x = PointLinear(*sizes), torch.randn(rows, sizes[0], requires_grad=True)
+    found, expected = layer(x), F.linear(x, layer.weight, layer.bias)
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(
+        *(torch.autograd.grad(y.square().sum(), x)[0] for y in (found, expected))
+    )
+
+
+def test_a_network_is_deterministic_in_eval(case: Case) -> None:
+    net = case.in_eval()
+    assert torch.equal(case.run(net, 3), case.run(net, 3))
+
+
+def test_a_batch_of_two_equals_each_alone_in_eval(case: Case) -> None:
+    net = case.in_eval()
+    together, alone = case.run(net, 3, 4), torch.cat([case.run(net, 3), case.run(net, 4)])
+    torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(together[0], together[1])
+
+
+@pytest.mark.parametrize("steps", [8, -16])
+def test_range_net_without_gru_is_equivariant_to_a_shift_by_its_stride(steps: int) -> None:
+    net, image = CASES["range"].in_eval(), torch.randn(1, 6, 7, 40)
+    torch.testing.assert_close(
+        net(image.roll(steps, 3)), net(image).roll(steps, 3), rtol=1e-4, atol=1e-5
+    )
+    assert not torch.allclose(net(image), net(image).roll(steps, 3))
+
+
+def test_the_unet_of_polar_net_is_equivariant_to_a_shift_by_its_stride() -> None:
+    net, pillars = CASES["polar"].in_eval(), torch.randn(1, 5, 9, 20)
+    torch.testing.assert_close(
+        net.unet(pillars.roll(4, 3)), net.unet(pillars).roll(4, 3), rtol=1e-4, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    "sizes", [(3, 4, 3, 4), (3, 4, 6, 8), (5, 3, 5, 12), (1, 1, 2, 4), (2, 5, 6, 5), (3, 4, 5, 8)]
+)
+@pytest.mark.parametrize("bias", [False, True])
+def test_a_joined_convolution_equals_one_over_the_upsampled_map(
+    sizes: tuple[int, int, int, int], bias: bool
+) -> None:
+    h, w, full_h, full_w = sizes
+    convolution, coarse, fine = (
+        RingConv2d(5, 4),
+        torch.randn(2, 3, h, w),
+        torch.randn(2, 2, full_h, full_w),
+    )
+    convolution.bias = nn.Parameter(torch.randn(4)) if bias else None
+    together = torch.cat([upsample(coarse, fine), fine], dim=1)
+    expected = convolution(together)
+    with torch.inference_mode():
+        torch.testing.assert_close(
+            convolve_joined(convolution, coarse, fine), expected, rtol=1e-4, atol=1e-5
+        )
+    assert torch.equal(convolve_joined(convolution, coarse, fine), expected)
+
+
+def test_a_joined_convolution_costs_less() -> None:
+    convolution, coarse, fine = (
+        RingConv2d(96, 32),
+        torch.randn(1, 64, 40, 60),
+        torch.randn(1, 32, 80, 120),
+    )
+    costs = []
+    for gradients in (True, False):
+        with torch.set_grad_enabled(gradients), FlopCounterMode(display=False) as counter:
+            convolve_joined(convolution, coarse, fine)
+        costs.append(counter.get_total_flops())
+    assert costs[1] < 0.65 * costs[0]  # (4 / 9 * 64 + 32) / 96, and the edges
+
+
+def test_the_unet_of_polar_net_halves_odd_sizes_upwards() -> None:
+    net, seen = CASES["polar"].in_eval(), []
+    for down in net.down:
+        down.register_forward_hook(lambda _, __, output: seen.append(tuple(output.shape[2:])))
+    net.unet(torch.randn(1, 5, 9, 11))
+    assert seen == [(5, 6), (3, 3)]
+
+
+def test_the_paper_size_range_net_costs_500_gflops_and_decodes_the_strides_4_to_128() -> None:
+    net, image = RangeNet(RangeNetConfig(), 19).eval(), torch.zeros(1, 6, 64, 4096)
+    seen: list[int] = []
+    for lateral in net.lateral:
+        lateral.register_forward_hook(
+            lambda _, inputs, __: seen.append(4096 // inputs[0].shape[-1])
+        )
+    with FlopCounterMode(
+        display=False
+    ) as counter:  # with gradients, and so the plain way of `joined`
+        assert net(image).shape == (1, 19, 64, 4096)
+    assert sorted(seen) == [4, 8, 16, 32, 64, 128]
+    assert counter.get_total_flops() == pytest.approx(500e9, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("width", "left", "right"), [(5, 1, 1), (4, 0, 2), (4, 3, 0), (3, 3, 3), (3, 7, 4), (1, 2, 5)]
+)
+def test_wrap_width_continues_circularly_and_has_its_gradient(
+    width: int, left: int, right: int
+) -> None:
+    x = torch.randn(2, 2, 3, width, dtype=torch.double, requires_grad=True)
+    columns = [x[..., (column - left) % width] for column in range(left + width + right)]
+    assert torch.equal(wrap_width(x, left, right), torch.stack(columns, dim=-1))
+    assert torch.equal(wrap_width(x.detach(), left, right), torch.stack(columns, dim=-1))
+    assert torch.autograd.gradcheck(lambda x: wrap_width(x, left, right), x)
+
+
+@pytest.mark.parametrize("width", [1, 2, 7, 8])
+@pytest.mark.parametrize("kernel", [1, 3, 5])
+def test_a_ring_convolution_is_equivariant_to_a_shift(kernel: int, width: int) -> None:
+    conv, x = RingConv2d(2, 3, kernel).double(), torch.randn(1, 2, 4, width).double()
+    torch.testing.assert_close(conv(x.roll(1, 3)), conv(x).roll(1, 3))
+    assert conv(x).shape == (1, 3, 4, width)
+
+
+@pytest.mark.parametrize(("height", "width"), [(5, 7), (4, 8), (1, 1)])
+def test_a_strided_ring_convolution_rounds_up(height: int, width: int) -> None:
+    found = RingConv2d(2, 3, stride=(2, 2))(torch.randn(1, 2, height, width))
+    assert found.shape == (1, 3, (height + 1) // 2, (width + 1) // 2)
+
+
+def gru_by_cells(layer: AzimuthGRU, x: Tensor, padding: int) -> Tensor:
+    """One cell after the other: column by column, from top to bottom, the padding's columns first."""
+    _, channels, height, width = x.shape
+    cell = nn.GRUCell(channels, channels)
+    cell.load_state_dict(
+        {name.removesuffix("_l0"): value for name, value in layer.gru.state_dict().items()}
+    )
+    hidden, out = torch.zeros(len(x), channels), torch.zeros_like(x)
+    for column in range(-padding, width):
+        for row in range(height):
+            hidden = cell(x[:, :, row, column % width], hidden)
+            out[:, :, row, max(column, 0)] = hidden
+    return out
+
+
+@pytest.mark.parametrize(("share", "padding"), [(0.0, 0), (0.4, 2), (1.0, 5), (1.4, 7)])
+def test_the_gru_equals_a_loop_over_the_cells(share: float, padding: int) -> None:
+    layer, x = AzimuthGRU(3, share), torch.randn(2, 3, 4, 5)
+    assert layer(x).shape == x.shape
+    torch.testing.assert_close(layer(x), gru_by_cells(layer, x, padding))
+
+
+@pytest.mark.parametrize(("share", "seen"), [(0.0, False), (0.25, True)])
+def test_the_gru_has_seen_the_other_end_if_padded(share: float, seen: bool) -> None:
+    layer, x = AzimuthGRU(3, share), torch.randn(1, 3, 2, 8)
+    changed = x.clone()
+    changed[..., -1] += 1
+    assert torch.equal(layer(x)[..., 0], layer(changed)[..., 0]) != seen
+    assert not torch.equal(layer(x)[..., -1], layer(changed)[..., -1])
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "factor"), [(5, 7, 2), (6, 8, 2), (1, 1, 2), (4, 12, 4)]
+)
+def test_upsample_gives_each_value_to_the_cells_it_stands_for(
+    height: int, width: int, factor: int
+) -> None:
+    coarse = torch.randn(1, 2, math.ceil(height / factor), math.ceil(width / factor))
+    found = upsample(coarse, torch.zeros(1, 9, height, width))
+    assert found.shape == (1, 2, height, width)
+    for row in range(height):
+        for column in range(width):
+            assert torch.equal(
+                found[:, :, row, column], coarse[:, :, row // factor, column // factor]
+            )
+
+
+def norms_of(net: nn.Module) -> int:
+    return sum(isinstance(m, nn.BatchNorm1d | nn.BatchNorm2d) for m in net.modules())
+
+
+def test_folded_batch_norms_change_no_output_of_a_network(case: Case) -> None:
+    net = case.in_eval()
+    before, norms = case.run(net, 3), norms_of(net)
+    fold_batch_norms(net)
+    torch.testing.assert_close(case.run(net, 3), before, rtol=1e-4, atol=1e-4)
+    assert norms_of(net) == 1 < norms  # that of the input stays: no layer is before it
+
+
+def test_dropblock_is_identity_in_eval_and_at_probability_zero() -> None:
+    x = torch.randn(2, 3, 9, 9)
+    assert torch.equal(DropBlock(0.5, 3).eval()(x), x)
+    assert torch.equal(DropBlock(0.0, 3).train()(x), x)
+
+
+@pytest.mark.parametrize("probability", [0.1, 0.5])
+@pytest.mark.parametrize("size", [1, 4, 7])
+def test_dropblock_drops_its_share_and_keeps_the_mean(probability: float, size: int) -> None:
+    torch.manual_seed(0)
+    found = DropBlock(probability, size).train()(torch.ones(16, 2, 80, 80))
+    assert (found == 0).float().mean().item() == pytest.approx(probability, rel=0.15)
+    assert found.mean().item() == pytest.approx(1, abs=1e-4)
+    assert found.unique().numel() == 2
+    assert torch.equal(found[:, 0], found[:, 1])
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32])
+def test_dropblock_keeps_the_mean_of_a_large_map_in_any_precision(kind: torch.dtype) -> None:
+    torch.manual_seed(0)
+    dropped = DropBlock(0.3, 7).train()(torch.ones(1, 2, 480, 360, dtype=kind))
+    assert dropped.float().mean() == pytest.approx(1, abs=0.02)
+
+
+def test_dropblock_drops_squares() -> None:
+    torch.manual_seed(0)
+    dropped = (DropBlock(0.02, 5).train()(torch.ones(1, 1, 60, 60)) == 0)[0, 0]
+    assert dropped.any()
+    covered = torch.zeros_like(dropped)
+    for row, column in (
+        dropped[2:-2, 2:-2].nonzero().tolist()
+    ):  # a square of nothing but dropped cells around it
+        if dropped[row : row + 5, column : column + 5].all():
+            covered[row : row + 5, column : column + 5] = True
+    assert torch.equal(covered[5:-5, 5:-5], dropped[5:-5, 5:-5])
+
+
+def test_dropblock_takes_maps_smaller_than_its_squares() -> None:
+    assert DropBlock(0.5, 7).train()(torch.ones(2, 1, 2, 3)).shape == (2, 1, 2, 3)
