@@ -1,4 +1,4 @@
-"""AMVNet: LiDAR semantic segmentation by two views and late fusion.
+"""AMVNet: LiDAR semantic segmentation by two projections and late fusion.
 
     segmenter = amvnet.load("sim-hdl64e")
     result = segmenter(points)
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from amvnet.errors import InputError
     from amvnet.inference.fusion import fuse
     from amvnet.inference.segmenter import Segmentation, Segmenter
+    from amvnet.models.methods import MethodName, Precision
     from amvnet.scan import Scan
     from amvnet.simulation import simulate
     from amvnet.weights.push import push
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 __all__ = ["InputError", "Scan", "Segmentation", "Segmenter", "fuse", "load", "push", "simulate"]
 __version__ = version("amvnet")
 
-_HOMES = {
+_MODULES = {
     "InputError": "amvnet.errors",
     "Scan": "amvnet.scan",
     "Segmentation": "amvnet.inference.segmenter",
@@ -37,24 +38,34 @@ _HOMES = {
 def load(
     weights: str,
     device: str = "cpu",
-    method: str = "amvnet",
-    precision: str = "float32",
+    method: MethodName = "amvnet",
+    precision: Precision = "float32",
     engine: str = "torch",
+    keep_memory: bool = False,
 ) -> Segmenter:
-    """A segmenter from a weights file, the name of built-in weights (`sim-hdl64e`), or the hub (`hf-hub:OWNER/NAME`).
+    """Return a segmenter with trained weights.
+
+    Args:
+        weights: the path of a weights file, the name of built-in weights (`sim-hdl64e`,
+            `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
+        device: "cpu", "cuda", "cuda:1", ...
+        method: "amvnet", or a part of it: "rv", "bev", "ensemble", "arithmetic" or "maximum".
+        precision: of the two networks: "float32", "bfloat16", or on a GPU "float16".
+        engine: what runs the networks: "torch", "compile", "onnx", or "auto", the fastest here.
+        keep_memory: let the whole process keep freed memory, see `Segmenter`.
 
     Raises:
-        InputError: where there are no such weights, or they lack a part that the method needs, or the engine a library.
+        InputError: if there are no such weights, they lack a part that the method needs, or the
+            engine lacks a library.
     """
-    segmenter = import_module("amvnet.inference.segmenter").Segmenter(
-        weights, device, method, precision
-    )
+    segmenter_class = import_module("amvnet.inference.segmenter").Segmenter
+    segmenter: Segmenter = segmenter_class(weights, device, method, precision, keep_memory)
     if engine != "torch":
         import_module("amvnet.export.engines").use_engine(segmenter, engine)
     return segmenter
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module 'amvnet' has no attribute {name!r}")
-    return getattr(import_module(_HOMES[name]), name)
+    return getattr(import_module(_MODULES[name]), name)

@@ -1,4 +1,4 @@
-"""`python -m amvnet` is the command line, and what torchrun starts."""
+"""Run the command line: `python -m amvnet`, which is also what torchrun starts."""
 
 import sys
 

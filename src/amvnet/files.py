@@ -8,25 +8,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from amvnet.data.formats.raw import count_rows as count_rows
 from amvnet.errors import InputError
 
-PARTS = f".{'[0-9a-f]' * 32}.part*"  # the names of files that `whole_file` has not finished
+PARTS = f".{'[0-9a-f]' * 32}.part*"  # names of files that `atomic_write` has not finished
 
 
 @contextmanager
 def atomic_write(path: Path | str) -> Iterator[Path]:
-    """Let a file appear whole or not at all: write to the path this yields, a rename does the rest.
+    """Yield a temporary path to write to, and rename it to `path` if the block succeeds.
 
-    The temporary file lies in the same folder (made where it is missing) and keeps the ending of
-    `path`. It is removed where the block raises.
+    The temporary file lies in the same folder, which is made if necessary, and keeps the ending of
+    `path`. It is removed if the block raises.
 
     Raises:
-        InputError: where the folder cannot be made or the file not be written.
+        InputError: if the folder cannot be made or the file cannot be written.
     """
     path = Path(path)
     make_folder(path.parent)
     part = path.with_name(f".{uuid.uuid4().hex}.part{path.suffix}")
+
     try:
         yield part
         os.replace(part, path)
@@ -39,10 +39,10 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and those above it.
+    """Make a folder and its parents.
 
     Raises:
-        InputError: where it cannot be made.
+        InputError: if it cannot be made.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)

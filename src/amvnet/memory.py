@@ -1,4 +1,4 @@
-"""Memory of this process: kept from one scan to the next, and how much it was at most."""
+"""Memory of this process: keep it from one scan to the next, and ask for its peak."""
 
 from __future__ import annotations
 
@@ -6,16 +6,23 @@ import ctypes
 import resource
 import sys
 
-# glibc's mallopt, from malloc.h
-M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
+# Options of glibc's mallopt, from malloc.h.
+M_TRIM_THRESHOLD = -1
+M_MMAP_MAX = -4
+M_ARENA_MAX = -8
 
 
 def keep_freed_memory() -> bool:
-    """Let this process keep what it frees; returns whether the C library could be told so (glibc's can).
+    """Let this process keep the memory that it frees, instead of returning it to the system.
 
-    By default glibc fetches each map of more than 32 MiB anew from the system, which fills it with zeros page by page:
-    up to half of a scan's time. What is kept is what the largest scan took. All threads share one heap, as those of
-    threads by themselves take no map of more than 64 MiB.
+    By default glibc asks the system for each block over 32 MiB and returns it when it is freed, and
+    the system fills every new block with zeros. Kept is at most what the largest scan needed. All
+    threads share one heap, because the heaps of single threads hold no block over 64 MiB.
+
+    This changes the allocator of the whole process.
+
+    Returns:
+        Whether the C library supports it: glibc on Linux does.
     """
     if not sys.platform.startswith("linux"):
         return False
@@ -23,14 +30,12 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):  # musl has none
         return False
-    return all(
-        mallopt(option, value)
-        for option, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1), (M_ARENA_MAX, 1))
-    )
+
+    options = ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1), (M_ARENA_MAX, 1))
+    return all(mallopt(option, value) for option, value in options)
 
 
 def peak_memory() -> int:
-    """Bytes of memory that this process has taken at most."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
-        1 if sys.platform == "darwin" else 1024
-    )
+    """Return the peak memory of this process in bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,4 +1,4 @@
-"""The command line: finds the verb, reads its arguments, and turns what goes wrong into one line and an exit code."""
+"""The command line: find the verb, parse its arguments, and turn errors into one line."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import dataclasses
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from amvnet import __version__
 from amvnet.cli.commands.ablate import ablate
@@ -26,54 +26,37 @@ from amvnet.cli.commands.submit import submit
 from amvnet.cli.commands.train import train
 from amvnet.cli.commands.view import view
 from amvnet.cli.console import say
-from amvnet.cli.parser import Parser, Positional, parser_of
+from amvnet.cli.parser import Command, make_parser
 from amvnet.errors import InputError, SomeBroken
 
-if TYPE_CHECKING:
-    from amvnet.config.schema import Recipe
+# Exit codes.
+DONE = 0
+FAILED = 1
+WRONG_INPUT = 2
+SOME_BROKEN = 3
 
-DONE, FAILED, WRONG_INPUT, SOME_BROKEN = 0, 1, 2, 3
-SHARED = ("train", "predict", "evaluate", "ablate")  # the verbs that several processes can share
+SHARED = ("train", "predict", "evaluate", "ablate")  # verbs that several processes can share
 
-VERBS: dict[str, tuple[Callable[..., None], Positional]] = {
-    "demo": (demo, {}),
-    "simulate": (simulate, {"out": {"metavar": "OUT", "type": Path}}),
-    "train": (train, {"recipe": {"metavar": "RECIPE"}}),
-    "predict": (predict, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
-    "evaluate": (evaluate, {"data": {"metavar": "DATA"}}),
-    "submit": (submit, {"data": {"metavar": "DATA"}}),
-    "fuse": (fuse, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
-    "rank": (rank, {"data": {"metavar": "DATA"}}),
-    "analyze": (analyze, {"data": {"metavar": "DATA"}}),
-    "ablate": (ablate, {"recipe": {"metavar": "RECIPE"}}),
-    "export": (export, {}),
-    "view": (view, {"inputs": {"metavar": "INPUT", "nargs": "+"}}),
-    "bench": (bench, {}),
-    "info": (info, {"weights": {"metavar": "W", "nargs": "?"}}),
+_DATA = {"data": {"metavar": "DATA"}}
+_INPUTS = {"inputs": {"metavar": "INPUT", "nargs": "+"}}
+_RECIPE = {"recipe": {"metavar": "RECIPE"}}
+
+VERBS: dict[str, Command] = {
+    "demo": Command(demo, {}),
+    "simulate": Command(simulate, {"out": {"metavar": "OUT", "type": Path}}),
+    "train": Command(train, _RECIPE),
+    "predict": Command(predict, _INPUTS),
+    "evaluate": Command(evaluate, _DATA),
+    "submit": Command(submit, _DATA),
+    "fuse": Command(fuse, _INPUTS),
+    "rank": Command(rank, _DATA),
+    "analyze": Command(analyze, _DATA),
+    "ablate": Command(ablate, _RECIPE),
+    "export": Command(export, {}),
+    "view": Command(view, _INPUTS),
+    "bench": Command(bench, {}),
+    "info": Command(info, {"weights": {"metavar": "W", "nargs": "?"}}),
 }
-
-
-def _parser(verb: str, recipe: Recipe | None = None) -> Parser:
-    return parser_of(verb, *VERBS[verb], recipe)
-
-
-def _with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
-    """The arguments of a verb that takes a recipe: read once to find it, and once more with its values as defaults."""
-    from amvnet.config.recipes import load_recipe
-    from amvnet.config.schema import Recipe
-
-    if {"-h", "--help"} & set(arguments):
-        recipe = Recipe() if arguments[0].startswith("-") else load_recipe(arguments[0])
-    else:
-        recipe = load_recipe(_parser(verb, Recipe()).parse_args(list(arguments)).recipe)
-    parser = _parser(verb, recipe)
-    made = vars(parser.instantiate(parser.parse_args(list(arguments))))
-    return made | {
-        "recipe": dataclasses.replace(
-            recipe, model=made.pop("model"), training=made.pop("training")
-        )
-    }
-
 
 USAGE = f"""usage: amvnet VERB ...
 
@@ -96,7 +79,11 @@ USAGE = f"""usage: amvnet VERB ...
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb; returns the exit code: 0 done, 2 the input is wrong, 3 some of many inputs are, 1 anything else."""
+    """Run one verb.
+
+    Returns:
+        The exit code: 0 done, 2 the input is wrong, 3 some of several inputs are, 1 anything else.
+    """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
         say(USAGE)
@@ -104,63 +91,86 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments[0] == "--version":
         say(__version__)
         return DONE
+
     try:
         run(arguments[0], arguments[1:])
     except InputError as error:
-        print(f"amvnet: {error}", file=sys.stderr)
+        _complain(str(error))
         return WRONG_INPUT
     except SomeBroken as error:
         for fault in error.faults:
-            print(f"amvnet: {fault}", file=sys.stderr)
-        print(f"amvnet: {error}", file=sys.stderr)
+            _complain(fault)
+        _complain(str(error))
         return SOME_BROKEN
-    except OSError as error:  # a full disk, say; what was there before is still whole
-        print(
-            f"amvnet: {error.filename or 'the disk'}: {error.strerror}; mend this and go on",
-            file=sys.stderr,
-        )
+    except OSError as error:  # a full disk, for example; earlier files are still whole
+        _complain(f"{error.filename or 'the disk'}: {error.strerror}; mend this and go on")
         return FAILED
     except KeyboardInterrupt:
-        print("amvnet: interrupted", file=sys.stderr)
+        _complain("interrupted")
         return FAILED
     return DONE
+
+
+def _complain(line: str) -> None:
+    print(f"amvnet: {line}", file=sys.stderr)
 
 
 def run(verb: str, arguments: Sequence[str]) -> None:
     """Run one verb.
 
     Raises:
-        InputError: where the verb, its arguments or what they name cannot be used.
+        InputError: if the verb, its arguments or what they name cannot be used.
     """
     if verb not in VERBS:
         raise InputError(
             f"expected a verb of {', '.join(VERBS)}, found {verb!r}; see amvnet --help"
         )
-    _quiet()
-    if verb not in SHARED and _several():
+    if verb not in SHARED and _has_several_processes():
         raise InputError(
             f"expected {', '.join(SHARED)} for several processes, found {verb}; run it in one"
         )
-    takes_recipe = "recipe" in VERBS[verb][1]
-    call = (
-        _with_recipe(verb, arguments)
-        if takes_recipe
-        else vars(_parser(verb).parse_args(list(arguments)))
+
+    _suppress_library_warnings()
+    if VERBS[verb].takes_recipe:
+        values = _parse_with_recipe(verb, arguments)
+    else:
+        values = vars(make_parser(verb, VERBS[verb]).parse_args(list(arguments)))
+    VERBS[verb].run(**values)
+
+
+def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
+    """Parse twice: once to find the recipe, and once more with its values as defaults."""
+    from amvnet.config.recipes import load_recipe
+    from amvnet.config.schema import Recipe
+
+    command = VERBS[verb]
+    if not {"-h", "--help"} & set(arguments):
+        parsed = make_parser(verb, command, Recipe()).parse_args(list(arguments))
+        recipe = load_recipe(parsed.recipe)
+    elif arguments[0].startswith("-"):
+        recipe = Recipe()
+    else:
+        recipe = load_recipe(arguments[0])
+
+    parser = make_parser(verb, command, recipe)
+    values = vars(parser.instantiate(parser.parse_args(list(arguments))))
+    values["recipe"] = dataclasses.replace(
+        recipe, model=values.pop("model"), training=values.pop("training")
     )
-    VERBS[verb][0](**call)
+    return values
 
 
-def _several() -> bool:
-    """Whether torchrun or SLURM has started several processes."""
+def _has_several_processes() -> bool:
+    """Return whether torchrun or SLURM has started several processes."""
     if not {"WORLD_SIZE", "SLURM_STEP_ID"} & set(os.environ):
         return False
-    from amvnet.distributed import started
+    from amvnet.distributed import started  # imports torch
 
     return started() > 1
 
 
-def _quiet() -> None:
-    """Keep the notes that libraries have for their developers from our users."""
+def _suppress_library_warnings() -> None:
+    """Suppress warnings that libraries have for developers."""
     warnings.filterwarnings("ignore", module="lightning")
     warnings.filterwarnings("ignore", module="torch")
 

@@ -12,8 +12,8 @@ from rich.table import Table
 
 from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.inference.methods import TITLES
 from amvnet.inference.timing import MEAN, STAGES
+from amvnet.models.methods import title_of
 from amvnet.weights.file import built_in
 
 PACKAGES = (
@@ -46,7 +46,7 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     )
     table.add_column("IoU in %")
     for name in methods:
-        table.add_column(TITLES.get(name, name), justify="right")
+        table.add_column(title_of(name), justify="right")
     for row in _rows(methods, taxonomy):
         if row is None:
             table.add_section()

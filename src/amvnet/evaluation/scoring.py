@@ -1,8 +1,9 @@
-"""Jobs behind the verbs: which scans there are, and scoring them; they print nothing."""
+"""Score the labels of a dataset's scans by the benchmark's official formulas."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,51 +14,77 @@ from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import draw_scan
-from amvnet.inference.methods import COMPARED
 from amvnet.inference.segmenter import Segmenter, check_scan
-from amvnet.progress import Progress
+from amvnet.models.methods import PAPER_METHODS
+from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 
 PICTURES = 4  # scans that are drawn, evenly spaced
 
 
+@dataclass(frozen=True)
+class MethodLabels:
+    """The labels of a scan with N points.
+
+    Attributes:
+        ids: (N,) train ids by method.
+        uncertain: (N,) bool, the uncertain points; None without two networks.
+    """
+
+    ids: dict[str, np.ndarray]
+    uncertain: np.ndarray | None = None
+
+
+LabelScan = Callable[[ScanRecord, Scan], MethodLabels]
+
+
 def evaluate(
     dataset: Dataset,
     records: Sequence[ScanRecord],
-    label: Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]],
+    label: LabelScan,
     pictures: Path | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
     processes: Processes = ALONE,
 ) -> Evaluation:
-    """Score the labels of some scans by the benchmark's formulas.
+    """Score the labels of some scans.
 
     Args:
-        label: what a scan's points are taken for: ids by method, and which points are uncertain.
+        label: labels a scan.
         pictures: a folder for drawings of some of the scans from above.
         processes: those that share the scans; each gets the evaluation of all.
+
+    Raises:
+        InputError: if a scan has no ground truth.
     """
-    mine = Evaluation(dataset.taxonomy)
-    places = np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int)
-    drawn = {records[place].name for place in places}
+    evaluation = Evaluation(dataset.taxonomy)
+    indices = np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int)
+    pictured = {records[index].name for index in indices}
+
     for record, scan in read_labelled(dataset, processes.share(records), progress):
         assert scan.labels is not None
-        found, uncertain = label(record, scan)
-        mine.add(scan.points, scan.labels, found, uncertain)
-        if pictures is not None and record.name in drawn:
-            path = pictures / f"{record.name.replace('/', '_')}.png"
+        labels = label(record, scan)
+        evaluation.add(scan.points, scan.labels, labels.ids, labels.uncertain)
+        if pictures is not None and record.name in pictured:
             draw_scan(
-                path, scan.points, dataset.taxonomy, found, scan.labels, uncertain, record.name
+                pictures / f"{record.name.replace('/', '_')}.png",
+                scan.points,
+                dataset.taxonomy,
+                labels.ids,
+                scan.labels,
+                uncertain=labels.uncertain,
+                title=record.name,
             )
-    return sum(processes.gather(mine), Evaluation(dataset.taxonomy))
+
+    return sum(processes.gather(evaluation), Evaluation(dataset.taxonomy))
 
 
 def read_labelled(
     dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
 ) -> Iterator[tuple[ScanRecord, Scan]]:
-    """Read scans that must have labels.
+    """Read scans that must have ground truth.
 
     Raises:
-        InputError: at the first that has none.
+        InputError: at the first scan that has none.
     """
     for done, record in enumerate(records):
         progress(done, len(records))
@@ -71,25 +98,31 @@ def read_labelled(
 
 
 def label_by_weights(
-    dataset: Dataset, segmenter: Segmenter, methods: Sequence[str] = COMPARED
-) -> Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]]:
-    """Labels by every one of some methods that the weights have the parts for.
+    dataset: Dataset, segmenter: Segmenter, methods: Sequence[str] = PAPER_METHODS
+) -> LabelScan:
+    """Return what labels scans by each of some methods that the weights have the parts for.
 
     Raises:
-        InputError: where the weights know other classes than the data set.
+        InputError: if the weights have other classes than the dataset.
     """
     check_classes(dataset, segmenter.taxonomy)
-    return lambda record, scan: segmenter.by_method(check_scan(scan), methods)
+
+    def label(record: ScanRecord, scan: Scan) -> MethodLabels:
+        return MethodLabels(*segmenter.labels_by_method(check_scan(scan), methods))
+
+    return label
 
 
-def label_from_files(
-    dataset: Dataset, folder: Path
-) -> Callable[[ScanRecord, Scan], tuple[dict[str, np.ndarray], np.ndarray | None]]:
-    """Labels from a folder of predictions.
+def label_from_files(dataset: Dataset, folder: Path) -> LabelScan:
+    """Return what reads the labels of scans from a folder of predictions.
 
     Raises:
-        InputError: where the folder is not there.
+        InputError: if there is no such folder.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
-    return lambda record, scan: ({"predictions": dataset.read_prediction(record, folder)}, None)
+
+    def label(record: ScanRecord, scan: Scan) -> MethodLabels:
+        return MethodLabels({"predictions": dataset.read_prediction(record, folder)})
+
+    return label

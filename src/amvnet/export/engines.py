@@ -1,125 +1,149 @@
-"""Other ways to run the networks of a segmenter: compiled by torch, or by ONNX Runtime."""
+"""Other engines for the networks of a segmenter: torch.compile, or ONNX Runtime."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from amvnet import __version__
 from amvnet.errors import InputError
 from amvnet.export.onnx import OPSET, check_libraries, export
-from amvnet.inference.methods import NEEDED
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.methods import METHODS
+from amvnet.models.polar_net import PolarNet
 from amvnet.models.precision import InPrecision
 from amvnet.models.views.range_view import CHANNELS
 from amvnet.onnx_runner import DESCRIPTION
 
 ENGINES = ("auto", "torch", "compile", "onnx")
-FASTEST = "torch"  # without a long start, see docs/performance.md; what "auto" takes
-PartRunner = Callable[[str], Any]  # from a part's name to what runs it
-CACHE = "AMVNET_CACHE"  # the variable that says where exported networks are kept
+FASTEST = "torch"  # what "auto" means: the others start slowly, see docs/performance.md
+CACHE = "AMVNET_CACHE"  # the environment variable with the folder of exported networks
+
+Runner = Callable[[Tensor], Tensor]
 
 
 def use_engine(segmenter: Segmenter, engine: str) -> str:
-    """Let the networks of a segmenter be run by an engine from now on; returns its name.
+    """Let an engine run the networks of a segmenter from now on.
 
-    What is around the networks stays torch's. `compile` takes a minute before the first scan. `onnx` exports the
-    networks once, in half a minute, and keeps them in `cache_folder`; it takes scans one by one.
+    Everything around the networks stays with torch. `compile` takes a minute before the first scan.
+    `onnx` exports the networks once, in half a minute, and keeps them in `cache_folder`; it takes
+    scans one by one.
+
+    Returns:
+        The name of the engine; for "auto", the one that it stands for.
 
     Raises:
-        InputError: where there is no such engine, or it lacks a library, a compiler or the device.
+        InputError: if there is no such engine, or it lacks a library, a compiler or the device.
     """
     if engine not in ENGINES:
         raise InputError(
             f"expected an engine of {', '.join(ENGINES)}, found {engine!r}; use one of them"
         )
-    engine = FASTEST if engine == "auto" else engine
-    if engine != "torch":
-        run = {"compile": _compiled, "onnx": _exported}[engine](segmenter)
-        needed = NEEDED[segmenter.method]
-        model = segmenter.model
-        if "range_net" in needed:
-            holder, name = (
-                (model.range_net, "net")
-                if isinstance(model.range_net, InPrecision)
-                else (model, "range_net")
-            )
-            setattr(holder, name, run("range_net"))
-        if "polar_net" in needed:  # the instance's goes before the class's method of this name
-            object.__setattr__(_inner(model.polar_net), "unet", run("polar_map"))
+    if engine == "auto":
+        engine = FASTEST
+    if engine == "compile":
+        _use_compile(segmenter)
+    if engine == "onnx":
+        _use_onnx(segmenter)
     segmenter.engine = engine
     return engine
 
 
-def _compiled(segmenter: Segmenter) -> PartRunner:
-    model, sizes = segmenter.model, segmenter.weights.model
-    a, b = sizes.range_view, sizes.polar_view
-    parts: dict[str, tuple[Any, tuple[int, ...]]] = {
-        "range_net": (_inner(model.range_net), (1, a.height, a.width, CHANNELS)),
-        "polar_map": (
-            _inner(model.polar_net).unet,
-            (1, b.radial, b.angular, sizes.polar_net.pillar),
-        ),
-    }
+def _use_compile(segmenter: Segmenter) -> None:
+    parts = METHODS[segmenter.method].parts
+    sizes = segmenter.weights.model
 
-    def run(name: str) -> Any:
-        function, shape = parts[name]
-        compiled = torch.compile(function)
-        try:
-            with torch.inference_mode():
-                compiled(torch.zeros(shape, device=segmenter.device).permute(0, 3, 1, 2))
-        except Exception as error:  # of a dozen classes; most often there is no C++ compiler
-            said = (str(error).splitlines() or [""])[0]
-            raise InputError(
-                f"expected torch.compile to work, found {said}; use the engine torch"
-            ) from error
-        return compiled
-
-    return run
+    if "range_net" in parts:
+        view = sizes.range_view
+        shape = (1, view.height, view.width, CHANNELS)
+        _set_range_net(segmenter, _compiled(_range_net(segmenter), shape, segmenter.device))
+    if "polar_net" in parts:
+        grid = sizes.polar_view
+        shape = (1, grid.radial, grid.angular, sizes.polar_net.pillar)
+        polar_net = _polar_net(segmenter)
+        polar_net.run_unet = _compiled(polar_net.unet, shape, segmenter.device)
 
 
-def _inner(net: nn.Module) -> nn.Module:
-    return net.net if isinstance(net, InPrecision) else net
-
-
-def _exported(segmenter: Segmenter) -> PartRunner:
+def _use_onnx(segmenter: Segmenter) -> None:
     if segmenter.device != "cpu" or segmenter.precision != "float32":
         found = f"{segmenter.precision} on {segmenter.device}"
         raise InputError(f"expected float32 on cpu for the engine onnx, found {found}; use compile")
+
+    parts = METHODS[segmenter.method].parts
     folder = exported(segmenter)
-    return lambda name: OnnxGraph(folder / f"{name}.onnx", torch.get_num_threads())
+    threads = torch.get_num_threads()
+    if "range_net" in parts:
+        _set_range_net(segmenter, OnnxGraph(folder / "range_net.onnx", threads))
+    if "polar_net" in parts:
+        _polar_net(segmenter).run_unet = OnnxGraph(folder / "polar_map.onnx", threads)
+
+
+def _compiled(function: Runner, shape: tuple[int, ...], device: str) -> Any:
+    """Return a function or module compiled for inputs of a shape (1, H, W, C), and run it once."""
+    compiled = torch.compile(function)
+    try:
+        with torch.inference_mode():
+            compiled(torch.zeros(shape, device=device).permute(0, 3, 1, 2))
+    except Exception as error:  # of a dozen classes; most often there is no C++ compiler
+        reason = (str(error).splitlines() or [""])[0]
+        raise InputError(
+            f"expected torch.compile to work, found {reason}; use the engine torch"
+        ) from error
+    return compiled
+
+
+def _range_net(segmenter: Segmenter) -> nn.Module:
+    net = segmenter.model.range_net
+    return net.net if isinstance(net, InPrecision) else net
+
+
+def _set_range_net(segmenter: Segmenter, net: nn.Module) -> None:
+    """Replace the range view's network; its precision stays."""
+    current = segmenter.model.range_net
+    if isinstance(current, InPrecision):
+        current.net = net
+    else:
+        segmenter.model.range_net = net
+
+
+def _polar_net(segmenter: Segmenter) -> PolarNet:
+    net = segmenter.model.polar_net
+    if isinstance(net, InPrecision):
+        net = net.net
+    assert isinstance(net, PolarNet)
+    return net
 
 
 def cache_folder() -> Path:
-    """Where exported networks are kept: $AMVNET_CACHE, or amvnet in the user's cache folder."""
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return Path(os.environ.get(CACHE) or caches / "amvnet")
+    """Return where exported networks are kept: $AMVNET_CACHE, or amvnet in the user's cache."""
+    if os.environ.get(CACHE):
+        return Path(os.environ[CACHE])
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(caches) / "amvnet"
 
 
 def exported(segmenter: Segmenter) -> Path:
-    """The folder of a segmenter's exported networks; they are exported where that has not been done."""
+    """Return the folder of a segmenter's exported networks, which are exported if necessary."""
     check_libraries()
     weights = segmenter.weights
-    told = [
-        *(weights.digest(part) for part in weights.parts),
-        repr(weights.model),
-        __version__,
-        torch.__version__,
-    ]
-    folder = cache_folder() / "onnx" / hashlib.sha256(repr((told, OPSET)).encode()).hexdigest()[:16]
+    digests = [weights.digest(part) for part in weights.parts]
+    key = [*digests, repr(weights.model), version("amvnet"), torch.__version__]
+    name = hashlib.sha256(repr((key, OPSET)).encode()).hexdigest()[:16]
+
+    folder = cache_folder() / "onnx" / name
     if not (folder / DESCRIPTION).is_file():
         export(weights, folder)
     return folder
 
 
 class OnnxGraph(nn.Module):
-    """An exported graph with one input (1, C, H, W) and one output, as a module; float32, no gradients."""
+    """An exported graph with one input (1, C, H, W) and one output; float32, without gradients."""
 
     def __init__(self, path: Path, threads: int) -> None:
         super().__init__()
@@ -139,4 +163,5 @@ class OnnxGraph(nn.Module):
             raise InputError(
                 f"expected one scan at a time for the engine onnx, found {len(x)}; use torch"
             )
-        return torch.from_numpy(self.session.run(None, {self.input: x.contiguous().numpy()})[0])
+        inputs = {self.input: x.contiguous().numpy()}
+        return torch.from_numpy(self.session.run(None, inputs)[0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,29 +11,28 @@ from typing import Any
 import numpy as np
 
 from amvnet.errors import InputError
-from amvnet.export.onnx_files import digest, one_line, quiet, strip
-from amvnet.inference.predict import Task
+from amvnet.export.onnx_files import digest, quiet, strip, writer_errors
+from amvnet.inference.inputs import ScanOptions, adapter_for, open_inputs
 from amvnet.inference.segmenter import Segmenter
-from amvnet.inference.tasks import Lone, tasks_in
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import ScanAdapter
 
-SIMULATED = "simulated"  # in place of a data set: streets of the weights' sensor
-SEED = 20_261_121  # of these streets, far from those of any training
-SCANS = 20  # that are taken, evenly spaced
-HELD = 5  # of so many scans the first one checks, the others calibrate
+SIMULATED = "simulated"  # instead of a dataset: streets of the weights' sensor
+SEED = 20_261_121  # of these streets, far from the seeds of any training
+SCANS = 20  # that are used, evenly spaced
+HELD = 5  # the first of every five scans checks, the others calibrate
 LEAST_AGREEMENT = 0.9  # of labels before and after; far less than a good calibration gives
-# The graphs that are convolutions, nearly all of the time, and whether their first layer stays as it is: the range
-# view's input is metres beside a mask of 0 and 1, for which 256 steps are too few.
+# The graphs that are convolutions, which take nearly all of the time, and whether their first layer
+# stays in float32: the range view's input has metres next to a mask of 0 and 1, for which 256 steps
+# are too few.
 FIRST_KEPT = {"range_net": True, "polar_map": False}
 
 
 def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
-    """Scans of a data set, scan files or folders of them as `predict` takes them, or of simulated streets.
+    """Read scans of a dataset, scan files or folders of them, or simulate streets.
 
     Raises:
-        InputError: where there are none, one is broken, or the weights' sensor cannot be simulated.
+        InputError: if there are none, one is broken, or the weights' sensor cannot be simulated.
     """
     if text != SIMULATED:
         return _read(text, segmenter)
@@ -42,7 +41,8 @@ def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
     sensor = segmenter.weights.sensor
     if sensor not in SENSORS:
         raise InputError(
-            f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; name scans"
+            f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; "
+            "name scans"
         )
     with TemporaryDirectory() as folder:
         simulate(folder, sensor=sensor, sequences=SCANS, scans=1, seed=SEED)
@@ -52,108 +52,101 @@ def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
 def quantise(
     folder: Path, names: Sequence[str], scans: Sequence[Scan]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Replace exported graphs by ones in int8.
+    """Replace exported graphs by quantised ones.
 
     Args:
         folder: what `amvnet export` wrote.
         names: the graphs, of `FIRST_KEPT`.
-        scans: one of five, from the first on, checks; the others calibrate. A lone one does both.
+        scans: the first of every five checks, the others calibrate. A single one does both.
 
     Yields:
-        Each name with what the description says anew: `precision`, `sha256`, and `agreement`, the share of the
-        points whose label by this network stays.
+        Each name with the changes of its description: `precision`, `sha256`, and `agreement`, the
+        share of the points whose label by this network stays.
 
     Raises:
-        InputError: where a graph cannot be quantised, or the agreement is below `LEAST_AGREEMENT`.
+        InputError: if a graph cannot be quantised, or the agreement is below `LEAST_AGREEMENT`.
     """
-    held, kept = list(scans[::HELD]), [scan for place, scan in enumerate(scans) if place % HELD]
-    before = _Recorder(folder)
+    checking = list(scans[::HELD])
+    calibrating = [scan for index, scan in enumerate(scans) if index % HELD] or checking
+    recorder = _Recorder(folder)
     for name in names:
-        expected = _labels(before, name, held)
-        before.given[name].clear()
-        _labels(before, name, kept or held)
-        _write(folder / f"{name}.onnx", before.given.pop(name))
-        agreement = float((_labels(OnnxSegmenter(folder), name, held) == expected).mean())
+        expected = _labels(recorder, name, checking)
+        recorder.recorded[name].clear()
+        _labels(recorder, name, calibrating)
+        path = folder / f"{name}.onnx"
+        _write(path, recorder.recorded.pop(name))
+
+        agreement = float((_labels(OnnxSegmenter(folder), name, checking) == expected).mean())
         if agreement < LEAST_AGREEMENT:
             raise InputError(
-                f"{name}: expected {LEAST_AGREEMENT:.0%} of the labels to stay in int8, found {agreement:.0%}; "
-                "calibrate with more scans, or leave out --int8"
+                f"{name}: expected {LEAST_AGREEMENT:.0%} of the labels to stay in int8, "
+                f"found {agreement:.0%}; calibrate with more scans, or leave out --int8"
             )
-        yield (
-            name,
-            {
-                "precision": "int8",
-                "sha256": digest(folder / f"{name}.onnx"),
-                "agreement": agreement,
-            },
-        )
+        yield name, {"precision": "int8", "sha256": digest(path), "agreement": agreement}
 
 
 class _Recorder(OnnxSegmenter):
-    """Keeps what each graph is given: a list of (input name, array)."""
+    """Records the inputs of each graph: a list of (input name, array)."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
-        self.given: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in FIRST_KEPT}
+        self.recorded: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in FIRST_KEPT}
 
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
-        if name in self.given:
-            self.given[name].append(
-                {self.description["graphs"][name]["inputs"][0]["name"]: inputs[0]}
-            )
+        if name in self.recorded:
+            input_name = self.description["graphs"][name]["inputs"][0]["name"]
+            self.recorded[name].append({input_name: inputs[0]})
         return super()._run(name, *inputs)
 
 
 def _read(text: str, segmenter: Segmenter) -> list[Scan]:
-    by: Callable[[Path, bool], Segmenter] = lambda place, lone: segmenter  # noqa: E731  nothing is segmented
-    with TemporaryDirectory() as nowhere:
-        fitting = ScanAdapter(segmenter.weights)
-        tasks = tasks_in(
-            [text], Lone(segmenter.taxonomy, by, fitting, Path(nowhere), None), None, "all"
-        )
-        scans = [task.read() for task in _spaced(tasks)]
-    found = [scan for scan in scans if scan.valid.any()]
-    if not found:
+    """Read up to `SCANS` scans, evenly spaced, adapted to the weights as `predict` does."""
+    adapter = adapter_for(segmenter.weights)
+    inputs = open_inputs([text], ScanOptions(), segmenter.taxonomy, adapter).scans
+    indices = np.linspace(0, len(inputs) - 1, min(SCANS, len(inputs))).astype(int)
+    loaded = [inputs[index].load().scan for index in indices]
+
+    scans = [scan for scan in loaded if scan.valid.any()]
+    if not scans:
         raise InputError(
             f"{text}: expected scans to calibrate with, found none with a finite point; name others"
         )
-    return found
-
-
-def _spaced(tasks: Sequence[Task]) -> list[Task]:
-    places = np.linspace(0, len(tasks) - 1, min(SCANS, len(tasks))).astype(int)
-    return [tasks[place] for place in places]
+    return scans
 
 
 def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarray:
-    """Of the finite points of all scans, by the network that the graph is a part of."""
-    found = []
+    """Return the labels of all scans' finite points, by the network that a graph is a part of."""
+    labels = []
     for scan in scans:
         points = scan.points[scan.valid]
-        ring = None if scan.ring is None else scan.ring[scan.valid]
-        scores = (
-            runner.score_range_view(points, ring)
-            if name == "range_net"
-            else runner.score_polar_view(points)
-        )
-        found.append(scores.argmax(axis=1))
-    return np.concatenate(found)
+        if name == "range_net":
+            ring = None if scan.ring is None else scan.ring[scan.valid]
+            scores = runner.score_range_view(points, ring)
+        else:
+            scores = runner.score_polar_view(points)
+        labels.append(scores.argmax(axis=1))
+    return np.concatenate(labels)
 
 
 def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
-    """Replace a graph by its quantised one, calibrated with some inputs.
+    """Replace a graph by its quantised version, calibrated with some inputs.
 
-    Unsigned activations and signed weights are what ONNX Runtime's kernels for x86 take whole. Weights have seven
-    bits: processors without VNNI would overflow with eight. The range of a value is the mean of those of the scans.
+    ONNX Runtime's kernels for x86 support unsigned activations with signed weights best. Weights
+    have seven bits, because processors without VNNI would overflow with eight. The range of a value
+    is the mean of its ranges in the scans.
     """
     from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
-    ready, done = path.with_suffix(".ready"), path.with_suffix(".int8")
-    with quiet("root"), one_line(path.stem, "onnxruntime.quantization", "onnx and onnxruntime"):
+    ready = path.with_suffix(".ready")
+    quantised = path.with_suffix(".int8")
+    libraries = "onnx and onnxruntime"
+    with quiet("root"), writer_errors(path.stem, "onnxruntime.quantization", libraries):
         quant_pre_process(path, ready, skip_symbolic_shape=True)
         quantize_static(
-            *(ready, done, _Inputs(inputs)),
+            ready,
+            quantised,
+            _Inputs(inputs),
             quant_format=QuantFormat.QDQ,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
@@ -164,21 +157,24 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
             extra_options={"CalibMovingAverage": True},
         )
     ready.unlink()
-    os.replace(done, path)
+    os.replace(quantised, path)
     strip(path)
 
 
 def _first_layer(path: Path) -> list[str]:
-    """The names of the nodes up to the first activation."""
+    """Return the names of the nodes up to the first activation."""
     import onnx
 
-    nodes = list(onnx.load(path).graph.node)
-    end = next((place for place, node in enumerate(nodes) if node.op_type == "LeakyRelu"), -1)
-    return [node.name for node in nodes[: end + 1]]
+    names = []
+    for node in onnx.load(path).graph.node:
+        names.append(node.name)
+        if node.op_type == "LeakyRelu":
+            return names
+    return []
 
 
 class _Inputs:
-    """The inputs as onnxruntime's calibration asks for them: one by one, then None."""
+    """Hands the inputs to onnxruntime's calibration: one by one, then None."""
 
     def __init__(self, inputs: list[dict[str, np.ndarray]]) -> None:
         self._left = iter(inputs)

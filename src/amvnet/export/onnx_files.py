@@ -1,4 +1,4 @@
-"""What the writers of ONNX say and leave behind, tidied."""
+"""Tidy what the writers of ONNX print, raise and leave in their files."""
 
 from __future__ import annotations
 
@@ -6,59 +6,48 @@ import hashlib
 import logging
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from amvnet.errors import InputError
+from amvnet.errors import one_line_errors
 
 
 def digest(path: Path) -> str:
-    """SHA-256 of a file."""
+    """Return the SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def strip(path: Path) -> None:
-    """Take out a writer's notes, which name places on this machine."""
+    """Remove a writer's notes from a graph; they name places on this machine."""
     import onnx
 
     model = onnx.load(path)
     graph = model.graph
-    for holder in (
-        model,
-        graph,
-        *graph.node,
-        *graph.initializer,
-        *graph.value_info,
-        *graph.input,
-        *graph.output,
-    ):
+    values = (*graph.initializer, *graph.value_info, *graph.input, *graph.output)
+    for holder in (model, graph, *graph.node, *values):
         holder.ClearField("metadata_props")
     onnx.save(model, path)
 
 
 @contextmanager
 def quiet(name: str) -> Iterator[None]:
-    """Without a writer's notes for developers; `name` is its logger's."""
+    """Suppress a writer's warnings and notes for developers; `name` is its logger's."""
     logger = logging.getLogger(name)
-    before = logger.level
+    level = logger.level
     logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        logger.setLevel(before)
+        logger.setLevel(level)
 
 
-@contextmanager
-def one_line(name: str, writer: str, libraries: str) -> Iterator[None]:
-    """What a writer complains of as one line; their errors share no class and span pages."""
-    try:
-        yield
-    except (InputError, OSError):
-        raise
-    except Exception as error:
+def writer_errors(name: str, writer: str, libraries: str) -> AbstractContextManager[None]:
+    """Turn a writer's exceptions, which share no class and span pages, into one line."""
+
+    def message(error: BaseException) -> str:
         kind = type(error).__name__
-        raise InputError(
-            f"{name}: expected a graph of {writer}, found {kind}; upgrade {libraries}"
-        ) from error
+        return f"{name}: expected a graph of {writer}, found {kind}; upgrade {libraries}"
+
+    return one_line_errors(message, leave=(OSError,))

@@ -1,63 +1,111 @@
-"""The job behind `amvnet fuse`: two models' scores from files, fused to labels where `predict` would write them."""
+"""Fuse two models' scores from files into label files, as `amvnet fuse` does."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.inference.fusion import Fusion
-from amvnet.inference.pipeline import Segment
-from amvnet.inference.predict import run_tasks
+from amvnet.inference.inputs import InputScan, ScanOptions, open_inputs
+from amvnet.inference.pipeline import OutputOptions, Pipeline, segment_inputs
 from amvnet.inference.score_files import ScorePair
 from amvnet.inference.segmenter import Segmentation, check_scan
-from amvnet.inference.tasks import Lone, tasks_in
-from amvnet.progress import Progress
+from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import ScanAdapter
 from amvnet.weights.file import Weights
 
 
+@dataclass(frozen=True)
+class FusionOptions:
+    """How two models' scores are fused.
+
+    Attributes:
+        head: weights with a point head; None gives the ensemble.
+        tau: threshold of the cosine similarity; None means the head's, or else the paper's.
+        taxonomy: the classes if there is no head; None means those of the inputs.
+    """
+
+    head: Weights | None = None
+    tau: float | None = None
+    taxonomy: Taxonomy | None = None
+
+
+class FileFusion:
+    """Fuses the scores that two models wrote for scans, and counts the uncertain points.
+
+    Args:
+        fusion: fuses the scores of one scan.
+        pair: the folders of scores.
+        classes: K.
+    """
+
+    def __init__(self, fusion: Fusion, pair: ScorePair, classes: int) -> None:
+        self.fusion = fusion
+        self.pair = pair
+        self.classes = classes
+        self.points = 0
+        self.uncertain = 0
+
+    @property
+    def uncertain_share(self) -> float:
+        """The share of the points so far that are uncertain."""
+        return self.uncertain / max(self.points, 1)
+
+    def __call__(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+        results = []
+        for scan_input, scan in zip(inputs, scans, strict=True):
+            checked = check_scan(scan)
+            f, g = self.pair.read(scan_input.scores_path, checked, self.classes)
+            result = self.fusion(checked, f, g)
+            self.uncertain += int(result.uncertain.sum())
+            self.points += len(checked)
+            results.append(result)
+        return results
+
+
 def fuse_files(
     inputs: Sequence[str],
     pair: ScorePair,
-    head: Weights | None,
-    taxonomy: Taxonomy,
     out: Path,
-    sequences: Sequence[str] | None = None,
-    progress: Progress = lambda done, total: None,
-    split: str = "all",
-    tau: float | None = None,
-    topic: str | None = None,
+    fusion: FusionOptions,
+    options: ScanOptions = ScanOptions(),
+    progress: Progress = no_progress,
 ) -> tuple[int, float]:
-    """Fuse two models' scores of the scans that `predict` would segment, and write the labels where it would.
+    """Fuse two models' scores of the scans that `predict` would segment, into its label files.
 
     Args:
-        others: as of `prediction.predict` and `fusion.Fusion`.
+        inputs: as of `predict.predict`.
+        pair: the two models' scores.
+        out: the folder of predictions.
+        fusion: the head, its threshold, and the classes.
+        options: which scans of the inputs to fuse.
 
     Returns:
-        how many label files there are now, and the share of the points that are uncertain.
+        The number of label files that there are now, and the share of the points that are
+        uncertain.
 
     Raises:
-        InputError: before anything is written where scores of a scan are not there; later where all are broken.
-        SomeBroken: at the end, where those of some scans are.
+        InputError: before anything is written, if scores of a scan are missing; later, if all are
+            broken.
+        SomeBroken: at the end, if the scores of some scans are broken.
     """
-    fusion, counts = Fusion(head, tau), [0, 0]
+    head = fusion.head
+    taxonomy = fusion.taxonomy if head is None else head.taxonomy
+    # The head sees scan files as the networks that it was trained with would.
+    view = ModelConfig().range_view if head is None else head.model.range_view
+    adapter = ScanAdapter(view, "" if head is None else head.sensor)
 
-    def by(scores: Path, lone: bool) -> Segment:
-        place = scores.relative_to(out)
-        for folder in (pair.a, pair.b):
-            folder.find(place)
-        return lambda scan: segment(place, check_scan(scan))
+    opened = open_inputs(inputs, options, taxonomy, adapter)
+    for scan in opened.scans:
+        pair.a.find(scan.scores_path)
+        pair.b.find(scan.scores_path)
 
-    def segment(place: Path, scan: Scan) -> Segmentation:
-        found = fusion(scan, *pair.read(place, scan, taxonomy.size))
-        counts[0], counts[1] = counts[0] + int(found.uncertain.sum()), counts[1] + len(scan)
-        return found
-
-    # The head sees lone scans as the networks beside it would have.
-    fitting = ScanAdapter(head or Weights(ModelConfig(), taxonomy))
-    tasks = tasks_in(inputs, Lone(taxonomy, by, fitting, out, topic), sequences, split)
-    written = run_tasks(tasks, out, {"fused": pair.said()}, progress=progress)
-    return written, counts[0] / max(counts[1], 1)
+    segment = FileFusion(Fusion(head, fusion.tau), pair, opened.taxonomy.size)
+    pipeline = Pipeline(segment, OutputOptions(out), opened.taxonomy)
+    settings = {"fused": pair.to_dict()}
+    written = segment_inputs(opened.scans, pipeline, settings, progress=progress)
+    return written, segment.uncertain_share

@@ -1,4 +1,4 @@
-"""The late fusion alone, for the scores of any two models (section 3.2 of the paper)."""
+"""The late fusion alone, for the scores of any two models (sections 3.2 and 3.3 of the paper)."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ import torch
 from amvnet.config.schema import AssertionConfig
 from amvnet.errors import InputError
 from amvnet.inference.score_files import SURE, check_probabilities
-from amvnet.inference.segmenter import Segmentation, check_scan, segmentation
-from amvnet.models.amvnet import Scores, merge, refine
-from amvnet.models.assertions import Assertion, Disagreement, build_assertion
+from amvnet.inference.segmenter import Segmentation, check_scan, to_segmentation
+from amvnet.models.amvnet import LateFusion, Scores
+from amvnet.models.assertions import Disagreement, build_assertion
 from amvnet.models.point_head import PointHead
+from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights, load
 
@@ -26,77 +27,88 @@ class Fusion:
 
     Args:
         head: a trained point head, or weights that hold one; None gives the ensemble.
-        tau: points whose scores have a cosine similarity of at most this are uncertain; by default the
-            threshold that weights were trained with, or else the paper's.
+        tau: points whose scores have a cosine similarity of at most this are uncertain; by default
+            the threshold that the weights were trained with, or the paper's without weights.
 
     Raises:
-        InputError: where the weights hold no head.
+        InputError: if the weights hold no head.
     """
 
     def __init__(self, head: Head = None, tau: float | None = None) -> None:
-        self.head, self.assertion = _head(head, tau)
+        self.model = _build_fusion(head, tau)
 
     def __call__(self, points: np.ndarray | Scan, f: np.ndarray, g: np.ndarray) -> Segmentation:
-        """Fuse (N, K) class probabilities of one scan's N points; raises InputError where they are none."""
+        """Fuse (N, K) class probabilities of one scan's N points.
+
+        Raises:
+            InputError: if the shapes do not fit, or the scores are not probabilities.
+        """
         scan = check_scan(points)
         self._check_shapes(scan, f, g)
-        x, a, b = (np.asarray(v, dtype=np.float32)[scan.valid] for v in (scan.points, f, g))
-        for name, values in (("f", a), ("g", b)):
-            check_probabilities(values, name, "apply softmax")
-        with torch.inference_mode():
-            return segmentation(scan.valid, self._merged(*map(torch.from_numpy, (x, a, b))))
+        f_valid = np.asarray(f, dtype=np.float32)[scan.valid]
+        g_valid = np.asarray(g, dtype=np.float32)[scan.valid]
+        check_probabilities(f_valid, "f", "apply softmax")
+        check_probabilities(g_valid, "g", "apply softmax")
 
-    def _merged(self, points: torch.Tensor, f: torch.Tensor, g: torch.Tensor) -> Scores:
-        """Of the P valid points, whose scores are (P, K)."""
-        f, g = f.clamp_min(SURE), g.clamp_min(SURE)
-        uncertain = self.assertion(f, g, points)
-        h = None if self.head is None else refine(self.head, points, f, g, uncertain)
-        return Scores(merge(f, g, uncertain, h), uncertain, None, None)
+        with torch.inference_mode():
+            scores = self.model.fuse(
+                PointBatch.of([scan]),
+                torch.from_numpy(f_valid).clamp_min(SURE),
+                torch.from_numpy(g_valid).clamp_min(SURE),
+            )
+        return to_segmentation(scan.valid, Scores(scores.merged, scores.uncertain, None, None))
 
     def _check_shapes(self, scan: Scan, f: np.ndarray, g: np.ndarray) -> None:
         if f.shape != g.shape or f.ndim != 2 or len(f) != len(scan):
             raise InputError(
-                f"expected two arrays of scores of shape ({len(scan)}, K), found {f.shape} and {g.shape}; "
-                "give both models' scores of this scan"
+                f"expected two arrays of scores of shape ({len(scan)}, K), "
+                f"found {f.shape} and {g.shape}; give both models' scores of this scan"
             )
-        classes = None if self.head is None else self.head.fc[-1].out_features
-        if classes not in (None, f.shape[1]):
+        if self.model.point_head is None:
+            return
+        classes = self.model.point_head.fc[-1].out_features
+        if classes != f.shape[1]:
             raise InputError(
-                f"expected scores of the head's {classes} classes, found {f.shape[1]}; use a head for them"
+                f"expected scores of the head's {classes} classes, found {f.shape[1]}; "
+                "use a head for them"
             )
 
 
 def fuse(
     points: np.ndarray, f: np.ndarray, g: np.ndarray, head: Head = None, tau: float | None = None
 ) -> np.ndarray:
-    """The late fusion alone, for any two models' scores (section 3.2 of the paper).
+    """Label points by the late fusion of two models' scores (sections 3.2 and 3.3 of the paper).
 
     Args:
         points: (N, 4) x, y, z in metres and intensity in [0, 1].
         f, g: (N, K) class probabilities of the two models.
         head: a trained point head, or weights that hold one; None gives the ensemble.
-        tau: points whose scores have a cosine similarity of at most this are uncertain; by default the
-            threshold that weights were trained with, or else the paper's.
+        tau: points whose scores have a cosine similarity of at most this are uncertain; by default
+            the threshold that the weights were trained with, or the paper's without weights.
 
     Returns:
-        (N,) uint8 train ids, 1..K; 0 where a point is not finite.
+        (N,) uint8 train ids 1..K; 0 for points that are not finite.
 
     Raises:
-        InputError: where the shapes do not fit, or the scores are not probabilities.
+        InputError: if the shapes do not fit, or the scores are not probabilities.
     """
     return Fusion(head, tau)(points, f, g).labels
 
 
-def _head(head: Head, tau: float | None) -> tuple[PointHead | None, Assertion]:
-    """The head, and the assertion that chooses its points."""
+def _build_fusion(head: Head, tau: float | None) -> LateFusion:
+    """Return the head with the assertion that chooses its points."""
     if isinstance(head, str | Path):
         head = load(head)
     config = AssertionConfig()
     if isinstance(head, Weights):
-        config, head = head.model.assertion, head.build_head()
+        config = head.model.assertion
+        head = head.build_head()
+
     if tau is None and config.name == "loss":
         raise InputError(
-            "expected an assertion that needs no labels, found loss; train the head with another one"
+            "expected an assertion that needs no labels, found loss; "
+            "train the head with another one"
         )
     assertion = build_assertion(config) if tau is None else Disagreement(tau)
-    return None if head is None else copy.deepcopy(head).cpu().eval(), assertion
+    point_head = None if head is None else copy.deepcopy(head).cpu().eval()
+    return LateFusion(assertion, point_head)

@@ -1,157 +1,335 @@
-"""A stream of scans: read, computed and written side by side, a few of them in memory at a time."""
+"""Segment many scans: read, compute and write at the same time, with few scans in memory."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import groupby, islice
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 
-from amvnet.data.label_files import write_uncertain
-from amvnet.errors import InputError
+from amvnet.data.formats.detect import READERS
+from amvnet.data.label_files import check_kind, write_uncertain
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.distributed import ALONE, Processes
+from amvnet.errors import InputError, SomeBroken
 from amvnet.files import atomic_write
-from amvnet.inference.segmenter import Segmentation, Segmenter
+from amvnet.inference.inputs import InputScan, LabelFormat, Labels, LoadedScan
+from amvnet.inference.journal import Journal
+from amvnet.inference.segmenter import Segmentation
+from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 
-AHEAD = 3  # scans that are read before they are asked for, and that may wait to be written
-Segment = Callable[[Scan], Segmentation]
+AHEAD = 3  # scans that are read before they are needed, and that may wait to be written
 Result = Segmentation | InputError
 
 
 @dataclass(frozen=True)
-class Task:
-    """One scan to segment: how it is read, by what it is segmented, and where its labels go."""
+class OutputOptions:
+    """What is written for each scan.
 
-    name: str
-    read: Callable[[], Scan]
-    segment: Segment
-    write: Callable[[Segmentation], Path]
-    scores: Path
+    Attributes:
+        folder: the folder of predictions.
+        kind: the format of scan files' labels, one of `label_files.KINDS`; datasets have their own.
+        scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
+            `.npz`.
+        uncertain: also write (N,) bool, the uncertain points, as `.uncertain.npy`.
 
-    @property
-    def uncertain(self) -> Path:
-        """Where it is written which points are uncertain."""
-        return self.scores.with_suffix(".uncertain.npy")
+    Raises:
+        InputError: if the format is unknown, or a library for it is missing.
+    """
+
+    folder: Path
+    kind: str = "label"
+    scores: bool = False
+    uncertain: bool = False
+
+    def __post_init__(self) -> None:
+        check_kind(self.kind)
 
 
-def stream(
-    tasks: Sequence[Task], scores: bool, uncertain: bool, batch: int = 1, at_once: int = 1
-) -> Iterator[tuple[Task, str | None]]:
-    """Each task when it is done, in order, with what is wrong with its scan; only a few scans are in memory."""
-    with (
-        ThreadPoolExecutor(1) as reader,
-        computers(at_once) as computer,
-        ThreadPoolExecutor(1) as writer,
-    ):
-        source, writing = iter(tasks), deque[tuple[Task, Future[None]]]()
-        read = ((task, reader.submit(task.read)) for task in source)
-        reading = deque(islice(read, max(AHEAD, batch * at_once)))
-        computing = deque[Future[list[tuple[Task, Result]]]]()
+@dataclass(frozen=True)
+class ExecutionOptions:
+    """How many scans are computed at a time, and by which processes.
+
+    Attributes:
+        batch: scans that go through the networks together; the labels are the same up to rounding.
+        at_once: on a CPU, scans that are segmented at the same time, each with its share of the
+            threads. None means as many as there are threads, at most 4; 1 on a GPU, or with an
+            engine other than torch, which shares out the threads itself.
+        resume: leave out what an interrupted run into the same folder has done.
+        processes: those that share the scans.
+
+    Raises:
+        InputError: if a number is below 1.
+    """
+
+    batch: int = 1
+    at_once: int | None = None
+    resume: bool = False
+    processes: Processes = ALONE
+
+    def __post_init__(self) -> None:
+        for option, count in (("batch", self.batch), ("at-once", self.at_once)):
+            if count is not None and count < 1:
+                raise InputError(
+                    f"expected one scan or more at a time, found {count}; set --{option}"
+                )
+
+
+class SegmentScans(Protocol):
+    """Segments some loaded scans of the inputs, in their order."""
+
+    def __call__(
+        self, inputs: Sequence[InputScan], scans: Sequence[Scan]
+    ) -> list[Segmentation]: ...
+
+
+@dataclass(frozen=True)
+class Segmented:
+    """A scan on its way through the pipeline, after its turn in the networks."""
+
+    scan: InputScan
+    loaded: LoadedScan | None
+    result: Result
+
+
+def segment_inputs(
+    scans: Sequence[InputScan],
+    pipeline: Pipeline,
+    settings: Mapping[str, Any],
+    progress: Progress = no_progress,
+) -> int:
+    """Segment scans, and write what is found for each.
+
+    Args:
+        settings: what the labels depend on, as JSON types; an interrupted run is resumed only with
+            the same settings.
+
+    Returns:
+        The number of label files of this run and the run that it resumes.
+
+    Raises:
+        InputError: if two scans would have the same files, or all scans are broken.
+        SomeBroken: at the end, if some of several scans are broken.
+    """
+    output = pipeline.output
+    processes = pipeline.execution.processes
+    _check_names(scans)
+    for scan in scans:
+        _check_folder(scan, output)
+
+    journal = Journal(output.folder, settings, pipeline.execution.resume, processes)
+    left = [scan for scan in processes.share(scans) if str(scan.scores_path) not in journal.done]
+    faults: list[str] = []
+    for done, (scan, fault) in enumerate(pipeline.stream(left)):
+        progress(done, len(left))
+        if fault is None:
+            journal.add(str(scan.scores_path))
+        else:
+            faults.append(fault)
+    progress(len(left), len(left))
+    journal.close()
+
+    _raise_faults(list(chain.from_iterable(processes.gather(faults))), len(scans))
+    return len(scans)
+
+
+def _raise_faults(faults: list[str], total: int) -> None:
+    """Raise an exception if some of all scans, or every one, were broken."""
+    if faults and len(faults) == total:
+        others = len(faults) - 1
+        more = f" (and {others} more scans, each broken)" if others else ""
+        raise InputError(faults[0] + more)
+    if faults:
+        raise SomeBroken(
+            f"{total - len(faults)} of {total} scans are segmented, {len(faults)} are broken",
+            faults,
+        )
+
+
+def _check_names(scans: Sequence[InputScan]) -> None:
+    names: dict[Path, str] = {}
+    for scan in scans:
+        if scan.scores_path in names:
+            raise InputError(
+                f"expected scans of different names, found {scan.name} twice "
+                f"({scan.scores_path.stem}); segment them in two runs with two folders"
+            )
+        names[scan.scores_path] = scan.name
+
+
+def _check_folder(scan: InputScan, output: OutputOptions) -> None:
+    """Raise InputError if the output would lie among the scans, and be taken for one of them."""
+    labels_like_scans = f".{output.kind}" in READERS
+    scores_like_scan = output.scores and scan.path.suffix.lower() == ".npz"
+    folder = (output.folder / scan.scores_path).parent
+    is_own_folder = folder.resolve() == scan.path.parent.resolve()
+    if is_own_folder and (labels_like_scans or scores_like_scan):
+        raise InputError(
+            f"{scan.path}: expected another folder for the labels, found the scan's own; "
+            "change --out"
+        )
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """Reads, segments and writes scans at the same time.
+
+    Attributes:
+        segment: segments scans that have been read.
+        output: what is written, and where.
+        taxonomy: the classes of the labels.
+        execution: how many scans at a time; `at_once` None means 1 here.
+    """
+
+    segment: SegmentScans
+    output: OutputOptions
+    taxonomy: Taxonomy
+    execution: ExecutionOptions = ExecutionOptions()
+
+    def stream(self, scans: Sequence[InputScan]) -> Iterator[tuple[InputScan, str | None]]:
+        """Yield each scan when its files are written, in order, with what is wrong with it.
+
+        Only a few scans are in memory at a time.
+        """
+        batch = self.execution.batch
+        at_once = self.execution.at_once or 1
+        with (
+            ThreadPoolExecutor(1) as reader,
+            computing_threads(at_once) as computer,
+            ThreadPoolExecutor(1) as writer,
+        ):
+            # Each of the three stages works while the others do, on scans further down the line.
+            loads = ((scan, reader.submit(scan.load)) for scan in scans)
+            reading = deque(islice(loads, max(AHEAD, batch * at_once)))
+            computing = deque[Future[list[Segmented]]]()
+            writing = deque[tuple[InputScan, Future[None]]]()
+            # One group waits, so that no thread has to.
+            most_groups = at_once + 1 if at_once > 1 else 1
+            try:
+                while reading or computing:
+                    while reading and len(computing) < most_groups:
+                        group = [reading.popleft() for _ in range(min(batch, len(reading)))]
+                        reading.extend(islice(loads, len(group)))
+                        computing.append(computer.submit(self._segment_group, group))
+
+                    for segmented in computing.popleft().result():
+                        if isinstance(segmented.result, InputError):
+                            yield segmented.scan, str(segmented.result)
+                            continue
+                        writing.append((segmented.scan, writer.submit(self._write, segmented)))
+                        while len(writing) > AHEAD:
+                            yield _wait(*writing.popleft())
+                while writing:
+                    yield _wait(*writing.popleft())
+            finally:
+                for pool in (reader, computer):
+                    pool.shutdown(wait=False, cancel_futures=True)
+
+    def _segment_group(
+        self, group: Sequence[tuple[InputScan, Future[LoadedScan]]]
+    ) -> list[Segmented]:
+        """Return the results of some scans that are being read; first those that are broken."""
+        broken: list[Segmented] = []
+        scans: list[InputScan] = []
+        loaded: list[LoadedScan] = []
+        for scan, load in group:
+            try:
+                loaded.append(load.result())
+                scans.append(scan)
+            except InputError as error:
+                broken.append(Segmented(scan, None, error))
+
+        results = self._segment_scans(scans, [one.scan for one in loaded])
+        return broken + [Segmented(*parts) for parts in zip(scans, loaded, results, strict=True)]
+
+    def _segment_scans(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Result]:
+        """Segment scans together, or one by one to find which of them is broken."""
+        if not scans:
+            return []
         try:
-            while reading or computing:
-                while reading and len(computing) < at_once + (
-                    at_once > 1
-                ):  # one waits, so that no thread has to
-                    some = [reading.popleft() for _ in range(min(batch, len(reading)))]
-                    reading.extend(islice(read, len(some)))
-                    computing.append(computer.submit(_segmented, some))
-                for task, result in computing.popleft().result():
-                    if isinstance(result, InputError):
-                        yield task, str(result)
-                        continue
-                    writing.append((task, writer.submit(_write, task, result, scores, uncertain)))
-                    while len(writing) > AHEAD:
-                        yield _written(*writing.popleft())
-            while writing:
-                yield _written(*writing.popleft())
-        finally:
-            for pool in (reader, computer):
-                pool.shutdown(wait=False, cancel_futures=True)
+            return list(self.segment(inputs, scans))
+        except InputError as error:
+            if len(scans) == 1:
+                return [error]
+
+        results: list[Result] = []
+        for scan_input, scan in zip(inputs, scans, strict=True):
+            results += self._segment_scans([scan_input], [scan])
+        return results
+
+    def _write(self, segmented: Segmented) -> None:
+        """Write what is asked for, the labels last."""
+        result = segmented.result
+        assert isinstance(result, Segmentation)
+        assert segmented.loaded is not None
+        folder = self.output.folder
+        scores_path = folder / segmented.scan.scores_path
+
+        if self.output.scores:
+            write_scores(scores_path, result)
+        if self.output.uncertain:
+            write_uncertain(scores_path.with_suffix(".uncertain.npy"), result.uncertain)
+        has_both = result.rv is not None and result.bev is not None
+        segmented.scan.write_labels(
+            folder,
+            LabelFormat(self.output.kind, self.taxonomy),
+            segmented.loaded,
+            Labels(result.labels, result.uncertain if has_both else None),
+        )
 
 
-class Here(Executor):
-    """Computes in the thread that asks, which has all of torch's threads: a second such thread halves their speed."""
+class CallingThread(Executor):
+    """Computes in the thread that asks, which has all of torch's threads.
+
+    A second thread with its own team of OpenMP threads would halve the speed of both.
+    """
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        done: Future[Any] = Future()
+        future: Future[Any] = Future()
         try:
-            done.set_result(function(*args, **kwargs))
+            future.set_result(function(*args, **kwargs))
         except BaseException as error:
-            done.set_exception(error)
-        return done
+            future.set_exception(error)
+        return future
 
 
 @contextmanager
-def computers(at_once: int) -> Iterator[Executor]:
-    """What computes so many groups of scans at a time, each with its share of torch's threads."""
+def computing_threads(at_once: int) -> Iterator[Executor]:
+    """Yield what computes `at_once` groups of scans at a time, each with a share of the threads."""
     if at_once == 1:
-        yield Here()
+        yield CallingThread()
         return
+
     threads = torch.get_num_threads()
+    share = max(threads // at_once, 1)
     try:
-        share = (max(threads // at_once, 1),)
-        with ThreadPoolExecutor(at_once, initializer=torch.set_num_threads, initargs=share) as pool:
+        with ThreadPoolExecutor(
+            at_once, initializer=torch.set_num_threads, initargs=(share,)
+        ) as pool:
             yield pool
     finally:
         torch.set_num_threads(threads)
 
 
-def _segmented(some: Sequence[tuple[Task, Future[Scan]]]) -> list[tuple[Task, Result]]:
-    """What is found for some tasks, in order, or what is wrong with their scans."""
-    return list(_each_segmented(some))
-
-
-def _each_segmented(some: Sequence[tuple[Task, Future[Scan]]]) -> Iterator[tuple[Task, Result]]:
-    read: list[tuple[Task, Scan]] = []
-    for task, coming in some:
-        try:
-            read.append((task, coming.result()))
-        except InputError as error:
-            yield task, error
-    for segment, group in groupby(read, key=lambda one: one[0].segment):
-        tasks, scans = zip(*group, strict=True)
-        yield from zip(tasks, _together(segment, scans), strict=True)
-
-
-def _together(segment: Segment, scans: Sequence[Scan]) -> Iterator[Result]:
-    """By one pass of the networks, where they are what segments; one by one to find which scan is at fault."""
-    if len(scans) > 1 and isinstance(segment, Segmenter):
-        with suppress(InputError):
-            yield from segment.many(scans)
-            return
-    for scan in scans:
-        try:
-            yield segment(scan)
-        except InputError as error:
-            yield error
-
-
-def _write(task: Task, result: Segmentation, scores: bool, uncertain: bool) -> None:
-    if scores:
-        write_scores(task.scores, result)
-    if uncertain:
-        write_uncertain(task.uncertain, result.uncertain)
-    task.write(result)
-
-
-def _written(task: Task, writing: Future[None]) -> tuple[Task, None]:
+def _wait(scan: InputScan, writing: Future[None]) -> tuple[InputScan, None]:
     writing.result()  # raises what went wrong
-    return task, None
+    return scan, None
 
 
 def write_scores(path: Path, result: Segmentation) -> None:
-    """Both networks' probabilities, (N, K) float16, as `rv` and `bev` of an `.npz`."""
-    found = {
-        name: v.astype(np.float16)
-        for name, v in (("rv", result.rv), ("bev", result.bev))
-        if v is not None
-    }
+    """Write both networks' probabilities, (N, K) float16, as `rv` and `bev` in an `.npz`."""
+    arrays: dict[str, Any] = {}
+    if result.rv is not None:
+        arrays["rv"] = result.rv.astype(np.float16)
+    if result.bev is not None:
+        arrays["bev"] = result.bev.astype(np.float16)
     with atomic_write(path) as part:
-        np.savez_compressed(part, **found)  # type: ignore[arg-type]  # of the arrays, none is an option
+        np.savez_compressed(part, **arrays)

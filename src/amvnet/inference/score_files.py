@@ -133,7 +133,7 @@ class ScorePair:
         """f and g of a scan, as `ScoreFolder.read` has them."""
         return self.a.read(place, scan, classes), self.b.read(place, scan, classes)
 
-    def said(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """What a user said, by model."""
         return {one.side: asdict(one) | {"folder": str(one.folder)} for one in (self.a, self.b)}
 

@@ -1,9 +1,9 @@
-"""Points in, labels out: a NumPy face on the torch core."""
+"""Points in, labels out: a NumPy interface to the torch model."""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,32 +13,33 @@ from torch import Tensor
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.methods import COMPARED, METHODS, NEEDED, Method
 from amvnet.memory import keep_freed_memory
-from amvnet.models.amvnet import ENSEMBLES, AMVNet, Scores, merge
+from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.layers import fold_batch_norms
-from amvnet.models.precision import InPrecision, Precision, check_precision
-from amvnet.models.streams import SideBySide
+from amvnet.models.methods import METHODS, PAPER_METHODS, MethodName, Precision
+from amvnet.models.precision import InPrecision, check_precision
+from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights, load
 
-MOST_AT_ONCE = 4  # scans, so that their memory is bounded on a processor of many cores
+MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
 
 
 @dataclass(frozen=True)
 class Segmentation:
-    """What is known of the N points of a scan, in their order.
+    """The result for the N points of a scan, in their order.
 
     A point that is not finite has id 0, is not uncertain, and has scores of 0.
 
     Attributes:
-        labels: (N,) uint8 train ids, 1..K; 0 where a point is not finite.
-        uncertain: (N,) bool: where the two networks disagree; all False for a single network.
-        scores: (N, K) float32 that the labels are the largest of; column c belongs to id c + 1. Of the geometric
-            mean, and so of the ensemble and of the certain points, a row does not sum to 1.
-        rv, bev: (N, K) float32 class probabilities of the two networks, or None where it was not asked.
+        labels: (N,) uint8 train ids 1..K; 0 for points that are not finite.
+        uncertain: (N,) bool, the points on which the two networks disagree; all False for a single
+            network.
+        scores: (N, K) float32 whose largest column c is the label c + 1. Rows of the geometric mean
+            (the ensemble, and AMVNet's certain points) do not sum to 1.
+        rv, bev: (N, K) float32 class probabilities by each network, or None if it did not run.
     """
 
     labels: np.ndarray
@@ -49,48 +50,56 @@ class Segmentation:
 
 
 class Segmenter:
-    """Gives every point of a scan its class.
+    """Segments scans with trained weights.
 
     Args:
         weights: trained weights, or the name or path of a weights file.
-        device: where to compute: "cpu", "cuda", ...
-        method: "amvnet", or to compare "rv" or "bev" alone, and "ensemble" (geometric mean), "arithmetic" or "maximum".
-        precision: of the two networks: "float32", "bfloat16", or on a GPU "float16"; all else is float32.
+        device: where to compute: "cpu", "cuda", "cuda:1", ...
+        method: "amvnet", or for comparison "rv" or "bev" (one network), "ensemble" (geometric
+            mean), "arithmetic" or "maximum".
+        precision: of the two networks: "float32", "bfloat16", or on a GPU "float16". Everything
+            else is computed in float32, the projections in float64.
+        keep_memory: on a CPU, let the whole process keep freed memory (`keep_freed_memory`), which
+            saves time for each scan. This changes the allocator of your program.
 
     Raises:
-        InputError: where the weights lack a part that the method needs, or there is no such device or precision.
+        InputError: if the weights lack a part that the method needs, or there is no such device or
+            precision.
     """
 
     def __init__(
         self,
         weights: Weights | Path | str,
         device: str = "cpu",
-        method: Method = "amvnet",
+        method: MethodName = "amvnet",
         precision: Precision = "float32",
+        keep_memory: bool = False,
     ) -> None:
         self.weights = weights if isinstance(weights, Weights) else load(weights)
-        self.method = _checked_method(method, self.weights)
+        self.method = _check_method(method, self.weights)
         if self.weights.model.assertion.name == "loss":
             raise InputError(
-                "expected an assertion that needs no labels, found loss; train the head with another one"
+                "expected an assertion that needs no labels, found loss; "
+                "train the head with another one"
             )
         self.engine = "torch"
-        self.device, self.precision = _checked_device(device), precision
+        self.device = _check_device(device)
+        self.precision = precision
         check_precision(precision, device)
-        if device == "cpu":
+        if keep_memory and device == "cpu":
             keep_freed_memory()
-        self.model = self.weights.build().to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+        model = self.weights.build().to(device)
+        self.model: AMVNet = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         fold_batch_norms(self.model)
-        _arrange(self.model, device, precision)
+        _set_up_networks(self.model, device, precision)
 
     @property
     def at_once(self) -> int:
-        """How many scans are best segmented side by side, each by its share of torch's threads."""
-        return (
-            min(torch.get_num_threads(), MOST_AT_ONCE)
-            if self.device == "cpu" and self.engine == "torch"
-            else 1
-        )
+        """How many scans are best segmented at the same time, each with its share of the threads."""
+        if self.device != "cpu" or self.engine != "torch":
+            return 1
+        return min(torch.get_num_threads(), MOST_AT_ONCE)
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -101,111 +110,134 @@ class Segmenter:
         """Segment one scan: (N, 4) x, y, z in metres and intensity in [0, 1], or a `Scan`.
 
         Raises:
-            InputError: where there is no finite point, or the model needs a ring index and there is none.
+            InputError: if there is no finite point, or the model needs a ring index and there is
+                none.
         """
         return self.many([points])[0]
 
     def many(self, scans: Sequence[np.ndarray | Scan]) -> list[Segmentation]:
-        """Segment some scans in one pass of the networks, which suits a GPU; the rest is as for one.
+        """Segment several scans in one pass of the networks, which suits a GPU.
 
         Raises:
-            InputError: where one of them cannot be segmented; segment them one by one to see which.
+            InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
         checked = [check_scan(points) for points in scans]
         batch = self._batch(checked)
-        labels, found = _fetched(self._scores(batch))
-        places = batch.slices()
+        labels, scores = _fetch(self._scores(batch))
         return [
-            _segmentation(one.valid, labels, found, place)
-            for one, place in zip(checked, places, strict=True)
+            _segmentation(scan.valid, labels, scores, points)
+            for scan, points in zip(checked, batch.slices(), strict=True)
         ]
 
     def by_ring(self) -> Segmenter:
-        """The same for scans whose `ring` is the row of each point, 0 the lowest, whatever rows the weights have."""
-        other = copy.copy(self)
-        other.model = copy.copy(self.model)
-        other.model.range_view = RangeView(replace(self.model.range_view.config, rows="ring"))
-        return other
+        """Return a segmenter for scans whose `ring` is the row of each point, 0 the lowest.
 
-    def by_method(
-        self, scan: Scan, methods: Sequence[str] = COMPARED
+        It shares the networks with this one, whatever the rows of the weights' range view are.
+        """
+        segmenter = copy.copy(self)
+        segmenter.model = copy.copy(self.model)
+        view = replace(self.model.range_view.config, rows="ring")
+        segmenter.model.range_view = RangeView(view)
+        return segmenter
+
+    def labels_by_method(
+        self, scan: Scan, methods: Sequence[str] = PAPER_METHODS
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-        """The (N,) train ids by each method that the weights have the parts for, and which points are uncertain."""
-        found, uncertain = self.scores_by_method(scan, methods)
-        labels = {name: expand_labels(found[name], scan.valid) for name in methods if name in found}
+        """Return (N,) train ids by each method that the weights have the parts for.
+
+        Returns:
+            The labels by method, and (N,) bool, the uncertain points; None without two networks.
+        """
+        scores, uncertain = self.scores_by_method(scan, methods)
+        labels = {
+            name: expand_labels(scores[name], scan.valid) for name in methods if name in scores
+        }
         return labels, None if uncertain is None else expand_to_scan(uncertain, scan.valid)
 
-    @torch.inference_mode()
     def scores_by_method(
-        self, scan: Scan, methods: Sequence[str] = COMPARED
+        self, scan: Scan, methods: Sequence[str] = PAPER_METHODS
     ) -> tuple[dict[str, Tensor], Tensor | None]:
-        """The same for the P valid points of a scan alone: (P, K) scores by each method, and (P,) bool."""
-        model, parts, batch = self.model, self.weights.parts, self._batch([scan])
-        found: dict[str, Tensor] = {}
-        if "range_net" in parts:
-            found["rv"] = model.score_range_view(batch)
-        if "polar_net" in parts:
-            found["bev"] = model.score_polar_view(batch)
-        if len(found) < 2:
-            return found, None
-        f, g = found["rv"], found["bev"]
-        uncertain = model.assertion(f, g, batch.points)
-        found |= {name: mean(f, g) for name, mean in ENSEMBLES.items() if name in methods}
-        if "point_head" in parts and "amvnet" in methods:
-            found["amvnet"] = merge(f, g, uncertain, model.refine(batch, f, g, uncertain))
-        return found, uncertain
+        """Return (P, K) scores of the P valid points of a scan, by each method.
+
+        The scores of every network that the weights have are among them.
+
+        Returns:
+            The scores by method, and (P,) bool, the uncertain points; None without two networks.
+        """
+        return self._scores_by_method(self._batch([scan]), methods, self.weights.parts)
+
+    @torch.inference_mode()
+    def _scores_by_method(
+        self, batch: PointBatch, methods: Collection[str], parts: Collection[str]
+    ) -> tuple[dict[str, Tensor], Tensor | None]:
+        """Run the steps of the method that some methods need, with the parts that there are."""
+        model = self.model
+        if "polar_net" not in parts:
+            networks = {"rv": model.score_range_view(batch)} if "range_net" in parts else {}
+            return networks, None
+        if "range_net" not in parts:
+            return {"bev": model.score_polar_view(batch)}, None
+
+        f, g = model.score(*model.project(batch))
+        uncertain = model.compare(batch, f, g)
+        scores = {"rv": f, "bev": g}
+        for name in methods:
+            ensemble = METHODS[name].ensemble
+            if ensemble is not None:
+                scores[name] = ensemble(f, g)
+        if "amvnet" in methods and "point_head" in parts:
+            h = model.refine(batch, f, g, uncertain)
+            scores["amvnet"] = model.merge(f, g, uncertain, h)
+        return scores, uncertain
 
     def _batch(self, scans: Sequence[Scan]) -> PointBatch:
         batch = PointBatch.of(scans)
-        return (batch.pin_memory() if _on_gpu(self.device) else batch).to(self.device)
+        if _is_gpu(self.device):
+            batch = batch.pin_memory()
+        return batch.to(self.device)
 
-    @torch.inference_mode()
     def _scores(self, batch: PointBatch) -> Scores:
-        model = self.model
-        if self.method == "amvnet":
-            return model(batch)
-        none = torch.zeros(len(batch.points), dtype=torch.bool, device=batch.points.device)
-        if self.method == "rv":
-            f = model.score_range_view(batch)
-            return Scores(f, none, f, None)
-        if self.method == "bev":
-            g = model.score_polar_view(batch)
-            return Scores(g, none, None, g)
-        f, g = model.run(model.score_range_view, model.score_polar_view, batch)
-        return Scores(ENSEMBLES[self.method](f, g), model.assertion(f, g, batch.points), f, g)
+        """Return the scores by this segmenter's own method."""
+        parts = METHODS[self.method].parts
+        scores, uncertain = self._scores_by_method(batch, (self.method,), parts)
+        if uncertain is None:
+            uncertain = torch.zeros(len(batch.points), dtype=torch.bool, device=self.device)
+        return Scores(scores[self.method], uncertain, scores.get("rv"), scores.get("bev"))
 
 
 def check_scan(points: np.ndarray | Scan) -> Scan:
-    """A scan that holds something to work on.
+    """Return a scan that has at least one valid point.
 
     Raises:
-        InputError: where it has no point, or no finite one.
+        InputError: if it has no point, or no finite one.
     """
     scan = points if isinstance(points, Scan) else Scan(np.asarray(points, dtype=np.float32))
     if not scan.valid.any():
-        found = "none finite" if len(scan) else "none"
+        problem = "none finite" if len(scan) else "none"
         raise InputError(
-            f"{scan.name or 'scan'}: expected points to segment, found {found}; leave the scan out"
+            f"{scan.name or 'scan'}: expected points to segment, found {problem}; "
+            "leave the scan out"
         )
     return scan
 
 
-def _checked_method(method: Method, weights: Weights) -> Method:
-    if method not in NEEDED:
+def _check_method(method: MethodName, weights: Weights) -> MethodName:
+    if method not in METHODS:
         raise InputError(
             f"expected a method of {', '.join(METHODS)}, found {method!r}; use one of them"
         )
-    missing = [part for part in NEEDED[method] if part not in weights.parts]
+    needed = METHODS[method].parts
+    missing = [part for part in needed if part not in weights.parts]
     if missing:
         raise InputError(
-            f"expected weights with {', '.join(NEEDED[method])} for the method {method}, found no {missing[0]}; "
-            "train that part, or choose a method without it"
+            f"expected weights with {', '.join(needed)} for the method {method}, "
+            f"found no {missing[0]}; train that part, or choose a method without it"
         )
     return method
 
 
-def _checked_device(name: str) -> str:
-    """The name of a device of this machine."""
+def _check_device(name: str) -> str:
+    """Return the name of a device of this machine."""
     try:
         torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError, NotImplementedError):
@@ -213,71 +245,73 @@ def _checked_device(name: str) -> str:
     return name
 
 
-def segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
-    """Put what was found for the valid points back among all points."""
-    return _segmentation(valid, *_fetched(scores), slice(None))
-
-
-def _fetched(scores: Scores) -> tuple[Tensor, Scores]:
-    """The labels (P,), and the scores, in the processor's memory; a GPU is waited for once."""
-    on_gpu = scores.merged.is_cuda
-
-    def fetch(values: Tensor) -> Tensor:
-        return values.to("cpu", non_blocking=on_gpu)  # to pinned memory then
-
-    labels = fetch(label_ids(scores.merged))
-    rv, bev = (None if values is None else fetch(values) for values in (scores.rv, scores.bev))
-    found = Scores(fetch(scores.merged), fetch(scores.uncertain), rv, bev)
-    if on_gpu:
-        torch.cuda.current_stream(scores.merged.device).synchronize()
-    return labels, found
-
-
-def _segmentation(valid: np.ndarray, labels: Tensor, scores: Scores, place: slice) -> Segmentation:
-    """Of the scan whose valid points stand at this place of a batch."""
-    rv, bev = (
-        None if values is None else expand_to_scan(values[place], valid)
-        for values in (scores.rv, scores.bev)
-    )
-    uncertain, merged = (
-        expand_to_scan(scores.uncertain[place], valid),
-        expand_to_scan(scores.merged[place], valid),
-    )
-    return Segmentation(expand_to_scan(labels[place], valid), uncertain, merged, rv, bev)
-
-
-def _on_gpu(device: str) -> bool:
+def _is_gpu(device: str) -> bool:
     return torch.device(device).type == "cuda"
 
 
-def _arrange(model: AMVNet, device: str, precision: Precision) -> None:
-    """Let the two networks compute in a precision, and on a GPU side by side."""
-    if _on_gpu(device):
-        model.run = SideBySide(device)
-    if precision != "float32" or _on_gpu(device):
+def _set_up_networks(model: AMVNet, device: str, precision: Precision) -> None:
+    """Let the two networks compute in a precision, and on a GPU at the same time."""
+    if _is_gpu(device):
+        model.arrange = TwoStreams(device)
+    if precision != "float32" or _is_gpu(device):
         model.range_net = InPrecision(model.range_net, device, precision)
         model.polar_net = InPrecision(model.polar_net, device, precision)
 
 
+def to_segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
+    """Return the result for all points of a scan, given the scores of its valid points."""
+    return _segmentation(valid, *_fetch(scores), slice(None))
+
+
+def _fetch(scores: Scores) -> tuple[Tensor, Scores]:
+    """Return the labels (P,) and the scores in CPU memory; waits for a GPU once."""
+    on_gpu = scores.merged.is_cuda
+
+    def fetch(values: Tensor) -> Tensor:
+        return values.to("cpu", non_blocking=on_gpu)  # into pinned memory if from a GPU
+
+    labels = fetch(label_ids(scores.merged))
+    fetched = Scores(
+        merged=fetch(scores.merged),
+        uncertain=fetch(scores.uncertain),
+        rv=None if scores.rv is None else fetch(scores.rv),
+        bev=None if scores.bev is None else fetch(scores.bev),
+    )
+    if on_gpu:
+        torch.cuda.current_stream(scores.merged.device).synchronize()
+    return labels, fetched
+
+
+def _segmentation(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> Segmentation:
+    """Return the result for one scan of a batch, whose valid points are at `points`."""
+    return Segmentation(
+        labels=expand_to_scan(labels[points], valid),
+        uncertain=expand_to_scan(scores.uncertain[points], valid),
+        scores=expand_to_scan(scores.merged[points], valid),
+        rv=None if scores.rv is None else expand_to_scan(scores.rv[points], valid),
+        bev=None if scores.bev is None else expand_to_scan(scores.bev[points], valid),
+    )
+
+
 def expand_to_scan(values: Tensor, valid: np.ndarray) -> np.ndarray:
-    """(P, ...) of the valid points -> (N, ...) of all, zeros for the others."""
-    found = values.cpu().numpy()
+    """Return (N, ...) values of all points, given (P, ...) of the valid ones; others are 0."""
+    of_valid = values.cpu().numpy()
     if valid.all():
-        return found
-    out = np.zeros((len(valid), *found.shape[1:]), dtype=found.dtype)
-    out[valid] = found
-    return out
+        return of_valid
+    expanded = np.zeros((len(valid), *of_valid.shape[1:]), dtype=of_valid.dtype)
+    expanded[valid] = of_valid
+    return expanded
 
 
 def expand_labels(scores: Tensor, valid: np.ndarray) -> np.ndarray:
-    """(P, K) scores of the valid points -> (N,) uint8 train ids of all, 0 where a point is not valid."""
+    """Return (N,) uint8 train ids, 0 for points that are not valid, given (P, K) scores."""
     return expand_to_scan(label_ids(scores), valid)
 
 
 def label_ids(scores: Tensor) -> Tensor:
-    """(P, K) scores -> (P,) uint8 train ids 1..K, of the largest, or the first of these."""
-    # On a CPU by NumPy, in half of torch's time.
-    best = (
-        torch.from_numpy(scores.numpy().argmax(axis=1)) if scores.is_cpu else scores.argmax(dim=1)
-    )
+    """Return (P,) uint8 train ids 1..K: the first column of (P, K) with the largest score."""
+    if scores.is_cpu:  # NumPy takes half of torch's time
+        best = torch.from_numpy(scores.numpy().argmax(axis=1))
+    else:
+        best = scores.argmax(dim=1)
     return (best + 1).to(torch.uint8)

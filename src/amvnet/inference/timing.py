@@ -1,8 +1,13 @@
-"""Time per stage from a scan's file to its written labels, and how near the networks come to the machine's limit."""
+"""Time per stage from a scan's file to its written labels, and the networks' share of the limit.
+
+The limit is the speed of a large matrix product on the same machine.
+"""
 
 from __future__ import annotations
 
+import copy
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,11 +23,13 @@ from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmenter, label_ids
 from amvnet.memory import peak_memory
-from amvnet.models.amvnet import build_amvnet, geometric_mean, merge, settle
+from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertions import cosine_similarity
 from amvnet.models.layers import linear
-from amvnet.models.point_head import nearest_neighbours
+from amvnet.models.methods import geometric_mean
+from amvnet.models.streams import one_after_the_other
 from amvnet.models.views.points import PointBatch
+from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.weights.file import PARTS, Weights, part_state
 
@@ -31,22 +38,23 @@ NETWORKS = ("RV", "BEV")
 FUSION = ("compare", "neighbours", "head", "merge")
 MEAN = "mean"  # what the ensemble does instead of the fusion
 WARM_UP = 2  # runs that do not count
-PRODUCT = (4096, 1024, 1024)  # of the matrices whose product is the machine's limit
+PRODUCT = (4096, 1024, 1024)  # rows, inner size and columns of the matrix product
 PRODUCT_RUNS = 3  # before each round
-UNCERTAIN = 0.1  # of the points, where random weights have nothing to say about it
+UNCERTAIN = 0.1  # of the points, for random weights, which cannot tell
 MEBIBYTE = 2**20
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is timed: a segmenter, where its scan comes from and its labels go.
+    """What is timed: a segmenter, where its scan comes from and where its labels go.
 
     Attributes:
         segmenter: with all of AMVNet.
         read: reads the scan.
         write: writes its (P,) train ids.
-        name: of the engine, or what else tells it from the others.
-        share: of the points that count as uncertain: those the networks agree on least; None as tau says.
+        name: of the engine, or whatever distinguishes it from other jobs.
+        share: of the points that count as uncertain: those on which the networks agree least; None
+            means as tau says.
     """
 
     segmenter: Segmenter
@@ -58,7 +66,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Timing:
-    """Seconds of each stage, and of `MEAN`; how many points the scan has, and how many of them were uncertain."""
+    """The seconds of each stage and of `MEAN`, and the numbers of points and uncertain points."""
 
     seconds: dict[str, float]
     points: int
@@ -70,83 +78,93 @@ class Timing:
         return sum(self.seconds[stage] for stage in STAGES)
 
 
+@dataclass(frozen=True)
+class LeastAgreeing:
+    """An assertion: a fixed share of the points, on which the networks agree least, is uncertain."""
+
+    share: float
+
+    def __call__(
+        self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None
+    ) -> Tensor:
+        count = round(self.share * len(f))
+        uncertain = torch.zeros(len(f), dtype=torch.bool, device=f.device)
+        uncertain[cosine_similarity(f, g).topk(count, largest=False).indices] = True
+        return uncertain
+
+
 def time_jobs(
-    jobs: Sequence[Job], runs: int, step: Callable[[int, int], None] = lambda done, total: None
+    jobs: Sequence[Job], runs: int, progress: Progress = no_progress
 ) -> list[dict[str, Any]]:
-    """Time some jobs in turn, so that what disturbs one disturbs all; returns a report of each, for JSON.
+    """Time some jobs in turn, so that a disturbance hits all of them.
+
+    Returns:
+        A report of each job, for JSON.
 
     Raises:
-        InputError: where there is no run to time, or the weights have no point head.
+        InputError: if there is no run to time, or the weights have no point head.
     """
     if runs < 1:
         raise InputError(f"expected one run or more, found {runs}; give a number from 1")
     for job in jobs:
-        if job.segmenter.method != "amvnet":
-            raise InputError(
-                f"expected the whole of AMVNet to time, found the method {job.segmenter.method}; use amvnet"
-            )
-        if job.share is not None and not 0 <= job.share <= 1:
-            raise InputError(
-                f"expected a share of uncertain points from 0 to 1, found {job.share}; give another"
-            )
-    found: list[list[Timing]] = [[] for _ in jobs]
+        _check_job(job)
+
+    timings: list[list[Timing]] = [[] for _ in jobs]
     limits: dict[str, float] = {}
-    for number in range(runs + WARM_UP):
+    for run in range(runs + WARM_UP):
         for kind, speed in product_limits(jobs[0].segmenter.device).items():
             limits[kind] = max(speed, limits.get(kind, 0))
-        for job, some in zip(jobs, found, strict=True):
-            some.append(run_once(job))
-        step(number + 1, runs + WARM_UP)
-    return [_report(job, some[WARM_UP:], limits) for job, some in zip(jobs, found, strict=True)]
+        for job, timings_of_job in zip(jobs, timings, strict=True):
+            timings_of_job.append(run_once(job))
+        progress(run + 1, runs + WARM_UP)
+
+    return [
+        _report(job, timings_of_job[WARM_UP:], limits)
+        for job, timings_of_job in zip(jobs, timings, strict=True)
+    ]
+
+
+def _check_job(job: Job) -> None:
+    method = job.segmenter.method
+    if method != "amvnet":
+        raise InputError(f"expected AMVNet to time, found the method {method}; use amvnet")
+    if job.share is not None and not 0 <= job.share <= 1:
+        raise InputError(
+            f"expected a share of uncertain points from 0 to 1, found {job.share}; give another"
+        )
 
 
 @torch.inference_mode()
 def run_once(job: Job) -> Timing:
-    """Time a job once: the steps of `AMVNet.forward`, each with a clock beside it."""
-    model, device = job.segmenter.model, job.segmenter.device
-    head = model.point_head
-    assert head is not None
+    """Time a job once, with a clock around each step of `AMVNet.forward`."""
+    device = job.segmenter.device
     clock = _Clock(device)
+    model = copy.copy(job.segmenter.model)
+    model.watch = clock
+    model.arrange = one_after_the_other
+    if job.share is not None:
+        model.assertion = LeastAgreeing(job.share)
+
     with clock("read"):
         scan = job.read()
     with clock("project"):
         batch = PointBatch.of([scan]).to(device)
-        image, grid = model.range_view.project(batch), model.polar_view.project(batch)
-    with clock("RV"):
-        f = image.to_points(model.range_net(image.image)).float().softmax(dim=1)
-    with clock("BEV"):
-        g = grid.to_points(model.polar_net(grid)).float().softmax(dim=1)
-    with clock(MEAN):
-        label_ids(geometric_mean(f, g)).cpu()
-    with clock("compare"):
-        uncertain = (
-            model.assertion(f, g, batch.points) if job.share is None else _least(f, g, job.share)
-        )
-        index = uncertain.nonzero()[:, 0]
-    with clock("neighbours"):
-        near = nearest_neighbours(batch.points, index, head.config.neighbours)
-    with clock("head"):
-        h = settle(head, batch.points, f, g, index, near)
+    scores = model(batch)
     with clock("merge"):
-        labels = label_ids(merge(f, g, uncertain, h)).cpu().numpy()
+        labels = label_ids(scores.merged).cpu().numpy()
     with clock("write"):
         job.write(labels)
-    return Timing(clock.seconds, len(f), len(index))
 
-
-def _least(f: Tensor, g: Tensor, share: float) -> Tensor:
-    """(P,) bool: the share of the points that the networks agree on least."""
-    count = round(share * len(f))
-    found = torch.zeros(len(f), dtype=torch.bool, device=f.device)
-    found[cosine_similarity(f, g).topk(count, largest=False).indices] = True
-    return found
+    with clock(MEAN):
+        label_ids(geometric_mean(scores.rv, scores.bev)).cpu()
+    return Timing(dict(clock.seconds), len(labels), int(scores.uncertain.sum()))
 
 
 class _Clock:
-    """Seconds by stage; waits for a GPU to finish before it looks."""
+    """Seconds by stage; waits for a GPU to finish before it is read."""
 
     def __init__(self, device: str) -> None:
-        self.seconds: dict[str, float] = {}
+        self.seconds: dict[str, float] = defaultdict(float)
         self._gpu = device.startswith("cuda")
 
     @contextmanager
@@ -155,102 +173,110 @@ class _Clock:
         yield
         if self._gpu:
             torch.cuda.synchronize()
-        self.seconds[stage] = time.perf_counter() - start
+        self.seconds[stage] += time.perf_counter() - start
 
 
-def _report(job: Job, runs: Sequence[Timing], limits: dict[str, float]) -> dict[str, Any]:
-    stages = {stage: _spread([run.seconds[stage] for run in runs]) for stage in (*STAGES, MEAN)}
-    fusion = _spread(
-        [sum(run.seconds[stage] for stage in FUSION) / run.all for run in runs], unit=1
-    )
-    networks = _spread(
-        [run.all / sum(run.seconds[stage] for stage in NETWORKS) for run in runs], unit=1
-    )
+def _report(job: Job, timings: Sequence[Timing], limits: dict[str, float]) -> dict[str, Any]:
+    stages = {}
+    for stage in (*STAGES, MEAN):
+        stages[stage] = _spread([timing.seconds[stage] for timing in timings], unit=1e3)
+
     flops = _flops(job)
+    networks = {}
+    for name in NETWORKS:
+        speed = flops[name] / stages[name]["median"] / 1e6  # GFLOP/s
+        networks[name] = {
+            "gflop": flops[name] / 1e9,
+            "gflop_per_s": speed,
+            "share_of_limit": speed / limits["float32"],
+        }
+
+    fusion_shares = [_sum(timing, FUSION) / timing.all for timing in timings]
+    over_networks = [timing.all / _sum(timing, NETWORKS) for timing in timings]
     return {
         "engine": job.name,
         "device": job.segmenter.device,
         "threads": torch.get_num_threads(),
-        "runs": len(runs),
-        "points": runs[0].points,
-        "uncertain": runs[0].uncertain,
+        "runs": len(timings),
+        "points": timings[0].points,
+        "uncertain": timings[0].uncertain,
         "stages_ms": stages,
-        "all_ms": _spread([run.all for run in runs]),
-        "fusion_share": fusion,
-        "all_over_networks": networks,
-        "networks": {
-            name: {
-                "gflop": flops[name] / 1e9,
-                "gflop_per_s": (speed := flops[name] / stages[name]["median"] / 1e6),
-                "share_of_limit": speed / limits["float32"],
-            }
-            for name in NETWORKS
-        },
+        "all_ms": _spread([timing.all for timing in timings], unit=1e3),
+        "fusion_share": _spread(fusion_shares, unit=1),
+        "all_over_networks": _spread(over_networks, unit=1),
+        "networks": networks,
         "limit_gflop_per_s": limits,
         "peak_memory_mib": _peak_memory(job.segmenter.device) / MEBIBYTE,
     }
 
 
-def _spread(values: Sequence[float], unit: float = 1e3) -> dict[str, float]:
-    """The median, and between what half of the values lie."""
+def _sum(timing: Timing, stages: Sequence[str]) -> float:
+    return sum(timing.seconds[stage] for stage in stages)
+
+
+def _spread(values: Sequence[float], unit: float) -> dict[str, float]:
+    """Return the median and the quartiles."""
     low, median, high = np.quantile(np.asarray(values) * unit, (0.25, 0.5, 0.75)).tolist()
     return {"median": median, "low": low, "high": high}
 
 
 @torch.inference_mode()
 def _flops(job: Job) -> dict[str, float]:
-    """Floating-point operations of each network for the scan; a multiplication and an addition are two."""
-    model, batch = (
-        job.segmenter.weights.build().to(job.segmenter.device),
-        PointBatch.of([job.read()]),
-    )
-    counted = {}
+    """Return each network's floating-point operations; a multiply-add counts as two."""
+    device = job.segmenter.device
+    model = job.segmenter.weights.build().to(device)
+    batch = PointBatch.of([job.read()]).to(device)
+
+    counts = {}
     for name, score in (("RV", model.score_range_view), ("BEV", model.score_polar_view)):
         with FlopCounterMode(display=False) as counter:
-            score(batch.to(job.segmenter.device))
-        counted[name] = float(counter.get_total_flops())
-    return counted
+            score(batch)
+        counts[name] = float(counter.get_total_flops())
+    return counts
 
 
 def product_limits(device: str) -> dict[str, float]:
-    """The most GFLOP/s of a large matrix product by any way that torch has, by type; on a GPU of bfloat16 too."""
+    """Return the GFLOP/s of a large matrix product, the fastest way that torch has, by type.
+
+    The types are float32, and on a GPU bfloat16.
+    """
     types = [torch.float32, torch.bfloat16] if device.startswith("cuda") else [torch.float32]
     rows, inner, columns = PRODUCT
     limits = {}
     for kind in types:
-        x, w = (
-            torch.randn(rows, inner, dtype=kind, device=device),
-            torch.randn(columns, inner, dtype=kind, device=device),
-        )
-        ways = (lambda x=x, w=w: x @ w.T), (lambda x=x, w=w: linear(x, w, None))
-        seconds = min(_fastest(way, device) for way in ways)
+        x = torch.randn(rows, inner, dtype=kind, device=device)
+        weight = torch.randn(columns, inner, dtype=kind, device=device)
+        seconds = min(_fastest(_matmul, x, weight), _fastest(linear, x, weight))
         limits[str(kind).removeprefix("torch.")] = 2 * rows * inner * columns / seconds / 1e9
     return limits
 
 
+def _matmul(x: Tensor, weight: Tensor, bias: None) -> Tensor:
+    return x @ weight.T
+
+
 @torch.inference_mode()
-def _fastest(function: Callable[[], object], device: str) -> float:
+def _fastest(product: Callable[[Tensor, Tensor, None], Tensor], x: Tensor, weight: Tensor) -> float:
+    """Return the seconds of the fastest of a few runs."""
     seconds = []
     for _ in range(PRODUCT_RUNS):
-        clock = _Clock(device)
+        clock = _Clock(str(x.device))
         with clock("product"):
-            function()
+            product(x, weight, None)
         seconds.append(clock.seconds["product"])
     return min(seconds)
 
 
 def _peak_memory(device: str) -> int:
-    """Bytes that the process has taken at most; on a GPU, of its memory."""
+    """Return the peak memory in bytes: of the GPU, or of the process."""
     return torch.cuda.max_memory_allocated(device) if device.startswith("cuda") else peak_memory()
 
 
 def untrained(recipe: Recipe) -> Weights:
-    """Random weights of a recipe's sizes, to time them."""
+    """Return random weights of a recipe's sizes, to time them."""
     taxonomy = TAXONOMIES[recipe.taxonomy]
     model = build_amvnet(recipe.model, taxonomy.size)
-    tensors = {
-        key: value
-        for part in PARTS
-        for key, value in part_state(part, getattr(model, part)).items()
-    }
+    tensors: dict[str, Tensor] = {}
+    for part in PARTS:
+        tensors |= part_state(part, getattr(model, part))
     return Weights(recipe.model, taxonomy, recipe.sensor, tensors)

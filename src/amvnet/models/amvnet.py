@@ -1,26 +1,45 @@
-"""AMVNet: two networks look at a scan in two projections; where they disagree, the point head decides."""
+"""AMVNet: two networks segment a scan in two projections, and a point head settles disputes."""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
-from amvnet.models.point_head import PointHead, nearest_neighbours, point_table, select_used_points
+from amvnet.models.methods import geometric_mean
+from amvnet.models.point_head import (
+    PointHead,
+    nearest_neighbours,
+    point_table,
+    select_used_points,
+)
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
-from amvnet.models.streams import Arrangement, in_turn
+from amvnet.models.streams import Arrangement, one_after_the_other
 from amvnet.models.views.points import PointBatch
-from amvnet.models.views.polar_view import PolarView
-from amvnet.models.views.range_view import RangeView
+from amvnet.models.views.polar_view import PolarGrid, PolarView
+from amvnet.models.views.range_view import RangeImage, RangeView
+
+Watch = Callable[[str], AbstractContextManager[Any]]  # entered around each step, by its name
 
 
 @dataclass(frozen=True)
 class Scores:
-    """What AMVNet finds for P points: merged, and f and g of the networks that were asked: (P, K); uncertain: (P,)."""
+    """Class probabilities of P points.
+
+    Attributes:
+        merged: (P, K) of AMVNet, or of the method that was asked for.
+        uncertain: (P,) bool, the points that the point head settles.
+        rv: (P, K) f, of the range view's network; None if it did not run.
+        bev: (P, K) g, of the bird's-eye view's network; None if it did not run.
+    """
 
     merged: Tensor
     uncertain: Tensor
@@ -28,11 +47,96 @@ class Scores:
     bev: Tensor | None
 
 
-class AMVNet(nn.Module):
-    """The whole method (section 3 of the paper) around parts that are built outside and do not know each other."""
+def unwatched(name: str) -> AbstractContextManager[None]:
+    """Do nothing around a step."""
+    return nullcontext()
+
+
+def step(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Mark a method as a step, around which `LateFusion.watch` is entered."""
+
+    def mark(method: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(method)
+        def watched(self: LateFusion, *args: Any) -> Any:
+            with self.watch(name):
+                return method(self, *args)
+
+        return watched
+
+    return mark
+
+
+class LateFusion(nn.Module):
+    """The fusion of any two networks' scores (sections 3.2 and 3.3 of the paper).
+
+    Args:
+        assertion: says which points are uncertain.
+        point_head: settles these; without one, the result is the ensemble.
+
+    Attributes:
+        watch: a context manager for each step, by name, to time the steps; does nothing by default.
+    """
+
+    def __init__(self, assertion: Assertion, point_head: PointHead | None) -> None:
+        super().__init__()
+        self.assertion = assertion
+        self.point_head = point_head
+        self.watch: Watch = unwatched
+
+    def fuse(self, batch: PointBatch, f: Tensor, g: Tensor) -> Scores:  # f, g: (P, K)
+        uncertain = self.compare(batch, f, g)
+        h = self.refine(batch, f, g, uncertain)
+        return Scores(self.merge(f, g, uncertain, h), uncertain, f, g)
+
+    @step("compare")
+    def compare(self, batch: PointBatch, f: Tensor, g: Tensor) -> Tensor:
+        """Return u: (P,) bool, the uncertain points."""
+        return self.assertion(f, g, batch.points)
+
+    def refine(self, batch: PointBatch, f: Tensor, g: Tensor, uncertain: Tensor) -> Tensor | None:
+        """Return h: (U, K) class probabilities of the uncertain points; None without a head."""
+        if self.point_head is None:
+            return None
+
+        # The neighbours of a point are points of its own scan.
+        parts = []
+        for scan in batch.slices():
+            points = batch.points[scan]
+            index = uncertain[scan].nonzero()[:, 0]  # (U,)
+            near = self.find_neighbours(points, index)  # (U, n)
+            parts.append(self.settle(points, f[scan], g[scan], index, near))
+        return torch.cat(parts)
+
+    @step("neighbours")
+    def find_neighbours(self, points: Tensor, index: Tensor) -> Tensor:
+        assert self.point_head is not None
+        return nearest_neighbours(points, index, self.point_head.config.neighbours)
+
+    @step("head")
+    def settle(self, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
+        """Return (U, K) for the points `index` (U,) of one scan, with neighbours `near` (U, n)."""
+        assert self.point_head is not None
+        used, (index, near) = select_used_points(len(points), index, near)
+        table = point_table(
+            points.index_select(0, used), f.index_select(0, used), g.index_select(0, used)
+        )
+        return self.point_head.score(table, index, near).softmax(dim=1)
+
+    @step("merge")
+    def merge(self, f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
+        return merge(f, g, uncertain, h)
+
+
+class AMVNet(LateFusion):
+    """The whole method (section 3), around parts that are built outside and do not know each other.
+
+    Attributes:
+        arrange: runs the two networks; one after the other by default.
+    """
 
     def __init__(
         self,
+        *,
         range_view: RangeView,
         polar_view: PolarView,
         range_net: nn.Module,
@@ -40,89 +144,64 @@ class AMVNet(nn.Module):
         assertion: Assertion,
         point_head: PointHead | None,
     ) -> None:
-        super().__init__()
-        self.range_view, self.polar_view = range_view, polar_view
-        self.range_net, self.polar_net = range_net, polar_net
-        self.assertion, self.point_head = assertion, point_head
-        self.run: Arrangement = in_turn
+        super().__init__(assertion, point_head)
+        self.range_view = range_view
+        self.polar_view = polar_view
+        self.range_net = range_net
+        self.polar_net = polar_net
+        self.arrange: Arrangement = one_after_the_other
 
     def forward(self, batch: PointBatch) -> Scores:
-        f, g = self.run(self.score_range_view, self.score_polar_view, batch)
-        uncertain = self.assertion(f, g, batch.points)
+        image, grid = self.project(batch)
+        f, g = self.score(image, grid)
+        uncertain = self.compare(batch, f, g)
         h = self.refine(batch, f, g, uncertain)
-        return Scores(merge(f, g, uncertain, h), uncertain, f, g)
+        y = self.merge(f, g, uncertain, h)
+        return Scores(y, uncertain, f, g)
+
+    @step("project")
+    def project(self, batch: PointBatch) -> tuple[RangeImage, PolarGrid]:
+        return self.range_view.project(batch), self.polar_view.project(batch)
+
+    def score(self, image: RangeImage, grid: PolarGrid) -> tuple[Tensor, Tensor]:
+        """Return f and g: (P, K) class probabilities by the two networks."""
+        return self.arrange(lambda: self.score_range(image), lambda: self.score_polar(grid))
+
+    @step("RV")
+    def score_range(self, image: RangeImage) -> Tensor:  # (P, K)
+        return image.to_points(self.range_net(image.image)).float().softmax(dim=1)
+
+    @step("BEV")
+    def score_polar(self, grid: PolarGrid) -> Tensor:  # (P, K)
+        return grid.to_points(self.polar_net(grid)).float().softmax(dim=1)
 
     def score_range_view(self, batch: PointBatch) -> Tensor:
-        """f: (P, K) class probabilities by the range view."""
-        view = self.range_view.project(batch)
-        return view.to_points(self.range_net(view.image)).float().softmax(dim=1)
+        """Return f: (P, K) class probabilities by the range view alone."""
+        return self.score_range(self.range_view.project(batch))
 
     def score_polar_view(self, batch: PointBatch) -> Tensor:
-        """g: (P, K) class probabilities by the bird's-eye view."""
-        view = self.polar_view.project(batch)
-        return view.to_points(self.polar_net(view)).float().softmax(dim=1)
-
-    def refine(self, batch: PointBatch, f: Tensor, g: Tensor, uncertain: Tensor) -> Tensor | None:
-        """h: (U, K) class probabilities of the uncertain points by the point head; None without one."""
-        if self.point_head is None:
-            return None
-        parts = [
-            refine(self.point_head, batch.points[s], f[s], g[s], uncertain[s])
-            for s in batch.slices()
-        ]
-        return torch.cat(parts)
-
-
-def refine(head: PointHead, points: Tensor, f: Tensor, g: Tensor, uncertain: Tensor) -> Tensor:
-    """h: (U, K) class probabilities of one scan's uncertain points, from themselves and their neighbours."""
-    index = uncertain.nonzero()[:, 0]
-    near = nearest_neighbours(points, index, head.config.neighbours)
-    return settle(head, points, f, g, index, near)
-
-
-def settle(
-    head: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor
-) -> Tensor:
-    """h: (U, K) of the points with these indices (U,), whose neighbours are (U, n)."""
-    asked, (index, near) = select_used_points(len(points), index, near)
-    table = point_table(*(values.index_select(0, asked) for values in (points, f, g)))
-    return head.score(table, index, near).softmax(dim=1)
+        """Return g: (P, K) class probabilities by the bird's-eye view alone."""
+        return self.score_polar(self.polar_view.project(batch))
 
 
 def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
-    """y: the head's scores for the uncertain points, the geometric mean of f and g for the others."""
+    """Return y: h for the uncertain points, the geometric mean of f and g for the others."""
     y = geometric_mean(f, g)
     if h is None:
         return y
-    # The second takes a processor twice the time, the first has it wait for a GPU.
-    return y.index_put((uncertain,), h) if y.is_cpu else y.masked_scatter(uncertain[:, None], h)
-
-
-def geometric_mean(f: Tensor, g: Tensor) -> Tensor:
-    """The ensemble that AMVNet rests on; all ensembles take and give (P, K)."""
-    return torch.sqrt(f * g)
-
-
-def arithmetic_mean(f: Tensor, g: Tensor) -> Tensor:
-    """An ensemble to compare with."""
-    return (f + g) / 2
-
-
-def maximum(f: Tensor, g: Tensor) -> Tensor:
-    """An ensemble to compare with."""
-    return torch.maximum(f, g)
-
-
-ENSEMBLES = {"arithmetic": arithmetic_mean, "maximum": maximum, "ensemble": geometric_mean}
+    if y.is_cpu:
+        return y.index_put((uncertain,), h)
+    # `index_put` would wait for a GPU; this takes twice the time on a CPU.
+    return y.masked_scatter(uncertain[:, None], h)
 
 
 def build_amvnet(config: ModelConfig, classes: int) -> AMVNet:
-    """AMVNet with fresh weights, for K classes."""
+    """Return AMVNet with fresh weights, for K classes."""
     return AMVNet(
-        RangeView(config.range_view),
-        PolarView(config.polar_view),
-        RangeNet(config.range_net, classes),
-        PolarNet(config.polar_net, config.polar_view.vertical, classes),
-        build_assertion(config.assertion),
-        PointHead(config.point_head, classes),
+        range_view=RangeView(config.range_view),
+        polar_view=PolarView(config.polar_view),
+        range_net=RangeNet(config.range_net, classes),
+        polar_net=PolarNet(config.polar_net, config.polar_view.vertical, classes),
+        assertion=build_assertion(config.assertion),
+        point_head=PointHead(config.point_head, classes),
     )

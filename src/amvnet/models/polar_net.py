@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -36,11 +38,14 @@ class PolarNet(nn.Module):
         self.up = nn.ModuleList(_double(channels, fine) for channels, fine in reversed(ups))
         self.drop = DropBlock(c.dropblock, c.dropblock_size)
         self.scores = nn.Conv2d(c.widths[0], vertical * classes, 1)
+        # What runs the U-Net: its own method, or an engine's compiled or exported equivalent.
+        self.run_unet: Callable[[Tensor], Tensor] | None = None
 
     def forward(self, grid: PolarGrid) -> Tensor:
         pillars = self.compress(self.pool(grid))  # (M, pillar)
         # An empty pillar has no point to score, and most are empty.
-        return self.score(grid.at_pillars(self.unet(grid.to_map(pillars))))
+        run_unet = self.unet if self.run_unet is None else self.run_unet
+        return self.score(grid.at_pillars(run_unet(grid.to_map(pillars))))
 
     def pool(self, grid: PolarGrid) -> Tensor:  # (M, point_widths[-1])
         if torch.is_grad_enabled():

@@ -1,4 +1,4 @@
-"""In what order the two networks run: one after the other, or side by side on a GPU's streams."""
+"""How the two networks run: one after the other, or at the same time on two CUDA streams."""
 
 from __future__ import annotations
 
@@ -8,27 +8,24 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from amvnet.models.views.points import PointBatch
-
-Score = Callable[[PointBatch], Tensor]
+Score = Callable[[], Tensor]  # runs one network; returns (P, K)
 
 
 class Arrangement(Protocol):
-    """Runs two scorers of a batch, and hands back what both found, in their order."""
+    """Runs the networks of both views, and returns their scores in this order."""
 
-    def __call__(self, first: Score, second: Score, batch: PointBatch) -> tuple[Tensor, Tensor]: ...
-
-
-def in_turn(first: Score, second: Score, batch: PointBatch) -> tuple[Tensor, Tensor]:
-    """One after the other."""
-    return first(batch), second(batch)
+    def __call__(self, score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]: ...
 
 
-class SideBySide:
-    """The first on a stream of its own, the second meanwhile on the current one.
+def one_after_the_other(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
+    """Run the range view's network first, then the bird's-eye view's."""
+    f = score_range()
+    g = score_polar()
+    return f, g
 
-    The second is the one that may wait for its own stream (the bird's-eye view counts the pillars with points): the
-    first has been handed to the GPU by then.
+
+class TwoStreams:
+    """Runs the range view's network on a stream of its own while the other one runs.
 
     Args:
         device: a CUDA device.
@@ -38,16 +35,16 @@ class SideBySide:
         self.device = torch.device(device)
         self.side = torch.cuda.Stream(self.device)
 
-    def __call__(self, first: Score, second: Score, batch: PointBatch) -> tuple[Tensor, Tensor]:
-        here = torch.cuda.current_stream(self.device)
-        self.side.wait_stream(here)  # until the points are there
+    def __call__(self, score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
+        current = torch.cuda.current_stream(self.device)
+
+        self.side.wait_stream(current)  # the projected points must be there
         with torch.cuda.stream(self.side):
-            f = first(batch)
-        g = second(batch)
-        here.wait_stream(
-            self.side
-        )  # from here on, so that the points' memory is free for others only after both
-        f.record_stream(
-            here
-        )  # its memory is of the other stream, which must not use it again before this one is done
+            f = score_range()
+        g = score_polar()
+
+        # From here on, and so that the inputs' memory is reused only after both networks.
+        current.wait_stream(self.side)
+        # The memory of f belongs to the side stream, which must not reuse it too early.
+        f.record_stream(current)
         return f, g

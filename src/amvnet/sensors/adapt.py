@@ -14,10 +14,10 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
+from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
 from amvnet.sensors.measure import Measured, elevations, measure
-from amvnet.weights.file import Weights
 
 MEASURED = 5  # scans of a source that are measured; then their median stays
 STEADY = (
@@ -56,13 +56,16 @@ class ScanAdapter:
 
     def __init__(
         self,
-        weights: Weights,
+        view: RangeViewConfig,
+        trained_for: str = "",
         given: Sensor | None = None,
-        say: Callable[[str], None] = lambda line: None,
+        say: Say = say_nothing,
     ) -> None:
-        self.given, self._say = given or Sensor(), say
-        self.trained, self.height = SENSORS.get(weights.sensor), HEIGHTS.get(weights.sensor)
-        self._view = weights.model.range_view
+        self.given = given or Sensor()
+        self._say = say
+        self.trained = SENSORS.get(trained_for)
+        self.height = HEIGHTS.get(trained_for)
+        self._view = view
         self._sources: dict[tuple[str, float | None], _Source] = {}
 
     def __call__(self, cloud: Cloud, source: str) -> Scan:

@@ -19,8 +19,8 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.distributed import ALONE, Processes, device_of
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
-from amvnet.models.amvnet import geometric_mean
 from amvnet.models.assertions import Assertion, build_assertion
+from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan

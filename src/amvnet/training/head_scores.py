@@ -1,4 +1,4 @@
-"""Whose scores the point head learns to settle: frozen networks, or two other models' scores in files."""
+"""The scores that the point head learns from: of frozen networks, or of two models in files."""
 
 from __future__ import annotations
 
@@ -19,17 +19,16 @@ from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights
 
-Scorer = Callable[
-    [ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]
-]  # f and g of a scan's valid points, (P, K)
+# Takes a scan and the batch of its P valid points; returns f and g, (P, K).
+Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]
 
 
 class ScoreSource(Protocol):
-    """Anything that gives f and g of some scans.
+    """Gives f and g of some scans.
 
     Attributes:
         records: the scans.
-        augmented: whether it can score them augmented, too.
+        augmented: whether it can score augmented scans too.
     """
 
     @property
@@ -39,7 +38,7 @@ class ScoreSource(Protocol):
     def augmented(self) -> bool: ...
 
     def scorer(self, device: str) -> Scorer:
-        """What scores a scan on a device, when it is asked."""
+        """Return what scores a scan on a device."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +51,16 @@ class NetworkScores:
 
     def scorer(self, device: str) -> Scorer:
         model = self.weights.build().to(device)
-        return lambda record, scan, batch: (
-            model.score_range_view(batch),
-            model.score_polar_view(batch),
-        )
+
+        def score(record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
+            return model.score(*model.project(batch))
+
+        return score
 
 
 @dataclass(frozen=True)
 class FileScores:
-    """Two other models' scores in files, of the scans as they are."""
+    """Two other models' scores in files, of scans without augmentation."""
 
     pair: ScorePair
     records: Sequence[ScanRecord]
@@ -69,36 +69,41 @@ class FileScores:
 
     def scorer(self, device: str) -> Scorer:
         def score(record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
-            found = self.pair.read(Path(record.prediction), scan, self.classes)
-            f, g = (torch.from_numpy(one[scan.valid]).clamp_min(SURE).to(device) for one in found)
-            return f, g
+            f, g = self.pair.read(Path(record.prediction), scan, self.classes)
+            f_valid = torch.from_numpy(f[scan.valid]).clamp_min(SURE)
+            g_valid = torch.from_numpy(g[scan.valid]).clamp_min(SURE)
+            return f_valid.to(device), g_valid.to(device)
 
         return score
 
 
 def score_source(
-    networks: Weights, scores: ScorePair | None, records: Sequence[ScanRecord]
+    weights: Weights, scores: ScorePair | None, records: Sequence[ScanRecord]
 ) -> ScoreSource:
-    """The networks, or files of scores where there are any.
+    """Return the scores in files if there are any, else those of the networks.
 
     Raises:
-        InputError: where there are no files, and a network is missing.
+        InputError: if there are no files, and a network is missing.
     """
     if scores is not None:
-        return FileScores(scores, records, networks.taxonomy.size)
-    if missing := [part for part in ("range_net", "polar_net") if part not in networks.parts]:
-        raise InputError(
-            f"expected trained networks for the head, found no {missing[0]}; train it, or give --init"
-        )
-    return NetworkScores(networks, records)
+        return FileScores(scores, records, weights.taxonomy.size)
+    for part in ("range_net", "polar_net"):
+        if part not in weights.parts:
+            raise InputError(
+                f"expected trained networks for the head, found no {part}; train it, or give --init"
+            )
+    return NetworkScores(weights, records)
 
 
-def scorer_with_head(networks: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
-    """The (P, K) scores of a batch by AMVNet whose head is being trained."""
-    model = networks.build()
+def scorer_with_head(weights: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
+    """Return what gives the (P, K) scores of a batch by AMVNet while its head is trained."""
+    model = weights.build()
     model.point_head = head
-    if (
-        networks.model.assertion.name == "loss"
-    ):  # which needs labels, that a picture of a prediction must not know
+    if weights.model.assertion.name == "loss":
+        # It needs labels, which a picture of a prediction must not use.
         model.assertion = Disagreement()
-    return lambda batch: model.to(batch.points.device)(batch).merged
+
+    def score(batch: PointBatch) -> Tensor:
+        return model.to(batch.points.device)(batch).merged
+
+    return score

@@ -1,4 +1,4 @@
-"""What the folder of a run says of it: its recipe, what each call made of what, and how to make it again."""
+"""What the folder of a run records: its recipe, what each call made of what, and how to repeat it."""
 
 from __future__ import annotations
 
@@ -6,133 +6,144 @@ import hashlib
 import platform
 import shlex
 from collections.abc import Sequence
-from importlib import metadata
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from amvnet.config.nested import to_dict
-from amvnet.config.schema import Recipe
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.inference.score_files import ScorePair
 from amvnet.training.fit import LAST
+from amvnet.training.run_plan import RunPlan
 from amvnet.weights.file import SIZES, Weights
 
 SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with
+PACKAGES = ("amvnet", "torch", "lightning", "numpy")
 
 
-def write_record(
-    out: Path,
-    recipe: Recipe,
-    dataset: Dataset,
-    train: Sequence[ScanRecord],
-    val: Sequence[ScanRecord],
-    stage: str,
-    init: Weights | None,
-    scores: ScorePair | None = None,
-) -> None:
-    """Write the recipe, and in run.yaml with what a stage (or all) is made, on what, and how to make it again."""
-    # Another call of this folder may have trained another stage on other scans: its entry stays, before this one.
-    earlier = {key: value for key, value in _calls(out / "run.yaml").items() if key != stage}
-    said = {
-        "repeat": shlex.join(map(str, _repeat(out, dataset, train, val, stage, init, scores))),
-        "versions": {
-            name: metadata.version(name) for name in ("amvnet", "torch", "lightning", "numpy")
-        },
+def write_record(plan: RunPlan, stage: str, init: Weights | None) -> None:
+    """Write recipe.yaml, and the entry of a stage (or "all") in run.yaml.
+
+    The entry says what is made, on which data, and by which command it can be repeated.
+    """
+    dataset = plan.scans.dataset
+    entry: dict[str, Any] = {
+        "repeat": shlex.join(_repeat_command(plan, stage, init is not None)),
+        "versions": {name: version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "data": str(dataset.root),
         "classes": dataset.taxonomy.name,
-        "train": sequence_names(train),
-        "val": sequence_names(val),
+        "train": sequence_names(plan.scans.train),
+        "val": sequence_names(plan.scans.val),
         "init": None if init is None else {part: init.digest(part) for part in init.parts},
-        **({} if scores is None else {"scores": scores.said()}),
     }
-    for name, tree in {
-        "recipe.yaml": to_dict(recipe),
-        "run.yaml": {**earlier, stage: said},
-    }.items():
-        with atomic_write(out / name) as part:
-            part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
+    if plan.scores is not None:
+        entry["scores"] = plan.scores.to_dict()
+
+    # Another call may have trained another stage on other scans: its entry stays, before this one.
+    entries = _entries(plan.out / "run.yaml")
+    entries.pop(stage, None)
+    entries[stage] = entry
+    _write_yaml(plan.out / "recipe.yaml", to_dict(plan.recipe))
+    _write_yaml(plan.out / "run.yaml", entries)
 
 
-def _calls(path: Path) -> dict[str, Any]:
-    """What run.yaml holds so far, by stage; nothing where it cannot be read."""
+def _write_yaml(path: Path, tree: dict[str, Any]) -> None:
+    with atomic_write(path) as part:
+        part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
+
+
+def _entries(path: Path) -> dict[str, Any]:
+    """Return what run.yaml holds so far, by stage; nothing if it cannot be read."""
     try:
-        found = yaml.safe_load(path.read_text())
+        entries = yaml.safe_load(path.read_text())
     except (OSError, ValueError, yaml.YAMLError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return entries if isinstance(entries, dict) else {}
 
 
-def _repeat(
-    out: Path,
-    dataset: Dataset,
-    train: Sequence[ScanRecord],
-    val: Sequence[ScanRecord],
-    stage: str,
-    init: Weights | None,
-    scores: ScorePair | None,
-) -> list[Any]:
-    """The command that makes a run again."""
-    validated = ["--val-sequences", ",".join(sequence_names(val))] if val else ["--with-val"]
-    return [
-        *("amvnet", "train", out / "recipe.yaml", "--data", dataset.root, "--stage", stage),
-        *("--train-sequences", ",".join(sequence_names(train)), *validated),
-        # Weights that were given have no name here; their digests tell whether it is they.
-        *([] if init is None else ["--init", "WEIGHTS"]),
-        *([] if scores is None else scores.options()),
-        *("--out", f"{out}-again"),
-    ]
+def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
+    """Return the command that repeats a run."""
+    scans = plan.scans
+    command = ["amvnet", "train", str(plan.out / "recipe.yaml")]
+    command += ["--data", str(scans.dataset.root), "--stage", stage]
+    command += ["--train-sequences", ",".join(sequence_names(scans.train))]
+    if scans.val:
+        command += ["--val-sequences", ",".join(sequence_names(scans.val))]
+    else:
+        command += ["--with-val"]
+    if has_init:
+        # The file of the initial weights has no name here; run.yaml has the digests of its parts.
+        command += ["--init", "WEIGHTS"]
+    if plan.scores is not None:
+        command += plan.scores.options()
+    return [*command, "--out", f"{plan.out}-again"]
 
 
-def stage_settings(
-    recipe: Recipe,
-    name: str,
-    part: str,
-    train: Sequence[ScanRecord],
-    val: Sequence[ScanRecord],
-    current: Weights,
-    scores: ScorePair | None = None,
-) -> dict[str, Any]:
-    """What the weights of a stage depend on; the data may move to another folder meanwhile."""
-    tree = to_dict(recipe)
-    training = {key: tree["training"][key] for key in (name, "augment", "seed", "precision")}
-    found = {"model": {key: tree["model"][key] for key in SIZES[part]}, "training": training}
-    found["scans"] = {"train": _digest_of_scans(train), "val": _digest_of_scans(val)}
-    if scores is not None:
-        found["scores"] = scores.digests([*train, *val])
+def stage_settings(plan: RunPlan, name: str, part: str, weights: Weights) -> dict[str, Any]:
+    """Return what the weights of a stage depend on.
+
+    The data may move to another folder meanwhile.
+
+    Args:
+        name: of the stage.
+        part: of the weights, which the stage trains.
+        weights: what the stage begins with.
+    """
+    recipe = to_dict(plan.recipe)
+    train = plan.scans.train
+    val = plan.scans.val
+    settings: dict[str, Any] = {
+        "model": {key: recipe["model"][key] for key in SIZES[part]},
+        "training": {
+            key: recipe["training"][key] for key in (name, "augment", "seed", "precision")
+        },
+        "scans": {"train": _digest_of_scans(train), "val": _digest_of_scans(val)},
+    }
+    if plan.scores is not None:
+        settings["scores"] = plan.scores.digests([*train, *val])
     elif name == "head":
-        found["networks"] = {
-            network: current.digest(network) for network in ("range_net", "polar_net")
+        settings["networks"] = {
+            network: weights.digest(network) for network in ("range_net", "polar_net")
         }
-    return found
+    return settings
 
 
-def check_begun(folder: Path, now: dict[str, Any], resume: bool) -> None:
-    """Raises InputError where a folder holds a stage of a run that is not to be resumed, or of another run."""
+def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
+    """Check that a stage can begin, or resume, in a folder.
+
+    Raises:
+        InputError: if the folder holds a stage that is not to be resumed, or of another run.
+    """
     if not (folder / LAST).is_file():
         return
     if not resume:
         raise InputError(
             f"{folder}: expected no earlier run, found one; add --resume or give another"
         )
-    begun = yaml.safe_load((folder / SETTINGS).read_text()) if (folder / SETTINGS).is_file() else {}
-    if begun != now:
-        other = ", ".join(key for key in now if begun.get(key) != now[key])
-        raise InputError(f"{folder}: expected what it was begun with ({SETTINGS}), found another {other}; "
-                         "resume it with that, or give another folder")  # fmt: skip
+
+    path = folder / SETTINGS
+    begun = yaml.safe_load(path.read_text()) if path.is_file() else {}
+    if begun != settings:
+        changed = [key for key in settings if begun.get(key) != settings[key]]
+        raise InputError(
+            f"{folder}: expected what it was begun with ({SETTINGS}), "
+            f"found another {', '.join(changed)}; resume it with that, or give another folder"
+        )
 
 
 def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
-    """The sequences of some scans."""
+    """Return the sequences of some scans, sorted."""
     return sorted({record.sequence for record in records})
 
 
 def _digest_of_scans(records: Sequence[ScanRecord]) -> str:
-    """Tells scans from other ones by their names and sizes."""
-    paths = [(record.name, record.points_path) for record in records]
-    known = [(name, path.stat().st_size if path.is_file() else None) for name, path in paths]
-    return hashlib.sha256(repr(known).encode()).hexdigest()[:16]
+    """Return a digest of the names and sizes of some scans."""
+    sizes = []
+    for record in records:
+        path = record.points_path
+        sizes.append((record.name, path.stat().st_size if path.is_file() else None))
+    return hashlib.sha256(repr(sizes).encode()).hexdigest()[:16]

@@ -3,94 +3,123 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from amvnet.config.schema import Recipe
-from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.distributed import ALONE, Processes
-from amvnet.evaluation import scoring as jobs
+from amvnet.data.datasets.select import TrainingScans
 from amvnet.evaluation.analysis import Swept
 from amvnet.evaluation.metrics import metrics
+from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
+from amvnet.progress import Say, say_nothing
 from amvnet.training.run import Run
+from amvnet.training.run_plan import RunOptions, RunPlan
 from amvnet.weights.file import Weights
 
 
-def sweep_neighbours(
-    recipe: Recipe,
-    weights: Weights,
-    dataset: Dataset,
-    train: Sequence[ScanRecord],
-    val: Sequence[ScanRecord],
-    values: Sequence[int],
-    out: Path,
-    say: Callable[[str], None] = lambda line: None,
-    device: str = "cpu",
-) -> Iterator[Swept]:
-    """Train a head for each number of neighbours, with the networks of the weights, and score it.
+@dataclass(frozen=True)
+class NeighbourStudy:
+    """Heads for different numbers of neighbours (Fig. 8 of the paper).
 
     Each is kept in OUT/neighbours/N; those that are finished are not trained again.
 
-    Raises:
-        InputError: where OUT holds heads for other networks, other scans or another recipe.
+    Attributes:
+        recipe: how the heads are trained.
+        weights: whose networks they are trained for.
+        scans: to train on, and to score.
+        out: the folder of the analysis.
     """
-    # Folds would train networks of their own.
-    training = dataclasses.replace(
-        recipe.training, head=dataclasses.replace(recipe.training.head, folds=1)
-    )
-    for n in values:
-        head = dataclasses.replace(weights.model.point_head, neighbours=n)
-        model = dataclasses.replace(weights.model, point_head=head)
-        networks = Weights(model, weights.taxonomy, weights.sensor)
-        for part in ("range_net", "polar_net"):
-            networks = networks.replace_part(part, weights)
-        changed = dataclasses.replace(recipe, model=model, training=training)
-        run = Run(changed, dataset, train, val, out / "neighbours" / str(n), True, say)
+
+    recipe: Recipe
+    weights: Weights
+    scans: TrainingScans
+    out: Path
+
+    def check(self) -> None:
+        """Raise InputError if the recipe does not fit the scans."""
+        RunPlan(self.recipe, self.scans, self.out)
+
+    def sweep(
+        self, numbers: Sequence[int], say: Say = say_nothing, device: str = "cpu"
+    ) -> Iterator[Swept]:
+        """Train a head for each number of neighbours, and yield its figures.
+
+        Raises:
+            InputError: if OUT holds heads for other networks, other scans or another recipe.
+        """
+        for number in numbers:
+            yield self._score(number, say, device)
+
+    def _score(self, number: int, say: Say, device: str) -> Swept:
+        networks = self._networks(number)
+        # Folds would train networks of their own.
+        head = dataclasses.replace(self.recipe.training.head, folds=1)
+        training = dataclasses.replace(self.recipe.training, head=head)
+        recipe = dataclasses.replace(self.recipe, model=networks.model, training=training)
+        out = self.out / "neighbours" / str(number)
+        run = Run(RunPlan(recipe, self.scans, out, RunOptions(resume=True, say=say)))
+
         segmenter = Segmenter(run.stages("head", networks), device)
-        found = jobs.evaluate(dataset, val, jobs.label_by_weights(dataset, segmenter))
-        yield Swept.of(
-            n, found.uncertain / max(found.asked, 1), found.matrices["amvnet"][0], dataset.taxonomy
+        dataset = self.scans.dataset
+        evaluation = evaluate(dataset, self.scans.val, label_by_weights(dataset, segmenter))
+        uncertain = evaluation.uncertain / max(evaluation.asked, 1)
+        matrix = evaluation.matrices["amvnet"][0]
+        return Swept.of(number, uncertain, matrix, dataset.taxonomy)
+
+    def _networks(self, number: int) -> Weights:
+        """Return the weights without their head, for a head with a number of neighbours."""
+        model = self.weights.model
+        head = dataclasses.replace(model.point_head, neighbours=number)
+        networks = Weights(
+            dataclasses.replace(model, point_head=head), self.weights.taxonomy, self.weights.sensor
         )
+        for part in ("range_net", "polar_net"):
+            networks = networks.replace_part(part, self.weights)
+        return networks
 
 
 def ablate(
     recipe: Recipe,
-    dataset: Dataset,
-    train: Sequence[ScanRecord],
-    val: Sequence[ScanRecord],
+    scans: TrainingScans,
     out: Path,
-    say: Callable[[str], None] = lambda line: None,
-    bars: bool = False,
+    options: RunOptions,
     device: str = "cpu",
-    processes: Processes = ALONE,
 ) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
     """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
 
-    Each is kept in a folder of OUT; a later call goes on where this one stopped.
+    Each is kept in a folder of OUT; a later call continues an interrupted one.
 
     Yields:
-        whether with the GRU, whether with class weights, and the figures as `evaluation.metrics` has them.
+        Whether with the GRU, whether with class weights, and the figures of `metrics`.
 
     Raises:
-        InputError: where OUT holds runs on other scans or of another recipe.
+        InputError: if OUT holds runs on other scans or of another recipe.
     """
     for gru, weighted in ((False, False), (True, False), (False, True), (True, True)):
-        model = dataclasses.replace(
-            recipe.model, range_net=dataclasses.replace(recipe.model.range_net, gru=gru)
+        name = "rv" + ("-gru" if gru else "") + ("-weights" if weighted else "")
+        options.say(f"{name}:")
+        plan = RunPlan(_ablated(recipe, gru, weighted), scans, out / name, options)
+        path = Run(plan).stages("rv")
+
+        segmenter = Segmenter(path, options.processes.device(device), "rv")
+        evaluation = evaluate(
+            scans.dataset,
+            scans.val,
+            label_by_weights(scans.dataset, segmenter),
+            processes=options.processes,
         )
-        rv = dataclasses.replace(recipe.training.rv, class_weights=weighted)
-        changed = dataclasses.replace(
-            recipe, model=model, training=dataclasses.replace(recipe.training, rv=rv)
-        )
-        name = "-".join(["rv", *(["gru"] if gru else []), *(["weights"] if weighted else [])])
-        say(f"{name}:")
-        path = Run(changed, dataset, train, val, out / name, True, say, bars, processes).stages(
-            "rv"
-        )
-        segmenter = Segmenter(path, processes.device(device), "rv")
-        scored = jobs.evaluate(
-            dataset, val, jobs.label_by_weights(dataset, segmenter), processes=processes
-        )
-        yield gru, weighted, metrics(scored.matrices["rv"][0], dataset.taxonomy)
+        yield gru, weighted, metrics(evaluation.matrices["rv"][0], scans.dataset.taxonomy)
+
+
+def _ablated(recipe: Recipe, gru: bool, weighted: bool) -> Recipe:
+    """Return a recipe with or without the GRU and the class weights of the range view."""
+    range_net = dataclasses.replace(recipe.model.range_net, gru=gru)
+    rv = dataclasses.replace(recipe.training.rv, class_weights=weighted)
+    return dataclasses.replace(
+        recipe,
+        model=dataclasses.replace(recipe.model, range_net=range_net),
+        training=dataclasses.replace(recipe.training, rv=rv),
+    )

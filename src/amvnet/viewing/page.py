@@ -18,7 +18,7 @@ import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.files import atomic_write
-from amvnet.inference.methods import TITLES
+from amvnet.models.methods import METHODS, title_of
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
 MOST_POINTS = (
@@ -125,14 +125,14 @@ def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
 
 def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, Any]:
     planes = {plane for scan in packed for plane in scan.about["planes"]}
-    sources = [name for name in ("truth", *TITLES, "labels") if name in planes]
+    sources = [name for name in ("truth", *METHODS, "labels") if name in planes]
     return {
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
         "colors": [UNLABELLED, *taxonomy.colors[1:]],
         "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
         "present": sorted(set().union(*(scan.present for scan in packed))),
-        "sources": [{"key": name, "title": _capital(TITLES.get(name, name))} for name in sources],
+        "sources": [{"key": name, "title": _capital(title_of(name))} for name in sources],
         "scans": [scan.about for scan in packed],
         "ranges": {
             "uncertainty": (0, 1),

@@ -14,7 +14,7 @@ import numpy as np
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.inference.methods import TITLES
+from amvnet.models.methods import title_of
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 
 TIMELINE = "scan"
@@ -121,7 +121,7 @@ def blueprint(frame: Frame) -> Any:
     def tabs(views: list[Any]) -> Any:
         return parts.Tabs(*views, active_tab=len(views) - 1)
 
-    titles = {method: TITLES.get(method, method) for method in frame.labels}
+    titles = {method: title_of(method) for method in frame.labels}
     truth, doubts = frame.truth is not None, frame.uncertain is not None
     views = [space("truth", "/truth")] if truth else []
     if titles:

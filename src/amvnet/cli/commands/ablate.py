@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from amvnet.cli.commands.train import _calm_lightning
 from amvnet.cli.console import on_terminal, say
 from amvnet.cli.options import describe_records, join_processes, open_data, parse_names
 
@@ -18,12 +17,12 @@ def ablate(
     val_sequences: str | None = None,
     device: str = "cpu",
 ) -> None:
-    """Train the range-view network with and without GRU and class weights, and write the paper's Table 5.
+    """Train the range-view network with and without GRU and class weights: the paper's Table 5.
 
     Args:
         recipe: what to train; a built-in recipe's name or a YAML file.
-        data: the data set.
-        out: folder for the four runs and the table; started again, it goes on.
+        data: the dataset.
+        out: folder for the four runs and the table; a second call continues an interrupted one.
         train_sequences: sequences or scenes to train on, with commas; default: the official split.
         val_sequences: sequences or scenes to score, with commas; default: the official split.
         device: where the trained networks are scored: cpu, cuda, cuda:1, ...
@@ -31,14 +30,18 @@ def ablate(
     from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of
     from amvnet.evaluation import charts
-    from amvnet.training.studies import ablate as compare
+    from amvnet.training.fit import quiet_lightning
+    from amvnet.training.run_plan import RunOptions
+    from amvnet.training.studies import ablate as ablate_recipe
 
-    _calm_lightning()
+    quiet_lightning()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
-    dataset = open_data(data, None)
-    learnt, val = split_records(dataset, parse_names(train_sequences), parse_names(val_sequences))
-    say(f"training on {describe_records(learnt)}; scoring on {describe_records(val)}")
-    rows = list(compare(recipe, dataset, learnt, val, out, say, on_terminal(), device, processes))
+    dataset = open_data(data)
+    scans = split_records(dataset, parse_names(train_sequences), parse_names(val_sequences))
+    say(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
+
+    options = RunOptions(resume=True, say=say, bars=on_terminal(), processes=processes)
+    rows = list(ablate_recipe(recipe, scans, out, options, device))
     if processes.first:
         files = charts.write_ablation(rows, out / "ablation")
         say(files[-1].read_text().rstrip())

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import json as json_format
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from amvnet.cli.commands.predict import PrecisionName
 from amvnet.cli.console import console, progress
-from amvnet.cli.options import join_processes, open_data, parse_methods, parse_names
+from amvnet.cli.options import Split, join_processes, open_data, parse_methods, parse_names
 from amvnet.errors import InputError
+from amvnet.models.methods import Precision
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
@@ -20,24 +20,25 @@ def evaluate(
     data: str,
     weights: str | None = None,
     predictions: Path | None = None,
-    split: Literal["train", "val", "test", "all"] = "val",
+    split: Split = "val",
     sequences: str | None = None,
     methods: str = "rv,bev,ensemble,amvnet",
     json: Path | None = None,
     pictures: Path | None = None,
     taxonomy: Path | None = None,
     device: str = "cpu",
-    precision: PrecisionName = "float32",
+    precision: Precision = "float32",
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
 
     Args:
-        data: the data set.
+        data: the dataset.
         weights: a weights file, or the name of a built-in one: all methods are scored.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
         split: the official split to score.
         sequences: sequences or scenes to score instead, with commas.
-        methods: what to score of weights, with commas; arithmetic and maximum are the other ensembles.
+        methods: what to score of weights, with commas; arithmetic and maximum are the other
+            ensembles.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
         taxonomy: a semantic-kitti.yaml with other classes.
@@ -45,38 +46,49 @@ def evaluate(
         precision: of the networks; float16 on a GPU only.
     """
     from amvnet.data.datasets.select import choose_records, custom_taxonomy
-    from amvnet.evaluation import scoring as jobs
+    from amvnet.evaluation.scoring import evaluate as evaluate_records
+    from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
-    from amvnet.inference.methods import widest_method
     from amvnet.inference.segmenter import Segmenter
+    from amvnet.models.methods import widest_method
     from amvnet.weights.file import load
 
-    if (weights is None) == (predictions is None):
+    processes = join_processes()
+    names = parse_names(sequences)
+    if weights is not None and predictions is None:
+        loaded = load(weights)
+        dataset = open_data(data, taxonomy or custom_taxonomy(loaded.taxonomy))
+        records = choose_records(dataset, names, split)
+        method = widest_method(loaded.parts)
+        segmenter = Segmenter(
+            loaded, processes.device(device), method, precision=precision, keep_memory=True
+        )
+        label = label_by_weights(dataset, segmenter, parse_methods(methods))
+    elif predictions is not None and weights is None:
+        dataset = open_data(data, taxonomy)
+        records = choose_records(dataset, names, split)
+        label = label_from_files(dataset, predictions)
+    else:
         raise InputError(
             "expected either --weights or --predictions, found both or neither; give one of them"
         )
-    processes = join_processes()
-    given = None if weights is None else load(weights)
-    dataset = open_data(data, taxonomy, None if given is None else custom_taxonomy(given.taxonomy))
-    records = choose_records(dataset, parse_names(sequences), split)
-    if given is not None:
-        segmenter = Segmenter(given, processes.device(device), widest_method(given), precision)
-        label = jobs.label_by_weights(dataset, segmenter, parse_methods(methods))
-    else:
-        label = jobs.label_from_files(dataset, Path(str(predictions)))
-    for path in (json, pictures):  # so that nothing is scored in vain
+
+    # Before any scan is scored, so that no time is wasted if a folder cannot be made.
+    for path in (json, pictures):
         if path is not None:
             make_folder(path.parent)
     with progress("scoring") as step:
-        found = jobs.evaluate(dataset, records, label, pictures, step, processes)
+        evaluation = evaluate_records(
+            dataset, records, label, pictures, progress=step, processes=processes
+        )
     if processes.first:
-        show_evaluation(found, data, dataset.taxonomy, json)
+        show_evaluation(evaluation, data, dataset.taxonomy, json)
 
 
 def show_evaluation(
     evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None
 ) -> None:
-    """Print the table, and write the same figures as JSON."""
+    """Print the table, and write the same figures as JSON if there is a path."""
     from amvnet.cli.tables import evaluation_table
     from amvnet.files import atomic_write
 
@@ -84,4 +96,4 @@ def show_evaluation(
     console.print(evaluation_table(figures, taxonomy))
     if path is not None:
         with atomic_write(path) as part:
-            part.write_text(json.dumps(figures, indent=1))
+            part.write_text(json_format.dumps(figures, indent=1))

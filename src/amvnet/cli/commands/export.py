@@ -1,4 +1,4 @@
-"""The verb that writes the networks for other runtimes: export."""
+"""The verb `export`."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from amvnet.cli.console import progress, say
 
 
 def export(weights: str, out: Path, int8: str | None = None) -> None:
-    """Write the networks and the head as ONNX, and a JSON that says all that a program in C++ needs.
+    """Write the networks and the head as ONNX, with a JSON that a program in C++ can follow.
 
     Args:
         weights: a weights file, or the name of a built-in one.
         out: folder for the graphs and amvnet.json.
-        int8: put the convolutions into 8-bit integers, for CPUs, calibrated with these scans: a data set, scan files
-            or a folder of them as predict takes them, or the word simulated.
+        int8: convert the convolutions to 8-bit integers, for CPUs, calibrated with these scans: a
+            dataset, scan files or a folder of them as predict takes them, or the word simulated.
     """
-    from amvnet.export.onnx import export as run
+    from amvnet.export.onnx import export as export_weights
 
     with progress("exporting") as step:
-        measured = run(weights, out, step, int8)
-    largest = max(measured.differences.values())
+        exported = export_weights(weights, out, step, int8)
+    largest = max(exported.differences.values())
     say(
-        f"{len(measured.differences)} graphs and amvnet.json in {out}; they differ from torch by at most {largest:.1e}"
+        f"{len(exported.differences)} graphs and amvnet.json in {out}; "
+        f"they differ from torch by at most {largest:.1e}"
     )
-    for name, share in measured.agreement.items():
+    for name, share in exported.agreement.items():
         say(
-            f"{name} is in int8 now; on scans it was not calibrated with, {share:.1%} of its labels are as before"
+            f"{name} is in int8 now; on scans it was not calibrated with, "
+            f"{share:.1%} of its labels are as before"
         )

@@ -6,7 +6,7 @@ from amvnet.cli.console import console, say
 
 
 def info(weights: str | None = None) -> None:
-    """Say what a weights file is; without one, what is installed.
+    """Describe a weights file; without one, show what is installed.
 
     Args:
         weights: a weights file, or the name of a built-in one: its model card, in Markdown.
@@ -15,7 +15,8 @@ def info(weights: str | None = None) -> None:
     from amvnet.weights.card import OURS, model_card
     from amvnet.weights.file import built_in, load
 
-    if weights is not None:
-        say(model_card(load(weights), weights, OURS if weights in built_in() else None).rstrip())
+    if weights is None:
+        console.print(installation_table())
         return
-    console.print(installation_table())
+    license_id = OURS if weights in built_in() else None
+    say(model_card(load(weights), weights, license_id).rstrip())

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import open_data, parse_names
+from amvnet.cli.options import Split, open_data, parse_names
 
 
 def rank(
@@ -14,18 +14,19 @@ def rank(
     weights: str,
     out: Path,
     by: Literal["disagreement", "labels"] = "disagreement",
-    split: Literal["train", "val", "test", "all"] = "all",
+    split: Split = "all",
     sequences: str | None = None,
     pictures: Path | None = None,
     device: str = "cpu",
 ) -> None:
-    """Say which clusters of points, and which scans, to look at next: to label them, or to correct their labels.
+    """Rank clusters of points, and scans, to look at next: to label them, or to check their labels.
 
     Args:
-        data: the data set.
+        data: the dataset.
         weights: a weights file with both networks, or the name of a built-in one.
-        out: the table of the clusters, FILE.csv; that of the scans is written beside it, FILE-scans.csv.
-        by: what is doubted: disagreement of the two views (what to label next), or labels that both contradict.
+        out: the table of the clusters, FILE.csv; that of the scans is FILE-scans.csv.
+        by: what is doubted: disagreement of the two views (what to label next), or labels that both
+            contradict.
         split: the official split.
         sequences: sequences or scenes instead, with commas.
         pictures: folder for drawings of the first clusters from above.
@@ -33,24 +34,27 @@ def rank(
     """
     from amvnet.data.datasets.select import choose_records, custom_taxonomy
     from amvnet.files import make_folder
-    from amvnet.inference.methods import widest_method
     from amvnet.inference.segmenter import Segmenter
-    from amvnet.ranking import rank as ranking
+    from amvnet.models.methods import widest_method
     from amvnet.ranking.pictures import draw
+    from amvnet.ranking.rank import rank as rank_records
+    from amvnet.ranking.rank import write_ranking
     from amvnet.weights.file import load
 
-    given = load(weights)
-    dataset = open_data(data, None, custom_taxonomy(given.taxonomy))
+    loaded = load(weights)
+    dataset = open_data(data, custom_taxonomy(loaded.taxonomy))
     records = choose_records(dataset, parse_names(sequences), split)
-    segmenter = Segmenter(given, device, widest_method(given))
-    for folder in (
-        out.parent,
-        *([] if pictures is None else [pictures]),
-    ):  # so that nothing is scored in vain
-        make_folder(folder)
-    with progress("scoring") as step:
-        found = ranking.rank(dataset, records, segmenter, by, step)
-    scans = ranking.write_ranking(found, dataset.taxonomy, out)
-    say(f"{len(found.clusters)} clusters in {out}, {len(records)} scans in {scans}")
+    segmenter = Segmenter(loaded, device, widest_method(loaded.parts), keep_memory=True)
+
+    # Before any scan is scored, so that no time is wasted if a folder cannot be made.
+    make_folder(out.parent)
     if pictures is not None:
-        say(f"{len(draw(found, dataset, segmenter, by, pictures))} pictures in {pictures}")
+        make_folder(pictures)
+
+    with progress("scoring") as step:
+        ranking = rank_records(dataset, records, segmenter, by, step)
+    scans = write_ranking(ranking, dataset.taxonomy, out)
+    say(f"{len(ranking.clusters)} clusters in {out}, {len(records)} scans in {scans}")
+    if pictures is not None:
+        drawn = draw(ranking, dataset, segmenter, by, pictures)
+        say(f"{len(drawn)} pictures in {pictures}")

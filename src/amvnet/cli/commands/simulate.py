@@ -17,7 +17,7 @@ def simulate(
     first_sequence: int = 0,
     processes: int | None = None,
 ) -> None:
-    """Write labelled scans of simulated streets; what an earlier call has written stays, and it goes on from there.
+    """Write labelled scans of simulated streets; scans of an earlier call stay and are not redone.
 
     Args:
         out: folder to write to.
@@ -26,12 +26,12 @@ def simulate(
         scans: number of scans in each sequence.
         seed: of all randomness; the same seed gives the same bytes.
         first_sequence: number of the first sequence.
-        processes: sequences that are simulated side by side; by default, one a processor.
+        processes: sequences that are simulated at the same time; default: one per processor.
     """
-    from amvnet.simulation import simulate as write
+    from amvnet.simulation import simulate as simulate_streets
 
     with progress("simulating") as step:
-        write(
+        simulate_streets(
             out,
             sensor=sensor,
             sequences=sequences,

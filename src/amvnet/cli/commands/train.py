@@ -1,8 +1,7 @@
-"""The verbs that train, or show what training gave: train, analyze, ablate."""
+"""The verb `train`."""
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,17 +37,18 @@ def train(
 
     Args:
         recipe: what to train; a built-in recipe's name or a YAML file.
-        data: the data set: semantickitti:PATH, nuscenes:PATH, or a path whose layout says which.
+        data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts.
         out: folder of the run.
         stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them.
-        resume: go on where an earlier run in the folder stopped.
+        resume: continue an earlier run in the folder.
         train_sequences: sequences or scenes to train on, with commas; default: the official split.
         val_sequences: sequences or scenes to validate on, with commas; default: the official split.
-        with_val: learn from these too, as for an entry to a benchmark; then nothing is validated.
-        dry_run: only take two steps of each network, and say what they cost and the whole training would.
+        with_val: train on these too, as for a benchmark's server; then nothing is validated.
+        dry_run: only take two steps of each network, and say what these and the training cost.
         taxonomy: a semantic-kitti.yaml with other classes.
-        scores_a: with --stage head: a folder of another model's scores, to train a head for it and --scores-b.
+        scores_a: with --stage head: a folder of another model's scores, to train a head for it and
+            --scores-b.
         scores_b: a folder of the other model's scores.
         key_a: which array of each .npz in --scores-a.
         key_b: which array of each .npz in --scores-b.
@@ -56,29 +56,25 @@ def train(
     """
     from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of
+    from amvnet.training.fit import quiet_lightning
     from amvnet.training.run import Run
-    from amvnet.weights import file as weights
+    from amvnet.training.run_plan import RunOptions, RunPlan
+    from amvnet.weights.file import load
 
-    _calm_lightning()
+    quiet_lightning()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     dataset = open_data(data, taxonomy)
-    learnt, val = split_records(
+    scans = split_records(
         dataset, parse_names(train_sequences), parse_names(val_sequences), with_val
     )
-    say(f"training on {describe_records(learnt)}; validating on {describe_records(val)}")
-    given = None if init is None else weights.load(init)
-    pair = parse_scores(scores_a, scores_b, key_a, key_b, logits)
-    run = Run(recipe, dataset, learnt, val, out, resume, say, on_terminal(), processes, pair)
+    say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
+    weights = None if init is None else load(init)
+    scores = parse_scores(scores_a, scores_b, key_a, key_b, logits)
+
+    options = RunOptions(resume=resume, say=say, bars=on_terminal(), processes=processes)
+    run = Run(RunPlan(recipe, scans, out, options, scores))
     if dry_run:
-        for trial in run.trials(stage):
-            say(trial)
+        for line in run.trials(stage):
+            say(line)
         return
-    say(f"weights in {run.stages(stage, given)}")
-
-
-def _calm_lightning() -> None:
-    for name in (
-        "lightning.pytorch",
-        "lightning.fabric",
-    ):  # which set their levels when they are imported
-        logging.getLogger(name).setLevel(logging.ERROR)
+    say(f"weights in {run.stages(stage, weights)}")

@@ -1,65 +1,105 @@
-"""Which scans of a dataset to use, and checks of its classes."""
+"""Choose the scans of a dataset to use, and the classes to read them with."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.errors import InputError
 
 
+@dataclass(frozen=True)
+class TrainingScans:
+    """The scans of a training.
+
+    Attributes:
+        dataset: where they are.
+        train: to learn from.
+        val: to validate with; empty if nothing is validated. No scan may be in both.
+
+    Raises:
+        InputError: if a scan is in both.
+    """
+
+    dataset: Dataset
+    train: Sequence[ScanRecord]
+    val: Sequence[ScanRecord]
+
+    def __post_init__(self) -> None:
+        names = {record.name for record in self.train}
+        common = names & {record.name for record in self.val}
+        if common:
+            raise InputError(
+                f"expected validation scans apart from training, found {min(common)} in both; "
+                "name others"
+            )
+
+
+def taxonomy_named(text: str) -> Taxonomy:
+    """Return the classes of a benchmark by its name, or those of a YAML file."""
+    return TAXONOMIES[text] if text in TAXONOMIES else taxonomy_from_yaml(text)
+
+
 def custom_taxonomy(taxonomy: Taxonomy) -> Taxonomy | None:
-    """A user's own classes, with which a data set has to be read; None for those of a benchmark."""
+    """Return a user's own classes, which a dataset must be read with; None for a benchmark's."""
     return taxonomy if taxonomy.name not in TAXONOMIES else None
 
 
 def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
-    """Raises InputError where weights know other classes than the data set."""
+    """Raise InputError if the classes, of weights or named by the user, are not the dataset's."""
     if taxonomy.classes != dataset.taxonomy.classes:
         raise InputError(
-            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those of "
-            f"{taxonomy.name}; use weights trained on this benchmark"
+            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those "
+            f"of {taxonomy.name}; use weights trained on this benchmark"
         )
 
 
 def choose_records(
     dataset: Dataset, sequences: Sequence[str] | None, split: str
 ) -> list[ScanRecord]:
-    """The scans of the named sequences, or else of a split."""
+    """Return the scans of the named sequences, or of a split if there are no names."""
     return dataset.records(dataset.sequences(split) if sequences is None else sequences)
 
 
 def split_records(
     dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
-) -> tuple[list[ScanRecord], list[ScanRecord]]:
-    """The scans to train on and those to validate with: as named, else by the official split.
+) -> TrainingScans:
+    """Return the scans to train on and to validate with: as named, else by the official split.
 
-    Of a data set that has no scan of one of the two official splits, the last sequence validates.
+    If a dataset has no scan of one of the two official splits, its last sequence validates.
 
     Args:
         with_val: train on both, and validate with none.
 
     Raises:
-        InputError: where there is just one sequence.
+        InputError: if there is just one sequence.
     """
     present = dataset.sequences("all")
-    official = {split: _present(dataset, split) for split in ("train", "val")}
-    if not (train or official["train"]) or not (val or official["val"]):
-        official = {"train": present[:-1], "val": present[-1:]}
-    val = val or [s for s in official["val"] if s not in (train or ())]
-    train = train or [s for s in official["train"] if s not in val]
+    official_train = _present(dataset, "train")
+    official_val = _present(dataset, "val")
+    if not (train or official_train) or not (val or official_val):
+        official_train = present[:-1]
+        official_val = present[-1:]
+
+    if not val:
+        val = [name for name in official_val if name not in (train or ())]
+    if not train:
+        train = [name for name in official_train if name not in val]
     if with_val:
-        return dataset.records([*train, *(s for s in val if s not in train)]), []
+        added = [name for name in val if name not in train]
+        return TrainingScans(dataset, dataset.records([*train, *added]), [])
     if not train or not val:
         raise InputError(
             f"{dataset.root}: expected two sequences, one to train on and one to validate with, "
             f"found {', '.join(present)}; name them"
         )
-    return dataset.records(train), dataset.records(val)
+    return TrainingScans(dataset, dataset.records(train), dataset.records(val))
 
 
 def _present(dataset: Dataset, split: str) -> tuple[str, ...]:
+    """Return the sequences of an official split that are on disk, which may be none."""
     try:
         return dataset.sequences(split)
     except InputError:

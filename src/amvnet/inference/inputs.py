@@ -1,0 +1,304 @@
+"""From what a user names to scans: datasets, scan files, bags, and folders of these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.open import is_dataset, open_dataset
+from amvnet.data.datasets.select import check_classes, choose_records, custom_taxonomy
+from amvnet.data.formats.detect import NamedScan, ending_of, scan_stem, scans_in_file
+from amvnet.data.formats.raw import NUSCENES_ENDING
+from amvnet.data.label_files import write_scan_labels
+from amvnet.data.scan_files import find_scans, read_labels
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.errors import InputError
+from amvnet.progress import Say, say_nothing
+from amvnet.scan import Scan
+from amvnet.sensors.adapt import MEASURED, ScanAdapter
+from amvnet.sensors.lidars import Sensor
+from amvnet.weights.file import Weights
+
+
+@dataclass(frozen=True)
+class ScanOptions:
+    """Which scans of the inputs to use.
+
+    Attributes:
+        sequences: of datasets, these sequences or scenes; None means those of `split`.
+        split: of datasets, the official split.
+        topic: of bags; None means the only topic with PointCloud2 messages.
+    """
+
+    sequences: Sequence[str] | None = None
+    split: str = "all"
+    topic: str | None = None
+
+
+@dataclass(frozen=True)
+class LoadedScan:
+    """A scan in memory.
+
+    Attributes:
+        scan: for the segmenter.
+        file_xyz: (N, 3) the coordinates in the scan's file; None for a scan of a dataset.
+    """
+
+    scan: Scan
+    file_xyz: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class LabelFormat:
+    """How labels of scan files are written: one of `label_files.KINDS`, in raw ids of a taxonomy."""
+
+    kind: str
+    taxonomy: Taxonomy
+
+
+class InputScan(Protocol):
+    """One scan of the inputs, not read yet."""
+
+    @property
+    def name(self) -> str:
+        """The name in messages, unique among the scans of one input."""
+
+    @property
+    def title(self) -> str:
+        """A short name for people who look at the scan."""
+
+    @property
+    def scores_path(self) -> Path:
+        """Where the `.npz` of its scores lies, relative to a folder of predictions."""
+
+    @property
+    def path(self) -> Path:
+        """The file that the scan is read from."""
+
+    @property
+    def is_adapted(self) -> bool:
+        """Whether `ring` is the row of the range image of each point, see `Segmenter.by_ring`."""
+
+    def load(self, labels: bool = False) -> LoadedScan:
+        """Read the scan, with ground truth if there is any and it is asked for.
+
+        Raises:
+            InputError: if it cannot be read.
+        """
+
+    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+        """Read (N,) train ids of its `count` points from a folder of predictions, or a file.
+
+        Raises:
+            InputError: if they cannot be read.
+        """
+
+    def write_labels(
+        self, out: Path, form: LabelFormat, loaded: LoadedScan, labels: Labels
+    ) -> Path:
+        """Write the labels into a folder of predictions; return the path of the file."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """(N,) train ids of a scan, and (N,) bool, the uncertain points; None if that is not known."""
+
+    ids: np.ndarray
+    uncertain: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class DatasetScan:
+    """A scan of a dataset."""
+
+    dataset: Dataset
+    record: ScanRecord
+    is_adapted = False
+
+    @property
+    def name(self) -> str:
+        return self.record.name
+
+    @property
+    def title(self) -> str:
+        if "/" in self.record.name:
+            return self.record.name
+        # nuScenes: a token says nothing to people; the last part of the file's name is the time.
+        time = scan_stem(self.record.points_path).split("__")[-1]
+        return f"{self.record.sequence}/{time}"
+
+    @property
+    def scores_path(self) -> Path:
+        return Path(self.record.prediction).with_suffix(".npz")
+
+    @property
+    def path(self) -> Path:
+        return self.record.points_path
+
+    def load(self, labels: bool = False) -> LoadedScan:
+        return LoadedScan(self.dataset.read(self.record, labels=labels))
+
+    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+        return self.dataset.read_prediction(self.record, path)
+
+    def write_labels(
+        self, out: Path, form: LabelFormat, loaded: LoadedScan, labels: Labels
+    ) -> Path:
+        return self.dataset.write_prediction(self.record, out, labels.ids)
+
+
+def adapter_for(
+    weights: Weights, given: Sensor | None = None, say: Say = say_nothing
+) -> ScanAdapter:
+    """Return what adapts scan files to some weights; see `ScanAdapter`."""
+    return ScanAdapter(weights.model.range_view, weights.sensor, given, say)
+
+
+class FileReader:
+    """Reads scan files, adapted to what some weights expect.
+
+    Whichever scan of a source is read first, after an interruption or in another process, the
+    first scans of the source are measured: all of its scans are adapted in the same way.
+
+    Args:
+        adapter: adapts the scans; None reads them as they are.
+    """
+
+    def __init__(self, adapter: ScanAdapter | None) -> None:
+        self.adapter = adapter
+        self._first: dict[str, list[NamedScan]] = {}
+
+    def add(self, scan: NamedScan) -> None:
+        """Take note of a scan, in the order of its source."""
+        first = self._first.setdefault(scan.source, [])
+        if len(first) < MEASURED:
+            first.append(scan)
+
+    def read(self, scan: NamedScan) -> LoadedScan:
+        if self.adapter is None:
+            cloud = scan.read()
+            return LoadedScan(cloud.to_scan(), cloud.xyz)
+
+        to_measure = self._first.pop(scan.source, [])
+        self.adapter.learn(scan.source, [first.read for first in to_measure])
+        cloud = scan.read()
+        return LoadedScan(self.adapter(cloud, scan.source), cloud.xyz)
+
+
+@dataclass(frozen=True)
+class FileScan:
+    """A scan in a file or a bag."""
+
+    path: Path
+    scan: NamedScan
+    reader: FileReader
+
+    @property
+    def name(self) -> str:
+        return self.scan.name
+
+    @property
+    def title(self) -> str:
+        return self.scan.name
+
+    @property
+    def scores_path(self) -> Path:
+        return Path(f"{self.scan.name}.npz")
+
+    @property
+    def is_adapted(self) -> bool:
+        return self.reader.adapter is not None
+
+    def load(self, labels: bool = False) -> LoadedScan:
+        return self.reader.read(self.scan)
+
+    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+        file = path / f"{self.scan.name}.label" if path.is_dir() else path
+        return read_labels(file, np.uint32, count, taxonomy.to_train)
+
+    def write_labels(
+        self, out: Path, form: LabelFormat, loaded: LoadedScan, labels: Labels
+    ) -> Path:
+        assert loaded.file_xyz is not None
+        return write_scan_labels(
+            out / self.scan.name,
+            form.kind,
+            loaded.file_xyz,
+            labels.ids,
+            form.taxonomy,
+            uncertain=labels.uncertain,
+        )
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The scans that a user named, and the classes of their labels."""
+
+    taxonomy: Taxonomy
+    scans: list[InputScan]
+
+
+def open_inputs(
+    inputs: Sequence[str],
+    options: ScanOptions,
+    taxonomy: Taxonomy | None = None,
+    adapter: ScanAdapter | None = None,
+) -> Inputs:
+    """List the scans of all inputs.
+
+    Args:
+        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
+        options: which of their scans to use.
+        taxonomy: the classes, of weights or as the user names them. If None, they are those of the
+            datasets; scan files have nuScenes' if they end in `.pcd.bin`, else SemanticKITTI's.
+        adapter: adapts scan files to weights; None reads them as they are.
+
+    Raises:
+        InputError: if an input is missing or has no scan, or the inputs have different classes.
+    """
+    reader = FileReader(adapter)
+    scans: list[InputScan] = []
+    taxonomies: list[Taxonomy] = []
+    for text in inputs:
+        if is_dataset(text):
+            dataset = _open_dataset(text, taxonomy)
+            records = choose_records(dataset, options.sequences, options.split)
+            scans += [DatasetScan(dataset, record) for record in records]
+            taxonomies.append(dataset.taxonomy)
+        else:
+            paths = find_scans(text)
+            scans += _file_scans(paths, reader, options.topic)
+            taxonomies.append(taxonomy or _usual_taxonomy(paths[0]))
+
+    if len({taxonomy.classes for taxonomy in taxonomies}) > 1:
+        raise InputError(
+            "expected inputs with the same classes, found several; take them one after the other"
+        )
+    return Inputs(taxonomies[0], scans)
+
+
+def _open_dataset(text: str, taxonomy: Taxonomy | None) -> Dataset:
+    if taxonomy is None:
+        return open_dataset(text)
+    dataset = open_dataset(text, custom_taxonomy(taxonomy))
+    check_classes(dataset, taxonomy)
+    return dataset
+
+
+def _file_scans(paths: Sequence[Path], reader: FileReader, topic: str | None) -> list[InputScan]:
+    scans: list[InputScan] = []
+    for path in paths:
+        for scan in scans_in_file(path, topic):
+            reader.add(scan)
+            scans.append(FileScan(path, scan, reader))
+    return scans
+
+
+def _usual_taxonomy(path: Path) -> Taxonomy:
+    """Return the classes that labels of a scan file have if nobody names them."""
+    return NUSCENES if ending_of(path) == NUSCENES_ENDING else SEMANTICKITTI

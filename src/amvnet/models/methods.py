@@ -1,0 +1,87 @@
+"""The methods that label points: one network alone, an ensemble of both, or AMVNet.
+
+This module does not import torch, so that the command line can list the methods quickly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
+Precision = Literal["float32", "bfloat16", "float16"]  # of the two networks
+Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]  # f, g: (P, K) -> (P, K)
+
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
+BOTH_NETWORKS = ("range_net", "polar_net")
+
+
+def geometric_mean(f: Tensor, g: Tensor) -> Tensor:
+    """Return the ensemble that AMVNet uses for certain points."""
+    return (f * g).sqrt()
+
+
+def arithmetic_mean(f: Tensor, g: Tensor) -> Tensor:
+    """Return an ensemble to compare with."""
+    return (f + g) / 2
+
+
+def maximum(f: Tensor, g: Tensor) -> Tensor:
+    """Return an ensemble to compare with."""
+    return f.maximum(g)
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to label points.
+
+    Attributes:
+        name: as users write it.
+        title: in tables and figures.
+        parts: the parts of a weights file that the method needs.
+        ensemble: combines the class probabilities f and g of the two networks; None if the method
+            is no ensemble.
+    """
+
+    name: MethodName
+    title: str
+    parts: tuple[str, ...]
+    ensemble: Ensemble | None = None
+
+
+# In the order of the paper's tables: each method may need more parts than those before it.
+METHODS: dict[str, Method] = {
+    method.name: method
+    for method in (
+        Method("rv", "RV", ("range_net",)),
+        Method("bev", "BEV", ("polar_net",)),
+        Method("arithmetic", "arithmetic mean", BOTH_NETWORKS, arithmetic_mean),
+        Method("maximum", "maximum", BOTH_NETWORKS, maximum),
+        Method("ensemble", "ensemble", BOTH_NETWORKS, geometric_mean),
+        Method("amvnet", "AMVNet", (*BOTH_NETWORKS, "point_head")),
+    )
+}
+ENSEMBLES: dict[str, Ensemble] = {
+    name: method.ensemble for name, method in METHODS.items() if method.ensemble is not None
+}
+PAPER_METHODS: tuple[MethodName, ...] = ("rv", "bev", "ensemble", "amvnet")  # Tables 3 and 4
+
+
+def title_of(name: str) -> str:
+    """Return the title of a method; other names, such as `labels`, are their own title."""
+    return METHODS[name].title if name in METHODS else name
+
+
+def widest_method(parts: Collection[str]) -> MethodName:
+    """Return the last method, in the order of the paper's tables, whose parts are all present.
+
+    Without any such method this is "amvnet", whose check names the missing parts.
+    """
+    names: list[MethodName] = [
+        method.name for method in METHODS.values() if set(method.parts) <= set(parts)
+    ]
+    return names[-1] if names else "amvnet"

@@ -1,0 +1,83 @@
+"""What a training run is to do, and how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from amvnet.config.schema import NetworkTraining, Recipe
+from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.taxonomy import TAXONOMIES
+from amvnet.distributed import ALONE, Processes
+from amvnet.errors import InputError
+from amvnet.inference.score_files import ScorePair
+from amvnet.progress import Say, say_nothing
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a training runs.
+
+    Attributes:
+        resume: continue an earlier run in the same folder.
+        say: prints lines about what happens.
+        bars: show progress bars instead of a line for each epoch.
+        processes: those that share the run; all must see its folder.
+    """
+
+    resume: bool = False
+    say: Say = say_nothing
+    bars: bool = False
+    processes: Processes = ALONE
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """One training run.
+
+    Attributes:
+        recipe: what to train.
+        scans: to learn from and to validate with. Without validation scans, the last weights are
+            kept.
+        out: the folder of the run.
+        options: how it runs.
+        scores: two other models' scores of the scans, for which the head is trained instead of the
+            networks'.
+
+    Raises:
+        InputError: if the processes cannot share the scans or the batches, or the recipe is for
+            other classes than the dataset's.
+    """
+
+    recipe: Recipe
+    scans: TrainingScans
+    out: Path
+    options: RunOptions = RunOptions()
+    scores: ScorePair | None = None
+
+    def __post_init__(self) -> None:
+        size = self.options.processes.size
+        val = self.scans.val
+        if 0 < len(val) < size:  # a process without a scan would keep the others waiting
+            raise InputError(
+                f"expected a validation scan for each of {size} processes, found {len(val)}; "
+                "name more"
+            )
+        for name in ("rv", "bev"):
+            _check_batch(getattr(self.recipe.training, name), name, size)
+
+        taxonomy = self.scans.dataset.taxonomy.name
+        # A user's own classes fit any recipe.
+        if taxonomy in TAXONOMIES and taxonomy != self.recipe.taxonomy:
+            raise InputError(
+                f"expected a data set with the classes of {self.recipe.taxonomy}, "
+                f"found {taxonomy}; use the recipe of that benchmark"
+            )
+
+
+def _check_batch(config: NetworkTraining, name: str, processes: int) -> None:
+    if config.batch % (processes * config.accumulate):
+        raise InputError(
+            f"expected a batch for {processes} processes, each in {config.accumulate} parts, found "
+            f"{config.batch}; set --training.{name}.batch or --training.{name}.accumulate"
+        )

@@ -1,0 +1,352 @@
+"""One stage of a training run: what it begins with, how it is fitted, and what it writes."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import yaml
+from lightning.pytorch.callbacks import Callback
+from torch import Tensor, nn
+
+from amvnet.config.schema import NetworkTraining
+from amvnet.errors import InputError
+from amvnet.files import atomic_write
+from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.models.views.points import PointBatch
+from amvnet.training.callbacks import KeepWeights, Pictures, Speed
+from amvnet.training.fit import FitOptions, Loaders, fit
+from amvnet.training.head_points import gather_points, make_head_loader
+from amvnet.training.head_scores import NetworkScores, ScoreSource, score_source, scorer_with_head
+from amvnet.training.head_stage import HeadStage
+from amvnet.training.loaders import ScanSet, count_classes, make_loader
+from amvnet.training.losses import class_weights
+from amvnet.training.run_plan import RunPlan
+from amvnet.training.run_record import SETTINGS, check_begun, sequence_names, stage_settings
+from amvnet.training.stages import NetworkStage, PolarStage, RangeStage
+from amvnet.weights.file import Weights, load, part_state, save
+
+PICTURED_SCANS = 2
+VAL_BATCHES = 64  # the head validates with batches this many times as large
+
+
+@dataclass(frozen=True)
+class StageRun:
+    """One stage of a run, in its folder.
+
+    Attributes:
+        plan: of the run.
+        name: of the stage, as --stage has it.
+        part: of the weights, which the stage trains.
+        weights: what the stage begins with.
+        train_networks: trains both networks of another plan; returns their weights file.
+    """
+
+    plan: RunPlan
+    name: str
+    part: str
+    weights: Weights
+    train_networks: Callable[[RunPlan], Path]
+
+    @property
+    def folder(self) -> Path:
+        return self.plan.out / self.name
+
+    @property
+    def done(self) -> Path:
+        """The file that marks the stage as finished."""
+        return self.folder / "done"
+
+    @property
+    def kept(self) -> Path:
+        """The weights of the stage that are used in the end."""
+        return self.folder / f"{self.plan.recipe.training.keep}.safetensors"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the weights of the stage depend on."""
+        return stage_settings(self.plan, self.name, self.part, self.weights)
+
+    def check_begun(self) -> None:
+        """Raise InputError if the folder holds a stage that cannot be resumed."""
+        check_begun(self.folder, self.settings, self.plan.options.resume)
+
+    def taken_up(self) -> Weights:
+        """Return the weights with this stage's part, if the stage is finished."""
+        if self.kept.is_file() and self.done.is_file():
+            return self.weights.replace_part(self.part, load(self.kept))
+        return self.weights
+
+    def train(self) -> Weights:
+        """Fit the stage; return the weights with the trained part."""
+        processes = self.plan.options.processes
+        if self.done.is_file() and self.plan.options.resume:
+            return self.weights
+
+        L.seed_everything(self.plan.recipe.training.seed, verbose=False)
+        resized = self.weights.resized(self.part, self.plan.recipe.model)
+        dataclasses.replace(self, weights=resized).fit()
+        processes.wait()
+        trained = resized.replace_part(self.part, load(self.kept))
+        if processes.first:
+            self.done.write_text("")
+        return trained
+
+    def fit(self) -> None:
+        """Fit the stage, and write its weights after each epoch."""
+        raise NotImplementedError
+
+    def model(self) -> AMVNet:
+        """Return a model whose part to be trained begins with the weights, if they have it."""
+        model = build_amvnet(self.weights.model, self.weights.taxonomy.size)
+        if self.part in self.weights.parts:
+            try:
+                getattr(model, self.part).load_state_dict(self.weights.part(self.part))
+            except RuntimeError:
+                raise InputError(
+                    f"expected weights whose {self.part} has the recipe's sizes, found others; "
+                    "use the recipe of the weights"
+                ) from None
+        return model
+
+    def class_weights(self) -> np.ndarray:
+        """Return (K,) the weights of the classes in the loss (section 4.2 of the paper)."""
+        counts = count_classes(
+            self.plan.scans.dataset,
+            self.plan.scans.train,
+            self.plan.out / "class_counts.npz",
+            self.plan.options.processes,
+        )
+        return class_weights(counts)
+
+    def keep_weights(self) -> KeepWeights:
+        """Return the callback that writes the trained part after each epoch."""
+        return KeepWeights(PartWriter(self, self.settings, time.time()), self.folder)
+
+    def pictures(self, score: Callable[[PointBatch], Tensor]) -> Pictures:
+        """Return the callback that draws validation scans, by the (P, K) scores of a batch."""
+        val = self.plan.scans.val
+        indices = np.linspace(0, len(val) - 1, min(PICTURED_SCANS, len(val))).astype(int)
+        dataset = self.plan.scans.dataset
+        is_first = self.plan.options.processes.first
+        scans = [dataset.read(val[index]) for index in indices] if is_first else []
+        return Pictures(scans, dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
+
+
+@dataclass(frozen=True)
+class PartWriter:
+    """Writes the part that a stage trains, with a description of its training."""
+
+    run: StageRun
+    settings: dict[str, Any]
+    started: float
+
+    def __call__(self, module: nn.Module, path: Path, metrics: dict[str, float]) -> None:
+        part = self.run.part
+        scans = self.run.plan.scans
+        description = {
+            **self.settings["training"],
+            "sequences": sequence_names(scans.train),
+            "validated_on": sequence_names(scans.val),
+            "scans": len(scans.train),
+        }
+        if "scores" in self.settings:
+            description["scores"] = self.settings["scores"]
+        description["seconds"] = round(time.time() - self.started)
+
+        trained = dataclasses.replace(
+            self.run.weights,
+            tensors=part_state(part, module),
+            training={part: description},
+            metrics={part: metrics},
+        )
+        save(trained, path)
+        with atomic_write(path.parent / SETTINGS) as file:
+            file.write_text(yaml.safe_dump(self.settings, sort_keys=False))
+
+
+@dataclass(frozen=True)
+class Network:
+    """How one of the two networks is trained, by attributes of `AMVNet`.
+
+    Attributes:
+        stage: its Lightning module.
+        view: the projection.
+        score: gives the scores of a batch.
+    """
+
+    stage: Callable[..., NetworkStage]
+    view: str
+    score: str
+
+
+NETWORKS = {
+    "rv": Network(RangeStage, "range_view", "score_range_view"),
+    "bev": Network(PolarStage, "polar_view", "score_polar_view"),
+}
+
+
+@dataclass(frozen=True)
+class NetworkRun(StageRun):
+    """Stage `rv` or `bev`: one of the two networks (section 3.1 of the paper)."""
+
+    @property
+    def config(self) -> NetworkTraining:
+        config: NetworkTraining = getattr(self.plan.recipe.training, self.name)
+        return config
+
+    def fit(self) -> None:
+        model = self.model()
+        weights = self.class_weights() if self.config.class_weights else None
+        score = getattr(model, NETWORKS[self.name].score)
+        callbacks = [self.keep_weights(), self.pictures(score)]
+        fit(self._stage(model, weights), self._options(), self._loaders(), callbacks)
+
+    def trial(self, steps: int) -> Speed:
+        """Take some steps; nothing is written."""
+        model = self.model()
+        # The weights of the classes cost a look at every scan, and nothing else.
+        uniform = class_weights(np.ones(self.weights.taxonomy.size))
+        stage = self._stage(model, uniform if self.config.class_weights else None)
+        options = dataclasses.replace(self._options(), steps=steps)
+        return fit(stage, options, self._loaders())
+
+    def _stage(self, model: AMVNet, weights: np.ndarray | None) -> NetworkStage:
+        network = NETWORKS[self.name]
+        return network.stage(
+            getattr(model, network.view),
+            getattr(model, self.part),
+            config=self.config,
+            taxonomy=self.weights.taxonomy,
+            weights=weights,
+            processes=self.plan.options.processes,
+        )
+
+    def _options(self) -> FitOptions:
+        config = self.config
+        return FitOptions(
+            self.plan.recipe.training,
+            self.folder,
+            config.epochs,
+            self.plan.options,
+            accumulate=config.accumulate,
+            clip=config.clip,
+        )
+
+    def _loaders(self) -> Loaders:
+        training = self.plan.recipe.training
+        scans = self.plan.scans
+        processes = self.plan.options.processes
+        batch = self.config.batch // self.config.accumulate // processes.size
+        train = make_loader(
+            ScanSet(scans.dataset, scans.train, training.augment, training.seed),
+            batch,
+            shuffle=True,
+            workers=training.workers,
+            processes=processes,
+        )
+        if not scans.val:
+            return Loaders(train, None)
+        val = make_loader(
+            ScanSet(scans.dataset, scans.val),
+            1,
+            shuffle=False,
+            workers=training.workers,
+            processes=processes,
+        )
+        return Loaders(train, val)
+
+
+@dataclass(frozen=True)
+class HeadRun(StageRun):
+    """Stage `head`: the point head on scores of frozen networks (section 3.3 of the paper)."""
+
+    def fit(self) -> None:
+        training = self.plan.recipe.training
+        config = training.head
+        scans = self.plan.scans
+        options = self.plan.options
+        processes = options.processes
+
+        # The uncertain points of all scans, with their scores and neighbours.
+        validated = score_source(self.weights, self.plan.scores, scans.val)
+        gather = functools.partial(
+            gather_points,
+            dataset=scans.dataset,
+            model=self.weights.model,
+            training=training,
+            processes=processes,
+        )
+        train = gather(
+            self._score_sources(),
+            views=config.views,
+            folder=self.folder / "train",
+            say=options.say,
+        )
+        val = gather([validated], views=0, folder=self.folder / "val") if scans.val else None
+
+        head = self.model().point_head
+        assert head is not None
+        weights = self.class_weights() if config.class_weights else None
+        stage = HeadStage(head, train, val, config, scans.dataset.taxonomy, weights, processes)
+        train_loader = make_head_loader(
+            train, config.batch, shuffle=True, seed=training.seed, processes=processes
+        )
+        val_loader = None
+        if val is not None:
+            val_loader = make_head_loader(
+                val,
+                VAL_BATCHES * config.batch,
+                shuffle=False,
+                seed=training.seed,
+                processes=processes,
+            )
+        callbacks: list[Callback] = [self.keep_weights()]
+        # Scores in files belong to scans that pictures cannot name.
+        if self.plan.scores is None:
+            callbacks.append(self.pictures(scorer_with_head(self.weights, head)))
+        # Of so few multiplications, bfloat16 would save nothing.
+        in_float32 = dataclasses.replace(training, precision="32-true")
+        fit_options = FitOptions(in_float32, self.folder, config.epochs, options)
+        fit(stage, fit_options, Loaders(train_loader, val_loader), callbacks)
+
+        processes.wait()
+        if processes.first:
+            for folder in ("train", "val"):
+                shutil.rmtree(self.folder / folder, ignore_errors=True)
+
+    def _score_sources(self) -> list[ScoreSource]:
+        """Return what scores which training scans: with folds, networks that have not seen them."""
+        train = self.plan.scans.train
+        folds = self.plan.recipe.training.head.folds
+        if folds < 2 or self.plan.scores is not None:
+            return [score_source(self.weights, self.plan.scores, train)]
+
+        names = sequence_names(train)
+        if len(names) < folds:
+            raise InputError(
+                f"expected at least {folds} training sequences for {folds} folds, "
+                f"found {len(names)}"
+            )
+        return [self._fold(index, set(names[index::folds])) for index in range(folds)]
+
+    def _fold(self, index: int, left_out: set[str]) -> NetworkScores:
+        """Return networks trained without some sequences, and the scans of these."""
+        scans = self.plan.scans
+        seen = [record for record in scans.train if record.sequence not in left_out]
+        unseen = [record for record in scans.train if record.sequence in left_out]
+        plan = dataclasses.replace(
+            self.plan,
+            scans=dataclasses.replace(scans, train=seen, val=unseen),
+            out=self.plan.out / "folds" / str(index),
+            options=dataclasses.replace(self.plan.options, resume=True),
+        )
+        return NetworkScores(load(self.train_networks(plan)), unseen)
