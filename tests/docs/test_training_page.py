@@ -68,7 +68,7 @@ def run(words: list[str], folder: Path) -> None:
 @pytest.mark.parametrize("page", ["README.md", "docs/training.md"])
 def test_the_commands_on_training_run(page: str, downloads: Path) -> None:
     commands = [words for words in commands_of(page) if any("/data/" in word for word in words)]
-    assert len(commands) >= 8
+    assert len(commands) >= (8 if page == "docs/training.md" else 4)
     for words in commands:
         run(words, downloads)
     assert load(downloads / "runs/kitti").parts == ("range_net", "polar_net", "point_head")
