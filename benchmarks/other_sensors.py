@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud
 from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.formats.cloud import Cloud
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.inputs import adapter_for
 from amvnet.inference.segmenter import Segmenter

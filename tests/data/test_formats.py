@@ -20,10 +20,10 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 from amvnet.data.formats.cloud import MAX_POINTS
-from amvnet.data.formats.detect import read_cloud, scan_stem, scans_in_file
+from amvnet.data.formats.detect import find_scans, read_cloud, scan_stem, scans_in_file
 from amvnet.data.formats.pcd import unpack_lzf
 from amvnet.data.formats.pointcloud2 import read_message
-from amvnet.data.scan_files import find_scans, read_scan
+from amvnet.data.scan_files import read_scan
 
 from fixtures.scan_writers import (
     FLOATS,

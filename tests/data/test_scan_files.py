@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
-from amvnet.data.scan_files import find_scans, read_scan, write_labels
+from amvnet.data.formats.detect import find_scans
+from amvnet.data.scan_files import read_scan, write_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.files import atomic_write
 

@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fixtures.worlds import fails
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.simulation import simulate, writing
+
+from fixtures.worlds import fails
 
 pytest.importorskip("embreex")
 

@@ -12,7 +12,6 @@ from amvnet.models.methods import METHODS
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
-    from amvnet.data.taxonomy import Taxonomy
     from amvnet.distributed import Processes
     from amvnet.inference.score_files import ScorePair, Which
 
@@ -32,17 +31,12 @@ def join_processes(cuda: bool = False) -> Processes:
     return processes
 
 
-def open_data(data: str, classes: Path | Taxonomy | None = None) -> Dataset:
-    """Open the dataset that a verb is given.
-
-    Args:
-        classes: the YAML file of a user's classes, or a taxonomy; None means the benchmark's own.
-    """
+def open_data(data: str, taxonomy: Path | None = None) -> Dataset:
+    """Open the dataset that a verb is given, with a user's YAML file of classes if there is one."""
     from amvnet.data.datasets.open import open_dataset
     from amvnet.data.taxonomy import taxonomy_from_yaml
 
-    taxonomy = taxonomy_from_yaml(classes) if isinstance(classes, Path) else classes
-    return open_dataset(data, taxonomy)
+    return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
 
 
 def describe_records(records: Sequence[ScanRecord]) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.formats.detect import ENDINGS, is_bag_folder, is_scan_file, read_cloud
+from amvnet.data.formats.detect import read_cloud
 from amvnet.data.formats.raw import (
     FULL_INTENSITY,
     KITTI_COLUMNS,
@@ -43,31 +43,6 @@ def read_scan(path: Path | str) -> Scan:
         InputError: if the file is missing, of another format, truncated, empty or all NaN.
     """
     return read_cloud(path).to_scan()
-
-
-def find_scans(path: Path | str) -> list[Path]:
-    """Return the scan files and bags of a folder, sorted by name; only the path if it is a file.
-
-    Hidden files are left out.
-
-    Raises:
-        InputError: if the path does not exist, or the folder has no scan.
-    """
-    path = Path(path)
-    if path.is_file() or is_bag_folder(path):
-        return [path]
-    if not path.is_dir():
-        raise InputError(
-            f"{path}: expected a scan file or a folder of scans, found nothing; check the path"
-        )
-
-    scans = sorted(filter(is_scan_file, path.iterdir()))
-    if not scans:
-        raise InputError(
-            f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; "
-            "give the folder of scans"
-        )
-    return scans
 
 
 def check_points(points: np.ndarray, path: Path) -> np.ndarray:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.select import check_classes
+from amvnet.data.datasets.open import check_classes
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation

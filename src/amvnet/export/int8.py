@@ -12,7 +12,7 @@ import numpy as np
 
 from amvnet.errors import InputError
 from amvnet.export.onnx_files import digest, quiet, strip, writer_errors
-from amvnet.inference.inputs import ScanOptions, adapter_for, open_inputs
+from amvnet.inference.inputs import Inputs, ScanOptions, adapter_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
@@ -102,9 +102,11 @@ class _Recorder(OnnxSegmenter):
 def _read(text: str, segmenter: Segmenter) -> list[Scan]:
     """Read up to `SCANS` scans, evenly spaced, adapted to the weights as `predict` does."""
     adapter = adapter_for(segmenter.weights)
-    inputs = open_inputs([text], ScanOptions(), segmenter.taxonomy, adapter).scans
-    indices = np.linspace(0, len(inputs) - 1, min(SCANS, len(inputs))).astype(int)
-    loaded = [inputs[index].load().scan for index in indices]
+    inputs = Inputs(ScanOptions(), segmenter.taxonomy, adapter)
+    inputs.open([text])
+    count = len(inputs.scans)
+    indices = np.linspace(0, count - 1, min(SCANS, count)).astype(int)
+    loaded = [inputs.scans[index].load().scan for index in indices]
 
     scans = [scan for scan in loaded if scan.valid.any()]
     if not scans:

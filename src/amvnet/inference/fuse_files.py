@@ -9,7 +9,7 @@ from pathlib import Path
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.inference.fusion import Fusion
-from amvnet.inference.inputs import InputScan, ScanOptions, open_inputs
+from amvnet.inference.inputs import Inputs, InputScan, ScanOptions
 from amvnet.inference.pipeline import OutputOptions, Pipeline, segment_inputs
 from amvnet.inference.score_files import ScorePair
 from amvnet.inference.segmenter import Segmentation, check_scan
@@ -99,7 +99,8 @@ def fuse_files(
     view = ModelConfig().range_view if head is None else head.model.range_view
     adapter = ScanAdapter(view, "" if head is None else head.sensor)
 
-    opened = open_inputs(inputs, options, taxonomy, adapter)
+    opened = Inputs(options, taxonomy, adapter)
+    opened.open(inputs)
     for scan in opened.scans:
         pair.a.find(scan.scores_path)
         pair.b.find(scan.scores_path)

@@ -9,13 +9,12 @@ from typing import Protocol
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.open import is_dataset, open_dataset
-from amvnet.data.datasets.select import check_classes, choose_records, custom_taxonomy
-from amvnet.data.formats.detect import NamedScan, ending_of, scan_stem, scans_in_file
+from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
+from amvnet.data.datasets.open import open_if_dataset
+from amvnet.data.formats.detect import NamedScan, ending_of, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.label_files import write_scan_labels
-from amvnet.data.scan_files import find_scans, read_labels
+from amvnet.data.scan_files import read_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.progress import Say, say_nothing
@@ -194,7 +193,6 @@ class FileReader:
 class FileScan:
     """A scan in a file or a bag."""
 
-    path: Path
     scan: NamedScan
     reader: FileReader
 
@@ -209,6 +207,10 @@ class FileScan:
     @property
     def scores_path(self) -> Path:
         return Path(f"{self.scan.name}.npz")
+
+    @property
+    def path(self) -> Path:
+        return self.scan.path
 
     @property
     def is_adapted(self) -> bool:
@@ -235,70 +237,65 @@ class FileScan:
         )
 
 
-@dataclass(frozen=True)
 class Inputs:
-    """The scans that a user named, and the classes of their labels."""
-
-    taxonomy: Taxonomy
-    scans: list[InputScan]
-
-
-def open_inputs(
-    inputs: Sequence[str],
-    options: ScanOptions,
-    taxonomy: Taxonomy | None = None,
-    adapter: ScanAdapter | None = None,
-) -> Inputs:
-    """List the scans of all inputs.
+    """The scans that a user named, and the classes of their labels.
 
     Args:
-        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
-        options: which of their scans to use.
+        options: which scans of the inputs to use.
         taxonomy: the classes, of weights or as the user names them. If None, they are those of the
             datasets; scan files have nuScenes' if they end in `.pcd.bin`, else SemanticKITTI's.
         adapter: adapts scan files to weights; None reads them as they are.
 
-    Raises:
-        InputError: if an input is missing or has no scan, or the inputs have different classes.
+    Attributes:
+        scans: in the order of the inputs.
     """
-    reader = FileReader(adapter)
-    scans: list[InputScan] = []
-    taxonomies: list[Taxonomy] = []
-    for text in inputs:
-        if is_dataset(text):
-            dataset = _open_dataset(text, taxonomy)
-            records = choose_records(dataset, options.sequences, options.split)
-            scans += [DatasetScan(dataset, record) for record in records]
-            taxonomies.append(dataset.taxonomy)
-        else:
-            paths = find_scans(text)
-            scans += _file_scans(paths, reader, options.topic)
-            taxonomies.append(taxonomy or _usual_taxonomy(paths[0]))
 
-    if len({taxonomy.classes for taxonomy in taxonomies}) > 1:
-        raise InputError(
-            "expected inputs with the same classes, found several; take them one after the other"
-        )
-    return Inputs(taxonomies[0], scans)
+    def __init__(
+        self,
+        options: ScanOptions,
+        taxonomy: Taxonomy | None = None,
+        adapter: ScanAdapter | None = None,
+    ) -> None:
+        self.scans: list[InputScan] = []
+        self._options = options
+        self._named_taxonomy = taxonomy
+        self._taxonomies: list[Taxonomy] = []
+        self._reader = FileReader(adapter)
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        return self._taxonomies[0]
+
+    def open(self, inputs: Sequence[str]) -> None:
+        """List the scans of all inputs.
+
+        Args:
+            inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of
+                these.
+
+        Raises:
+            InputError: if an input is missing or has no scan, or the inputs have different classes.
+        """
+        options = self._options
+        for text in inputs:
+            dataset = open_if_dataset(text, self._named_taxonomy)
+            if dataset is not None:
+                for record in choose_records(dataset, options.sequences, options.split):
+                    self.scans.append(DatasetScan(dataset, record))
+                self._taxonomies.append(dataset.taxonomy)
+            else:
+                for scan in list_scans(text, options.topic):
+                    self._reader.add(scan)
+                    self.scans.append(FileScan(scan, self._reader))
+                self._taxonomies.append(self._named_taxonomy or _usual_taxonomy(self.scans[-1]))
+
+        if len({taxonomy.classes for taxonomy in self._taxonomies}) > 1:
+            raise InputError(
+                "expected inputs with the same classes, found several; "
+                "take them one after the other"
+            )
 
 
-def _open_dataset(text: str, taxonomy: Taxonomy | None) -> Dataset:
-    if taxonomy is None:
-        return open_dataset(text)
-    dataset = open_dataset(text, custom_taxonomy(taxonomy))
-    check_classes(dataset, taxonomy)
-    return dataset
-
-
-def _file_scans(paths: Sequence[Path], reader: FileReader, topic: str | None) -> list[InputScan]:
-    scans: list[InputScan] = []
-    for path in paths:
-        for scan in scans_in_file(path, topic):
-            reader.add(scan)
-            scans.append(FileScan(path, scan, reader))
-    return scans
-
-
-def _usual_taxonomy(path: Path) -> Taxonomy:
+def _usual_taxonomy(scan: InputScan) -> Taxonomy:
     """Return the classes that labels of a scan file have if nobody names them."""
-    return NUSCENES if ending_of(path) == NUSCENES_ENDING else SEMANTICKITTI
+    return NUSCENES if ending_of(scan.path) == NUSCENES_ENDING else SEMANTICKITTI

@@ -8,7 +8,7 @@ from itertools import groupby
 from typing import Any
 
 from amvnet.errors import InputError
-from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.inputs import Inputs, InputScan, ScanOptions, adapter_for
 from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline, segment_inputs
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.progress import Progress, no_progress
@@ -48,13 +48,14 @@ def predict(
             "use amvnet"
         )
     adapter = adapter or adapter_for(segmenter.weights)
-    scans = open_inputs(inputs, options, segmenter.taxonomy, adapter).scans
+    opened = Inputs(options, segmenter.taxonomy, adapter)
+    opened.open(inputs)
 
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
     segment = NetworkSegmentation(segmenter)
     pipeline = Pipeline(segment, output, segmenter.taxonomy, execution)
     settings = _settings(segmenter, output, adapter)
-    return segment_inputs(scans, pipeline, settings, progress)
+    return segment_inputs(opened.scans, pipeline, settings, progress)
 
 
 class NetworkSegmentation:

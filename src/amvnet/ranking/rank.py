@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.select import check_classes
+from amvnet.data.datasets.open import check_classes
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.files import atomic_write
 from amvnet.errors import InputError
+from amvnet.files import atomic_write
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan
 from amvnet.simulation.lidar import require_embree

@@ -11,7 +11,7 @@ import numpy as np
 from amvnet.data.datasets.select import taxonomy_named
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.inputs import Inputs, InputScan, ScanOptions, adapter_for
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
 from amvnet.progress import Progress, no_progress
@@ -156,7 +156,8 @@ def choose_frames(
 
     adapter = None if source.segmenter is None else adapter_for(source.segmenter.weights)
     taxonomy = source.named_taxonomy()
-    opened = open_inputs(inputs, ScanOptions(sequences), taxonomy, adapter)
+    opened = Inputs(ScanOptions(sequences), taxonomy, adapter)
+    opened.open(inputs)
 
     scans = opened.scans
     if labels is not None and labels.is_file() and len(scans) > 1:

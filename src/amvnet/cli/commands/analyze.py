@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, open_data, parse_names, parse_numbers
+from amvnet.cli.options import Split, parse_names, parse_numbers
 from amvnet.errors import InputError
 
 
@@ -36,12 +36,9 @@ def analyze(
         device: cpu, cuda, cuda:1, ...
     """
     from amvnet.config.recipes import load_recipe
-    from amvnet.data.datasets.select import (
-        TrainingScans,
-        check_classes,
-        choose_records,
-        custom_taxonomy,
-    )
+    from amvnet.data.datasets.base import choose_records
+    from amvnet.data.datasets.open import open_with_classes
+    from amvnet.data.datasets.select import TrainingScans
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
@@ -55,9 +52,8 @@ def analyze(
             "expected --neighbours and --recipe together, found one of them; give both or neither"
         )
     loaded = load(weights)
-    dataset = open_data(data, custom_taxonomy(loaded.taxonomy))
+    dataset = open_with_classes(data, loaded.taxonomy)
     segmenter = Segmenter(loaded, device, keep_memory=True)
-    check_classes(dataset, loaded.taxonomy)
     records = choose_records(dataset, parse_names(sequences), split)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.

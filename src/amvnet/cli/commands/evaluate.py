@@ -45,7 +45,8 @@ def evaluate(
         device: cpu, cuda, cuda:1, ...
         precision: of the networks; float16 on a GPU only.
     """
-    from amvnet.data.datasets.select import choose_records, custom_taxonomy
+    from amvnet.data.datasets.base import choose_records
+    from amvnet.data.datasets.open import open_with_classes
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
@@ -57,7 +58,10 @@ def evaluate(
     names = parse_names(sequences)
     if weights is not None and predictions is None:
         loaded = load(weights)
-        dataset = open_data(data, taxonomy or custom_taxonomy(loaded.taxonomy))
+        if taxonomy is None:
+            dataset = open_with_classes(data, loaded.taxonomy)
+        else:
+            dataset = open_data(data, taxonomy)
         records = choose_records(dataset, names, split)
         method = widest_method(loaded.parts)
         segmenter = Segmenter(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, open_data, parse_names
+from amvnet.cli.options import Split, parse_names
 
 
 def rank(
@@ -32,7 +32,8 @@ def rank(
         pictures: folder for drawings of the first clusters from above.
         device: cpu, cuda, cuda:1, ...
     """
-    from amvnet.data.datasets.select import choose_records, custom_taxonomy
+    from amvnet.data.datasets.base import choose_records
+    from amvnet.data.datasets.open import open_with_classes
     from amvnet.files import make_folder
     from amvnet.inference.segmenter import Segmenter
     from amvnet.models.methods import widest_method
@@ -42,7 +43,7 @@ def rank(
     from amvnet.weights.file import load
 
     loaded = load(weights)
-    dataset = open_data(data, custom_taxonomy(loaded.taxonomy))
+    dataset = open_with_classes(data, loaded.taxonomy)
     records = choose_records(dataset, parse_names(sequences), split)
     segmenter = Segmenter(loaded, device, widest_method(loaded.parts), keep_memory=True)
 

@@ -78,3 +78,10 @@ class Dataset(Protocol):
         Raises:
             InputError: where there is not one id per point, or an id is outside 0..K.
         """
+
+
+def choose_records(
+    dataset: Dataset, sequences: Sequence[str] | None, split: str
+) -> list[ScanRecord]:
+    """Return the scans of the named sequences, or of a split if there are no names."""
+    return dataset.records(dataset.sequences(split) if sequences is None else sequences)

@@ -1,79 +1,105 @@
-"""From what a user writes to an open data set."""
+"""Open the dataset that a user names."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.semantickitti import SemanticKitti
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
 
-__all__ = ["Dataset", "ScanRecord", "is_dataset", "open_dataset"]
+Reader = type[SemanticKitti] | type[NuScenes]
 
-KINDS: dict[str, type[SemanticKitti] | type[NuScenes]] = {
-    "semantickitti": SemanticKitti,
-    "nuscenes": NuScenes,
-}
+READERS: dict[str, Reader] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
 
 
 def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
-    """Open a data set.
+    """Open a dataset.
 
     Args:
-        spec: `semantickitti:PATH`, `nuscenes:PATH`, `nuscenes:PATH@v1.0-mini`, or a plain path
-            whose layout says which of them it is.
-        taxonomy: the classes, where they are not the benchmark's own.
+        spec: `semantickitti:PATH`, `nuscenes:PATH`, `nuscenes:PATH@v1.0-mini`, or a plain path with
+            the layout of one of them.
+        taxonomy: the classes, if they are not the benchmark's own.
 
     Raises:
-        InputError: where the path is not there or does not have the layout.
+        InputError: if the path does not exist or does not have the layout.
     """
-    kind, _, place = str(spec).partition(":")
-    if kind not in KINDS:
-        kind, place = "", str(spec)
-    path, version = _split_version(place)
+    kind, _, rest = str(spec).partition(":")
+    path, version = _split_version(rest if kind in READERS else str(spec))
     if not path.is_dir():
         raise InputError(f"{path}: expected the folder of a data set, found none; check the path")
-    return _open(KINDS[kind] if kind else _guess(path), path, version, taxonomy)
 
-
-def is_dataset(spec: str) -> bool:
-    """Whether a text names a data set, by its prefix or by the layout of its folder, rather than scan files."""
-    path, version = _split_version(spec)
-    named = spec.partition(":")[0] in KINDS or version is not None
-    return named or (path.is_dir() and any(opener.matches(path) for opener in KINDS.values()))
-
-
-def _split_version(place: str) -> tuple[Path, str | None]:
-    """Split PATH@v1.0-mini; other names with an @ stay whole."""
-    path, at, version = place.rpartition("@")
-    if not at or not version.startswith("v1.0-") or Path(place).exists():
-        return Path(place).expanduser(), None
-    return Path(path).expanduser(), version
-
-
-def _guess(path: Path) -> type[SemanticKitti] | type[NuScenes]:
-    found = [opener for opener in KINDS.values() if opener.matches(path)]
-    if len(found) == 1:
-        return found[0]
-    raise InputError(
-        f"{path}: expected either sequences/XX/velodyne (SemanticKITTI) or v1.0-*/sample_data.json (nuScenes), "
-        f"found {'both' if found else 'neither'}; write {' or '.join(f'{kind}:PATH' for kind in KINDS)}"
-    )
-
-
-def _open(
-    opener: type[SemanticKitti] | type[NuScenes],
-    path: Path,
-    version: str | None,
-    taxonomy: Taxonomy | None,
-) -> Dataset:
+    reader = READERS[kind] if kind in READERS else _guess_reader(path)
     options = {} if taxonomy is None else {"taxonomy": taxonomy}
-    if issubclass(opener, NuScenes):
-        return opener(path, version=version, **options)
+    if issubclass(reader, NuScenes):
+        return reader(path, version=version, **options)
     if version is not None:
         raise InputError(
             f"{path}: expected no version after @, found {version}; only nuScenes has versions"
         )
-    return opener(path, **options)
+    return reader(path, **options)
+
+
+def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
+    """Open a dataset that must have the classes of some weights.
+
+    Raises:
+        InputError: as `open_dataset`, or if it has other classes.
+    """
+    # A benchmark brings its own classes; a user's own ones, it must be read with.
+    is_custom = taxonomy.name not in TAXONOMIES
+    dataset = open_dataset(spec, taxonomy if is_custom else None)
+    check_classes(dataset, taxonomy)
+    return dataset
+
+
+def open_if_dataset(spec: str, taxonomy: Taxonomy | None) -> Dataset | None:
+    """Open a dataset, with the classes of weights if there are any; None if it names scan files.
+
+    Raises:
+        InputError: as `open_with_classes`.
+    """
+    if not is_dataset(spec):
+        return None
+    return open_dataset(spec) if taxonomy is None else open_with_classes(spec, taxonomy)
+
+
+def is_dataset(spec: str) -> bool:
+    """Return whether a text names a dataset, by its prefix or by the layout of its folder."""
+    path, version = _split_version(spec)
+    kind = spec.partition(":")[0]
+    if kind in READERS or version is not None:
+        return True
+    return path.is_dir() and any(reader.matches(path) for reader in READERS.values())
+
+
+def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
+    """Raise InputError if weights have other classes than the dataset."""
+    if taxonomy.classes != dataset.taxonomy.classes:
+        raise InputError(
+            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those "
+            f"of {taxonomy.name}; use weights trained on this benchmark"
+        )
+
+
+def _split_version(text: str) -> tuple[Path, str | None]:
+    """Split PATH@v1.0-mini; other names with an @ stay whole."""
+    path, at, version = text.rpartition("@")
+    if not at or not version.startswith("v1.0-") or Path(text).exists():
+        return Path(text).expanduser(), None
+    return Path(path).expanduser(), version
+
+
+def _guess_reader(path: Path) -> Reader:
+    """Return the reader of a folder's layout."""
+    readers = [reader for reader in READERS.values() if reader.matches(path)]
+    if len(readers) == 1:
+        return readers[0]
+    found = "both" if readers else "neither"
+    choices = " or ".join(f"{kind}:PATH" for kind in READERS)
+    raise InputError(
+        f"{path}: expected either sequences/XX/velodyne (SemanticKITTI) or v1.0-*/sample_data.json "
+        f"(nuScenes), found {found}; write {choices}"
+    )

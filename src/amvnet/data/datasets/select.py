@@ -1,4 +1,4 @@
-"""Choose the scans of a dataset to use, and the classes to read them with."""
+"""Choose the scans of a training, and the classes that a user names."""
 
 from __future__ import annotations
 
@@ -40,27 +40,6 @@ class TrainingScans:
 def taxonomy_named(text: str) -> Taxonomy:
     """Return the classes of a benchmark by its name, or those of a YAML file."""
     return TAXONOMIES[text] if text in TAXONOMIES else taxonomy_from_yaml(text)
-
-
-def custom_taxonomy(taxonomy: Taxonomy) -> Taxonomy | None:
-    """Return a user's own classes, which a dataset must be read with; None for a benchmark's."""
-    return taxonomy if taxonomy.name not in TAXONOMIES else None
-
-
-def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
-    """Raise InputError if the classes, of weights or named by the user, are not the dataset's."""
-    if taxonomy.classes != dataset.taxonomy.classes:
-        raise InputError(
-            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those "
-            f"of {taxonomy.name}; use weights trained on this benchmark"
-        )
-
-
-def choose_records(
-    dataset: Dataset, sequences: Sequence[str] | None, split: str
-) -> list[ScanRecord]:
-    """Return the scans of the named sequences, or of a split if there are no names."""
-    return dataset.records(dataset.sequences(split) if sequences is None else sequences)
 
 
 def split_records(

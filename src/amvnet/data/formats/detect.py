@@ -1,4 +1,4 @@
-"""Which format a scan file has, by what is in it, and the scans that a file holds."""
+"""Find scan files and bags, detect their formats, and list the scans that they hold."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ READERS: dict[str, Callable[[Path], Cloud]] = {
 }
 BAGS = (".bag", ".mcap", ".db3")
 ENDINGS = (*READERS, *BAGS)
-FOLDER = ""  # in place of an ending: the folder of a ROS 2 bag
+FOLDER = ""  # instead of an ending: the folder of a ROS 2 bag
+# The first bytes of files.
 BEGINNINGS = {
     b"\x93NUMPY": ".npy",
     b"PK\x03\x04": ".npz",
@@ -41,70 +42,78 @@ BEGINNINGS = {
     b"#ROSBAG": ".bag",
     b"\x89MCAP0\r\n": ".mcap",
     b"SQLite format 3\x00": ".db3",
-}  # of files
+}
 
 
 @dataclass(frozen=True)
 class NamedScan:
-    """A scan that is not read yet.
+    """A scan in a file or a bag, not read yet.
 
     Attributes:
-        name: unique among the scans of one input: `000000` of a file `000000.bin`, `drive/000000` of a bag `drive.bag`.
-        source: tells the scans of one recording from others: the bag, or the folder and the ending.
+        name: unique among the scans of one input: `000000` for the file `000000.bin`,
+            `drive/000000` for the first scan of the bag `drive.bag`.
+        source: the same for all scans of one recording: the bag, or the folder and the ending.
+        path: the file or the bag.
         read: reads it.
     """
 
     name: str
     source: str
+    path: Path
     read: Callable[[], Cloud]
 
 
-def is_bag_folder(path: Path) -> bool:
-    """Whether a folder is a ROS 2 bag."""
-    return (path / METADATA).is_file() and any(
-        any(path.glob(f"*{ending}*")) for ending in (".db3", ".mcap")
-    )
+def find_scans(path: Path | str) -> list[Path]:
+    """Return the scan files and bags of a folder, sorted by name; only the path if it is a file.
 
-
-def is_scan_file(path: Path) -> bool:
-    """Whether the name of a file in a folder says that it is a scan or a bag, and not what was found of one."""
-    if path.name.startswith(".") or path.name.endswith(".uncertain.npy"):
-        return False
-    if path.suffix == ".npz" and path.with_suffix(".label").exists():
-        return False
-    return is_bag_folder(path) if path.is_dir() else path.name.lower().endswith(ENDINGS)
-
-
-def ending_of(path: Path) -> str:
-    """The ending that a file should have, by its first bytes, or else by its name.
+    Hidden files are left out.
 
     Raises:
-        InputError: where neither says it.
+        InputError: if the path does not exist, or the folder has no scan.
     """
-    if path.is_dir():
-        return FOLDER
-    if not path.is_file():
-        raise InputError(f"{path}: expected a scan file, found none; check the path")
-    with path.open("rb") as file:
-        begin = file.read(max(map(len, BEGINNINGS)))
-    for known, ending in BEGINNINGS.items():
-        if begin.startswith(known):
-            return ending
-    named = next((ending for ending in ENDINGS if path.name.lower().endswith(ending)), None)
-    if columns_of(path) is not None:
-        return named if named in (NUSCENES_ENDING, ".bin") else ".bin"
-    if named is None:
+    path = Path(path)
+    if path.is_file() or is_bag_folder(path):
+        return [path]
+    if not path.is_dir():
         raise InputError(
-            f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; convert it to one"
+            f"{path}: expected a scan file or a folder of scans, found nothing; check the path"
         )
-    return named
+
+    paths = sorted(filter(is_scan_file, path.iterdir()))
+    if not paths:
+        raise InputError(
+            f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; "
+            "give the folder of scans"
+        )
+    return paths
+
+
+def list_scans(path: Path | str, topic: str | None = None) -> Iterator[NamedScan]:
+    """Yield the scans of a file, a bag, or a folder of these; those of a bag in order of time.
+
+    Args:
+        topic: of bags; None means the only topic with PointCloud2 messages.
+
+    Raises:
+        InputError: if there is no scan, a format cannot be told, or a bag cannot be read.
+    """
+    for file in find_scans(path):
+        ending = ending_of(file)
+        name = scan_stem(file)
+        if ending in READERS:
+            source = str(file.parent / f"*{ending}")
+            yield NamedScan(name, source, file, partial(READERS[ending], file))
+            continue
+        bag = Bag(file, ending, topic)
+        for index in range(len(bag)):
+            yield NamedScan(f"{name}/{index:06d}", str(file), file, partial(bag.read, index))
 
 
 def read_cloud(path: Path | str) -> Cloud:
-    """Read the one scan of a file.
+    """Read the only scan of a file.
 
     Raises:
-        InputError: where the file is missing, of another format, broken, or a bag of several scans.
+        InputError: if the file is missing, of another format, broken, or a bag of several scans.
     """
     path = Path(path)
     ending = ending_of(path)
@@ -118,28 +127,61 @@ def read_cloud(path: Path | str) -> Cloud:
     return bag.read(0)
 
 
-def scans_in_file(path: Path, topic: str | None = None) -> Iterator[NamedScan]:
-    """The scans of a file: itself, or those of a bag, in order of time.
-
-    Args:
-        topic: of a bag; by default its only one with PointCloud2.
+def ending_of(path: Path) -> str:
+    """Return the ending that a file should have, by its first bytes, or else by its name.
 
     Raises:
-        InputError: where the format cannot be told, or a bag not be read.
+        InputError: if neither tells.
     """
-    ending = ending_of(path)
-    if ending in READERS:
-        yield NamedScan(
-            scan_stem(path), str(path.parent / f"*{ending}"), lambda: READERS[ending](path)
+    if path.is_dir():
+        return FOLDER
+    if not path.is_file():
+        raise InputError(f"{path}: expected a scan file, found none; check the path")
+
+    with path.open("rb") as file:
+        beginning = file.read(max(map(len, BEGINNINGS)))
+    for known, ending in BEGINNINGS.items():
+        if beginning.startswith(known):
+            return ending
+
+    named = _named_ending(path)
+    if columns_of(path) is not None:
+        return named if named in (NUSCENES_ENDING, ".bin") else ".bin"
+    if named is None:
+        raise InputError(
+            f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; "
+            "convert it to one"
         )
-        return
-    bag = Bag(path, ending, topic)
-    for place in range(len(bag)):
-        yield NamedScan(f"{scan_stem(path)}/{place:06d}", str(path), partial(bag.read, place))
+    return named
+
+
+def _named_ending(path: Path) -> str | None:
+    for ending in ENDINGS:
+        if path.name.lower().endswith(ending):
+            return ending
+    return None
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Return whether a folder is a ROS 2 bag."""
+    if not (path / METADATA).is_file():
+        return False
+    return any(path.glob("*.db3*")) or any(path.glob("*.mcap*"))
+
+
+def is_scan_file(path: Path) -> bool:
+    """Return whether a name in a folder is that of a scan or a bag, and not of predictions."""
+    if path.name.startswith(".") or path.name.endswith(".uncertain.npy"):
+        return False
+    if path.suffix == ".npz" and path.with_suffix(".label").exists():
+        return False
+    return is_bag_folder(path) if path.is_dir() else path.name.lower().endswith(ENDINGS)
 
 
 def scan_stem(path: Path) -> str:
-    """A scan file's name without its ending, `.pcd.bin` included."""
+    """Return a scan file's name without its ending, also without `.pcd.bin`."""
     name = path.absolute().name if path.name in ("", "..") else path.name
-    found = next((ending for ending in ENDINGS if name.lower().endswith(ending)), path.suffix)
-    return name if path.is_dir() or not found else name[: -len(found)]
+    if path.is_dir():
+        return name
+    ending = _named_ending(path.with_name(name)) or path.suffix
+    return name.removesuffix(name[len(name) - len(ending) :]) if ending else name
