@@ -3,7 +3,8 @@
 
 const ATTRIBUTES = { position: 0, intensity: 1, disagreement: 2, label: 3, truth: 4, uncertain: 5 };
 const RINGS = [10, 20, 30, 40, 50], SIDES = 180;
-const MOST_PIXELS = 6e6;  // up to this number, the canvas has two pixels for one along both axes, for smooth edges
+// The canvas is drawn at up to twice the window's resolution, for smooth edges, up to this number of pixels.
+const MOST_PIXELS = 6e6;
 
 class Drawing {
   constructor(canvas) {

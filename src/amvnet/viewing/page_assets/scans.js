@@ -38,7 +38,7 @@ async function read(index) {
   return { ...said, index, planes, positions: positionsOf(bytes, said.count) };
 }
 
-/** Return a promise of the scan at an index: {name, count, center, step, positions, planes: {intensity, truth, rv, ...}}. */
+/** Return a promise of a scan: {name, count, center, step, positions, planes: {intensity, truth, ...}}. */
 function scanAt(index) {
   if (!loaded.has(index)) loaded.set(index, read(index));
   return loaded.get(index);
