@@ -12,40 +12,48 @@ from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
 from amvnet.evaluation.top_view import UNCERTAIN, WRONG, draw_scan
 
-PATCH = 400  # points of one class in one block, dense enough to fill pixels
+BLOCK = 400  # points of one class in one block, dense enough to fill pixels
 
 
 def blocks(classes: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Points in one dense block per class, and their ids."""
+    """Return points in one dense block per class, and their ids."""
     rng = np.random.default_rng(0)
-    points = rng.random((PATCH * len(classes), 4)) * 8
-    points[:, 0] += np.repeat(np.arange(len(classes)) * 10.0 - 40, PATCH)
-    return points.astype(np.float32), np.repeat(classes, PATCH).astype(np.uint8)
+    points = rng.random((BLOCK * len(classes), 4)) * 8
+    points[:, 0] += np.repeat(np.arange(len(classes)) * 10.0 - 40, BLOCK)
+    return points.astype(np.float32), np.repeat(classes, BLOCK).astype(np.uint8)
 
 
-def has(image: np.ndarray, color: tuple[float, ...]) -> bool:
-    return bool((np.abs(image[..., :3] - np.asarray(color)).max(axis=-1) < 2 / 255).sum() > 50)
+def has_color(image: np.ndarray, color: tuple[float, ...]) -> bool:
+    """Return whether more than 50 pixels have a colour, RGB in [0, 1]."""
+    difference = np.abs(image[..., :3] - np.asarray(color)).max(axis=-1)
+    return bool((difference < 2 / 255).sum() > 50)
+
+
+def class_color(class_id: int) -> tuple[float, ...]:
+    return tuple(part / 255 for part in NUSCENES.colors[class_id])
 
 
 def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
     points, truth = blocks([4, 11, 16])
-    wrong = np.where(np.arange(len(truth)) < PATCH, 3, truth)
+    prediction = truth.copy()
+    prediction[:BLOCK] = 3
     path = draw_scan(
         tmp_path / "a" / "b.png",
         points,
         NUSCENES,
-        {"RV": wrong, "AMVNet": truth},
-        truth,
-        truth == 4,
-        "title",
+        {"RV": prediction, "AMVNet": truth},
+        truth=truth,
+        uncertain=truth == 4,
+        title="title",
     )
+
     image = imread(path)
     for class_id in (3, 4, 11, 16):
-        assert has(image, tuple(part / 255 for part in NUSCENES.colors[class_id]))
-    assert not has(image, tuple(part / 255 for part in NUSCENES.colors[7]))
-    assert has(image, WRONG)
-    assert has(image, UNCERTAIN)
-    assert [p.name for p in path.parent.iterdir()] == ["b.png"]
+        assert has_color(image, class_color(class_id))
+    assert not has_color(image, class_color(7))
+    assert has_color(image, WRONG)
+    assert has_color(image, UNCERTAIN)
+    assert [file.name for file in path.parent.iterdir()] == ["b.png"]
 
 
 @pytest.mark.parametrize("with_truth", [False, True])
@@ -53,10 +61,10 @@ def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
 def test_every_part_is_optional(tmp_path: Path, with_truth: bool, with_uncertain: bool) -> None:
     points, ids = blocks([1, 0])
     points[0] = np.nan
+    truth = ids if with_truth else None
     uncertain = ids > 0 if with_uncertain else None
-    assert draw_scan(
-        tmp_path / "a.png", points, NUSCENES, {"p": ids}, ids if with_truth else None, uncertain
-    ).is_file()
+    path = tmp_path / "a.png"
+    assert draw_scan(path, points, NUSCENES, {"p": ids}, truth, uncertain=uncertain).is_file()
 
 
 def test_truth_alone_is_enough(tmp_path: Path) -> None:

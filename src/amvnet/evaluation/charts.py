@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,134 +17,188 @@ from amvnet.files import atomic_write
 
 SIZE = (6.0, 3.6)  # inches
 DOTS_PER_INCH = 160
-# Title, marker and line of each method.
+MOST_MARKED = 20  # values of a sweep that get a marker each; more of them would overlap
+Cell = str | float | int | None
+
+
+@dataclass(frozen=True)
+class Style:
+    """The title of a method, and how Matplotlib draws it."""
+
+    title: str
+    marker: str
+    line: str
+
+
 STYLES = {
-    "rv": ("RV", "o", ":"),
-    "bev": ("BEV", "s", "--"),
-    "ensemble": ("ensemble", "^", "-."),
-    "amvnet": ("AMVNet", "D", "-"),
+    "rv": Style("RV", marker="o", line=":"),
+    "bev": Style("BEV", marker="s", line="--"),
+    "ensemble": Style("ensemble", marker="^", line="-."),
+    "amvnet": Style("AMVNet", marker="D", line="-"),
 }
-Row = Sequence[str | float | int | None]
 
 
 def write_all(found: Analysis, dataset: str, out: Path) -> list[Path]:
-    """Histogram, mIoU by distance, sweep of tau, and Tables 3 and 4; returns the files.
+    """Write the histogram, mIoU by distance, the sweep of tau, and Tables 3 and 4.
 
     Args:
-        dataset: what the user named the data, for the titles.
+        found: the analysis.
+        dataset: the dataset as the user named it, for the titles.
+        out: folder for the files.
+
+    Returns:
+        The files that were written.
     """
     return [
-        *_similarity(found, dataset, out / "similarity"),
-        *_distance(found, dataset, out / "distance"),
+        *_write_similarity(found, dataset, out / "similarity"),
+        *_write_distance(found, dataset, out / "distance"),
         *write_sweep(found.sweep(), "tau", found.tau, dataset, out / "tau"),
-        *_classes(found, out / "classes"),
-        *_methods(found, out / "methods"),
+        *_write_classes(found, out / "classes"),
+        *_write_methods(found, out / "methods"),
     ]
 
 
 def write_sweep(
     swept: Sequence[Swept], name: str, used: float, dataset: str, path: Path
 ) -> list[Path]:
-    """Figure 8 of the paper: what a parameter does to mIoU, and to the share of uncertain points."""
+    """Write Figure 8 of the paper: mIoU and the share of uncertain points over a parameter.
+
+    Args:
+        swept: the figures reached with each value.
+        name: the parameter's name.
+        used: the value in the weights.
+        dataset: the dataset as the user named it, for the title.
+        path: the files to write, without an ending.
+
+    Returns:
+        The files that were written.
+    """
+    values = []
+    mious = []
+    shares = []
+    rows: list[Sequence[Cell]] = []
+    for result in swept:
+        values.append(result.value)
+        mious.append(100 * result.miou)
+        shares.append(100 * result.uncertain)
+        rows.append((values[-1], shares[-1], mious[-1], 100 * result.accuracy))
+
     figure, axes = _figure(f"{name} on {dataset}")
-    values = [one.value for one in swept]
-    marker = "" if len(swept) > 20 else "o"
-    axes.plot(values, [100 * one.miou for one in swept], color="black", marker=marker, label="mIoU")
+    marker = "" if len(swept) > MOST_MARKED else "o"
+    miou_line = axes.plot(values, mious, color="black", marker=marker, label="mIoU")
     axes.set(xlabel=name, ylabel="mIoU (%)")
     axes.axvline(used, color="0.6", linewidth=0.8, linestyle=":")
-    share = axes.twinx()
-    shares = [100 * one.uncertain for one in swept]
-    share.plot(
-        values, shares, color="tab:orange", linestyle="--", marker=marker, label="uncertain points"
-    )
-    share.set_ylabel("uncertain points (%)")
-    share.set_ylim(bottom=0)
-    lines = [*axes.get_lines()[:1], *share.get_lines()]
-    axes.legend(lines, [line.get_label() for line in lines], frameon=False, loc="upper left")
-    rows = [(one.value, 100 * one.uncertain, 100 * one.miou, 100 * one.accuracy) for one in swept]
+
+    share_axes = axes.twinx()
+    share_style = {"color": "tab:orange", "linestyle": "--", "marker": marker}
+    share_line = share_axes.plot(values, shares, label="uncertain points", **share_style)
+    share_axes.set_ylabel("uncertain points (%)")
+    share_axes.set_ylim(bottom=0)
+
+    axes.legend(handles=[*miou_line, *share_line], frameon=False, loc="upper left")
     return _write(path, (name, "uncertain %", "mIoU %", "accuracy %"), rows, figure)
 
 
 def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path) -> list[Path]:
-    """Table 5 of the paper."""
-    table = [("yes" if gru else "no", "yes" if weighted else "no", _percent(found["miou"]), _percent(found["accuracy"]))
-             for gru, weighted, found in rows]  # fmt: skip
+    """Write Table 5 of the paper, the ablation of the range-view network.
+
+    Args:
+        rows: with the GRU or not, with class weights or not, and the metrics reached.
+        path: the files to write, without an ending.
+
+    Returns:
+        The files that were written.
+    """
+    table: list[Sequence[Cell]] = []
+    for gru, weighted, reached in rows:
+        miou = _percent(reached["miou"])
+        accuracy = _percent(reached["accuracy"])
+        table.append(("yes" if gru else "no", "yes" if weighted else "no", miou, accuracy))
     return _write(path, ("GRU", "class weights", "mIoU %", "accuracy %"), table)
 
 
-def _similarity(found: Analysis, dataset: str, path: Path) -> list[Path]:
-    """Figure 5 of the paper: how often the networks agree how much, on a logarithmic scale."""
-    figure, axes = _figure(f"agreement of the two networks on {dataset}")
+def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
+    """Write Figure 5 of the paper: a histogram of how well the two networks agree."""
     edges = np.arange(BINS + 1) / BINS
-    axes.stairs(np.maximum(found.points, 0.5), edges, fill=True, color="0.55")
-    axes.axvline(
-        found.tau, color="black", linewidth=0.8, linestyle=":", label=f"tau = {found.tau:g}"
-    )
-    axes.set(
-        xlabel="cosine similarity of the two scores", ylabel="points", yscale="log", xlim=(0, 1)
-    )
+    total = max(analysis.points.sum(), 1)
+    rows: list[Sequence[Cell]] = []
+    for (low, high), count in zip(pairwise(edges), analysis.points, strict=True):
+        rows.append((low, high, int(count), 100 * float(count / total)))
+
+    figure, axes = _figure(f"agreement of the two networks on {dataset}")
+    # A logarithmic scale has no 0: empty bins end below one point.
+    axes.stairs(np.maximum(analysis.points, 0.5), edges, fill=True, color="0.55")
+    label = f"tau = {analysis.tau:g}"
+    axes.axvline(analysis.tau, color="black", linewidth=0.8, linestyle=":", label=label)
+    axes.set(xlabel="cosine similarity of the two scores", xlim=(0, 1))
+    axes.set(ylabel="points", yscale="log")
     axes.legend(frameon=False, loc="upper left")
-    total = max(found.points.sum(), 1)
-    rows = [
-        (edges[i], edges[i + 1], int(n), 100 * float(n / total)) for i, n in enumerate(found.points)
-    ]
     return _write(path, ("above", "up to", "points", "points %"), rows, figure)
 
 
-def _distance(found: Analysis, dataset: str, path: Path) -> list[Path]:
-    """Figure 6 of the paper: mIoU over the classes present, by distance from the sensor."""
+def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
+    """Write Figure 6 of the paper: mIoU over the classes present, by distance from the sensor."""
+    methods = analysis.evaluation.report(dataset)["methods"]
+    table: list[list[Cell]] = []
+    middles = []
+    for extent in methods["amvnet"]["by_distance"]:
+        table.append([extent["from_m"], extent["to_m"]])
+        middles.append((extent["from_m"] + extent["to_m"]) / 2)
+
     figure, axes = _figure(f"mIoU by distance on {dataset}")
-    report = found.evaluation.report(dataset)["methods"]
-    bins = report["amvnet"]["by_distance"]
-    middles = [(one["from_m"] + one["to_m"]) / 2 for one in bins]
-    for name, (title, marker, line) in STYLES.items():
-        values = [_percent(one["miou_present"]) for one in report[name]["by_distance"]]
-        shown = [np.nan if value is None else value for value in values]
+    for method, style in STYLES.items():
+        heights = []
+        for row, extent in zip(table, methods[method]["by_distance"], strict=True):
+            miou = _percent(extent["miou_present"])
+            row.append(miou)
+            heights.append(np.nan if miou is None else miou)
         axes.plot(
-            middles, shown, label=title, marker=marker, linestyle=line, color="black", markersize=4
+            middles,
+            heights,
+            label=style.title,
+            marker=style.marker,
+            linestyle=style.line,
+            color="black",
+            markersize=4,
         )
+
     axes.set(xlabel="distance from the sensor (m)", ylabel="mIoU, classes present (%)")
     axes.legend(frameon=False)
-    rows = [
-        (
-            one["from_m"],
-            one["to_m"],
-            *(_percent(report[name]["by_distance"][i]["miou_present"]) for name in STYLES),
-        )
-        for i, one in enumerate(bins)
-    ]
-    return _write(
-        path, ("from m", "to m", *(f"{title} %" for title, _, _ in STYLES.values())), rows, figure
-    )
+    columns = [f"{style.title} %" for style in STYLES.values()]
+    return _write(path, ("from m", "to m", *columns), table, figure)
 
 
-def _classes(found: Analysis, path: Path) -> list[Path]:
-    """Table 3 of the paper: IoU by class."""
-    by_method = {
-        name: metrics(found.evaluation.matrices[name][0], found.taxonomy) for name in STYLES
-    }
-    rows: list[Row] = [
-        (c, *(_percent(m["iou"][c]) for m in by_method.values())) for c in found.taxonomy.classes
-    ]
-    rows.append(("mIoU", *(_percent(m["miou"]) for m in by_method.values())))
-    rows.append(("fwIoU", *(_percent(m["fwiou"]) for m in by_method.values())))
-    return _write(path, ("IoU %", *(title for title, _, _ in STYLES.values())), rows)
+def _write_classes(analysis: Analysis, path: Path) -> list[Path]:
+    """Write Table 3 of the paper: IoU by class."""
+    reached = []
+    for method in STYLES:
+        matrix = analysis.evaluation.matrices[method][0]
+        reached.append(metrics(matrix, analysis.taxonomy))
+
+    rows: list[Sequence[Cell]] = []
+    for name in analysis.taxonomy.classes:
+        rows.append((name, *(_percent(values["iou"][name]) for values in reached)))
+    rows.append(("mIoU", *(_percent(values["miou"]) for values in reached)))
+    rows.append(("fwIoU", *(_percent(values["fwiou"]) for values in reached)))
+    return _write(path, ("IoU %", *(style.title for style in STYLES.values())), rows)
 
 
-def _methods(found: Analysis, path: Path) -> list[Path]:
-    """Table 4 of the paper: the networks, the ensembles and AMVNet."""
-    titles = {name: title for name, (title, _, _) in STYLES.items()} | {
-        "arithmetic": "arithmetic mean",
-        "ensemble": "geometric mean",
-    }
-    rows = []
-    for name, matrices in found.evaluation.matrices.items():
-        reached = metrics(matrices[0], found.taxonomy)
-        figures = (_percent(reached[key]) for key in ("miou", "miou_present", "accuracy", "fwiou"))
-        rows.append((titles.get(name, name), *figures))
-    return _write(
-        path, ("method", "mIoU %", "mIoU % of the classes present", "accuracy %", "fwIoU %"), rows
-    )
+def _write_methods(analysis: Analysis, path: Path) -> list[Path]:
+    """Write Table 4 of the paper: the networks, the ensembles and AMVNet."""
+    titles = {method: style.title for method, style in STYLES.items()}
+    titles["arithmetic"] = "arithmetic mean"
+    titles["ensemble"] = "geometric mean"
+
+    rows: list[Sequence[Cell]] = []
+    for method, matrices in analysis.evaluation.matrices.items():
+        reached = metrics(matrices[0], analysis.taxonomy)
+        row: list[Cell] = [titles.get(method, method)]
+        for key in ("miou", "miou_present", "accuracy", "fwiou"):
+            row.append(_percent(reached[key]))
+        rows.append(row)
+
+    columns = ("method", "mIoU %", "mIoU % of the classes present", "accuracy %", "fwIoU %")
+    return _write(path, columns, rows)
 
 
 def _percent(value: float | None) -> float | None:
@@ -150,6 +206,7 @@ def _percent(value: float | None) -> float | None:
 
 
 def _figure(title: str) -> tuple[Any, Any]:
+    """Return an empty Matplotlib figure with a title, and its axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -161,22 +218,35 @@ def _figure(title: str) -> tuple[Any, Any]:
     return figure, axes
 
 
-def _write(path: Path, heads: Sequence[str], rows: Sequence[Row], figure: Any = None) -> list[Path]:
-    """The same rows as CSV and as Markdown, and the figure where there is one."""
-    files = [path.with_suffix(".csv"), path.with_suffix(".md")]
-    with atomic_write(files[0]) as part, part.open("w", newline="") as file:
-        csv.writer(file).writerows([heads, *rows])
-    cells = [heads, ["---"] * len(heads), *([_shown(value) for value in row] for row in rows)]
-    with atomic_write(files[1]) as part:
-        part.write_text("".join(f"| {' | '.join(row)} |\n" for row in cells))
-    if figure is not None:
-        files.append(path.with_suffix(".png"))
-        with atomic_write(files[-1]) as part:
-            figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor="white")
-    return files
+def _write(
+    path: Path, columns: Sequence[str], rows: Sequence[Sequence[Cell]], figure: Any = None
+) -> list[Path]:
+    """Write the rows as CSV and as Markdown, and the figure as PNG if there is one."""
+    csv_path = path.with_suffix(".csv")
+    with atomic_write(csv_path) as part, part.open("w", newline="") as file:
+        csv.writer(file).writerows([columns, *rows])
+
+    lines = [_markdown_row(columns), _markdown_row(["---"] * len(columns))]
+    for row in rows:
+        lines.append(_markdown_row(row))
+    markdown_path = path.with_suffix(".md")
+    with atomic_write(markdown_path) as part:
+        part.write_text("".join(lines))
+
+    if figure is None:
+        return [csv_path, markdown_path]
+    png_path = path.with_suffix(".png")
+    with atomic_write(png_path) as part:
+        figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor="white")
+    return [csv_path, markdown_path, png_path]
 
 
-def _shown(value: str | float | int | None) -> str:
-    if value is None:
+def _markdown_row(cells: Sequence[Cell]) -> str:
+    texts = [_cell_text(cell) for cell in cells]
+    return f"| {' | '.join(texts)} |\n"
+
+
+def _cell_text(cell: Cell) -> str:
+    if cell is None:
         return "–"
-    return f"{value:.2f}" if isinstance(value, float) else str(value)
+    return f"{cell:.2f}" if isinstance(cell, float) else str(cell)

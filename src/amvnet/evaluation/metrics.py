@@ -1,4 +1,4 @@
-"""Confusion matrices, and the official formulas of both benchmarks on them."""
+"""Confusion matrices, and the official formulas of both benchmarks applied to them."""
 
 from __future__ import annotations
 
@@ -12,75 +12,84 @@ import numpy as np
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
-EDGES = (
-    0.0,
-    10.0,
-    20.0,
-    30.0,
-    40.0,
-    50.0,
-)  # metres; those of SemanticKITTI's evaluation by distance
+# Metres; the distances of SemanticKITTI's evaluation by distance.
+EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
 
 
 def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarray:
-    """Count how often each true class was given each class.
+    """Count how often each true class was predicted as each class.
 
     Args:
-        truth: (N,) ids in 0..K.
-        prediction: (N,) ids in 0..K.
+        truth: (N,) train ids in 0..K.
+        prediction: (N,) train ids in 0..K.
         size: K, the number of classes.
 
     Returns:
         (K + 1, K + 1) int64; the row is the true id, the column the predicted one.
 
     Raises:
-        InputError: where the two differ in length or an id is outside 0..K.
+        InputError: if the two differ in length or an id is outside 0..K.
     """
-    truth, prediction = np.asarray(truth), np.asarray(prediction)
+    truth = np.asarray(truth)
+    prediction = np.asarray(prediction)
     if truth.shape != prediction.shape or truth.ndim != 1:
         raise InputError(
-            f"expected one predicted id for each of the {truth.shape} true ids, found {prediction.shape}; "
-            "give the prediction of this scan"
+            f"expected one predicted id for each of the {truth.shape} true ids, "
+            f"found {prediction.shape}; give the prediction of this scan"
         )
-    for kind, ids in (("true", truth), ("predicted", prediction)):
-        if ids.size and not 0 <= ids.min() <= ids.max() <= size:
-            raise InputError(
-                f"expected {kind} ids 0..{size}, found {ids.min()}..{ids.max()}; map raw labels to train ids first"
-            )
+    _check_ids(truth, "true", size)
+    _check_ids(prediction, "predicted", size)
+
     cells = truth.astype(np.int64) * (size + 1) + prediction
-    return np.bincount(cells, minlength=(size + 1) ** 2).reshape(size + 1, size + 1)
+    counts = np.bincount(cells, minlength=(size + 1) ** 2)
+    return counts.reshape(size + 1, size + 1)
+
+
+def _check_ids(ids: np.ndarray, kind: str, size: int) -> None:
+    if len(ids) and not 0 <= ids.min() <= ids.max() <= size:
+        raise InputError(
+            f"expected {kind} ids 0..{size}, found {ids.min()}..{ids.max()}; "
+            "map raw labels to train ids first"
+        )
 
 
 def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
     """Apply the benchmark's formulas to a confusion matrix.
 
-    Points whose truth is ignored (row 0) never count. A labelled point that was predicted as
-    ignored (column 0) counts as missed for its class, and is left out of the accuracy, as in
+    Points whose true label is ignored (row 0) never count. A labelled point that was predicted
+    as ignored (column 0) counts as missed for its class, but does not enter the accuracy, as in
     SemanticKITTI's tool; nuScenes' tool does not allow such predictions.
 
     Args:
         matrix: (K + 1, K + 1) counts, truth by prediction.
-        taxonomy: its `counts_absent` says what a class counts that is in neither of them.
+        taxonomy: the classes; its `counts_absent` says whether a class that is neither in the
+            truth nor predicted enters the mIoU, with an IoU of 0.
 
     Returns:
-        "miou" (official), "miou_present" (over the classes in the truth), "accuracy", "fwiou"
-        (IoU weighted by the frequency in the truth) and "iou" {class: value}, fractions; None
-        where nothing was there to count.
+        Fractions, or None if there were no points to count: "miou" (official), "miou_present"
+        (over the classes in the truth), "accuracy", "fwiou" (IoU weighted by the frequency in
+        the truth) and "iou" {class: value}.
     """
-    counted = matrix[1:].astype(np.float64)  # (K, K + 1): the points whose truth is a class
-    hit = np.diagonal(counted[:, 1:])
-    true, predicted = counted.sum(axis=1), counted[:, 1:].sum(axis=0)
-    union = true + predicted - hit
-    iou = np.divide(hit, union, out=np.zeros_like(hit), where=union > 0)
+    labelled = matrix[1:].astype(np.float64)  # (K, K + 1)
+    correct = np.diagonal(labelled[:, 1:])
+    true = labelled.sum(axis=1)
+    predicted = labelled[:, 1:].sum(axis=0)
+    union = true + predicted - correct
+    iou = np.divide(correct, union, out=np.zeros_like(correct), where=union > 0)
+
+    present = true > 0
     averaged = np.full(len(iou), True) if taxonomy.counts_absent else union > 0
+
+    iou_by_class: dict[str, float | None] = {}
+    for index, name in enumerate(taxonomy.classes):
+        iou_by_class[name] = float(iou[index]) if union[index] > 0 else None
+
     return {
         "miou": _ratio(iou[averaged].sum(), averaged.sum()),
-        "miou_present": _ratio(iou[true > 0].sum(), (true > 0).sum()),
-        "accuracy": _ratio(hit.sum(), predicted.sum()),
+        "miou_present": _ratio(iou[present].sum(), present.sum()),
+        "accuracy": _ratio(correct.sum(), predicted.sum()),
         "fwiou": _ratio((true * iou).sum(), true.sum()),
-        "iou": {
-            name: float(iou[c]) if union[c] else None for c, name in enumerate(taxonomy.classes)
-        },
+        "iou": iou_by_class,
     }
 
 
@@ -90,17 +99,18 @@ def _ratio(part: float, whole: float) -> float | None:
 
 @dataclass
 class Evaluation:
-    """Counts of any number of scans for any number of methods.
+    """The counts of any number of scans for any number of methods.
 
     Attributes:
         taxonomy: the classes.
-        edges: distances from the sensor in metres; between each two of them is one bin, both
-            ends open, as in SemanticKITTI's tool.
-        matrices: method -> (bins + 1, K + 1, K + 1) counts; the first is over all distances.
-        scans: how many scans were added.
-        points: how many points these scans have, labelled or not.
-        uncertain: how many of the points of `asked` were uncertain.
-        asked: how many points the uncertainty was given for.
+        edges: distances from the sensor in metres. Two neighbouring edges bound a bin, which
+            contains neither of them, as in SemanticKITTI's tool.
+        matrices: method -> (bins + 1, K + 1, K + 1) counts; the first matrix is over all
+            distances.
+        scans: number of scans that were added.
+        points: number of points in these scans, labelled or not.
+        uncertain: number of uncertain points among those of `asked`.
+        asked: number of points in the scans that were added with their uncertain points.
     """
 
     taxonomy: Taxonomy
@@ -124,20 +134,17 @@ class Evaluation:
             points: (N, 3 or more) x, y, z in metres.
             truth: (N,) train ids.
             predictions: method -> (N,) train ids.
-            uncertain: (N,) bool, or None where no method says so.
+            uncertain: (N,) bool, or None if it is not known which points are uncertain.
 
         Raises:
-            InputError: where the shapes do not fit or an id is outside 0..K.
+            InputError: if the shapes differ or an id is outside 0..K; nothing is counted then.
         """
         masks = self._masks(points)
-        size = self.taxonomy.size
-        counts = {
-            method: np.stack(
-                [confusion(truth, ids, size), *(confusion(truth[m], ids[m], size) for m in masks)]
-            )
-            for method, ids in predictions.items()
-        }
-        self._count(counts)
+        counts = {}
+        for method, ids in predictions.items():
+            counts[method] = self._confusions(truth, ids, masks)
+
+        self._add_counts(counts)
         self.scans += 1
         self.points += len(points)
         if uncertain is not None:
@@ -145,58 +152,73 @@ class Evaluation:
             self.asked += len(uncertain)
 
     def merge(self, other: Evaluation) -> None:
-        """Add the counts of another evaluation of other scans.
+        """Add the counts of another evaluation, which scored other scans.
 
         Raises:
-            InputError: where its classes or its bins are other ones.
+            InputError: if its classes or its bins differ.
         """
-        if (self.taxonomy.classes, tuple(self.edges)) != (
-            other.taxonomy.classes,
-            tuple(other.edges),
-        ):
+        same_classes = self.taxonomy.classes == other.taxonomy.classes
+        same_edges = tuple(self.edges) == tuple(other.edges)
+        if not (same_classes and same_edges):
             raise InputError(
                 f"expected an evaluation of {self.taxonomy.name} with edges {tuple(self.edges)}, "
-                f"found {other.taxonomy.name} with {tuple(other.edges)}; merge equal ones"
+                f"found one of {other.taxonomy.name} with edges {tuple(other.edges)}; "
+                "merge evaluations of the same classes and edges"
             )
-        self._count(other.matrices)
+
+        self._add_counts(other.matrices)
         self.scans += other.scans
         self.points += other.points
         self.uncertain += other.uncertain
         self.asked += other.asked
 
     def __add__(self, other: Evaluation) -> Evaluation:
-        """A new evaluation with the counts of both; raises as `merge`."""
+        """Return a new evaluation with the counts of both; raises what `merge` raises."""
         total = Evaluation(self.taxonomy, self.edges)
         total.merge(self)
         total.merge(other)
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
-        """All figures as JSON types; `dataset` is what the user named the data."""
+        """Return all figures as JSON types.
+
+        Args:
+            dataset: the dataset, as the user named it.
+        """
+        methods = {}
+        for method, matrices in self.matrices.items():
+            methods[method] = self._method_report(matrices)
+
         return {
             "dataset": dataset,
             "scans": self.scans,
             "points": self.points,
             "uncertain_fraction": _ratio(self.uncertain, self.asked),
-            "methods": {method: self._figures(stack) for method, stack in self.matrices.items()},
+            "methods": methods,
         }
 
-    def _figures(self, stack: np.ndarray) -> dict[str, Any]:
-        bins = [
-            {
-                "from_m": float(near),
-                "to_m": float(far),
-                "points": int(matrix.sum()),
-                **metrics(matrix, self.taxonomy),
-            }
-            for (near, far), matrix in zip(pairwise(self.edges), stack[1:], strict=True)
-        ]
-        return {**metrics(stack[0], self.taxonomy), "by_distance": bins}
+    def _method_report(self, matrices: np.ndarray) -> dict[str, Any]:
+        bins = []
+        for (near, far), matrix in zip(pairwise(self.edges), matrices[1:], strict=True):
+            extent = {"from_m": float(near), "to_m": float(far), "points": int(matrix.sum())}
+            bins.append({**extent, **metrics(matrix, self.taxonomy)})
+        return {**metrics(matrices[0], self.taxonomy), "by_distance": bins}
 
     def _masks(self, points: np.ndarray) -> list[np.ndarray]:
-        distance = np.linalg.norm(points[:, :3], axis=1)
-        return [(distance > near) & (distance < far) for near, far in pairwise(self.edges)]
+        """Return for each bin which points are in it, (N,) bool."""
+        distances = np.linalg.norm(points[:, :3], axis=1)
+        return [(near < distances) & (distances < far) for near, far in pairwise(self.edges)]
 
-    def _count(self, counts: Mapping[str, np.ndarray]) -> None:
-        for method, stack in counts.items():
-            self.matrices[method] = self.matrices.get(method, 0) + stack
+    def _confusions(
+        self, truth: np.ndarray, ids: np.ndarray, masks: Sequence[np.ndarray]
+    ) -> np.ndarray:
+        """Return the (bins + 1, K + 1, K + 1) counts of all points and of each mask's points."""
+        size = self.taxonomy.size
+        matrices = [confusion(truth, ids, size)]
+        for mask in masks:
+            matrices.append(confusion(truth[mask], ids[mask], size))
+        return np.stack(matrices)
+
+    def _add_counts(self, counts: Mapping[str, np.ndarray]) -> None:
+        for method, matrices in counts.items():
+            self.matrices[method] = self.matrices.get(method, 0) + matrices

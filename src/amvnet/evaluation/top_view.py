@@ -1,7 +1,8 @@
-"""A scan from above: truth, predictions, errors and doubts side by side in one PNG."""
+"""A scan from above: truth, predictions, errors and uncertain points in one PNG."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,23 +14,33 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 
-REACH = 50.0  # metres from the sensor to each side
+REACH = 50.0  # metres shown on each side of the sensor
 PANEL = 4.6  # inches, width and height of one panel
 DOTS_PER_INCH = 130
-ENTRIES = 3  # of the legend, below each column of panels
-DOT = 1.1  # area of a point in square typographic points
+ENTRIES = 3  # legend entries in a line, for each column of panels
+LEGEND_LINE = 0.2  # inches, height of one line of the legend
+LEGEND_MARGIN = 0.5  # inches
+DOT = 1.1  # area of a point in square typographic points, if REACH metres are shown
 
 Color = tuple[float, float, float]
 IGNORED: Color = (0.8, 0.8, 0.8)
 PLAIN: Color = (0.75, 0.75, 0.75)
 WRONG: Color = (0.9, 0.0, 0.0)
 UNCERTAIN: Color = (0.93, 0.5, 0.0)
-GROUND, INK, LINES = "white", "black", "0.6"
+GROUND = "white"
+INK = "black"
+LINES = "0.6"
 
 
 @dataclass(frozen=True)
 class _Panel:
-    """One view: a title, (N, 3) colours in [0, 1] and (N,) bool, the points to draw on top."""
+    """One view of the scan.
+
+    Attributes:
+        title: the line above it.
+        colors: (N, 3) RGB in [0, 1].
+        on_top: (N,) bool, the points that are drawn over all others.
+    """
 
     title: str
     colors: np.ndarray
@@ -49,25 +60,35 @@ def draw_scan(
 ) -> Path:
     """Draw one scan from above, x to the right and y up, 50 m (`reach`) to each side.
 
-    The first row has the truth and each prediction. Below a prediction are its errors (correct
-    grey, wrong red; ignored points count as neither), below the truth the uncertain points.
-    The legend has the classes that appear. The file appears whole or not at all.
+    The first row shows the truth and each prediction. Below each prediction are its errors
+    (correct in grey, wrong in red; ignored points count as neither), below the truth the
+    uncertain points. The legend has the classes that appear. The file appears whole or not at
+    all.
 
     Args:
-        path: the PNG to write.
-        others: as of `scan_figure`.
+        path: the PNG to write; the other arguments are those of `scan_figure`.
 
     Returns:
         The path that was written.
 
     Raises:
-        InputError: where there is nothing to draw, or an array is not one value per point.
+        InputError: if there is nothing to draw, or an array does not have one value per point.
     """
     path = Path(path)
     try:
-        figure = scan_figure(points, taxonomy, panels, truth, uncertain, title, reach, marked)
+        figure = scan_figure(
+            points,
+            taxonomy,
+            panels,
+            truth=truth,
+            uncertain=uncertain,
+            title=title,
+            reach=reach,
+            marked=marked,
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
     with atomic_write(path) as part:
         figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor=GROUND)
     return path
@@ -83,32 +104,30 @@ def scan_figure(
     reach: float = REACH,
     marked: str = "uncertain",
 ) -> Any:
-    """The Matplotlib figure that `draw_scan` writes.
+    """Return the Matplotlib figure that `draw_scan` writes.
 
     Args:
         points: (N, 3 or more) x, y, z in metres.
         taxonomy: names and colours of the classes.
-        panels: title -> (N,) train ids of a prediction; may be empty where there is a truth.
+        panels: title -> (N,) train ids of a prediction; may be empty if there is a truth.
         truth: (N,) train ids, or None.
         uncertain: (N,) bool, or None.
         title: a line above all panels.
-        reach: metres that are shown to each side.
-        marked: what the points of `uncertain` are.
+        reach: metres shown on each side.
+        marked: the name of the points in `uncertain`, for their panel and the legend.
 
     Raises:
-        InputError: where there is nothing to draw, or an array is not one value per point.
+        InputError: if there is nothing to draw, or an array does not have one value per point.
     """
     _check(len(points), panels, truth, uncertain)
-    rows = _rows(taxonomy, panels, truth, uncertain, marked)
-    seen = np.unique(np.concatenate([*panels.values(), *([] if truth is None else [truth])]))
-    errors = truth is not None and bool(panels)
-    return _figure(
-        points,
-        rows,
-        _entries(taxonomy, seen, errors, marked if uncertain is not None else ""),
-        title,
-        reach,
-    )
+
+    grid = _grid(taxonomy, panels, truth, uncertain, marked)
+    entries = _class_entries(taxonomy, panels, truth)
+    if truth is not None and panels:
+        entries.append(("wrong", WRONG))
+    if uncertain is not None and marked:
+        entries.append((marked, UNCERTAIN))
+    return _figure(points, grid, entries, title, reach)
 
 
 def _check(
@@ -118,62 +137,83 @@ def _check(
     uncertain: np.ndarray | None,
 ) -> None:
     if not panels and truth is None:
-        raise InputError("expected a prediction or a truth to draw, found neither; give one")
+        raise InputError("expected a prediction or the truth to draw, found neither; give one")
+
     for name, values in {**panels, "truth": truth, "uncertain": uncertain}.items():
         if values is not None and np.shape(values) != (count,):
             raise InputError(
                 f"expected {count} values for {name!r}, one per point, found {np.shape(values)}; "
-                "give those of this scan"
+                "give the values of this scan"
             )
 
 
-def _rows(
+def _grid(
     taxonomy: Taxonomy,
     panels: Mapping[str, np.ndarray],
     truth: np.ndarray | None,
     uncertain: np.ndarray | None,
     marked: str,
 ) -> list[list[_Panel | None]]:
-    """The grid: one column per prediction, after one for the truth; None leaves a place free."""
+    """Return the rows of panels; None leaves a cell of the grid empty.
+
+    With truth, its column is the first, and each prediction has a column of its own. Without
+    truth there is one row, and the uncertain points are its last panel.
+    """
     palette = np.asarray(taxonomy.colors) / 255.0
     palette[0] = IGNORED
-    shown = [_Panel(name, palette[ids], ids > 0) for name, ids in panels.items()]
-    doubts = [] if uncertain is None else [_chosen(marked, uncertain, len(uncertain), UNCERTAIN)]
+
+    predictions = [_Panel(title, palette[ids], ids > 0) for title, ids in panels.items()]
+    uncertainty = None
+    if uncertain is not None:
+        uncertainty = _highlight(marked, uncertain, len(uncertain), UNCERTAIN)
     if truth is None:
-        return [[*shown, *doubts]]
-    known = truth > 0
-    errors = [
-        _chosen(f"errors of {n}", (ids != truth) & known, known.sum(), WRONG)
-        for n, ids in panels.items()
-    ]
-    first: list[_Panel | None] = [_Panel("truth", palette[truth], known), *shown]
-    second: list[_Panel | None] = [doubts[0] if doubts else None, *errors]
-    return [first, second] if doubts or errors else [first]
+        return [[*predictions]] if uncertainty is None else [[*predictions, uncertainty]]
+
+    labelled = truth > 0
+    errors = []
+    for title, ids in panels.items():
+        wrong = (ids != truth) & labelled
+        errors.append(_highlight(f"errors of {title}", wrong, labelled.sum(), WRONG))
+
+    first_row: list[_Panel | None] = [_Panel("truth", palette[truth], labelled), *predictions]
+    if uncertainty is None and not errors:
+        return [first_row]
+    return [first_row, [uncertainty, *errors]]
 
 
-def _chosen(title: str, chosen: np.ndarray, count: int, color: Color) -> _Panel:
-    """A panel of chosen points in one colour and all others in grey, with their share of `count`."""
-    share = np.count_nonzero(chosen) / max(count, 1)
-    return _Panel(f"{title} ({share:.1%})", np.where(chosen[:, None], color, PLAIN), chosen)
+def _highlight(title: str, mask: np.ndarray, total: int, color: Color) -> _Panel:
+    """Return a panel with the points of a mask in one colour and all others in grey.
+
+    The title also gives the number of these points as a share of `total`.
+    """
+    share = np.count_nonzero(mask) / max(total, 1)
+    colors = np.where(mask[:, None], color, PLAIN)
+    return _Panel(f"{title} ({share:.1%})", colors, mask)
 
 
-def _entries(
-    taxonomy: Taxonomy, seen: np.ndarray, errors: bool, marked: str
+def _class_entries(
+    taxonomy: Taxonomy, panels: Mapping[str, np.ndarray], truth: np.ndarray | None
 ) -> list[tuple[str, Color]]:
-    """(name, colour) of the legend: the classes that appear, then what the other panels show."""
-    palette = [(r / 255, g / 255, b / 255) for r, g, b in taxonomy.colors]
-    entries = [(taxonomy.classes[c - 1], palette[c]) for c in seen.tolist() if c]
-    extras = {
-        "ignored": (0 in seen, IGNORED),
-        "wrong": (errors, WRONG),
-        marked: (bool(marked), UNCERTAIN),
-    }
-    return entries + [(name, color) for name, (appears, color) in extras.items() if appears]
+    """Return (name, colour) of the classes that appear, for the legend; "ignored" comes last."""
+    arrays = list(panels.values())
+    if truth is not None:
+        arrays.append(truth)
+    class_ids = np.unique(np.concatenate(arrays)).tolist()
+
+    entries: list[tuple[str, Color]] = []
+    for class_id in class_ids:
+        if class_id > 0:
+            red, green, blue = taxonomy.colors[class_id]
+            color = (red / 255, green / 255, blue / 255)
+            entries.append((taxonomy.classes[class_id - 1], color))
+    if 0 in class_ids:
+        entries.append(("ignored", IGNORED))
+    return entries
 
 
 def _figure(
     points: np.ndarray,
-    rows: list[list[_Panel | None]],
+    grid: list[list[_Panel | None]],
     entries: list[tuple[str, Color]],
     title: str,
     reach: float,
@@ -181,35 +221,44 @@ def _figure(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    columns = len(rows[0])
-    legend = 0.2 * -(-len(entries) // (ENTRIES * columns)) + 0.5  # inches
-    size = (columns * PANEL, len(rows) * PANEL + legend)
-    figure = Figure(figsize=size, facecolor=GROUND, layout="constrained")
+    rows = len(grid)
+    columns = len(grid[0])
+    legend_lines = math.ceil(len(entries) / (ENTRIES * columns))
+    height = rows * PANEL + (LEGEND_LINE * legend_lines + LEGEND_MARGIN)
+    figure = Figure(figsize=(columns * PANEL, height), facecolor=GROUND, layout="constrained")
     FigureCanvasAgg(figure)
-    for place, panel in enumerate((panel for row in rows for panel in row), start=1):
-        if panel is not None:
-            _draw(figure.add_subplot(len(rows), columns, place), points, panel, reach)
+
+    for row, row_panels in enumerate(grid):
+        for column, panel in enumerate(row_panels):
+            if panel is not None:
+                axes = figure.add_subplot(rows, columns, row * columns + column + 1)
+                _draw_panel(axes, points, panel, reach)
+
     if title:
         figure.suptitle(title, color=INK, fontsize=13)
-    _legend(figure, entries, columns)
+    _draw_legend(figure, entries, columns)
     return figure
 
 
-def _draw(axes: Any, points: np.ndarray, panel: _Panel, reach: float) -> None:
+def _draw_panel(axes: Any, points: np.ndarray, panel: _Panel, reach: float) -> None:
     inside = (np.abs(points[:, :2]) <= reach).all(axis=1)
-    order = np.argsort(points[inside, 2], kind="stable")  # what is higher hides what is below
+    xyz = points[inside, :3]
+
+    # Higher points hide lower ones, and the points on top hide all others.
+    order = np.argsort(xyz[:, 2], kind="stable")
     order = order[np.argsort(panel.on_top[inside][order], kind="stable")]
-    xy, colors = points[inside, :2][order], panel.colors[inside][order]
+
     axes.scatter(
-        xy[:, 0],
-        xy[:, 1],
-        c=colors,
+        xyz[order, 0],
+        xyz[order, 1],
+        c=panel.colors[inside][order],
         s=DOT * REACH / reach,
         marker="o",
         linewidths=0,
         rasterized=True,
     )
     axes.plot(0, 0, marker="+", color=INK, markersize=7)
+
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", facecolor=GROUND)
     axes.set_title(panel.title, color=INK, fontsize=11)
     axes.set_xlabel("x (m)", color=INK, fontsize=8)
@@ -219,13 +268,13 @@ def _draw(axes: Any, points: np.ndarray, panel: _Panel, reach: float) -> None:
         spine.set_color(LINES)
 
 
-def _legend(figure: Any, entries: list[tuple[str, Color]], columns: int) -> None:
+def _draw_legend(figure: Any, entries: list[tuple[str, Color]], columns: int) -> None:
     from matplotlib.patches import Patch
 
-    handles = [
-        Patch(facecolor=color, edgecolor="0.5", linewidth=0.5, label=name)
-        for name, color in entries
-    ]
+    handles = []
+    for name, color in entries:
+        handles.append(Patch(facecolor=color, edgecolor="0.5", linewidth=0.5, label=name))
+
     figure.legend(
         handles=handles,
         loc="outside lower center",

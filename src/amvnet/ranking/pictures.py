@@ -1,4 +1,4 @@
-"""The first clusters of a ranking from above: where they are, and what each view and the label take them for."""
+"""Pictures of the first clusters of a ranking from above: the two views, the label, the cluster."""
 
 from __future__ import annotations
 
@@ -13,45 +13,48 @@ from amvnet.ranking.rank import Criterion, Ranking, find_clusters, find_doubts
 
 PICTURES = 12  # clusters that are drawn
 REACH = 8.0  # metres from the cluster to each side
-DEEP = 6.0  # metres above and below it: what is farther would hide it
+DEPTH = 6.0  # metres above and below it: farther points, such as treetops, would hide it
 
 
 def draw(
     ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: Criterion, folder: Path
 ) -> list[Path]:
-    """Draw the first clusters, each with its surroundings; returns the files, RANK.png."""
-    return [
-        _draw(row, ranking, dataset, segmenter, by, folder / f"{place:02d}.png")
-        for place, row in enumerate(ranking.clusters[:PICTURES], start=1)
-    ]
+    """Draw the first clusters, each with its surroundings, and return the files, RANK.png."""
+    paths = []
+    for number, row in enumerate(ranking.clusters[:PICTURES], start=1):
+        path = folder / f"{number:02d}.png"
+        _draw_cluster(row, ranking, dataset, segmenter, by=by, path=path)
+        paths.append(path)
+    return paths
 
 
-def _draw(
+def _draw_cluster(
     row: np.void,
     ranking: Ranking,
     dataset: Dataset,
     segmenter: Segmenter,
     by: Criterion,
     path: Path,
-) -> Path:
+) -> None:
     record = ranking.records[row["scan"]]
     scan = check_scan(dataset.read(record))
     doubts = find_doubts(scan, segmenter, by)
-    _, of = find_clusters(doubts)
+    _, cluster_ids = find_clusters(doubts)
+    in_cluster = cluster_ids == cluster_ids[row["point"]]
+
     points = scan.points[:, :3] - row["xyz"]
-    near = (np.abs(points) <= (REACH, REACH, DEEP)).all(axis=1)
-    panels = {
-        "rv": doubts.rv,
-        "bev": doubts.bev,
-        **({} if scan.labels is None else {"label": doubts.label}),
-    }
+    near = (np.abs(points) <= (REACH, REACH, DEPTH)).all(axis=1)
+    panels = {"rv": doubts.rv[near], "bev": doubts.bev[near]}
+    if scan.labels is not None:
+        panels["label"] = doubts.label[near]
+
     x, y, z = row["xyz"]
-    return draw_scan(
+    draw_scan(
         path,
         points[near],
         dataset.taxonomy,
-        {name: ids[near] for name, ids in panels.items()},
-        uncertain=(of == of[row["point"]])[near],
+        panels,
+        uncertain=in_cluster[near],
         title=f"{record.name}, around ({x:.1f}, {y:.1f}, {z:.1f}) m",
         reach=REACH,
         marked="cluster",

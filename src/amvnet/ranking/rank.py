@@ -1,4 +1,7 @@
-"""What to look at next: clusters of points on which the two views disagree, or whose label both contradict."""
+"""Which points to look at next: where the two views disagree, or both contradict the label.
+
+Such points are grouped into clusters, and the most doubtful clusters come first.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,20 @@ from amvnet.scan import Scan
 
 Criterion = Literal["disagreement", "labels"]
 
-NEAR = 1.5  # metres: what is nearer to the sensor is the vehicle that carries it
-FEW = 20.0  # points: a cluster counts as if so many more of it were beyond doubt, so that stray points do not lead
-COMMON = 0.5  # power of how often the views contradict labels so: a mistake that they make often says less
+# Metres: points nearer to the sensor than this belong to the vehicle that carries it.
+NEAR = 1.5
+# Points without doubt that are added to each cluster's mean, so that stray points do not lead.
+FEW = 20.0
+# Scores are divided by the number of clusters with the same contradiction to this power:
+# a contradiction that is met often is a mistake of the views.
+COMMON = 0.5
+
 COLUMNS = ("rank", "scan", "score", "x", "y", "z", "points", "point", "rv", "bev", "label")
 SCAN_COLUMNS = ("rank", "scan", "score", "points", "clusters")
+
+# One cluster: number of its scan, score, its middle point's place in metres, number of its
+# points, index of the middle point in the scan, train ids (the most common one by each view,
+# and the middle point's label), and kind of doubt.
 ROW = np.dtype(
     [
         ("scan", np.int32),
@@ -46,14 +58,17 @@ ROW = np.dtype(
 
 @dataclass(frozen=True)
 class Doubts:
-    """What is doubted of a scan with N points.
+    """How doubtful each of the N points of a scan is.
 
     Attributes:
         xyz: (N, 3) metres.
-        doubt: (N,) float32 in [0, 1], 0 where nothing is doubted.
-        rv, bev, label: (N,) train ids: by the two views and by the labels (0 where there is none).
-        kind: (N,) of what kind a doubt is; a cluster has points of one kind.
-        whole: (N,) number of points of the labelled thing that a point is part of, where the labels are doubted.
+        doubt: (N,) float32 in [0, 1]; 0 for points that are not doubted.
+        rv: (N,) train ids by the range view.
+        bev: (N,) train ids by the bird's-eye view.
+        label: (N,) train ids of the labels; 0 if there are none.
+        kind: (N,) kind of doubt; a cluster has points of one kind.
+        whole: (N,) number of points of the labelled thing that each point is part of, if labels
+            are doubted, or None.
     """
 
     xyz: np.ndarray
@@ -67,14 +82,14 @@ class Doubts:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The clusters and the scans of a data set, the most doubtful first.
+    """The clusters and the scans of a dataset, the most doubtful first.
 
     Attributes:
-        records: the scans, in the order of their numbers.
+        records: the S scans, in the order of their numbers.
         clusters: rows of `ROW`.
         scans: (S,) scan numbers.
         scores: (S,) mean doubt of their points.
-        sizes: (S,) their points.
+        sizes: (S,) numbers of their points.
     """
 
     records: Sequence[ScanRecord]
@@ -91,159 +106,232 @@ def rank(
     by: Criterion,
     progress: Progress = lambda done, total: None,
 ) -> Ranking:
-    """Rank the clusters of some scans, one scan in memory at a time and 39 bytes a cluster.
+    """Rank the clusters of some scans; memory holds one scan, and 35 bytes for each cluster.
 
     Args:
-        by: `disagreement`: where the two views disagree, labelled or not: what to label next. `labels`: where both
-            views contradict the label: what may be labelled wrong.
+        dataset: the dataset that has the scans.
+        records: the scans.
+        segmenter: the two networks.
+        by: `disagreement` ranks where the two views disagree, labelled or not: what to label
+            next. `labels` ranks where both views contradict the label: what may be labelled
+            wrong.
+        progress: told before each scan, and at the end, how many scans are done.
 
     Raises:
-        InputError: where the weights lack a network or know other classes, or labels are asked for and missing.
+        InputError: if the weights lack a network or have other classes than the dataset, or if
+            labels are doubted and a scan has none.
     """
     check_classes(dataset, segmenter.taxonomy)
     if not {"range_net", "polar_net"} <= set(segmenter.weights.parts):
-        raise InputError("expected weights with both networks, found one; train the other, too")
-    found, means, sizes = (
-        [np.zeros(0, dtype=ROW)],
-        np.zeros(len(records)),
-        np.zeros(len(records), dtype=np.int64),
-    )
-    for place, record in enumerate(records):
-        progress(place, len(records))
+        raise InputError("expected weights with both networks, found only one; train the other")
+
+    rows_by_scan = [np.zeros(0, dtype=ROW)]
+    mean_doubts = np.zeros(len(records))
+    sizes = np.zeros(len(records), dtype=np.int64)
+    for number, record in enumerate(records):
+        progress(number, len(records))
         doubts = find_doubts(check_scan(dataset.read(record)), segmenter, by)
         rows, _ = find_clusters(doubts)
-        rows["scan"] = place
-        found.append(rows)
-        means[place], sizes[place] = doubts.doubt.mean(), len(doubts.doubt)
+        rows["scan"] = number
+        rows_by_scan.append(rows)
+        mean_doubts[number] = doubts.doubt.mean()
+        sizes[number] = len(doubts.doubt)
     progress(len(records), len(records))
-    rows = np.concatenate(found)
+
+    clusters = np.concatenate(rows_by_scan)
     if by == "labels":
-        rows["score"] /= _times(rows["kind"]) ** COMMON
-    # Stable, and so the same on every machine: of equals, the first of the data set leads.
-    order, scans = np.argsort(-rows["score"], kind="stable"), np.argsort(-means, kind="stable")
-    return Ranking(records, rows[order], scans, means[scans], sizes[scans])
+        clusters["score"] /= _frequencies(clusters["kind"]) ** COMMON
+
+    # Stable, and so the same on every machine: among equals, the dataset's order decides.
+    cluster_order = np.argsort(-clusters["score"], kind="stable")
+    scan_order = np.argsort(-mean_doubts, kind="stable")
+    return Ranking(
+        records,
+        clusters=clusters[cluster_order],
+        scans=scan_order,
+        scores=mean_doubts[scan_order],
+        sizes=sizes[scan_order],
+    )
 
 
 def find_doubts(scan: Scan, segmenter: Segmenter, by: Criterion) -> Doubts:
-    """What is doubted of one scan's points.
+    """Return how doubtful each point of a scan is.
 
     Raises:
-        InputError: where labels are asked for and the scan has none.
+        InputError: if labels are doubted and the scan has none.
     """
     if by == "labels" and scan.labels is None:
         raise InputError(
-            f"{scan.name}: expected labels to doubt, found none; name labelled sequences"
+            f"{scan.name}: expected labels to check, found none; choose sequences with labels"
         )
+
     scores, uncertain = segmenter.scores_by_method(scan, ("rv", "bev"))
     assert uncertain is not None
-    f, g = scores["rv"], scores["bev"]
-    xyz, valid = scan.points[:, :3], scan.valid
-    seen = torch.from_numpy(np.hypot(*scan.points[valid, :2].T) >= NEAR).to(f.device)
-    rv, bev = (expand_to_scan((one.argmax(dim=1) + 1).to(torch.uint8), valid) for one in (f, g))
+    f = scores["rv"]  # (P, K) class probabilities of the P valid points
+    g = scores["bev"]  # (P, K)
+    valid = scan.valid
+    rv = _predicted_ids(f, valid)
+    bev = _predicted_ids(g, valid)
     label = np.zeros(len(scan), dtype=np.uint8) if scan.labels is None else scan.labels
+
+    xyz = scan.points[:, :3]
+    distance = np.hypot(xyz[valid, 0], xyz[valid, 1])
+    outside = torch.from_numpy(distance >= NEAR).to(f.device)  # (P,) not on the vehicle
+
     if by == "disagreement":
-        doubt = expand_to_scan(
-            (1 - cosine_similarity(f, g)).clamp(0, 1) * (uncertain & seen), valid
-        )
-        return Doubts(xyz, doubt, rv, bev, label, _pair(rv, bev))
-    against, said = _contradicted(f, g, torch.from_numpy(label[valid]).to(f.device))
-    doubt, kind = expand_to_scan(against * seen, valid), _pair(label, expand_to_scan(said, valid))
-    return Doubts(xyz, doubt, rv, bev, label, kind, _sizes_of_things(xyz, label, valid))
+        disagreement = (1 - cosine_similarity(f, g)).clamp(0, 1)
+        doubt = expand_to_scan(disagreement * (uncertain & outside), valid)
+        return Doubts(xyz, doubt, rv, bev, label, kind=_pair(rv, bev))
+
+    contradiction, ids = _contradiction(f, g, torch.from_numpy(label[valid]).to(f.device))
+    doubt = expand_to_scan(contradiction * outside, valid)
+    kind = _pair(label, expand_to_scan(ids, valid))
+    whole = _thing_sizes(xyz, label, valid)
+    return Doubts(xyz, doubt, rv, bev, label, kind=kind, whole=whole)
 
 
-def _sizes_of_things(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """(N,) how many points the connected thing of one label has that a point is part of."""
-    sizes, thing = np.ones(len(xyz)), cluster(xyz[valid], label[valid])
-    sizes[valid] = np.bincount(thing)[thing]
+def _predicted_ids(probabilities: torch.Tensor, valid: np.ndarray) -> np.ndarray:
+    """Return the (N,) train ids of a scan's points from (P, K) probabilities of its valid ones."""
+    ids = probabilities.argmax(dim=1) + 1
+    return expand_to_scan(ids.to(torch.uint8), valid)
+
+
+def _contradiction(
+    f: torch.Tensor, g: torch.Tensor, label: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return how strongly both views contradict the labels, and the class they agree on.
+
+    The contradiction is the probability that the less confident view gives the class they agree
+    on, minus the larger of the two probabilities of the label. It is 0 if that is negative, and
+    for points without a label.
+
+    Args:
+        f: (P, K) class probabilities of the range view.
+        g: (P, K) class probabilities of the bird's-eye view.
+        label: (P,) train ids.
+
+    Returns:
+        (P,) contradictions in [0, 1] and (P,) train ids.
+    """
+    agreed = (f * g).argmax(dim=1)
+    column = (label.long() - 1).clamp_min(0)
+    for_label = torch.maximum(f, g).gather(1, column[:, None])[:, 0]
+    for_agreed = torch.minimum(f, g).gather(1, agreed[:, None])[:, 0]
+    contradiction = (for_agreed - for_label).clamp_min(0) * (label > 0)
+    return contradiction, (agreed + 1).to(torch.uint8)
+
+
+def _thing_sizes(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return for each point, (N,), the size of its thing: connected points with one label."""
+    things = cluster(xyz[valid], label[valid])
+    sizes = np.ones(len(xyz))
+    sizes[valid] = np.bincount(things)[things]
     return sizes
 
 
-def _contradicted(
-    f: torch.Tensor, g: torch.Tensor, label: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """(P,) by how much the views contradict the labels, and (P,) what they say together.
-
-    Both views must: it is what the less sure one gives that class, less what the other one at most gives the label.
-    """
-    said = (f * g).argmax(dim=1)
-    own = torch.maximum(f, g).gather(1, (label.long() - 1).clamp_min(0)[:, None])[:, 0]
-    other = torch.minimum(f, g).gather(1, said[:, None])[:, 0]
-    return (other - own).clamp_min(0) * (label > 0), (said + 1).to(torch.uint8)
-
-
 def find_clusters(doubts: Doubts) -> tuple[np.ndarray, np.ndarray]:
-    """The clusters of one scan, rows of `ROW` in no order, and (N,) which of them a point is in, -1 for none."""
-    of = np.full(len(doubts.doubt), -1)
-    index = np.flatnonzero(doubts.doubt > 0)
-    of[index] = group = cluster(doubts.xyz[index], doubts.kind[index])
-    size = np.bincount(group)
-    rows = np.zeros(len(size), dtype=ROW)
-    rows["points"] = size
-    rows["point"] = index[_middles(doubts.xyz[index], group, size)]
-    # A cluster that is the whole of a labelled thing counts more than one at the edge of it.
-    share = 1.0 if doubts.whole is None else size / doubts.whole[rows["point"]]
-    rows["score"] = share * np.bincount(group, doubts.doubt[index]) / (size + FEW)
-    rows["xyz"] = doubts.xyz[rows["point"]]
-    rows["label"], rows["kind"] = doubts.label[rows["point"]], doubts.kind[rows["point"]]
-    for name, ids in (("rv", doubts.rv), ("bev", doubts.bev)):
-        rows[name] = _commonest(ids[index], group, len(size))
-    return rows, of
+    """Group the doubted points of one scan into clusters.
+
+    Returns:
+        The clusters, rows of `ROW` in no particular order, and the (N,) cluster of each point,
+        -1 for points that are not doubted.
+    """
+    doubted = np.flatnonzero(doubts.doubt > 0)
+    group = cluster(doubts.xyz[doubted], doubts.kind[doubted])
+    cluster_ids = np.full(len(doubts.doubt), -1)
+    cluster_ids[doubted] = group
+
+    sizes = np.bincount(group)
+    middle = doubted[_middle_points(doubts.xyz[doubted], group, sizes)]
+    total_doubt = np.bincount(group, doubts.doubt[doubted])
+    # A cluster that is a whole labelled thing counts more than one at the edge of a thing.
+    share = 1.0 if doubts.whole is None else sizes / doubts.whole[middle]
+
+    rows = np.zeros(len(sizes), dtype=ROW)
+    rows["score"] = share * total_doubt / (sizes + FEW)
+    rows["xyz"] = doubts.xyz[middle]
+    rows["points"] = sizes
+    rows["point"] = middle
+    rows["rv"] = _most_common(doubts.rv[doubted], group, len(sizes))
+    rows["bev"] = _most_common(doubts.bev[doubted], group, len(sizes))
+    rows["label"] = doubts.label[middle]
+    rows["kind"] = doubts.kind[middle]
+    return rows, cluster_ids
 
 
-def _middles(xyz: np.ndarray, group: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Of each group, the place of the point that is nearest to its mean."""
-    mean = np.stack([np.bincount(group, column) / size for column in xyz.T], axis=1)
-    order = np.lexsort((((xyz - mean[group]) ** 2).sum(axis=1), group))
-    return order[np.cumsum(size) - size]
+def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Return for each group the index of the point nearest to the group's mean."""
+    mean = np.stack([np.bincount(group, axis) / sizes for axis in xyz.T], axis=1)
+    squared_distance = ((xyz - mean[group]) ** 2).sum(axis=1)
+    order = np.lexsort((squared_distance, group))
+    group_starts = np.cumsum(sizes) - sizes
+    return order[group_starts]
 
 
-def _commonest(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+def _most_common(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
+    """Return the most common id in each of `count` groups; the lowest one among equals."""
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
     return table.argmax(axis=1)
 
 
 def _pair(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return one number for each pair of train ids."""
     return first.astype(np.int64) * 256 + second
 
 
-def _times(kind: np.ndarray) -> np.ndarray:
-    """How many of all are of the same kind."""
-    _, which, times = np.unique(kind, return_inverse=True, return_counts=True)
-    return times[which]
+def _frequencies(kind: np.ndarray) -> np.ndarray:
+    """Return for each element how many elements have the same value."""
+    _, index, counts = np.unique(kind, return_inverse=True, return_counts=True)
+    return counts[index]
 
 
 def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
-    """Write the clusters to `path` (CSV), and the scans beside it; returns the latter's file."""
+    """Write the clusters to a CSV file, and the scans to another one next to it.
+
+    Args:
+        ranking: the clusters and the scans.
+        taxonomy: names of the classes.
+        path: the file of the clusters, NAME.csv.
+
+    Returns:
+        The file of the scans, NAME-scans.csv.
+    """
     _write(path, COLUMNS, _cluster_rows(ranking, taxonomy))
-    scans = path.with_name(f"{path.stem}-scans{path.suffix}")
-    _write(scans, SCAN_COLUMNS, _scan_rows(ranking))
-    return scans
+    scans_path = path.with_name(f"{path.stem}-scans{path.suffix}")
+    _write(scans_path, SCAN_COLUMNS, _scan_rows(ranking))
+    return scans_path
 
 
 def _write(path: Path, columns: Sequence[str], rows: Iterator[list[Any]]) -> None:
     with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        writer.writerows([place, *row] for place, row in enumerate(rows, start=1))
+        for number, row in enumerate(rows, start=1):
+            writer.writerow([number, *row])
 
 
 def _cluster_rows(ranking: Ranking, taxonomy: Taxonomy) -> Iterator[list[Any]]:
+    """Yield the columns of each cluster but its rank."""
     names = ("", *taxonomy.classes)
     for row in ranking.clusters:
-        classes = [names[row[column]] for column in ("rv", "bev", "label")]
-        place = [f"{value:.2f}" for value in row["xyz"]]
+        x, y, z = row["xyz"]
         yield [
             ranking.records[row["scan"]].name,
             f"{row['score']:.4f}",
-            *place,
+            f"{x:.2f}",
+            f"{y:.2f}",
+            f"{z:.2f}",
             row["points"],
             row["point"],
-            *classes,
+            names[row["rv"]],
+            names[row["bev"]],
+            names[row["label"]],
         ]
 
 
 def _scan_rows(ranking: Ranking) -> Iterator[list[Any]]:
+    """Yield the columns of each scan but its rank."""
     clusters = np.bincount(ranking.clusters["scan"], minlength=len(ranking.records))
     for scan, score, size in zip(ranking.scans, ranking.scores, ranking.sizes, strict=True):
         yield [ranking.records[scan].name, f"{score:.5f}", size, clusters[scan]]

@@ -1,4 +1,4 @@
-"""One HTML page that shows scans in 3D: everything is in it, and nothing is fetched."""
+"""One self-contained HTML page that shows scans in 3D; it fetches nothing."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import base64
 import hashlib
 import html
 import json
+import math
 import re
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -21,29 +22,36 @@ from amvnet.files import atomic_write
 from amvnet.models.methods import METHODS, title_of
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
-MOST_POINTS = (
-    400_000  # of one scan; of more, every second or third is drawn, so that a telephone can
-)
-REACH = 500.0  # metres along each axis; farther points are left out, so that positions stay within 1.6 cm of the truth
+# Of one scan. Of a larger scan, every second or third point is drawn, so that phones can keep up.
+MOST_POINTS = 400_000
+# Metres along each axis; farther points are left out, so that positions are exact to 1.6 cm.
+REACH = 500.0
 LEVELS = 32_767  # int16
-STOPS = 17  # colours from which the page makes a ramp
-RAMPS = {
-    "height": ("turbo", 0.06, 0.94),
-    "intensity": ("inferno", 0.16, 1.0),
-}  # colour map, and the part that is used
+STOPS = 17  # colours between which the page interpolates a ramp
+# Matplotlib's colour map, and the part of it that is used.
+RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
 DOUBT = (RIGHT, (128, 104, 92), (190, 110, 50), UNCERTAIN, (255, 190, 60))
 SCRIPTS = ("scans", "camera", "shaders", "draw", "look", "panel", "point", "hands", "page")
 
 
 @dataclass(frozen=True)
 class Packed:
-    """One scan as the page carries it: what JSON says of it, and its planes, deflated and in base64."""
+    """One scan as the page carries it.
+
+    Attributes:
+        about: what the page's JSON says about the scan.
+        planes: its points' values, deflated and in base64.
+        present: ids of the classes in its truth and labels.
+        height: metres; almost all points are between these two.
+        intensity: almost all intensities are below this one.
+        ground: metres, height of the ground.
+    """
 
     about: dict[str, Any]
     planes: str
-    present: frozenset[int]  # ids of the classes in it
-    height: tuple[float, float]  # most points are between these, metres
-    intensity: float  # most points are below
+    present: frozenset[int]
+    height: tuple[float, float]
+    intensity: float
     ground: float
 
 
@@ -52,167 +60,225 @@ def write_page(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy, ti
 
     Args:
         path: the HTML file.
-        frames: the scans, in order of the page's slider.
+        frames: the scans, in the order of the page's slider.
         taxonomy: names and colours of the classes.
-        title: of the page.
+        title: the page's title.
+
+    Returns:
+        The path that was written.
 
     Raises:
-        InputError: where the file cannot be written.
+        InputError: if the file cannot be written.
     """
     packed = [pack(frame) for frame in frames]
     page = assemble(packed, taxonomy, title)
     with atomic_write(path) as part:
-        part.write_bytes(page.encode("utf-8", "replace"))  # names of files need not be Unicode
+        part.write_bytes(page.encode("utf-8", "replace"))  # file names may not be Unicode
     return Path(path)
 
 
 def pack(frame: Frame) -> Packed:
-    """Quantise one scan: positions to int16 within the scan's extent, all else to bytes.
+    """Quantise one scan: positions to int16 within the scan's extent, all other values to bytes.
 
-    The planes are the low and the high bytes of the differences of x, of y and of z from point to point, and then what
-    `about["planes"]` names, a byte for each point.
+    The planes are, for each of x, y and z, the low bytes and then the high bytes of the
+    differences between consecutive points, followed by one byte a point for each of
+    `about["planes"]`.
     """
-    kept = frame.valid & (np.abs(frame.points[:, :3]) <= REACH).all(axis=1)
-    every = -(-int(kept.sum()) // MOST_POINTS) or 1
-    chosen = np.flatnonzero(kept)[::every]
-    xyz = frame.points[chosen, :3].astype(np.float64)
-    center, step = _extent(xyz)
+    in_reach = frame.valid & (np.abs(frame.points[:, :3]) <= REACH).all(axis=1)
+    indices = np.flatnonzero(in_reach)
+    left_out = len(frame.points) - len(indices)
+    stride = max(1, math.ceil(len(indices) / MOST_POINTS))
+    indices = indices[::stride]
+
+    xyz = frame.points[indices, :3].astype(np.float64)
+    center, step = _quantisation(xyz)
     steps = np.round((xyz - center) / step).astype(np.int16)
-    values = {name: values[chosen] for name, values in _values(frame).items()}
-    data = b"".join(
-        [*(_differences(axis) for axis in steps.T), *(plane.tobytes() for plane in values.values())]
-    )
-    low, high = (float(v) for v in np.percentile(xyz[:, 2], (1, 99))) if len(xyz) else (0.0, 1.0)
+    values = {name: plane[indices] for name, plane in _byte_planes(frame).items()}
+    planes = [_differences(axis) for axis in steps.T]
+    planes += [plane.tobytes() for plane in values.values()]
+
     about = {
         "name": frame.name,
-        "count": len(chosen),
-        "note": _note(len(frame.points) - int(kept.sum()), every),
+        "count": len(indices),
+        "note": _note(left_out, stride),
         "center": center.tolist(),
         "step": step.tolist(),
         "planes": list(values),
     }
-    ids = [values[name] for name in (*frame.labels, "truth") if name in values]
+    deflated = zlib.compress(b"".join(planes), 9)
+    height, ground = _heights(xyz[:, 2])
     return Packed(
-        about,
-        base64.b64encode(zlib.compress(data, 9)).decode("ascii"),
-        frozenset(int(i) for plane in ids for i in np.unique(plane)),
-        (low, high),
-        float(np.percentile(values["intensity"], 98)) / 255 if len(chosen) else 1.0,
-        float(np.percentile(xyz[:, 2], 10)) if len(xyz) else 0.0,
+        about=about,
+        planes=base64.b64encode(deflated).decode("ascii"),
+        present=_class_ids(values, (*frame.labels, "truth")),
+        height=height,
+        intensity=_bright(values["intensity"]),
+        ground=ground,
     )
 
 
 def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
-    """The text of the page. What the user's files are called goes in as JSON, or escaped."""
-    style, script = _source("page.css"), "\n".join(_source(f"{name}.js") for name in SCRIPTS)
-    scans = [
-        f'<script type="text/plain" id="scan-{place}">{scan.planes}</script>'
-        for place, scan in enumerate(packed)
-    ]
-    return _fill(
-        _source("page.html"),
-        {
-            "POLICY": f"default-src 'none'; style-src '{_hash(style)}'; script-src '{_hash(script)}'; img-src data:; "
-            "base-uri 'none'; form-action 'none'",
-            "TITLE": html.escape(title),
-            "STYLE": style,
-            "SCRIPT": script,
-            "ABOUT": _json(_about(packed, taxonomy, title)),
-            "SCANS": "\n".join(scans),
-        },
+    """Return the text of the page; the names of the user's files go in as JSON, or escaped."""
+    style = _source("page.css")
+    script = "\n".join(_source(f"{name}.js") for name in SCRIPTS)
+    policy = (
+        f"default-src 'none'; style-src '{_hash(style)}'; script-src '{_hash(script)}'; "
+        "img-src data:; base-uri 'none'; form-action 'none'"
     )
+
+    scans = []
+    for index, scan in enumerate(packed):
+        scans.append(f'<script type="text/plain" id="scan-{index}">{scan.planes}</script>')
+
+    parts = {
+        "POLICY": policy,
+        "TITLE": html.escape(title),
+        "STYLE": style,
+        "SCRIPT": script,
+        "ABOUT": _json(_about(packed, taxonomy, title)),
+        "SCANS": "\n".join(scans),
+    }
+    return _fill(_source("page.html"), parts)
 
 
 def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, Any]:
-    planes = {plane for scan in packed for plane in scan.about["planes"]}
-    sources = [name for name in ("truth", *METHODS, "labels") if name in planes]
+    """Return what the page's scripts need to know besides the points."""
+    present: set[int] = set()
+    planes: set[str] = set()
+    for scan in packed:
+        present |= scan.present
+        planes |= set(scan.about["planes"])
+
+    sources = []
+    for name in ("truth", *METHODS, "labels"):
+        if name in planes:
+            sources.append({"key": name, "title": _capitalise(title_of(name))})
+
+    lowest = min(scan.height[0] for scan in packed)
+    highest = max(scan.height[1] for scan in packed)
+    brightest = max(scan.intensity for scan in packed)
     return {
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
         "colors": [UNLABELLED, *taxonomy.colors[1:]],
         "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
-        "present": sorted(set().union(*(scan.present for scan in packed))),
-        "sources": [{"key": name, "title": _capital(title_of(name))} for name in sources],
+        "present": sorted(present),
+        "sources": sources,
         "scans": [scan.about for scan in packed],
         "ranges": {
             "uncertainty": (0, 1),
-            "height": (
-                min(scan.height[0] for scan in packed),
-                max(scan.height[1] for scan in packed),
-            ),
-            "intensity": (0, max(scan.intensity for scan in packed)),
+            "height": (lowest, highest),
+            "intensity": (0, brightest),
         },
-        "ramps": {"uncertainty": DOUBT, **{name: _ramp(*part) for name, part in RAMPS.items()}},
+        "ramps": {
+            "uncertainty": DOUBT,
+            "height": _ramp(*RAMPS["height"]),
+            "intensity": _ramp(*RAMPS["intensity"]),
+        },
         "ground": float(np.median([scan.ground for scan in packed])),
     }
 
 
-def _values(frame: Frame) -> dict[str, np.ndarray]:
-    """The planes of bytes beside the positions, (N,) uint8 each."""
-    intensity = np.nan_to_num(frame.points[:, 3])
-    planes = {"intensity": _byte(intensity)}
+def _byte_planes(frame: Frame) -> dict[str, np.ndarray]:
+    """Return the values of the points other than positions, (N,) uint8 each."""
+    planes = {"intensity": _to_bytes(np.nan_to_num(frame.points[:, 3]))}
     if frame.truth is not None:
         planes["truth"] = frame.truth.astype(np.uint8)
-    planes |= {name: ids.astype(np.uint8) for name, ids in frame.labels.items()}
+    for method, ids in frame.labels.items():
+        planes[method] = ids.astype(np.uint8)
     if frame.uncertain is not None and frame.disagreement is not None:
-        planes |= {
-            "uncertain": frame.uncertain.astype(np.uint8),
-            "disagreement": _byte(frame.disagreement),
-        }
+        planes["uncertain"] = frame.uncertain.astype(np.uint8)
+        planes["disagreement"] = _to_bytes(frame.disagreement)
     return planes
 
 
-def _byte(values: np.ndarray) -> np.ndarray:
-    """[0, 1] -> 0..255."""
+def _to_bytes(values: np.ndarray) -> np.ndarray:
+    """Map values in [0, 1] to 0..255."""
     return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
 
 
-def _extent(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(3,) middle of the points, and (3,) metres of one step of an int16 along each axis."""
+def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (3,) middle of the points, and the (3,) metres of one step of an int16."""
     if not len(xyz):
         return np.zeros(3), np.ones(3)
-    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    low = xyz.min(axis=0)
+    high = xyz.max(axis=0)
     return (low + high) / 2, np.maximum((high - low) / 2, 1e-3) / LEVELS
 
 
 def _differences(steps: np.ndarray) -> bytes:
-    """(N,) int16 -> low and then high bytes of the differences (modulo 2^16), which deflate to half the size."""
+    """Return the low and then the high bytes of the differences of (N,) int16, modulo 2^16.
+
+    They deflate to half the size of the positions themselves.
+    """
     changes = np.diff(steps.view(np.uint16), prepend=np.uint16(0)).astype("<u2")
     return changes.view(np.uint8).reshape(-1, 2).T.tobytes()
 
 
-def _capital(text: str) -> str:
+def _heights(z: np.ndarray) -> tuple[tuple[float, float], float]:
+    """Return the range that most heights are in, and the height of the ground, in metres."""
+    if not len(z):
+        return (0.0, 1.0), 0.0
+    low, high = np.percentile(z, (1, 99))
+    return (float(low), float(high)), float(np.percentile(z, 10))
+
+
+def _bright(intensity: np.ndarray) -> float:
+    """Return the intensity in [0, 1] that only a few points exceed, from bytes."""
+    return float(np.percentile(intensity, 98)) / 255 if len(intensity) else 1.0
+
+
+def _class_ids(planes: Mapping[str, np.ndarray], names: Sequence[str]) -> frozenset[int]:
+    """Return the class ids in the planes that have one of these names."""
+    ids: set[int] = set()
+    for name in names:
+        if name in planes:
+            ids.update(np.unique(planes[name]).tolist())
+    return frozenset(ids)
+
+
+def _capitalise(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def _note(left_out: int, every: int) -> str:
-    notes = [f"{left_out:,} without a place or beyond {REACH:g} m" if left_out else ""]
-    notes.append(f"one in {every} of the scan" if every > 1 else "")
-    return "; ".join(note for note in notes if note)
+def _note(left_out: int, stride: int) -> str:
+    """Return which points the page does not show, or an empty text if it shows all."""
+    notes = []
+    if left_out:
+        notes.append(f"{left_out:,} without a place or beyond {REACH:g} m")
+    if stride > 1:
+        notes.append(f"one in {stride} of the scan")
+    return "; ".join(notes)
 
 
 def _ramp(name: str, start: float, end: float) -> list[list[int]]:
+    """Return RGB colours in 0..255 from a part of one of Matplotlib's colour maps."""
     from matplotlib import colormaps
 
-    return (
-        (colormaps[name](np.linspace(start, end, STOPS))[:, :3] * 255).round().astype(int).tolist()
-    )
+    colors = colormaps[name](np.linspace(start, end, STOPS))[:, :3]
+    return (colors * 255).round().astype(int).tolist()
 
 
 def _source(name: str) -> str:
-    return (resources.files("amvnet.viewing") / "page_assets" / name).read_text(encoding="utf-8")
+    """Read one of the page's files."""
+    path = resources.files("amvnet.viewing") / "page_assets" / name
+    return path.read_text(encoding="utf-8")
 
 
 def _hash(text: str) -> str:
-    """What a content security policy allows to run: this text and no other."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    """Return what a content security policy says to allow this text and no other."""
+    digest = hashlib.sha256(text.encode()).digest()
+    return "sha256-" + base64.b64encode(digest).decode()
 
 
 def _json(tree: Any) -> str:
-    """JSON that cannot end the element it lies in."""
+    """Return JSON that cannot close the HTML element that contains it."""
     return json.dumps(tree, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _fill(template: str, parts: Mapping[str, str]) -> str:
-    """Put each part in its place once; what looks like a place within a part stays as it is."""
-    return re.sub("@@([A-Z]+)@@", lambda found: parts[found[1]], template)
+    """Replace each @@NAME@@ of a template by the part of that name.
+
+    Parts are not searched: one that contains @@NAME@@ itself stays as it is.
+    """
+    return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], template)

@@ -1,4 +1,4 @@
-"""Scans, labels, uncertain points and errors on a time line of Rerun."""
+"""Scans, labels, uncertain points and errors on a Rerun timeline."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ from amvnet.models.methods import title_of
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 
 TIMELINE = "scan"
-DOT, LARGE_DOT = 1.2, 1.8  # radius of points on the screen
-GROUND = (13, 17, 24)
+DOT = 1.2  # radius of a point on the screen, in Rerun's ui points
+LARGE_DOT = 1.8  # that of an error or an uncertain point
+GROUND = (13, 17, 24)  # colour behind the points
 
 
 def check_rerun() -> Any:
-    """The Rerun SDK.
+    """Return the Rerun SDK.
 
     Raises:
-        InputError: where it is not installed.
+        InputError: if it is not installed.
     """
     try:
         import rerun
@@ -39,11 +40,14 @@ def check_rerun() -> Any:
 
 
 def check_window() -> None:
-    """Raises InputError where there is no Rerun, or no screen to open a window on."""
+    """Check that Rerun can open a window.
+
+    Raises:
+        InputError: if Rerun is not installed, or there is no screen.
+    """
     check_rerun()
-    if sys.platform == "linux" and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
+    has_screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if sys.platform == "linux" and not has_screen:
         raise InputError(
             "expected a screen for a window, found none; write a file with --html or --save"
         )
@@ -54,13 +58,17 @@ def save_recording(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy
 
     Args:
         path: the file, NAME.rrd.
-        frames: the scans in their order, at least one; each is a step of the time line `scan`.
+        frames: the scans in their order, at least one; each is a step of the timeline `scan`.
         taxonomy: names and colours of the classes.
 
+    Returns:
+        The path that was written.
+
     Raises:
-        InputError: where Rerun is not installed, or the file cannot be written.
+        InputError: if Rerun is not installed, or the file cannot be written.
     """
-    stream, first, frames = _stream(), *_first(frames)
+    stream = _new_stream()
+    first, frames = _peek(frames)
     with atomic_write(path) as part:
         stream.save(part, default_blueprint=blueprint(first))
         try:
@@ -71,39 +79,44 @@ def save_recording(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy
 
 
 def open_window(frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
-    """Show the same in a window of Rerun, scan by scan as they are made.
+    """Show the same in a Rerun window, each scan as soon as it is ready.
 
     Raises:
-        InputError: where Rerun is not installed, or cannot open a window.
+        InputError: if Rerun is not installed, or cannot open a window.
     """
-    stream, first, frames = _stream(), *_first(frames)
-    # Without an activated environment, the viewer beside this Python is not on the path.
-    os.environ["PATH"] = os.pathsep.join(
-        [os.environ.get("PATH", ""), str(Path(sys.executable).parent)]
-    )
+    stream = _new_stream()
+    first, frames = _peek(frames)
+
+    # If no environment is activated, the viewer next to this Python is not on the path.
+    folders = [os.environ.get("PATH", ""), str(Path(sys.executable).parent)]
+    os.environ["PATH"] = os.pathsep.join(folders)
     try:
         stream.spawn(default_blueprint=blueprint(first))
     except RuntimeError as error:
         reason = str(error).splitlines()[0]
         raise InputError(
-            f"expected a window of Rerun, found: {reason}; write a file with --save or --html"
+            f"expected Rerun to open a window, found: {reason}; write a file with --save or --html"
         ) from None
+
     log(stream, frames, taxonomy)
     stream.disconnect()
 
 
 def log(stream: Any, frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
-    """Log scans: `points`, `truth`, `labels/METHOD`, `errors/METHOD`, `uncertain`, and shares below `percent`."""
+    """Log scans to a recording stream, one step of the timeline each.
+
+    The entities are `points`, `truth`, `labels/METHOD`, `errors/METHOD` and `uncertain`, and
+    below `percent` the shares of errors and uncertain points.
+    """
     rerun = check_rerun()
+    names = ("unlabelled", *taxonomy.classes)
     colors = (UNLABELLED, *taxonomy.colors[1:])
-    classes = zip(("unlabelled", *taxonomy.classes), colors, strict=True)
-    context = [
-        rerun.AnnotationInfo(id=i, label=name, color=color)
-        for i, (name, color) in enumerate(classes)
-    ]
-    stream.log(
-        "/", rerun.AnnotationContext(context), rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True
-    )
+    classes = []
+    for class_id, (name, color) in enumerate(zip(names, colors, strict=True)):
+        classes.append(rerun.AnnotationInfo(id=class_id, label=name, color=color))
+    context = rerun.AnnotationContext(classes)
+    stream.log("/", context, rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
     for step, frame in enumerate(frames):
         stream.set_time(TIMELINE, sequence=step)
         stream.log("name", rerun.TextLog(frame.name))
@@ -112,78 +125,106 @@ def log(stream: Any, frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
 
 
 def blueprint(frame: Frame) -> Any:
-    """Side by side what such a frame has: truth, labels, errors, uncertain points; a curve of their shares."""
+    """Return a layout for scans that have what this frame has.
+
+    Truth, labels, errors and uncertain points lie side by side, above a curve of the shares of
+    errors and uncertain points. The methods are tabs of one view.
+    """
     import rerun.blueprint as parts
 
-    def space(name: str, *paths: str) -> Any:
-        return parts.Spatial3DView(origin="/", contents=list(paths), name=name, background=GROUND)
-
-    def tabs(views: list[Any]) -> Any:
-        return parts.Tabs(*views, active_tab=len(views) - 1)
-
+    has_errors = bool(frame.labels) and frame.truth is not None
+    has_uncertain = frame.uncertain is not None
     titles = {method: title_of(method) for method in frame.labels}
-    truth, doubts = frame.truth is not None, frame.uncertain is not None
-    views = [space("truth", "/truth")] if truth else []
+
+    views = []
+    if frame.truth is not None:
+        views.append(_view("truth", "/truth"))
     if titles:
-        views.append(tabs([space(title, f"/labels/{m}") for m, title in titles.items()]))
-    if titles and truth:
-        views.append(
-            tabs([space(f"errors of {t}", "/points", f"/errors/{m}") for m, t in titles.items()])
-        )
-    if doubts:
-        views.append(space("uncertain", "/points", "/uncertain"))
-    grid = parts.Grid(*(views or [space("points", "/points")]))
-    if not doubts and not (titles and truth):
-        return parts.Blueprint(grid, collapse_panels=True)
-    shares = parts.TimeSeriesView(origin="/percent", name="percent of the points")
-    return parts.Blueprint(parts.Vertical(grid, shares, row_shares=[5, 1]), collapse_panels=True)
+        labels = [_view(title, f"/labels/{method}") for method, title in titles.items()]
+        views.append(_tabs(labels))
+    if has_errors:
+        errors = []
+        for method, title in titles.items():
+            errors.append(_view(f"errors of {title}", "/points", f"/errors/{method}"))
+        views.append(_tabs(errors))
+    if has_uncertain:
+        views.append(_view("uncertain", "/points", "/uncertain"))
+    if not views:
+        views.append(_view("points", "/points"))
+
+    layout = parts.Grid(*views)
+    if has_errors or has_uncertain:
+        shares = parts.TimeSeriesView(origin="/percent", name="percent of the points")
+        layout = parts.Vertical(layout, shares, row_shares=[5, 1])
+    return parts.Blueprint(layout, collapse_panels=True)
 
 
-def _first(frames: Iterable[Frame]) -> tuple[Frame, Iterable[Frame]]:
-    """The first frame, and all of them."""
-    rest = iter(frames)
-    first = next(rest)
-    return first, chain([first], rest)
+def _view(name: str, *paths: str) -> Any:
+    """Return a 3D view of some entities."""
+    import rerun.blueprint as parts
+
+    return parts.Spatial3DView(origin="/", contents=list(paths), name=name, background=GROUND)
 
 
-def _stream() -> Any:
+def _tabs(views: list[Any]) -> Any:
+    """Return views as tabs, the last one in front."""
+    import rerun.blueprint as parts
+
+    return parts.Tabs(*views, active_tab=len(views) - 1)
+
+
+def _peek(frames: Iterable[Frame]) -> tuple[Frame, Iterable[Frame]]:
+    """Return the first frame, and all of them with the first."""
+    iterator = iter(frames)
+    first = next(iterator)
+    return first, chain([first], iterator)
+
+
+def _new_stream() -> Any:
     return check_rerun().RecordingStream("amvnet")
 
 
 def _log_points(stream: Any, rerun: Any, frame: Frame) -> None:
+    dot = rerun.Radius.ui_points(DOT)
+    large_dot = rerun.Radius.ui_points(LARGE_DOT)
     xyz = frame.points[frame.valid, :3]
 
-    def points(chosen: np.ndarray | None = None, dot: float = DOT, **looks: Any) -> Any:
-        places = xyz if chosen is None else frame.points[frame.valid & chosen, :3]
-        return rerun.Points3D(places, radii=rerun.Radius.ui_points(dot), **looks)
-
-    stream.log("points", points(colors=RIGHT if frame.labels else _by_height(xyz)))
+    colors = RIGHT if frame.labels else _height_colors(xyz)
+    stream.log("points", rerun.Points3D(xyz, radii=dot, colors=colors))
     if frame.truth is not None:
-        stream.log("truth", points(class_ids=frame.truth[frame.valid]))
+        class_ids = frame.truth[frame.valid]
+        stream.log("truth", rerun.Points3D(xyz, radii=dot, class_ids=class_ids))
+
     for method, ids in frame.labels.items():
-        stream.log(f"labels/{method}", points(class_ids=ids[frame.valid]))
-        if (errors := frame.errors(method)) is not None:
-            stream.log(f"errors/{method}", points(errors, LARGE_DOT, colors=WRONG))
+        class_ids = ids[frame.valid]
+        stream.log(f"labels/{method}", rerun.Points3D(xyz, radii=dot, class_ids=class_ids))
+        errors = frame.errors(method)
+        if errors is not None:
+            wrong = frame.points[frame.valid & errors, :3]
+            stream.log(f"errors/{method}", rerun.Points3D(wrong, radii=large_dot, colors=WRONG))
+
     if frame.uncertain is not None:
-        stream.log("uncertain", points(frame.uncertain, LARGE_DOT, colors=UNCERTAIN))
+        uncertain = frame.points[frame.valid & frame.uncertain, :3]
+        stream.log("uncertain", rerun.Points3D(uncertain, radii=large_dot, colors=UNCERTAIN))
 
 
 def _log_shares(stream: Any, rerun: Any, frame: Frame) -> None:
-    """Shares in percent: of the points that truth names, those taken for something else; of all, the uncertain."""
+    """Log percentages: wrong ones of the points with a true class, uncertain ones of all points."""
     for method in frame.labels:
-        if (errors := frame.errors(method)) is not None and frame.truth is not None:
-            stream.log(
-                f"percent/wrong/{method}",
-                rerun.Scalars(100 * errors.sum() / max((frame.truth > 0).sum(), 1)),
-            )
+        errors = frame.errors(method)
+        if errors is not None and frame.truth is not None:
+            scored = max((frame.truth > 0).sum(), 1)
+            stream.log(f"percent/wrong/{method}", rerun.Scalars(100 * errors.sum() / scored))
+
     if frame.uncertain is not None:
         stream.log("percent/uncertain", rerun.Scalars(100 * frame.uncertain.mean()))
 
 
-def _by_height(xyz: np.ndarray) -> np.ndarray:
-    """(N, 3) uint8 colours."""
+def _height_colors(xyz: np.ndarray) -> np.ndarray:
+    """Return (N, 3) uint8 colours of points by their height."""
     from matplotlib import colormaps
 
-    low, high = np.percentile(xyz[:, 2], (1, 99))
-    share = np.clip((xyz[:, 2] - low) / max(high - low, 1e-6), 0, 1)
+    z = xyz[:, 2]
+    low, high = np.percentile(z, (1, 99))
+    share = np.clip((z - low) / max(high - low, 1e-6), 0, 1)
     return (colormaps["turbo"](share)[:, :3] * 255).astype(np.uint8)

@@ -1,7 +1,7 @@
-// A camera that turns about a point; z is up, lengths are metres, matrices are column by column.
+// A camera that orbits a point; z is up, lengths are in metres, matrices are column-major.
 "use strict";
 
-const FIELD = Math.tan((25 * Math.PI) / 180);  // half the height of what is seen, at a distance of 1
+const FIELD = Math.tan((25 * Math.PI) / 180);  // half the height of the field of view at a distance of 1
 const NEAREST = 0.5, FARTHEST = 1500;
 const FIRST = { azimuth: 3.6, elevation: 0.55, distance: 46, target: [4, 0, -1] };
 const ABOVE = { azimuth: Math.PI, elevation: Math.PI / 2, distance: 95, target: [0, 0, 0] };
@@ -9,7 +9,7 @@ const STREET = { azimuth: Math.PI, elevation: 0.2, distance: 14, target: [6, 0, 
 
 class Camera {
   constructor() {
-    this.middle = [0, 0];  // where the target is seen, in clip space: beside the panel, and not behind it
+    this.middle = [0, 0];  // the target on the screen, in clip space: next to the panel, not behind it
     this.set(FIRST);
   }
 
@@ -25,7 +25,7 @@ class Camera {
     this.target = this.target.map((value) => Math.min(Math.max(value, -FARTHEST), FARTHEST));
   }
 
-  /** Unit vectors to the right, up and towards the camera. */
+  /** Return unit vectors to the right, up and towards the camera. */
   axes() {
     const ca = Math.cos(this.azimuth), sa = Math.sin(this.azimuth);
     const ce = Math.cos(this.elevation), se = Math.sin(this.elevation);
@@ -40,7 +40,7 @@ class Camera {
     return this.distance + FARTHEST;
   }
 
-  /** From metres to clip space. */
+  /** Return the (4, 4) matrix from metres to clip space. */
   matrix(aspect) {
     const { right, up, back } = this.axes();
     const eye = this.target.map((value, axis) => value + this.distance * back[axis]);
@@ -65,14 +65,14 @@ class Camera {
     this.clamp();
   }
 
-  /** Move along the screen; dx and dy are shares of the height of the window. */
+  /** Move along the screen; dx and dy are fractions of the window's height. */
   move(dx, dy) {
     const { right, up } = this.axes(), metres = 2 * FIELD * this.distance;
     this.target = this.target.map((value, axis) => value + metres * (dy * up[axis] - dx * right[axis]));
     this.clamp();
   }
 
-  /** Zoom by a factor; what lies at (x, y) from the target on the screen, in shares of its height, stays there. */
+  /** Zoom by a factor; the point at (x, y) from the target, in fractions of the window's height, stays in place. */
   zoom(factor, x = 0, y = 0) {
     const before = this.distance;
     this.distance *= factor;

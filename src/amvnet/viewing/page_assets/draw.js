@@ -3,7 +3,8 @@
 
 const ATTRIBUTES = { position: 0, intensity: 1, disagreement: 2, label: 3, truth: 4, uncertain: 5 };
 const RINGS = [10, 20, 30, 40, 50], SIDES = 180;
-const MOST_PIXELS = 6e6;  // up to these, two are drawn for each of the window along both axes: edges get smooth
+// The canvas is drawn at up to twice the window's resolution, for smooth edges, up to this number of pixels.
+const MOST_PIXELS = 6e6;
 
 class Drawing {
   constructor(canvas) {
@@ -80,7 +81,7 @@ class Drawing {
     return buffer;
   }
 
-  /** Points are drawn beside the window first, so that their depth can be looked at. */
+  /** Make the textures that points are drawn to first, so that a shader can read their depth. */
   makeTarget() {
     const gl = this.gl;
     this.colors = this.texture(2, null);
@@ -108,7 +109,7 @@ class Drawing {
     gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, this.depths, 0);
   }
 
-  /** The buffers of a scan, made when it is first drawn. */
+  /** Return the buffers of a scan; they are made when it is first drawn. */
   buffersOf(scan) {
     if (!this.uploaded.has(scan.index)) {
       const buffers = { position: this.buffer(scan.positions) };
@@ -118,7 +119,7 @@ class Drawing {
     return this.uploaded.get(scan.index);
   }
 
-  /** Hand the planes of a scan to the shader; one that the scan lacks counts as 0 at every point. */
+  /** Bind the planes of a scan to the shader's attributes; a missing plane is 0 at every point. */
   bind(scan, labels) {
     const gl = this.gl, buffers = this.buffersOf(scan);
     gl.bindVertexArray(this.empty);

@@ -1,14 +1,14 @@
 // Mouse, touch and keys.
 "use strict";
 
-const STILL = 5;  // pixels that a finger may move in a click
-const TWICE = 400;  // milliseconds between the two clicks of a double one
+const STILL = 5;  // pixels that a pointer may move during a click
+const TWICE = 400;  // milliseconds, at most, between the clicks of a double click
 
-/** Turn, move and zoom with pointers; `on` is told of what changed, and of clicks. */
+/** Turn, move and zoom with pointers; calls `on.camera()` after a change and `on.click(x, y, again)`. */
 class Hands {
   constructor(canvas, camera, on) {
     Object.assign(this, { canvas, camera, on });
-    this.down = new Map();  // pointer -> its last place
+    this.down = new Map();  // pointer id -> its last position
     this.last = { time: 0, x: 0, y: 0 };
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
@@ -37,7 +37,7 @@ class Hands {
     this.on.camera();
   }
 
-  /** Two fingers: their middle moves the scene, their distance zooms it. */
+  /** Move the scene with the middle of two fingers, and zoom with their distance. */
   pinch(pointer, before, now) {
     const [other] = [...this.down].filter(([id]) => id !== pointer).map(([, place]) => place);
     const apart = (place) => Math.max(Math.hypot(place.x - other.x, place.y - other.y), 1);
@@ -67,14 +67,14 @@ class Hands {
     return this.canvas.clientHeight;
   }
 
-  /** A place in the window, from the camera's target, right and up, in shares of its height. */
+  /** Return a window position relative to the camera's target: right and up, in fractions of the height. */
   fromTarget(x, y) {
     const [right, up] = this.camera.middle, width = this.canvas.clientWidth;
     return [(x - (width * (1 + right)) / 2) / this.height, ((this.height * (1 - up)) / 2 - y) / this.height];
   }
 }
 
-/** Listen to keys: `keys` is a list of [key, ...] names, what they do in words, and the function. */
+/** Listen to keys: `keys` is a list of [names of keys, description, function]. */
 function listen(keys) {
   const lines = keys.flatMap(([names, words]) => [
     element("dt", { text: names.map((name) => (name === " " ? "space" : name)).join("  ") }),

@@ -1,4 +1,4 @@
-// What is shown and how, kept in the address (#color=error&hide=1,2), so that a link shows the same.
+// What is shown and how. The address keeps it (#color=error&hide=1,2), so that a link shows the same.
 "use strict";
 
 const SIZES = [0.4, 4];
@@ -6,7 +6,7 @@ const TITLES = { class: "Class", error: "Error", uncertainty: "Uncertainty", hei
 const predictions = about.sources.map((source) => source.key).filter((key) => key !== "truth");
 const has = (plane) => about.scans.some((scan) => scan.planes.includes(plane));
 
-/** The colourings and the choices of points that the page has the data for. */
+/** The colourings, selections of points and labels for which the page has data. */
 const possible = {
   color: MODES.filter((mode) => ({
     class: about.sources.length > 0,
@@ -38,7 +38,7 @@ class Look {
     Object.assign(this, firstLook, { hidden: new Set() });
   }
 
-  /** Change some of it; what would show nothing is put right. */
+  /** Apply changes, and correct combinations that would show nothing. */
   set(changes) {
     Object.assign(this, changes);
     if (this.labels === "truth" && (this.color === "error" || this.only === "wrong")) {
@@ -62,7 +62,7 @@ class Look {
     return about.ranges[this.color] ?? [0, 1];
   }
 
-  /** Read what the address says; what it does not say, or says wrongly, is as at first. */
+  /** Read the address, with defaults for missing or invalid values; return the camera's numbers. */
   read(hash) {
     const said = new URLSearchParams(hash.replace(/^#/, ""));
     const chosen = (name) => (possible[name].includes(said.get(name)) ? said.get(name) : firstLook[name]);
@@ -84,7 +84,7 @@ class Look {
     return (said.get("camera") ?? "").split(",").map(Number);
   }
 
-  /** The address of this look; what is as at first is left out. */
+  /** Return the address of this look, without values that are the defaults. */
   hash(camera) {
     const said = new URLSearchParams();
     if (this.scan) said.set("scan", this.scan + 1);
@@ -100,7 +100,7 @@ class Look {
 
 const ramps = new Map();
 
-/** 256 colours between the stops of a ramp. */
+/** Return the 256 colours of a ramp, interpolated between its stops. */
 function rampOf(name) {
   if (!ramps.has(name)) {
     const stops = about.ramps[name] ?? [[0, 0, 0]], bytes = new Uint8Array(4 * 256);
@@ -114,7 +114,7 @@ function rampOf(name) {
   return ramps.get(name);
 }
 
-/** For each point whether it is drawn, by the rule of the shader. */
+/** Return a function that says whether a point is drawn, by the same rule as the shader. */
 function shownBy(look, scan) {
   const ids = scan.planes[look.labels], { truth, uncertain } = scan.planes;
   return (i) => {
@@ -125,7 +125,7 @@ function shownBy(look, scan) {
   };
 }
 
-/** Points of each class in a scan and how many of them are drawn: {all: [...], drawn: [...]}, by id. */
+/** Count the points of each class in a scan, and those that are drawn: {all: [...], drawn: [...]}, by id. */
 function tally(look, scan) {
   const ids = scan.planes[look.labels], shown = shownBy(look, scan);
   const all = new Array(about.classes.length).fill(0), drawn = [...all];
@@ -137,7 +137,7 @@ function tally(look, scan) {
   return { all, drawn };
 }
 
-/** Of the points that have a class in truth, how many get another one by some labels: {scored, wrong}. */
+/** Count the points with a true class, and those that the labels give another class: {scored, wrong}. */
 function errorsOf(scan, labels) {
   const { truth } = scan.planes, ids = scan.planes[labels];
   if (!truth || !ids) return { scored: 0, wrong: 0 };

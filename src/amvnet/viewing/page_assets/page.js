@@ -1,9 +1,9 @@
-// Puts the parts together: one look, one camera, one scan at a time; draws when something has changed.
+// Puts the parts together: one look, one camera, one scan at a time; draws only after a change.
 "use strict";
 
 const look = new Look(), camera = new Camera();
-const PAUSE = 800;  // milliseconds between the scans when they are played
-const GLIDE = 0.04;  // of the window's height, by one press of a key
+const PAUSE = 800;  // milliseconds between scans during playback
+const GLIDE = 0.04;  // fraction of the window's height that one key press moves
 let drawing, panel, scan = null, chosen = -1, asked = 0, playing = 0, remembering = 0;
 
 function redraw() {
@@ -18,7 +18,7 @@ function draw() {
   mark();
 }
 
-/** The ring about the point that was clicked. */
+/** Put the ring around the point that was clicked. */
 function mark() {
   const marker = byId("marker"), canvas = byId("canvas");
   marker.hidden = byId("point").hidden = chosen < 0;
@@ -29,7 +29,7 @@ function mark() {
   marker.style.top = `${((1 - v / w) / 2) * canvas.clientHeight}px`;
 }
 
-/** Change the look, and show it. */
+/** Change the look and show it. */
 async function change(changes) {
   look.set(changes);
   await show();
@@ -38,7 +38,7 @@ async function change(changes) {
 
 async function show() {
   const wanted = look.scan, found = await scanAt(wanted);
-  if (look.scan !== wanted) return;  // another one was asked for meanwhile
+  if (look.scan !== wanted) return;  // another scan was chosen while this one was read
   if (found !== scan) chosen = -1;
   scan = found;
   const drawn = panel.show(look, scan);
@@ -46,18 +46,18 @@ async function show() {
   byId("place").textContent = `${wanted + 1} of ${about.scans.length} · ${scan.name}`;
   byId("place").title = scan.name;
   redraw();
-  // For whoever looks at the page by a program.
+  // For programs that read the page, such as tests.
   Object.assign(document.documentElement.dataset, { drawn: JSON.stringify(drawn), scan: wanted, color: look.color });
 }
 
-/** Keep the look in the address, though not at every step of a movement. */
+/** Save the look in the address, but not at every step of a movement. */
 function remember() {
   clearTimeout(remembering);
   const place = [camera.azimuth, camera.elevation, camera.distance, ...camera.target];
   remembering = setTimeout(() => history.replaceState(null, "", look.hash(place)), 250);
 }
 
-/** Do as the address says. */
+/** Restore the look and the camera from the address. */
 function recall() {
   const [azimuth, elevation, distance, ...target] = look.read(location.hash);
   const whole = target.length === 3 && [azimuth, elevation, distance, ...target].every(Number.isFinite);
@@ -71,7 +71,7 @@ function moved() {
   remember();
 }
 
-/** Go to a place; in a window that is higher than wide, farther away. */
+/** Move the camera to a place; farther away if the window is higher than wide. */
 function stand(place) {
   camera.set({ ...place, distance: place.distance * Math.sqrt(Math.max(1, innerHeight / innerWidth)) });
   moved();
@@ -95,12 +95,12 @@ function click(x, y, again) {
   moved();
 }
 
-/** The next one of a list, in a circle. */
+/** Return the next element of a list; after the last comes the first. */
 function next(list, now) {
   return list[(list.indexOf(now) + 1) % list.length];
 }
 
-/** [keys, what they do in words, the function]; what one scan has no use for is left out. */
+/** [names of keys, description, function]; a page with one scan leaves out those for several. */
 const KEYS = [
   [["1", "2", "3", "4", "5"].slice(0, possible.labels.length), "labels, from the first on",
     (key) => change({ labels: possible.labels[Number(key) - 1] })],
@@ -136,7 +136,7 @@ const KEYS = [
 
 function start() {
   if (!("DecompressionStream" in window)) throw new Error("This page needs a browser of 2023 or later.");
-  // A telephone may take the graphics processor away from a page that lies in the background.
+  // A phone may take the GPU away from a page in the background.
   byId("canvas").addEventListener("webglcontextlost", (event) => event.preventDefault());
   byId("canvas").addEventListener("webglcontextrestored", () => location.reload());
   drawing = new Drawing(byId("canvas"));

@@ -1,4 +1,4 @@
-// The panel: labels, colouring with its key, classes to switch on and off. Names are only ever put in as text.
+// The panel: labels, colouring with its key, classes to switch on and off. Names are only inserted as text.
 "use strict";
 
 const byId = (id) => document.getElementById(id);
@@ -7,7 +7,7 @@ const counted = (count) => count.toLocaleString("en");
 const capital = (text) => text.charAt(0).toUpperCase() + text.slice(1);
 const cssColor = ([r, g, b]) => `rgb(${r}, ${g}, ${b})`;
 
-/** An element with a class, a text and children. */
+/** Return an element with a class, a text and children. */
 function element(kind, { name = "", text = "", children = [], ...rest } = {}) {
   const made = document.createElement(kind);
   if (name) made.className = name;
@@ -22,13 +22,13 @@ function swatch(color) {
   return made;
 }
 
-/** A row: swatch, name, value. */
+/** Return a row: swatch, name, value. */
 function row(kind, color, text, value) {
   const texts = [element("span", { name: "name", text, title: text }), element("span", { name: "value", text: value })];
   return element(kind, { children: color ? [swatch(color), ...texts] : texts });
 }
 
-/** Fill a group of buttons of which one is chosen; arrow keys move the choice. */
+/** Fill a group of radio buttons; arrow keys move the choice. */
 function choices(group, keys, chosen, make, choose) {
   const focused = group.contains(document.activeElement);
   const buttons = keys.map((key) => {
@@ -51,7 +51,7 @@ function choices(group, keys, chosen, make, choose) {
 }
 
 class Panel {
-  /** `change` takes what is to change of the look. */
+  /** `change` is called with changes of the look. */
   constructor(change) {
     this.change = change;
     byId("title").textContent = about.title;
@@ -73,7 +73,7 @@ class Panel {
     byId("fold").setAttribute("aria-expanded", String(!folded));
   }
 
-  /** The middle of what the panel leaves free of the window, in clip space. */
+  /** Return the middle of the part of the window that the panel leaves free, in clip space. */
   free() {
     const { right, top, height } = byId("panel").getBoundingClientRect();
     if (this.narrow) return [0, 1 - top / innerHeight];
@@ -95,7 +95,7 @@ class Panel {
     return drawn;
   }
 
-  /** The labels to choose from, with the share of points that each gets right in this scan. */
+  /** Show the labels to choose from, each with its share of correct points in this scan. */
   showLabels(look, scan) {
     const make = (key) => {
       const { title } = about.sources.find((source) => source.key === key);
@@ -142,7 +142,7 @@ class Panel {
     return element("div", { name: "rows", children: [row("div", null, "uncertain", share(doubted, scan.count))] });
   }
 
-  /** A row for each class that any scan has; alt and a click leave it alone. */
+  /** Show a row for each class in any scan; alt-click shows only that class. */
   showClasses(look, all) {
     const list = byId("classes"), focused = document.activeElement?.dataset?.id;
     const rows = about.present.map((id) => {

@@ -1,9 +1,9 @@
-// The point that was clicked: which it is, and all that is known of it.
+// The point that was clicked: finds it, and shows its classes and values.
 "use strict";
 
-const CLOSE = 9;  // pixels from the pointer, within which a point is taken
+const CLOSE = 9;  // pixels from the pointer, within which a point can be clicked
 
-/** The nearest point to the eye among those drawn close to (x, y) in the window, or -1. */
+/** Return the index of the drawn point near (x, y) in the window that is nearest to the eye, or -1. */
 function pointAt(x, y, scan, look, matrix, width, height) {
   const shown = shownBy(look, scan), { center, step, positions } = scan;
   let best = -1, least = Infinity;
@@ -12,7 +12,7 @@ function pointAt(x, y, scan, look, matrix, width, height) {
     const [u, v, , w] = projected(p, matrix);
     if (w <= 0) continue;
     const off = Math.hypot(((u / w + 1) / 2) * width - x, ((1 - v / w) / 2) * height - y);
-    const cost = w * (1 + off);  // a point in front, or else one that was hit better
+    const cost = w * (1 + off);  // prefers points in front, then points closer to the pointer
     if (off < CLOSE && cost < least && shown(i)) [best, least] = [i, cost];
   }
   return best;
@@ -22,7 +22,7 @@ function projected([x, y, z], m) {
   return [0, 1, 2, 3].map((r) => m[r] * x + m[4 + r] * y + m[8 + r] * z + m[12 + r]);
 }
 
-/** Fill the card with a point's classes and values. */
+/** Show a point's classes and values on the card. */
 function describe(i, scan) {
   const { planes } = scan, [x, y, z] = placeOf(scan, i), lines = [];
   const truth = planes.truth ? planes.truth[i] : 0;

@@ -2,7 +2,7 @@
 "use strict";
 
 const about = JSON.parse(document.getElementById("about").textContent);
-const loaded = new Map();  // index of a scan -> promise of it
+const loaded = new Map();  // index of a scan -> promise of the scan
 
 function bytesOf(text) {
   const characters = atob(text), bytes = new Uint8Array(characters.length);
@@ -15,7 +15,7 @@ async function inflated(bytes) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** (3 n) int16 x, y, z, x, ...: each axis lies there as low bytes and high bytes of what it changes by. */
+/** Return (3 n) int16 x, y, z, x, ... from the low and the high bytes of each axis' differences. */
 function positionsOf(bytes, count) {
   const positions = new Int16Array(3 * count);
   for (let axis = 0; axis < 3; axis++) {
@@ -38,13 +38,13 @@ async function read(index) {
   return { ...said, index, planes, positions: positionsOf(bytes, said.count) };
 }
 
-/** The scan of an index: {name, count, center, step, positions, planes: {intensity, truth, rv, ...}}. */
+/** Return a promise of a scan: {name, count, center, step, positions, planes: {intensity, truth, ...}}. */
 function scanAt(index) {
   if (!loaded.has(index)) loaded.set(index, read(index));
   return loaded.get(index);
 }
 
-/** Metres in the sensor's frame. */
+/** Return [x, y, z] of a point, in metres in the sensor's frame. */
 function placeOf(scan, i) {
   return [0, 1, 2].map((axis) => scan.center[axis] + scan.step[axis] * scan.positions[3 * i + axis]);
 }

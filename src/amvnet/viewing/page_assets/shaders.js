@@ -1,4 +1,4 @@
-// What runs on the graphics processor: points and their colours, rings on the ground, depth made visible.
+// GPU shaders: points and their colours, rings on the ground, shading by depth.
 "use strict";
 
 const MODES = ["class", "error", "uncertainty", "height", "intensity"];
@@ -17,7 +17,7 @@ uniform vec2 range;
 uniform vec3 right, wrong, unscored;
 uniform float size, smallest;
 uniform int mode, only;
-uniform sampler2D classes;  // colour of each class; alpha 0 where it is hidden
+uniform sampler2D classes;  // colour of each class; alpha 0 if it is hidden
 uniform sampler2D ramp;
 flat out vec3 color;
 
@@ -37,7 +37,7 @@ void main() {
   if (mode == 4) color = ramped(intensity);
   bool shown = own.a > 0.5 && (only == 0 || (only == 1 && missed) || (only == 2 && doubted));
   gl_Position = shown ? matrix * vec4(at, 1.0) : vec4(0.0, 0.0, 2.0, 1.0);
-  // Lasers spread: what is far from the sensor is drawn larger, so that surfaces stay whole.
+  // Laser beams diverge: points far from the sensor are drawn larger, so that surfaces have no gaps.
   float metres = 0.055 + 0.002 * length(at);
   bool stressed = (mode == 1 && missed) || (mode == 2 && doubted);
   gl_PointSize = clamp(size * metres / gl_Position.w, smallest, 40.0) * (stressed ? 1.4 : 1.0);
@@ -67,7 +67,7 @@ void main() { painted = vec4(strength); }`;
 const SCREEN_SHADER = `#version 300 es
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }`;
 
-// Points behind others get darker beside them (eye-dome lighting): edges and depth show without normals.
+// Eye-dome lighting: points next to nearer ones are darkened, which shows edges and depth without normals.
 const SCREEN_COLOR = `#version 300 es
 precision highp float;
 uniform sampler2D colors;
