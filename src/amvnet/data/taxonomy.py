@@ -225,7 +225,11 @@ def _missing_tables(config: Any) -> list[str]:
     if not isinstance(config, dict):
         return list(_YAML_TABLES)
 
-    missing = [table for table in _YAML_TABLES if not isinstance(config.get(table), dict)]
+    missing = []
+    for table in _YAML_TABLES:
+        if not isinstance(config.get(table), dict):
+            missing.append(table)
+
     if "split" not in missing:
         for split in _YAML_SPLITS.values():
             if split not in config["split"]:
@@ -240,11 +244,14 @@ def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
     """
     learning_to_raw = config["learning_map_inv"]
     ignored = config["learning_ignore"]
-    learning_ids = sorted(i for i in learning_to_raw if i != 0 and not ignored[i])
+    learning_ids = []
+    for learning in learning_to_raw:
+        if learning != 0 and not ignored[learning]:
+            learning_ids.append(learning)
 
     raw_ids = [learning_to_raw[0]]
     train_ids = {}
-    for train, learning in enumerate(learning_ids, start=1):
+    for train, learning in enumerate(sorted(learning_ids), start=1):
         raw_ids.append(learning_to_raw[learning])
         train_ids[learning] = train
 
