@@ -89,7 +89,7 @@ KITTI: dict[str, Fault] = {
     ),
     "a prediction too many": (
         added("sequences/08/predictions/000000.label"),
-        "predictions alone",
+        "only predictions",
         False,
     ),
     "uint8": (as_type("<u1"), "of 8 bits; write the ids as uint32", True),
@@ -117,7 +117,7 @@ KITTI: dict[str, Fault] = {
     ),
     "scan past the last": (
         added("sequences/11/predictions/000921.label"),
-        "predictions alone",
+        "only predictions",
         False,
     ),
 }
@@ -133,7 +133,7 @@ LIDARSEG: dict[str, Fault] = {
     "flag too many": (meta(use_sonar=True), "use_sonar", True),
     "flag as text": (meta(use_radar="false"), "true or false for use_radar", True),
     "flag as number": (meta(use_lidar=1), "true or false for use_lidar", True),
-    "a token too many": (added("lidarseg/test/x_lidarseg.bin", b"1"), "predictions alone", False),
+    "a token too many": (added("lidarseg/test/x_lidarseg.bin", b"1"), "only predictions", False),
     "no class": (change(lambda d: b"\0" + d[1:]), "found 0 for 1 of", True),
     "class 17": (change(lambda d: b"\x11" + d[1:]), "found 17;", True),
     "255": (change(lambda d: b"\xff" + d[1:]), "found 255;", True),
