@@ -291,4 +291,5 @@ def test_real_scans_open(name: str, sequence: str, rings: int) -> None:
         assert scan.ring.max() == rings - 1
     else:
         assert scan.ring is None
+
     assert (scan.labels is None) == (records[0].labels_path is None)

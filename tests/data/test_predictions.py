@@ -66,6 +66,7 @@ def test_other_files_in_the_folder_change_nothing(predictions: Predictions) -> N
         "submission.json",
     ):
         (folder / name).write_bytes(b"not a prediction")
+
     assert predictions.score() == score
 
 
@@ -76,6 +77,7 @@ def test_signed_ids_and_instances_are_the_same_labels(predictions: Predictions) 
         if predictions.dtype == "<u4":
             ids |= 7 << 16
         ids.astype(predictions.dtype.replace("u", "i")).tofile(path)
+
     assert predictions.score() == score
 
 

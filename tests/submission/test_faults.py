@@ -192,7 +192,10 @@ NUSCENES = {
     "uint32": Fault(changed(uint8_as_uint32), "of 32 bits; write", official=True),
 }
 FAULTS = {"semantickitti": BOTH | SEMANTICKITTI, "nuscenes": BOTH | NUSCENES}
-BROKEN = [(benchmark, name) for benchmark, faults in FAULTS.items() for name in faults]
+BROKEN = []
+for _benchmark, _faults in FAULTS.items():
+    for _name in _faults:
+        BROKEN.append((_benchmark, _name))
 
 
 def is_refused_officially(case: Case, path: Path) -> bool:
@@ -337,6 +340,7 @@ def test_no_flipped_byte_is_a_traceback(case: Case, tmp_path: Path) -> None:
             submission.check(rules, path)
         except InputError:
             errors += 1
+
     assert errors > 100
 
 
@@ -361,6 +365,7 @@ def test_a_zip_bomb_is_not_unpacked(name: str, cases: dict[str, Case], tmp_path:
     ):
         for _ in range(size // 1_000_000):
             file.write(bytes(1_000_000))
+
     assert path.stat().st_size < size / 100
 
     error, peak = measured(lambda: refused(case, path))

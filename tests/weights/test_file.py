@@ -119,6 +119,7 @@ def test_replacing_a_part_changes_only_that_part(weights: Weights, part: str) ->
         source = other if name == part else weights
         assert mixed.training[name] == source.training[name]
         assert_same_tensors(mixed.part(name), source.part(name))
+
     assert not np.array_equal(segment(mixed).scores, segment(weights).scores)
 
 

@@ -20,6 +20,7 @@ def merge_trees(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, A
             merged[key] = merge_trees(base_value, value)
         else:
             merged[key] = value
+
     return merged
 
 
@@ -50,6 +51,7 @@ def to_dict(config: Any) -> dict[str, Any]:
             tree[key] = to_dict(value)
         else:
             tree[key] = value
+
     return tree
 
 
@@ -63,6 +65,7 @@ def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
             raise InputError(
                 f"{where}: expected one of {', '.join(kinds)}, found {key!r}; correct the key"
             )
+
         changes[key] = _convert(getattr(default, key), value, kinds[key], f"{where}: {key}")
 
     try:
@@ -97,6 +100,7 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
             raise InputError(
                 f"{where}: expected one of {', '.join(choices)}, found {value!r}; correct the value"
             )
+
         return value
 
     if isinstance(default, float):

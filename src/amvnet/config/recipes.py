@@ -51,6 +51,7 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
     except yaml.YAMLError as error:
         reason = str(error).splitlines()[0]
         raise InputError(f"{name_or_path}: expected YAML, found {reason}; mend the file") from None
+
     if not isinstance(tree, dict):
         raise InputError(
             f"{name_or_path}: expected keys and values, found {type(tree).__name__}; mend the file"
@@ -64,6 +65,7 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
             f"{name_or_path}: expected the name of a recipe as base, found {base!r}; "
             "correct the value"
         )
+
     return merge_trees(_read_tree(base, (*dependents, name_or_path)), tree)
 
 
@@ -76,6 +78,7 @@ def _read_text(name_or_path: str) -> str:
             f"expected a recipe's name or a YAML file, found {name_or_path!r}; "
             f"the built-in ones are {', '.join(recipe_names())}"
         )
+
     try:
         return Path(name_or_path).read_text(encoding="utf-8")
     except UnicodeDecodeError:

@@ -64,11 +64,11 @@ class Taxonomy:
                 f"found {sorted(wrong_train_ids)}; correct the table"
             )
 
-        wrong_raw_ids = [raw for raw in self.raw_ids if not 0 <= raw <= INSTANCE_MASK]
-        if wrong_raw_ids:
+        raw_ids = self.raw_ids
+        if raw_ids and (min(raw_ids) < 0 or max(raw_ids) > INSTANCE_MASK):
             raise InputError(
                 f"taxonomy {self.name}: expected raw ids 0..{INSTANCE_MASK}, "
-                f"found {wrong_raw_ids[:5]}; correct the table"
+                f"found {min(raw_ids)}..{max(raw_ids)}; correct the table"
             )
 
     def _check_length(self, kind: str, length: int) -> None:
@@ -124,6 +124,7 @@ class Taxonomy:
                 f"found {unknown[:5].tolist()}; check that the file holds labels, "
                 "or give the label map (YAML) that it was written with"
             )
+
         return train.astype(np.uint8)
 
     def to_raw(self, ids: np.ndarray) -> np.ndarray:
@@ -144,6 +145,7 @@ class Taxonomy:
                 f"taxonomy {self.name}: expected train ids 0..{self.size}, "
                 f"found {ids.min()}..{ids.max()}; give train ids of this taxonomy"
             )
+
         return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
@@ -234,6 +236,7 @@ def _missing_tables(config: Any) -> list[str]:
         for split in _YAML_SPLITS.values():
             if split not in config["split"]:
                 missing.append(f"split.{split}")
+
     return missing
 
 

@@ -39,11 +39,13 @@ class Submission:
                 f"{self.unmatched} predictions are of scans that are not on disk; "
                 "their length is not checked"
             )
+
         if self.official is not None and self.predictions < self.official:
             notes.append(
                 f"the benchmark has {self.official} scans in this split; "
                 "its server refuses an archive of fewer"
             )
+
         return notes
 
 
@@ -197,6 +199,7 @@ def _parts(names: Iterable[str], index: int) -> set[str]:
         path_parts = name.split("/")
         if index < len(path_parts):
             parts.add(path_parts[index])
+
     return parts
 
 

@@ -164,6 +164,7 @@ def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = No
             f"{dataset.root}: expected SemanticKITTI or nuScenes, found another data set; "
             "give one of them"
         )
+
     return RULES[type(dataset)](dataset, split, sequences)
 
 
@@ -186,6 +187,7 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
         absent = [name for name in wanted if name in TEST_SCANS and name not in present]
     else:
         wanted = tuple(sorted(set(sequences)))
+
     records = dataset.records([name for name in wanted if name not in absent])
 
     folders = ["sequences/"]

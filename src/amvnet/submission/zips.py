@@ -62,11 +62,13 @@ class Archive:
                 f"{self.path}: expected {name} whole, found it broken ({_reason(error)}); "
                 "pack it again"
             ) from None
+
         if len(data) != self.sizes[name]:
             raise InputError(
                 f"{self.path}: expected {self.sizes[name]} bytes in {name} as it declares, "
                 f"found {len(data)}; pack it again"
             )
+
         return data
 
 
@@ -110,6 +112,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
                 folders.add(entry.filename)
             else:
                 sizes[entry.filename] = entry.file_size
+
         yield Archive(path, sizes, frozenset(folders), archive)
 
 
@@ -135,6 +138,7 @@ def _entry(name: str) -> zipfile.ZipInfo:
     else:
         entry.external_attr = (stat.S_IFREG | 0o644) << 16
         entry.compress_type = zipfile.ZIP_DEFLATED
+
     return entry
 
 
@@ -145,11 +149,13 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
                 f"{path}: expected no password, found {entry.filename!r} encrypted; "
                 "pack without one"
             )
+
         if not _is_inside(entry.orig_filename):
             raise InputError(
                 f"{path}: expected paths below the archive's own folder, "
                 f"found {entry.orig_filename!r}; pack with relative names and slashes"
             )
+
         if entry.compress_type not in METHODS:
             raise InputError(
                 f"{path}: expected files stored or deflated, found {entry.filename!r} by method "

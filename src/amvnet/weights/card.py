@@ -56,17 +56,22 @@ def front_matter(weights: Weights, licence: str | None = None) -> str:
         "library_name": "amvnet",
         "tags": ["lidar", "point-cloud", "semantic-segmentation", weights.taxonomy.name],
     }
+
     if licence is not None:
         metadata["license"] = licence
+
     return f"---\n{yaml.safe_dump(metadata, sort_keys=False)}---\n\n"
 
 
 def _summary(weights: Weights) -> str:
-    parts = ", ".join(f"{TITLES[part].lower()} (`{part}`)" for part in weights.parts) or "nothing"
     sensor = f" of the sensor {weights.sensor}" if weights.sensor else ""
+    parts = []
+    for part in weights.parts:
+        parts.append(f"{TITLES[part].lower()} (`{part}`)")
+
     return (
         f"LiDAR semantic segmentation (AMVNet, arXiv 2012.04934) for scans{sensor}. "
-        f"In this file: {parts}."
+        f"In this file: {', '.join(parts) or 'nothing'}."
     )
 
 
@@ -132,8 +137,11 @@ def _metrics(weights: Weights) -> str:
     lines = [f"| | {' | '.join(METRICS.values())} |", "|---" * (len(METRICS) + 1) + "|"]
     for part in weights.parts:
         metrics = weights.metrics.get(part, {})
-        cells = [_percent(metrics.get(key)) for key in METRICS]
-        lines.append(f"| {TITLES[part]} | {' | '.join(cells)} |")
+        cells = [TITLES[part]]
+        for key in METRICS:
+            cells.append(_percent(metrics.get(key)))
+        lines.append(f"| {' | '.join(cells)} |")
+
     return "On the scans named below as validated on, %:\n\n" + "\n".join(lines)
 
 
@@ -146,6 +154,7 @@ def _training(weights: Weights, part: str) -> str:
     count = 0
     for tensor in weights.part(part).values():
         count += tensor.numel()
+
     rows = [("values", f"{count:,}")]
 
     # The data come first, then the settings in their own order.
@@ -156,6 +165,7 @@ def _training(weights: Weights, part: str) -> str:
     for key, value in record.items():
         if key not in DATA:
             rows.append((key, _plain(value)))
+
     return _list(rows)
 
 
@@ -171,4 +181,5 @@ def _plain(value: Any) -> str:
         if len(value) > LISTED:
             return f"{len(value)}, from {value[0]} to {value[-1]}"
         return ", ".join(map(str, value))
+
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -72,6 +72,7 @@ class Weights:
         for key, tensor in self.tensors.items():
             if key.startswith(prefix):
                 state[key.removeprefix(prefix)] = tensor
+
         return state
 
     def digest(self, name: str) -> str:
@@ -79,6 +80,7 @@ class Weights:
         digest = hashlib.sha256()
         for key, tensor in sorted(self.part(name).items()):
             digest.update(key.encode() + tensor.cpu().contiguous().numpy().tobytes())
+
         return digest.hexdigest()[:16]
 
     def replace_part(self, name: str, other: Weights) -> Weights:
@@ -91,6 +93,7 @@ class Weights:
             raise InputError(
                 f"expected weights with the part {name}, found {', '.join(other.parts) or 'none'}"
             )
+
         if self.taxonomy.classes != other.taxonomy.classes:
             raise InputError(
                 f"expected weights for the classes of {self.taxonomy.name}, "
@@ -132,6 +135,7 @@ class Weights:
         model = build_amvnet(self.model, self.taxonomy.size)
         for part in self.parts:
             self._load_part(part, getattr(model, part))
+
         if "point_head" not in self.parts:
             model.point_head = None
         return model.eval()
@@ -146,6 +150,7 @@ class Weights:
             raise InputError(
                 "expected weights with a point head, found none; train one with --stage head"
             )
+
         head = PointHead(self.model.point_head, self.taxonomy.size)
         self._load_part("point_head", head)
         return head.eval()
@@ -167,6 +172,7 @@ def part_state(part: str, module: torch.nn.Module) -> dict[str, Tensor]:
     state = {}
     for key, tensor in module.state_dict().items():
         state[f"{part}.{key}"] = tensor.detach().cpu().clone().contiguous()
+
     return state
 
 
@@ -198,6 +204,7 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
             save_file(tensors, part, metadata={KEY: json.dumps(description)})
         except SafetensorError as error:  # a full disk
             raise OSError(errno.EIO, str(error).splitlines()[0], str(path)) from None
+
     return Path(path)
 
 
@@ -212,6 +219,7 @@ def load(name_or_path: str | Path) -> Weights:
         InputError: if there is no such file or name, or it is not a weights file of this project.
     """
     path = _find(str(name_or_path))
+
     tensors = {}
     try:
         with safe_open(path, "pt") as file:
@@ -241,6 +249,7 @@ def _check_description(description: Any, path: Path) -> None:
             f"{path}: expected weights with AMVNet's description inside, found none; "
             "give AMVNet weights"
         )
+
     for key, kind in _DESCRIPTION.items():
         value = description.get(key)
         if not isinstance(value, kind):
@@ -261,12 +270,14 @@ def _find(name_or_path: str) -> Path:
         return hub.fetch(name_or_path)
 
     path = built_in().get(name_or_path, Path(name_or_path))
-    run_weights = path / "weights.safetensors"
-    if path.is_dir() and run_weights.is_file():
-        return run_weights  # of the folder of a training run
+    run_weights = path / "weights.safetensors"  # if the path is the folder of a training run
+    if run_weights.is_file():
+        return run_weights
+
     if not path.is_file():
         names = ", ".join(built_in()) or "none"
         raise InputError(
             f"expected a weights file, found no {name_or_path}; check the path (built in: {names})"
         )
+
     return path

@@ -61,6 +61,7 @@ def client() -> Any:
         raise InputError(
             "expected huggingface_hub for the hub, found none; pip install 'amvnet[hub]'"
         ) from None
+
     return huggingface_hub
 
 

@@ -50,4 +50,5 @@ def push(
                 allow_patterns=[FILE, CARD],
                 commit_message="AMVNet weights",
             )
+
     return str(getattr(commit, "commit_url", commit))

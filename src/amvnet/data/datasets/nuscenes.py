@@ -32,6 +32,7 @@ def _scenes(numbers: str) -> frozenset[str]:
         first, _, last = part.partition("-")
         for number in range(int(first), int(last or first) + 1):
             names.add(f"scene-{number:04d}")
+
     return frozenset(names)
 
 
@@ -102,6 +103,7 @@ class NuScenes:
                 f"({len(scenes)} in the tables of {self.version}), found none; "
                 f"name the scenes to use, such as {', '.join(examples)}"
             )
+
         return tuple(present)
 
     def scenes(self, split: str) -> tuple[str, ...]:
@@ -115,6 +117,7 @@ class NuScenes:
                 f"{self.root}: expected a split of {', '.join(SPLITS)}, "
                 f"found {split!r}; give one of them"
             )
+
         scenes = []
         for scene in sorted(self._records_by_scene):
             if split in ("all", self._split(scene).removeprefix("mini_")):
@@ -145,6 +148,7 @@ class NuScenes:
             ids = files.read_labels(
                 record.labels_path, np.uint8, len(points), self._categories_to_train
             )
+
         return Scan(points, labels=ids, ring=ring, name=record.name)
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
@@ -172,6 +176,7 @@ class NuScenes:
         else:
             expected = version or "a folder v1.0-*"
             advice = "give the folder that holds it"
+
         raise InputError(
             f"{self.root}: expected {expected}, found {', '.join(present) or 'none'}; {advice}"
         )
@@ -186,12 +191,14 @@ class NuScenes:
                 f"{path}: expected a table of nuScenes, found no file; "
                 f"unpack the metadata of {self.version}"
             )
+
         try:
             rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise InputError(
                 f"{path}: expected a table in JSON, found {error}; unpack the file again"
             ) from None
+
         return rows
 
     def _category_lookup(self) -> np.ndarray:
@@ -205,12 +212,15 @@ class NuScenes:
                     f"{path}: expected an index in every category, found none; "
                     "unpack nuScenes-lidarseg over it"
                 )
+
             if row["name"] not in self.taxonomy.raw_to_train:
                 raise InputError(
                     f"{path}: expected the categories of nuScenes, found {row['name']!r}; "
                     "correct the table"
                 )
+
             table[row["index"]] = self.taxonomy.raw_to_train[row["name"]]
+
         return table
 
     def _categories_to_train(self, indices: np.ndarray) -> np.ndarray:
@@ -224,6 +234,7 @@ class NuScenes:
                 f"expected indices of category.json, found {unknown}; "
                 "use the tables that came with the labels"
             )
+
         return train.astype(np.uint8)
 
     def _index(self) -> dict[str, list[ScanRecord]]:
@@ -289,6 +300,7 @@ class NuScenes:
                 return "mini_val"
             if scene in MINI_TRAIN:
                 return "mini_train"
+
         return "val" if scene in VAL else "train"
 
     def _count_points(self, record: ScanRecord) -> int:

@@ -36,6 +36,7 @@ def read_prediction(path: Path, dtype: DTypeLike, count: int, taxonomy: Taxonomy
         raise InputError(
             f"{path}: expected the prediction of a scan, found no file; predict this scan, too"
         )
+
     check_size(path, path.stat().st_size, count, dtype)
     return train_ids(path, np.fromfile(path, dtype=dtype, count=count), taxonomy)
 
@@ -61,6 +62,7 @@ def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> Non
             f"{name}: expected {dtype} ids, found ids of {8 * size // count} bits; "
             f"write the ids as {dtype}"
         )
+
     is_whole = size % dtype.itemsize == 0
     found = f"{size // dtype.itemsize}" if is_whole else f"{size} bytes"
     raise InputError(
@@ -92,6 +94,7 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
             f"{name}: expected little-endian {raw.dtype} ids, found the class 0 with other bits, "
             f"as float32 and big-endian ids read; write the ids as little-endian {raw.dtype}"
         )
+
     try:
         return taxonomy.to_train(raw)
     except InputError:

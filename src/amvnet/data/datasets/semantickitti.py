@@ -61,6 +61,7 @@ class SemanticKitti:
                 f"({', '.join(splits[split])}), found {', '.join(present)}; "
                 "name the sequences to use"
             )
+
         return sequences
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
@@ -78,6 +79,7 @@ class SemanticKitti:
             ids = files.read_labels(
                 record.labels_path, np.uint32, len(points), self.taxonomy.to_train
             )
+
         return Scan(points, labels=ids, name=record.name)
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
@@ -128,4 +130,5 @@ class SemanticKitti:
                 f"{folder / 'velodyne'}: expected the scans *.bin of sequence {sequence}, "
                 f"found none; there is {', '.join(self._present())}"
             )
+
         return records
