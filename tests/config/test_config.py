@@ -1,4 +1,4 @@
-"""Configurations go to dictionaries and back; a wrong key or value is named; a recipe states only what differs."""
+"""Configurations survive the way to dictionaries and back; wrong keys and values are named."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.errors import InputError
 
 
-def write(folder: Path, text: str) -> str:
+def write_recipe(folder: Path, text: str) -> str:
     path = folder / "mine.yaml"
     path.write_text(text)
     return str(path)
 
 
-def leaves(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def flatten(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the leaves of nested dictionaries by their path: {"model.range_view.width": 96}."""
+    leaves: dict[str, Any] = {}
     for key, value in tree.items():
-        flat |= (
-            leaves(value, f"{prefix}{key}.")
-            if isinstance(value, dict)
-            else {f"{prefix}{key}": value}
-        )
-    return flat
+        if isinstance(value, dict):
+            leaves.update(flatten(value, f"{prefix}{key}."))
+        else:
+            leaves[f"{prefix}{key}"] = value
+    return leaves
 
 
 @pytest.mark.parametrize("name", recipe_names())
 def test_a_recipe_survives_the_way_to_json_and_yaml_and_back(name: str) -> None:
     recipe = load_recipe(name)
     tree = to_dict(recipe)
+
     assert json.loads(json.dumps(tree)) == tree
     assert from_dict(Recipe, json.loads(json.dumps(tree))) == recipe
     assert from_dict(Recipe, yaml.safe_load(yaml.safe_dump(tree))) == recipe
@@ -44,43 +45,49 @@ def test_a_recipe_survives_the_way_to_json_and_yaml_and_back(name: str) -> None:
 
 
 def test_every_builtin_recipe_is_there() -> None:
-    names = {"semantickitti", "nuscenes", "simulated"}
-    names |= {f"{name}-{part}" for name in names - {"simulated"} for part in ("polarnet", "no-rnn")}
-    assert set(recipe_names()) == names | {f"{name}-compact" for name in names} | {
-        "simulated-hdl32e-compact"
-    }
+    full_size = {"simulated"}
+    for benchmark in ("semantickitti", "nuscenes"):
+        full_size |= {benchmark, f"{benchmark}-polarnet", f"{benchmark}-no-rnn"}
+    compact = {f"{name}-compact" for name in full_size} | {"simulated-hdl32e-compact"}
+
+    assert set(recipe_names()) == full_size | compact
 
 
-def test_the_recipes_hold_the_papers_numbers() -> None:
-    kitti, nuscenes = load_recipe("semantickitti"), load_recipe("nuscenes")
-    view, grid = kitti.model.range_view, kitti.model.polar_view
-    assert (view.rows, view.height, view.width, view.fov_up, view.fov_down) == (
-        "elevation",
-        64,
-        4096,
-        3.0,
-        -25.0,
-    )
-    assert (grid.radial, grid.angular, grid.vertical, grid.radius_max) == (480, 360, 32, 50.0)
-    assert (grid.z_min, grid.z_max) == (-3.0, 1.5)
-    assert (kitti.model.assertion.threshold, kitti.model.point_head.neighbours) == (0.85, 15)
-    assert [(s.epochs, s.batch) for s in (kitti.training.rv, kitti.training.bev)] == [
-        (160, 32),
-        (40, 8),
-    ]
-    view, grid = nuscenes.model.range_view, nuscenes.model.polar_view
-    assert (view.rows, view.height, view.width, grid.z_min, grid.z_max) == (
-        "ring",
-        32,
-        1920,
-        -2.0,
-        4.0,
-    )
-    assert [(s.epochs, s.batch) for s in (nuscenes.training.rv, nuscenes.training.bev)] == [
-        (400, 64),
-        (40, 8),
-    ]
-    assert nuscenes.taxonomy == "nuscenes"
+def test_the_semantickitti_recipe_holds_the_papers_numbers() -> None:
+    recipe = load_recipe("semantickitti")
+    assert recipe.taxonomy == "semantickitti"
+
+    view = recipe.model.range_view
+    assert view.rows == "elevation"
+    assert (view.height, view.width) == (64, 4096)
+    assert (view.fov_up, view.fov_down) == (3.0, -25.0)
+
+    grid = recipe.model.polar_view
+    assert (grid.radial, grid.angular, grid.vertical) == (480, 360, 32)
+    assert (grid.radius_max, grid.z_min, grid.z_max) == (50.0, -3.0, 1.5)
+
+    assert recipe.model.assertion.threshold == 0.85
+    assert recipe.model.point_head.neighbours == 15
+
+    training = recipe.training
+    assert (training.rv.epochs, training.rv.batch) == (160, 32)
+    assert (training.bev.epochs, training.bev.batch) == (40, 8)
+
+
+def test_the_nuscenes_recipe_holds_the_papers_numbers() -> None:
+    recipe = load_recipe("nuscenes")
+    assert recipe.taxonomy == "nuscenes"
+
+    view = recipe.model.range_view
+    assert view.rows == "ring"
+    assert (view.height, view.width) == (32, 1920)
+
+    grid = recipe.model.polar_view
+    assert (grid.z_min, grid.z_max) == (-2.0, 4.0)
+
+    training = recipe.training
+    assert (training.rv.epochs, training.rv.batch) == (400, 64)
+    assert (training.bev.epochs, training.bev.batch) == (40, 8)
 
 
 @pytest.mark.parametrize("name", recipe_names())
@@ -94,7 +101,7 @@ def test_an_empty_tree_gives_the_defaults() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "pattern"),
     [
         ("modle: {}", "modle"),
         ("model: {range_view: {hieght: 3}}", "hieght"),
@@ -117,17 +124,17 @@ def test_an_empty_tree_gives_the_defaults() -> None:
     ],
 )
 def test_a_wrong_key_or_value_is_an_input_error_that_names_it(
-    tmp_path: Path, text: str, named: str
+    tmp_path: Path, text: str, pattern: str
 ) -> None:
-    with pytest.raises(InputError, match=f"mine.yaml.*{named}") as caught:
-        load_recipe(write(tmp_path, text))
-    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=f"mine.yaml.*{pattern}") as error:
+        load_recipe(write_recipe(tmp_path, text))
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("text", ["- a\n- b", "just words", "a: [1, 2", "a: b: c"])
-def test_a_file_that_is_no_mapping_is_an_input_error(tmp_path: Path, text: str) -> None:
+def test_a_file_without_keys_is_an_input_error(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError, match=r"mine\.yaml"):
-        load_recipe(write(tmp_path, text))
+        load_recipe(write_recipe(tmp_path, text))
 
 
 def test_an_unknown_recipe_is_an_input_error_that_lists_the_known_ones() -> None:
@@ -136,14 +143,14 @@ def test_an_unknown_recipe_is_an_input_error_that_lists_the_known_ones() -> None
 
 
 @pytest.mark.parametrize("base", ["nothing-like-it", "3", "[nuscenes]", "{a: 1}"])
-def test_a_base_that_is_no_recipe_is_an_input_error(tmp_path: Path, base: str) -> None:
+def test_a_base_that_is_not_a_recipe_is_an_input_error(tmp_path: Path, base: str) -> None:
     with pytest.raises(InputError):
-        load_recipe(write(tmp_path, f"base: {base}"))
+        load_recipe(write_recipe(tmp_path, f"base: {base}"))
 
 
 def test_a_recipe_that_is_its_own_base_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(InputError):
-        load_recipe(write(tmp_path, f"base: {tmp_path / 'mine.yaml'}"))
+        load_recipe(write_recipe(tmp_path, f"base: {tmp_path / 'mine.yaml'}"))
 
 
 def test_a_binary_file_is_an_input_error(tmp_path: Path) -> None:
@@ -153,47 +160,57 @@ def test_a_binary_file_is_an_input_error(tmp_path: Path) -> None:
         load_recipe(str(path))
 
 
-def test_a_list_of_booleans_is_no_list_of_numbers(tmp_path: Path) -> None:
+def test_a_list_of_booleans_is_not_a_list_of_numbers(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="widths"):
-        load_recipe(write(tmp_path, "model: {range_net: {widths: [true, false]}}"))
+        load_recipe(write_recipe(tmp_path, "model: {range_net: {widths: [true, false]}}"))
 
 
 @pytest.mark.parametrize("base", ["nuscenes-compact", "semantickitti"])
-def test_a_users_file_overrides_just_what_it_states(tmp_path: Path, base: str) -> None:
-    text = f"base: {base}\nmodel: {{range_view: {{width: 96}}}}\ntraining: {{rv: {{lr: 1}}, keep: last}}"
-    found, original = (
-        leaves(to_dict(load_recipe(write(tmp_path, text)))),
-        leaves(to_dict(load_recipe(base))),
+def test_a_users_file_overrides_only_what_it_states(tmp_path: Path, base: str) -> None:
+    path = write_recipe(
+        tmp_path,
+        f"base: {base}\n"
+        "model: {range_view: {width: 96}}\n"
+        "training: {rv: {lr: 1}, keep: last}\n",
     )
-    changed = {key: value for key, value in found.items() if value != original[key]}
+    original = flatten(to_dict(load_recipe(base)))
+    leaves = flatten(to_dict(load_recipe(path)))
+
+    changed = {key: value for key, value in leaves.items() if value != original[key]}
     assert changed == {"model.range_view.width": 96, "training.rv.lr": 1.0, "training.keep": "last"}
-    assert isinstance(found["training.rv.lr"], float)
+    assert isinstance(leaves["training.rv.lr"], float)
 
 
 @pytest.mark.parametrize(("text", "value"), [("2e-3", 2e-3), ("1E-4", 1e-4), ("5", 5.0)])
 def test_numbers_with_an_exponent_are_numbers(tmp_path: Path, text: str, value: float) -> None:
-    assert load_recipe(write(tmp_path, f"training: {{rv: {{lr: {text}}}}}")).training.rv.lr == value
+    recipe = load_recipe(write_recipe(tmp_path, f"training: {{rv: {{lr: {text}}}}}"))
+    assert recipe.training.rv.lr == value
 
 
 def test_a_users_file_without_a_base_builds_on_the_papers_sizes(tmp_path: Path) -> None:
-    recipe = load_recipe(write(tmp_path, "training: {seed: 5}"))
-    assert recipe == dataclasses.replace(
-        Recipe(), training=dataclasses.replace(Recipe().training, seed=5)
-    )
+    recipe = load_recipe(write_recipe(tmp_path, "training: {seed: 5}"))
+    training = dataclasses.replace(Recipe().training, seed=5)
+    assert recipe == dataclasses.replace(Recipe(), training=training)
 
 
 def test_a_users_file_may_build_on_another_users_file(tmp_path: Path) -> None:
-    (tmp_path / "first.yaml").write_text("base: nuscenes\ntraining: {seed: 5, workers: 2}")
-    training = load_recipe(
-        write(tmp_path, f"base: {tmp_path / 'first.yaml'}\ntraining: {{seed: 6}}")
-    ).training
-    assert (training.seed, training.workers, training.rv.epochs) == (6, 2, 400)
+    first = tmp_path / "first.yaml"
+    first.write_text("base: nuscenes\ntraining: {seed: 5, workers: 2}")
+    second = write_recipe(tmp_path, f"base: {first}\ntraining: {{seed: 6}}")
+
+    training = load_recipe(second).training
+    assert training.seed == 6
+    assert training.workers == 2
+    assert training.rv.epochs == 400
 
 
 def test_merging_trees_leaves_both_as_they_were() -> None:
-    base, over = {"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}}
+    base = {"a": {"b": 1, "c": 2}, "d": 3}
+    over = {"a": {"b": 4}}
     assert merge_trees(base, over) == {"a": {"b": 4, "c": 2}, "d": 3}
-    assert (base, over) == ({"a": {"b": 1, "c": 2}, "d": 3}, {"a": {"b": 4}})
+
+    assert base == {"a": {"b": 1, "c": 2}, "d": 3}
+    assert over == {"a": {"b": 4}}
 
 
 @pytest.mark.parametrize(
@@ -221,4 +238,4 @@ def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(
     tmp_path: Path, text: str
 ) -> None:
     with pytest.raises(InputError, match=r"mine\.yaml: .*expected .* found .*correct the value"):
-        load_recipe(write(tmp_path, text))
+        load_recipe(write_recipe(tmp_path, text))

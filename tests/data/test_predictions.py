@@ -1,10 +1,11 @@
-"""Predictions of other tools are scored by name; what is usually written instead of them is told in one line."""
+"""Predictions of other tools are scored by file name; the usual mistakes are named in one line."""
 
 from __future__ import annotations
 
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,35 +13,50 @@ import pytest
 
 from fixtures.worlds import GOLDEN, run_cli
 
-SETS = {
-    "semantickitti": ("sequences/08/predictions", "<u4"),
-    "nuscenes": ("lidarseg/mini_val", "u1"),
-}
+
+@dataclass
+class Predictions:
+    """A golden dataset and a copy of predictions for it.
+
+    Attributes:
+        spec: how the command line opens the dataset.
+        folder: the folder of predictions.
+        dtype: number type of the predictions.
+    """
+
+    spec: str
+    folder: Path
+    dtype: str
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files of the predictions, sorted."""
+        return sorted([*self.folder.rglob("*.label"), *self.folder.rglob("*.bin")])
+
+    def score(self) -> float:
+        """Return the mIoU that `amvnet evaluate` reports."""
+        report = self.folder.parent / "report.json"
+        arguments = (self.spec, "--predictions", self.folder, "--json", report)
+        assert run_cli("evaluate", *arguments) == (0, "")
+        return json.loads(report.read_text())["methods"]["predictions"]["miou"]
 
 
-@pytest.fixture(params=SETS)
-def given(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path, str]:
-    """The golden set, a copy of its predictions, and their number type."""
-    name = request.param
-    folder, dtype = SETS[name]
-    source = GOLDEN / name / ("results" if name == "nuscenes" else "")
-    shutil.copytree(source / folder, tmp_path / "p" / folder)
-    return f"{name}:{GOLDEN / name}", tmp_path / "p", dtype
+@pytest.fixture(params=["semantickitti", "nuscenes"])
+def predictions(request: pytest.FixtureRequest, tmp_path: Path) -> Predictions:
+    folder = tmp_path / "predictions"
+    if request.param == "semantickitti":
+        data = GOLDEN / "semantickitti"
+        shutil.copytree(data / "sequences/08/predictions", folder / "sequences/08/predictions")
+        return Predictions(f"semantickitti:{data}", folder, "<u4")
+
+    data = GOLDEN / "nuscenes"
+    shutil.copytree(data / "results/lidarseg/mini_val", folder / "lidarseg/mini_val")
+    return Predictions(f"nuscenes:{data}", folder, "u1")
 
 
-def first(folder: Path) -> Path:
-    return min(path for path in folder.rglob("*") if path.suffix in (".label", ".bin"))
-
-
-def scored(spec: str, folder: Path) -> float:
-    out = folder.parent / "m.json"
-    assert run_cli("evaluate", spec, "--predictions", folder, "--json", out) == (0, "")
-    return json.loads(out.read_text())["methods"]["predictions"]["miou"]
-
-
-def test_files_beside_the_predictions_change_nothing(given: tuple[str, Path, str]) -> None:
-    spec, folder, _ = given
-    before = scored(spec, folder)
+def test_other_files_in_the_folder_change_nothing(predictions: Predictions) -> None:
+    score = predictions.score()
+    folder = predictions.paths[0].parent
     for name in (
         "scores.npz",
         "._000000.label",
@@ -49,67 +65,90 @@ def test_files_beside_the_predictions_change_nothing(given: tuple[str, Path, str
         "zzz_lidarseg.bin",
         "submission.json",
     ):
-        (first(folder).parent / name).write_bytes(b"not a prediction")
-    assert scored(spec, folder) == before
+        (folder / name).write_bytes(b"not a prediction")
+
+    assert predictions.score() == score
 
 
-def test_signed_ids_and_instances_are_the_same_labels(given: tuple[str, Path, str]) -> None:
-    spec, folder, dtype = given
-    before = scored(spec, folder)
-    for path in [p for p in folder.rglob("*") if p.is_file()]:
-        ids = np.fromfile(path, dtype)
-        (ids | (7 << 16) if dtype == "<u4" else ids).astype(dtype.replace("u", "i")).tofile(path)
-    assert scored(spec, folder) == before
+def test_signed_ids_and_instances_are_the_same_labels(predictions: Predictions) -> None:
+    score = predictions.score()
+    for path in predictions.paths:
+        ids = np.fromfile(path, predictions.dtype)
+        if predictions.dtype == "<u4":
+            ids |= 7 << 16
+        ids.astype(predictions.dtype.replace("u", "i")).tofile(path)
+
+    assert predictions.score() == score
 
 
-def test_a_point_without_class_is_missed(given: tuple[str, Path, str]) -> None:
-    spec, folder, dtype = given
-    before = scored(spec, folder)
-    np.zeros_like(np.fromfile(first(folder), dtype)).tofile(first(folder))
-    assert scored(spec, folder) < before
+def test_a_point_without_class_is_missed(predictions: Predictions) -> None:
+    score = predictions.score()
+    path = predictions.paths[0]
+    np.zeros_like(np.fromfile(path, predictions.dtype)).tofile(path)
+    assert predictions.score() < score
 
 
-WRONG: dict[str, tuple[Callable[[np.ndarray], np.ndarray | None], str]] = {
+def fill(ids: np.ndarray, *values: int) -> np.ndarray:
+    return np.resize(np.array(values, ids.dtype), len(ids))
+
+
+def minus_one(ids: np.ndarray) -> np.ndarray:
+    """Return -1 for every point, which is 255 in one byte."""
+    return np.full_like(ids, -1, dtype=ids.dtype.str.replace("u", "i"))
+
+
+def classes(ids: np.ndarray) -> np.ndarray:
+    return ids & 0xFFFF
+
+
+# How to change the ids of a good prediction (None: remove the file), and words of the message.
+Mistake = tuple[Callable[[np.ndarray], np.ndarray | None], str]
+MISTAKES: dict[str, Mistake] = {
     "int64": (lambda ids: ids.astype("<i8"), "ids of 64 bits"),
     "uint16": (lambda ids: ids.astype("<u2"), "ids of 16 bits"),
     "a point too few": (lambda ids: ids[:-1], "one per point"),
-    "two scans in one": (lambda ids: np.tile(ids, 3), "one per point"),
-    "255 and -1 for no class": (
-        lambda ids: np.full_like(ids, -1, dtype=ids.dtype.str.replace("u", "i")),
-        "raw ids",
-    ),
-    "fine categories": (
-        lambda ids: np.resize(np.array([23, 24, 31], ids.dtype), len(ids)),
-        "found 23, 24",
-    ),
+    "two scans too many": (lambda ids: np.tile(ids, 3), "one per point"),
+    "255 and -1 for no class": (minus_one, "raw ids"),
+    "fine categories": (lambda ids: fill(ids, 23, 24, 31), "found 23, 24"),
     "missing": (lambda ids: None, "no file"),
     "empty": (lambda ids: ids[:0], "found 0"),
 }
-WRONG_KITTI: dict[str, tuple[Callable[[np.ndarray], np.ndarray | None], str]] = {
-    "float32": (lambda ids: (ids & 0xFFFF).astype("<f4"), "float32"),
-    "big-endian": (lambda ids: (ids & 0xFFFF).astype(">u4"), "big-endian"),
+SEMANTICKITTI_MISTAKES: dict[str, Mistake] = {
+    "float32": (lambda ids: classes(ids).astype("<f4"), "float32"),
+    "big-endian": (lambda ids: classes(ids).astype(">u4"), "big-endian"),
     "uint8": (lambda ids: ids.astype("u1"), "ids of 8 bits"),
-    "train ids": (lambda ids: np.resize(np.arange(20, dtype="<u4"), len(ids)), "train ids"),
+    "train ids": (lambda ids: fill(ids, *range(20)), "train ids"),
 }
 
 
-MISTAKES = [("semantickitti", mistake) for mistake in WRONG | WRONG_KITTI] + [
-    ("nuscenes", mistake) for mistake in WRONG
-]
+def check_mistake(predictions: Predictions, mistake: Mistake) -> None:
+    """Check that a mistake in the first prediction is named in one line."""
+    change, words = mistake
+    path = predictions.paths[0]
+    ids = change(np.fromfile(path, predictions.dtype))
+    if ids is None:
+        path.unlink()
+    else:
+        ids.tofile(path)
+
+    report = predictions.folder.parent / "report.json"
+    arguments = (predictions.spec, "--predictions", predictions.folder, "--json", report)
+    code, error = run_cli("evaluate", *arguments)
+    assert code == 2
+    assert error.count("\n") == 1
+    for word in (str(path), "expected", "found", "; ", words):
+        assert word in error
+    assert not report.exists()
 
 
-@pytest.mark.parametrize(("given", "mistake"), MISTAKES, indirect=["given"])
-def test_what_is_no_prediction_is_one_line(
-    mistake: str, given: tuple[str, Path, str], tmp_path: Path
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_is_named_in_one_line(name: str, predictions: Predictions) -> None:
+    check_mistake(predictions, MISTAKES[name])
+
+
+@pytest.mark.parametrize("name", SEMANTICKITTI_MISTAKES)
+@pytest.mark.parametrize("predictions", ["semantickitti"], indirect=True)
+def test_a_mistake_in_four_byte_ids_is_named_in_one_line(
+    name: str, predictions: Predictions
 ) -> None:
-    spec, folder, dtype = given
-    path = first(folder)
-    change, words = (WRONG | WRONG_KITTI)[mistake]
-    made = change(np.fromfile(path, dtype))
-    path.unlink()
-    if made is not None:
-        made.tofile(path)
-    code, error = run_cli("evaluate", spec, "--predictions", folder, "--json", tmp_path / "m.json")
-    assert (code, error.count("\n")) == (2, 1), error
-    assert all(word in error for word in (str(path), "expected", "found", "; ", words)), error
-    assert not (tmp_path / "m.json").exists()
+    check_mistake(predictions, SEMANTICKITTI_MISTAKES[name])

@@ -1,8 +1,11 @@
-"""A weights file explains itself, comes back as it was, and is never run; parts are replaced one by one."""
+"""A weights file explains itself, is loaded as it was saved, and is never executed."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +15,18 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
+from torch import Tensor
 
+import amvnet.weights
 from amvnet.config.nested import to_dict
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.segmenter import Segmenter
+from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.weights.file import PARTS, Weights, load, save
 
 from fixtures.worlds import fresh_weights, street, without
+
+POINTS = street(9)[0]
 
 
 @pytest.fixture(scope="module")
@@ -32,21 +39,34 @@ def path(weights: Weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save(weights, tmp_path_factory.mktemp("weights") / "w.safetensors")
 
 
-def scores(weights: Weights) -> np.ndarray:
-    return Segmenter(weights, method="ensemble")(street(9)[0]).scores
+def segment(weights: Weights | str) -> Segmentation:
+    return Segmenter(weights)(POINTS)
 
 
-def test_what_was_saved_is_loaded(weights: Weights, path: Path) -> None:
+def ensemble_scores(weights: Weights) -> np.ndarray:
+    return Segmenter(weights, method="ensemble")(POINTS).scores
+
+
+def assert_same_tensors(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> None:
+    assert set(first) == set(second)
+    for name, tensor in first.items():
+        assert torch.equal(tensor, second[name])
+
+
+# --- load and save ---
+
+
+def test_saved_weights_are_loaded_unchanged(weights: Weights, path: Path) -> None:
     loaded = load(path)
-    assert set(loaded.tensors) == set(weights.tensors)
-    assert all(torch.equal(loaded.tensors[name], value) for name, value in weights.tensors.items())
+    assert_same_tensors(loaded.tensors, weights.tensors)
     assert replace(loaded, tensors={}) == replace(weights, tensors={})
 
 
-def test_loaded_weights_segment_as_the_saved_ones(weights: Weights, path: Path) -> None:
-    ours, theirs = (Segmenter(w)(street(9)[0]) for w in (weights, str(path)))
-    assert np.array_equal(ours.scores, theirs.scores)
-    assert np.array_equal(ours.labels, theirs.labels)
+def test_loaded_weights_segment_like_the_saved_ones(weights: Weights, path: Path) -> None:
+    saved = segment(weights)
+    loaded = segment(str(path))
+    assert np.array_equal(loaded.scores, saved.scores)
+    assert np.array_equal(loaded.labels, saved.labels)
 
 
 def test_the_folder_of_a_run_stands_for_its_weights(weights: Weights, tmp_path: Path) -> None:
@@ -54,48 +74,61 @@ def test_the_folder_of_a_run_stands_for_its_weights(weights: Weights, tmp_path: 
     assert load(tmp_path).parts == PARTS
 
 
-def test_the_description_is_read_without_our_code(weights: Weights, path: Path) -> None:
+def test_the_package_offers_load_and_weights() -> None:
+    assert amvnet.weights.load is load
+    assert amvnet.weights.Weights is Weights
+
+
+def test_importing_the_package_does_not_import_torch() -> None:
+    code = "import sys, amvnet.weights; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_the_description_can_be_read_without_this_package(weights: Weights, path: Path) -> None:
     with safe_open(path, "np") as file:
-        said = json.loads(file.metadata()["amvnet"])
+        description = json.loads(file.metadata()["amvnet"])
         names = set(file.keys())
+
     assert names == set(weights.tensors)
-    assert said["model"] == to_dict(weights.model)
-    assert said["taxonomy"]["classes"] == list(SEMANTICKITTI.classes)
-    assert (said["sensor"], said["training"], said["metrics"]) == (
-        weights.sensor,
-        dict(weights.training),
-        dict(weights.metrics),
-    )
+    assert description["model"] == to_dict(weights.model)
+    assert description["taxonomy"]["classes"] == list(SEMANTICKITTI.classes)
+    assert description["sensor"] == weights.sensor
+    assert description["training"] == weights.training
+    assert description["metrics"] == weights.metrics
 
 
-def test_half_is_half_the_size_and_nearly_the_same(
+def test_half_precision_halves_the_size_and_hardly_changes_the_scores(
     weights: Weights, path: Path, tmp_path: Path
 ) -> None:
     half = save(weights, tmp_path / "half.safetensors", half=True)
-    count = sum(v.numel() for v in weights.tensors.values() if v.ndim > 1)
+
+    count = sum(tensor.numel() for tensor in weights.tensors.values() if tensor.ndim > 1)
     assert path.stat().st_size - half.stat().st_size == pytest.approx(2 * count, abs=2000)
-    assert np.abs(scores(load(half)) - scores(weights)).max() < 0.02
+    assert np.abs(ensemble_scores(load(half)) - ensemble_scores(weights)).max() < 0.02
+
+
+# --- parts ---
 
 
 @pytest.mark.parametrize("part", PARTS)
-def test_replacing_a_part_changes_that_part_alone(weights: Weights, part: str) -> None:
+def test_replacing_a_part_changes_only_that_part(weights: Weights, part: str) -> None:
     other = fresh_weights(seed=1)
     mixed = weights.replace_part(part, other)
+
     for name in PARTS:
         source = other if name == part else weights
         assert mixed.training[name] == source.training[name]
-        assert all(torch.equal(v, source.part(name)[k]) for k, v in mixed.part(name).items())
-    assert not np.array_equal(
-        Segmenter(mixed)(street(9)[0]).scores, Segmenter(weights)(street(9)[0]).scores
-    )
+        assert_same_tensors(mixed.part(name), source.part(name))
+
+    assert not np.array_equal(segment(mixed).scores, segment(weights).scores)
 
 
-def test_all_parts_replaced_are_the_other_weights(weights: Weights) -> None:
+def test_replacing_all_parts_gives_the_other_weights(weights: Weights) -> None:
     other = fresh_weights(seed=1)
     mixed = weights
     for part in PARTS:
         mixed = mixed.replace_part(part, other)
-    assert np.array_equal(scores(mixed), scores(other))
+    assert np.array_equal(ensemble_scores(mixed), ensemble_scores(other))
 
 
 def test_a_part_brings_its_sizes(weights: Weights) -> None:
@@ -105,13 +138,14 @@ def test_a_part_brings_its_sizes(weights: Weights) -> None:
     assert mixed.model.polar_view == weights.model.polar_view
 
 
-def test_parts_add_up(weights: Weights) -> None:
-    networks, head = without(weights, "point_head"), without(weights, "range_net", "polar_net")
-    assert (networks.parts, head.parts) == (PARTS[:2], PARTS[2:])
+def test_networks_and_head_of_two_files_add_up(weights: Weights) -> None:
+    networks = without(weights, "point_head")
+    head = without(weights, "range_net", "polar_net")
+    assert networks.parts == ("range_net", "polar_net")
+    assert head.parts == ("point_head",)
+
     whole = networks.replace_part("point_head", head)
-    assert np.array_equal(
-        Segmenter(whole)(street(9)[0]).scores, Segmenter(weights)(street(9)[0]).scores
-    )
+    assert np.array_equal(segment(whole).scores, segment(weights).scores)
 
 
 @pytest.mark.parametrize("part", PARTS)
@@ -120,7 +154,7 @@ def test_a_part_for_other_classes_is_refused(weights: Weights, part: str) -> Non
         weights.replace_part(part, fresh_weights(NUSCENES))
 
 
-def test_a_part_that_is_not_there_is_refused(weights: Weights) -> None:
+def test_a_missing_part_is_refused(weights: Weights) -> None:
     with pytest.raises(InputError, match="point_head"):
         weights.replace_part("point_head", without(weights, "point_head"))
 
@@ -131,38 +165,49 @@ def test_parameters_that_do_not_fit_their_sizes_are_refused(weights: Weights) ->
         replace(weights, model=config).build()
 
 
-def described(path: Path, description: Any) -> None:
-    save_file({"range_net.a": torch.zeros(2)}, path, metadata={"amvnet": json.dumps(description)})
+# --- files that are not weights ---
 
 
-BROKEN = {
-    "no file": lambda path, good: None,
-    "empty": lambda path, good: path.write_bytes(b""),
-    "text": lambda path, good: path.write_text("weights"),
-    "truncated": lambda path, good: path.write_bytes(good[: len(good) // 2]),
-    "truncated header": lambda path, good: path.write_bytes(good[:100]),
-    "pickle": lambda path, good: torch.save({"range_net.a": torch.zeros(2)}, path),
-    "without description": lambda path, good: save_file({"range_net.a": torch.zeros(2)}, path),
-    "description of another kind": lambda path, good: described(path, ["format"]),
-    "another format": lambda path, good: described(path, {"format": 99}),
-    "format alone": lambda path, good: described(path, {"format": 1}),
-    "model of another kind": lambda path, good: described(path, {**said(good), "model": 5}),
-    "no taxonomy": lambda path, good: described(path, {**said(good), "taxonomy": {}}),
-}
-
-
-def said(good: bytes) -> dict[str, Any]:
-    """The description in the bytes of a weights file."""
-    header = json.loads(good[8 : 8 + int.from_bytes(good[:8], "little")])
+def read_description(content: bytes) -> dict[str, Any]:
+    """Return the description in the bytes of a weights file."""
+    size = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + size])
     return json.loads(header["__metadata__"]["amvnet"])
 
 
+def save_described(path: Path, description: Any) -> None:
+    """Write a safetensors file with any description."""
+    save_file({"range_net.a": torch.zeros(2)}, path, metadata={"amvnet": json.dumps(description)})
+
+
+def save_changed(path: Path, content: bytes, **changes: object) -> None:
+    """Write a safetensors file with some fields of a good description changed."""
+    save_described(path, {**read_description(content), **changes})
+
+
+# How to write a broken file, given its path and the content of a good one.
+BROKEN = {
+    "no file": lambda path, content: None,
+    "empty": lambda path, content: path.write_bytes(b""),
+    "text": lambda path, content: path.write_text("weights"),
+    "truncated": lambda path, content: path.write_bytes(content[: len(content) // 2]),
+    "truncated header": lambda path, content: path.write_bytes(content[:100]),
+    "pickle": lambda path, content: torch.save({"range_net.a": torch.zeros(2)}, path),
+    "without description": lambda path, content: save_file({"range_net.a": torch.zeros(2)}, path),
+    "description of another kind": lambda path, content: save_described(path, ["format"]),
+    "another format": lambda path, content: save_described(path, {"format": 99}),
+    "only the format": lambda path, content: save_described(path, {"format": 1}),
+    "model of another kind": lambda path, content: save_changed(path, content, model=5),
+    "no taxonomy": lambda path, content: save_changed(path, content, taxonomy={}),
+}
+
+
 @pytest.mark.parametrize("kind", BROKEN)
-def test_what_is_not_a_weights_file_is_refused_in_one_line(
+def test_a_file_that_is_not_weights_is_refused_in_one_line(
     kind: str, path: Path, tmp_path: Path
 ) -> None:
-    bad = tmp_path / "bad.safetensors"
-    BROKEN[kind](bad, path.read_bytes())
+    broken = tmp_path / "broken.safetensors"
+    BROKEN[kind](broken, path.read_bytes())
     with pytest.raises(InputError) as error:
-        load(bad)
+        load(broken)
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""Weights from and to the hub, and their card; the hub is a folder here, and no test needs a network."""
+"""Weights from and to the hub, and their card; the hub is a folder here, no network is needed."""
 
 from __future__ import annotations
 
@@ -15,29 +15,28 @@ import amvnet
 from amvnet.weights.card import model_card
 from amvnet.weights.file import load, save
 
-from fixtures.worlds import fails, fresh_weights, street, without
-from fixtures.worlds import run_cli as verb
+from fixtures.worlds import fails, fresh_weights, run_cli, street, without
 
 NAME = "hf-hub:somebody/streets"
 POINTS = street(3, 300)[0]
 
 
 class Hub:
-    """What is used of the hub's client, on a folder: its repositories are folders of it."""
+    """The used part of the hub's client; every repository is a folder below `root`."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.asked: list[dict[str, object]] = []
+        self.calls: list[dict[str, object]] = []
 
     def hf_hub_download(self, repo_id: str, filename: str, revision: str | None = None) -> str:
-        self.asked.append({"repo_id": repo_id, "revision": revision})
+        self.calls.append({"repo_id": repo_id, "revision": revision})
         path = self.root / repo_id / filename
         if not path.is_file():
             raise FileNotFoundError(f"\n404 Client Error.\n\nEntry Not Found for {repo_id}.")
         return str(path)
 
     def create_repo(self, repo_id: str, private: bool, exist_ok: bool) -> None:
-        self.asked.append({"repo_id": repo_id, "private": private})
+        self.calls.append({"repo_id": repo_id, "private": private})
         (self.root / repo_id).mkdir(parents=True, exist_ok=exist_ok)
 
     def upload_folder(
@@ -50,57 +49,63 @@ class Hub:
 
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
-    found = Hub(tmp_path / "hub")
-    monkeypatch.setitem(sys.modules, "huggingface_hub", found)  # type: ignore[arg-type]
-    return found
+    hub = Hub(tmp_path / "hub")
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)  # type: ignore[arg-type]
+    return hub
 
 
-def test_what_is_pushed_is_loaded(hub: Hub) -> None:
-    assert (
-        amvnet.push(fresh_weights(), NAME, private=True) == "https://hub/somebody/streets/commit/1"
-    )
-    assert sorted(path.name for path in (hub.root / "somebody/streets").iterdir()) == [
-        "README.md",
-        "model.safetensors",
-    ]
-    own, theirs = amvnet.Segmenter(fresh_weights()), amvnet.load(NAME)
-    assert np.array_equal(own(POINTS).labels, theirs(POINTS).labels)
-    assert hub.asked[0] == {"repo_id": "somebody/streets", "private": True}
+def test_pushed_weights_can_be_loaded(hub: Hub) -> None:
+    address = amvnet.push(fresh_weights(), NAME, private=True)
+    assert address == "https://hub/somebody/streets/commit/1"
+    assert hub.calls[0] == {"repo_id": "somebody/streets", "private": True}
+    folder = hub.root / "somebody/streets"
+    assert sorted(path.name for path in folder.iterdir()) == ["README.md", "model.safetensors"]
+
+    pushed = amvnet.Segmenter(fresh_weights())
+    loaded = amvnet.load(NAME)
+    assert np.array_equal(loaded(POINTS).labels, pushed(POINTS).labels)
+
+
+def test_a_revision_can_be_named(hub: Hub) -> None:
+    amvnet.push(fresh_weights(), NAME)
     load(f"{NAME}@v2")
-    assert hub.asked[-1] == {"repo_id": "somebody/streets", "revision": "v2"}
+    assert hub.calls[-1] == {"repo_id": "somebody/streets", "revision": "v2"}
 
 
 def test_the_verbs_take_names_of_the_hub(
     hub: Hub, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     amvnet.push(save(fresh_weights(), tmp_path / "w.safetensors"), "somebody/streets")
-    POINTS.tofile(tmp_path / "a.bin")
-    assert verb("predict", tmp_path / "a.bin", "--weights", NAME, "--out", tmp_path / "out") == (
-        0,
-        "",
-    )
-    assert verb("info", NAME) == (0, "")
-    card = (hub.root / "somebody/streets/README.md").read_text()
-    assert (
-        capsys.readouterr().out.split("# hf-hub", 1)[1].strip()
-        == card.split("# hf-hub", 1)[1].strip()
-    )
+    scan = tmp_path / "a.bin"
+    POINTS.tofile(scan)
+    assert run_cli("predict", scan, "--weights", NAME, "--out", tmp_path / "out") == (0, "")
+    capsys.readouterr()
+
+    # `info` prints the card that lies on the hub, without its front matter.
+    assert run_cli("info", NAME) == (0, "")
+    _, card = (hub.root / "somebody/streets/README.md").read_text().split("# hf-hub", 1)
+    _, printed = capsys.readouterr().out.split("# hf-hub", 1)
+    assert printed.strip() == card.strip()
 
 
 def test_the_card_says_what_the_hub_and_people_need(hub: Hub) -> None:
     amvnet.push(fresh_weights(), NAME, licence="cc-by-nc-sa-4.0")
-    _, front, card = (hub.root / "somebody/streets/README.md").read_text().split("---\n", 2)
-    assert yaml.safe_load(front)["license"] == "cc-by-nc-sa-4.0"
-    assert yaml.safe_load(front)["library_name"] == "amvnet"
-    for words in (
-        f'amvnet.load("{NAME}")',
-        "traffic-sign",
-        "sensor tiny",
-        "| 50.0 |",
-        "seed: 0",
-        "cc-by-nc-sa-4.0",
-    ):
-        assert words in card
+    text = (hub.root / "somebody/streets/README.md").read_text()
+    _, front_matter, card = text.split("---\n", 2)
+
+    metadata = yaml.safe_load(front_matter)
+    assert metadata["license"] == "cc-by-nc-sa-4.0"
+    assert metadata["library_name"] == "amvnet"
+
+    assert f'amvnet.load("{NAME}")' in card
+    assert "traffic-sign" in card
+    assert "sensor tiny" in card
+    assert "| 50.0 |" in card
+    assert "seed: 0" in card
+    assert "cc-by-nc-sa-4.0" in card
+
+
+def test_a_card_without_a_licence_says_so() -> None:
     assert "names no licence" in model_card(fresh_weights(), "w")
 
 
@@ -114,32 +119,41 @@ def test_the_card_says_what_the_hub_and_people_need(hub: Hub) -> None:
         ("range_net", "polar_net"),
     ],
 )
-def test_the_cards_code_runs(dropped: tuple[str, ...], tmp_path: Path) -> None:
+def test_the_code_of_the_card_runs(dropped: tuple[str, ...], tmp_path: Path) -> None:
     path = save(without(fresh_weights(), *dropped), tmp_path / "w.safetensors")
-    code = model_card(load(path), str(path)).split("```python\n")[1].split("```")[0]
+    card = model_card(load(path), str(path))
+    code = card.split("```python\n")[1].split("```")[0]
+
     scores = np.full((len(POINTS), 19), 1 / 19, np.float32)
     names = {"points": POINTS, "f": scores, "g": scores}
     exec(code, names)
-    found = names["labels"] if "labels" in names else names["result"].labels
-    assert found.shape == (len(POINTS),)
+    labels = names["labels"] if "labels" in names else names["result"].labels
+    assert labels.shape == (len(POINTS),)
 
 
-def test_what_goes_wrong_is_one_line(
-    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_that_cannot_be_loaded_is_one_line(hub: Hub) -> None:
     fails(lambda: load("hf-hub:nobody/nothing"), "nobody/nothing", "404", "model.safetensors")
     fails(lambda: load("hf-hub:nothing"), "OWNER/NAME")
-    fails(lambda: amvnet.push(fresh_weights(), "streets"), "OWNER/NAME")
-    (hub.root / "somebody/pickles").mkdir(parents=True)
-    (hub.root / "somebody/pickles/model.safetensors").write_bytes(b"\x80\x04\x95")
+
+    folder = hub.root / "somebody/pickles"
+    folder.mkdir(parents=True)
+    (folder / "model.safetensors").write_bytes(b"\x80\x04\x95")
     fails(lambda: load("hf-hub:somebody/pickles"), "safetensors")
-    monkeypatch.setattr(
-        hub, "upload_folder", lambda **more: (_ for _ in ()).throw(RuntimeError("no way in"))
-    )
+
+
+def test_a_push_that_fails_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    fails(lambda: amvnet.push(fresh_weights(), "streets"), "OWNER/NAME")
+
+    def refuse(**arguments: object) -> object:
+        raise RuntimeError("no way in")
+
+    monkeypatch.setattr(hub, "upload_folder", refuse)
     fails(lambda: amvnet.push(fresh_weights(), NAME), "no way in", "hf auth login")
 
 
-def test_without_the_extra_the_command_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_client_the_message_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    for call in (lambda: load(NAME), lambda: amvnet.push(fresh_weights(), NAME)):
-        fails(call, "pip install 'amvnet[hub]'")
+    fails(lambda: load(NAME), "pip install 'amvnet[hub]'")
+    fails(lambda: amvnet.push(fresh_weights(), NAME), "pip install 'amvnet[hub]'")

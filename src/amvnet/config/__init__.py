@@ -1,1 +1,1 @@
-"""The numbers of a model and of a training: schema, bounds and recipes."""
+"""The numbers of a model and of its training: schema, bounds and recipes."""

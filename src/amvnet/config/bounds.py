@@ -1,4 +1,4 @@
-"""Numbers that say which values they may have, and dataclasses that refuse others."""
+"""Ranges of numbers, and dataclasses that refuse numbers outside of them."""
 
 from __future__ import annotations
 
@@ -11,20 +11,28 @@ from amvnet.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers that a value may have, for `Annotated`."""
+    """The numbers that a value may have, for `Annotated`.
+
+    Attributes:
+        low: lower end.
+        high: upper end.
+        open: whether the ends themselves are excluded.
+    """
 
     low: float
     high: float = math.inf
-    open: bool = False  # without its ends
+    open: bool = False
 
     def __contains__(self, value: Any) -> bool:
-        return self.low < value < self.high if self.open else self.low <= value <= self.high
+        if self.open:
+            return self.low < value < self.high
+        return self.low <= value <= self.high
 
     def __repr__(self) -> str:
-        low, high = ("above", "below") if self.open else ("at least", "at most")
-        return f"{low} {self.low:g}" + (
-            "" if math.isinf(self.high) else f" and {high} {self.high:g}"
-        )
+        lower = f"{'above' if self.open else 'at least'} {self.low:g}"
+        if math.isinf(self.high):
+            return lower
+        return f"{lower} and {'below' if self.open else 'at most'} {self.high:g}"
 
 
 Count = Annotated[int, Range(1)]
@@ -34,23 +42,36 @@ Share = Annotated[float, Range(0, 1)]
 
 
 class Checked:
-    """A dataclass that refuses numbers out of their ranges."""
+    """A base of dataclasses whose numbers must lie in the `Range` of their annotation."""
 
     def __post_init__(self) -> None:
-        """Raises InputError on the first value out of its range."""
+        """Check every number.
+
+        Raises:
+            InputError: at the first number out of its range.
+        """
         for name, kind in get_type_hints(type(self), include_extras=True).items():
             value = getattr(self, name)
             if isinstance(value, tuple):
-                kind = get_args(kind)[0]
-            for allowed in getattr(kind, "__metadata__", ()):
-                if wrong := [
-                    v for v in (value if isinstance(value, tuple) else (value,)) if v not in allowed
-                ]:
-                    raise InputError(
-                        f"{name}: expected a number {allowed}, found {wrong[0]}; correct the value"
-                    )
+                item_kind = get_args(kind)[0]
+                for item in value:
+                    _check_range(name, item, item_kind)
+            else:
+                _check_range(name, value, kind)
 
     def check(self, holds: bool, expected: str, found: str) -> None:
-        """Raises InputError unless something holds."""
+        """Check a condition on several numbers.
+
+        Raises:
+            InputError: if it does not hold.
+        """
         if not holds:
             raise InputError(f"expected {expected}, found {found}; correct the values")
+
+
+def _check_range(name: str, value: Any, kind: Any) -> None:
+    for allowed in getattr(kind, "__metadata__", ()):
+        if value not in allowed:
+            raise InputError(
+                f"{name}: expected a number {allowed}, found {value}; correct the value"
+            )

@@ -1,8 +1,7 @@
-"""The configuration's dataclasses from nested dictionaries, as YAML and JSON hold them, and back."""
+"""The configuration as nested dictionaries, as YAML and JSON hold them, and back."""
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast, get_args, get_type_hints
@@ -13,20 +12,29 @@ T = TypeVar("T")
 
 
 def merge_trees(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """`base` with every leaf that `over` names replaced."""
+    """Return a copy of `base` in which the leaves of `over` replace those of the same keys."""
     merged = dict(base)
     for key, value in over.items():
-        below = merged.get(key)
-        both = isinstance(value, Mapping) and isinstance(below, Mapping)
-        merged[key] = merge_trees(cast(Mapping[str, Any], below), value) if both else value
+        base_value = merged.get(key)
+        if isinstance(value, Mapping) and isinstance(base_value, Mapping):
+            merged[key] = merge_trees(base_value, value)
+        else:
+            merged[key] = value
+
     return merged
 
 
 def from_dict(cls: type[T], tree: Any, where: str = "configuration") -> T:
-    """A dataclass whose fields all have defaults, from nested dictionaries; what is not named keeps its default.
+    """Return a dataclass with the values of nested dictionaries.
+
+    Args:
+        cls: a dataclass whose fields all have defaults.
+        tree: values by field name; fields that it does not name keep their defaults.
+        where: the beginning of the message.
 
     Raises:
-        InputError: on a key that is not there, a value of another kind than the default's, or out of its range.
+        InputError: if a key is not a field, a value is not of the default's type, or a number is
+            out of its range.
     """
     if not isinstance(tree, Mapping):
         raise InputError(f"{where}: expected keys and values, found {tree!r}; correct the value")
@@ -34,48 +42,86 @@ def from_dict(cls: type[T], tree: Any, where: str = "configuration") -> T:
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Nested dictionaries and lists of a dataclass."""
-    return {k: list(v) if isinstance(v, tuple) else to_dict(v) if dataclasses.is_dataclass(v) else v
-            for k, v in vars(config).items()}  # fmt: skip
+    """Return a dataclass as nested dictionaries, with lists for its tuples."""
+    tree: dict[str, Any] = {}
+    for key, value in vars(config).items():
+        if isinstance(value, tuple):
+            tree[key] = list(value)
+        elif dataclasses.is_dataclass(value):
+            tree[key] = to_dict(value)
+        else:
+            tree[key] = value
+
+    return tree
 
 
 def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
+    """Return a dataclass with some fields replaced by the values of a tree."""
     kinds = get_type_hints(type(default))
+
     changes = {}
     for key, value in tree.items():
         if key not in kinds:
             raise InputError(
                 f"{where}: expected one of {', '.join(kinds)}, found {key!r}; correct the key"
             )
-        changes[key] = _value(getattr(default, key), value, kinds[key], f"{where}: {key}")
+
+        changes[key] = _convert(getattr(default, key), value, kinds[key], f"{where}: {key}")
+
     try:
         return dataclasses.replace(cast(Any, default), **changes)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
 
-def _value(default: Any, value: Any, kind: Any, where: str) -> Any:
+def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
+    """Return a value as the type of a field.
+
+    Args:
+        default: the field's default value.
+        value: the value in YAML's or JSON's types.
+        kind: the field's type.
+        where: the beginning of the message.
+    """
     if dataclasses.is_dataclass(default):
-        if isinstance(value, Mapping):
-            return _replace(default, value, where)
-    elif isinstance(default, tuple):
-        if isinstance(value, list | tuple):
-            return tuple(_value(default[0], one, get_args(kind)[0], where) for one in value)
-    elif allowed := get_args(kind):  # of a Literal
-        if value in allowed:
-            return value
-        raise InputError(
-            f"{where}: expected one of {', '.join(allowed)}, found {value!r}; correct the value"
-        )
-    elif (
-        isinstance(default, float)
-        and isinstance(value, int | float | str)
-        and not isinstance(value, bool)
-    ):
-        with contextlib.suppress(ValueError):
-            return float(value)  # YAML takes 2e-3 for text
-    elif type(value) is type(default):
+        if not isinstance(value, Mapping):
+            raise _wrong_type(default, value, where)
+        return _replace(default, value, where)
+
+    if isinstance(default, tuple):
+        if not isinstance(value, list | tuple):
+            raise _wrong_type(default, value, where)
+        item_kind = get_args(kind)[0]
+        return tuple(_convert(default[0], item, item_kind, where) for item in value)
+
+    choices = get_args(kind)  # of a Literal
+    if choices:
+        if value not in choices:
+            raise InputError(
+                f"{where}: expected one of {', '.join(choices)}, found {value!r}; correct the value"
+            )
+
         return value
-    raise InputError(
+
+    if isinstance(default, float):
+        return _convert_float(default, value, where)
+
+    if type(value) is not type(default):
+        raise _wrong_type(default, value, where)
+    return value
+
+
+def _convert_float(default: float, value: Any, where: str) -> float:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number and not isinstance(value, str):
+        raise _wrong_type(default, value, where)
+    try:
+        return float(value)
+    except ValueError:  # a text, but not one such as 2e-3, which YAML does not read as a number
+        raise _wrong_type(default, value, where) from None
+
+
+def _wrong_type(default: Any, value: Any, where: str) -> InputError:
+    return InputError(
         f"{where}: expected a value like {default!r}, found {value!r}; correct the value"
     )

@@ -1,7 +1,7 @@
 """Every number of the method and of its training, in one tree of frozen dataclasses.
 
-The defaults are the paper's sizes for SemanticKITTI; a recipe (a YAML file in `recipes/`, or a
-user's own) states only what differs from them.
+The defaults are the paper's sizes for SemanticKITTI. A recipe (a YAML file in `recipes/`, or a
+user's own) states only what differs from them. "Open" marks what the paper does not state.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ class RangeViewConfig(Checked):
     """The range image (section 3.1 of the paper)."""
 
     rows: Literal["elevation", "ring"] = "elevation"
-    """What a point's row is: its elevation within the field of view, or the index of its laser."""
+    """A point's row is its elevation within the field of view, or the index of its laser."""
     height: Count = 64
-    """Rows of the range image; the lasers of the sensor."""
+    """Rows of the range image: the lasers of the sensor."""
     width: Count = 4096
     """Columns of the range image, over 360 degrees."""
     fov_up: float = 3.0
@@ -31,10 +31,11 @@ class RangeViewConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+
         self.check(
-            self.fov_up > self.fov_down,
-            "fov_up above fov_down",
-            f"{self.fov_up} and {self.fov_down}",
+            holds=self.fov_up > self.fov_down,
+            expected="fov_up above fov_down",
+            found=f"{self.fov_up} and {self.fov_down}",
         )
 
 
@@ -59,9 +60,17 @@ class PolarViewConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        radii, heights = (self.radius_min, self.radius_max), (self.z_min, self.z_max)
-        self.check(radii[0] < radii[1], "radius_min below radius_max", f"{radii[0]} and {radii[1]}")
-        self.check(heights[0] < heights[1], "z_min below z_max", f"{heights[0]} and {heights[1]}")
+
+        self.check(
+            holds=self.radius_min < self.radius_max,
+            expected="radius_min below radius_max",
+            found=f"{self.radius_min} and {self.radius_max}",
+        )
+        self.check(
+            holds=self.z_min < self.z_max,
+            expected="z_min below z_max",
+            found=f"{self.z_min} and {self.z_max}",
+        )
 
 
 @dataclass(frozen=True)
@@ -71,11 +80,11 @@ class RangeNetConfig(Checked):
     stem: Count = 32
     """Channels at full resolution."""
     widths: tuple[Count, ...] = (64, 96, 160, 256, 256, 256, 256)
-    """Channels at the width strides 2, 4, 8, ..., one entry a stride."""
+    """Channels at the width strides 2, 4, 8, ..., one entry per stride."""
     blocks: tuple[Count, ...] = (2, 4, 4, 4, 2, 2, 2)
     """Residual blocks at each of these strides."""
     height_strides: tuple[Count, ...] = (1, 1, 1, 1, 2, 2, 2)
-    """By what each of these stages divides the height: only the later ones do."""
+    """Height stride of each of these stages: only the later ones reduce the height."""
     decoder: Count = 128
     """Channels of the decoder."""
     head: Count = 64
@@ -89,12 +98,14 @@ class RangeNetConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        stages = len(self.widths), len(self.blocks), len(self.height_strides)
-        fit = len(set(stages)) == 1 and stages[0] > 1
+
+        widths = len(self.widths)
+        blocks = len(self.blocks)
+        strides = len(self.height_strides)
         self.check(
-            fit,
-            "as many widths, blocks and height_strides, two or more",
-            "{}, {} and {}".format(*stages),
+            holds=widths == blocks == strides and widths > 1,
+            expected="as many widths as blocks and height_strides, two or more",
+            found=f"{widths}, {blocks} and {strides}",
         )
 
 
@@ -115,9 +126,9 @@ class PolarNetConfig(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.check(
-            len(self.point_widths) > 1, "two or more point_widths", str(len(self.point_widths))
-        )
+
+        layers = len(self.point_widths)
+        self.check(layers > 1, "two or more point_widths", str(layers))
         self.check(len(self.widths) > 0, "one or more widths", "none")
 
 
@@ -126,9 +137,9 @@ class AssertionConfig(Checked):
     """Which points are uncertain (section 3.2 of the paper)."""
 
     name: Literal["disagreement", "entropy", "loss"] = "disagreement"
-    """The assertion: cosine similarity of the two networks' scores, their entropy, or a high loss."""
+    """The assertion: low cosine similarity of the networks' scores, high entropy, or high loss."""
     threshold: float = 0.85
-    """tau: uncertain where the cosine similarity is at most this (nats for the other assertions: at least this)."""
+    """tau: uncertain at a cosine similarity of at most this; the others: at least this, in nats."""
 
 
 @dataclass(frozen=True)
@@ -142,16 +153,17 @@ class PointHeadConfig(Checked):
     fc: Count = 128
     """Channels of the fully connected layer before the scores."""
     position_scale: float = 0.05
-    """By what a point's own x, y, z in metres are multiplied, to be of the order of its scores."""
+    """Factor of x, y, z (metres) as features, so that they are of the order of the scores."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+
         self.check(len(self.hidden) > 0, "one or more hidden layers", "none")
 
 
 @dataclass(frozen=True)
 class ModelConfig(Checked):
-    """The whole of AMVNet."""
+    """The whole model."""
 
     range_view: RangeViewConfig = RangeViewConfig()
     """The range image."""
@@ -169,10 +181,10 @@ class ModelConfig(Checked):
 
 @dataclass(frozen=True)
 class AugmentConfig(Checked):
-    """Augmentation of the points in training (section 4.1 of the paper names the kinds)."""
+    """Augmentation of the points in training (section 4.1 of the paper lists the kinds)."""
 
     scale: Annotated[float, Range(0, 0.99)] = 0.05
-    """Scaling by 1 +- this, one factor a scan."""
+    """Scaling by 1 +- this, one factor per scan."""
     flip: Share = 0.5
     """Probability of mirroring x, and of mirroring y."""
     jitter: NotNegative = 0.01
@@ -180,15 +192,15 @@ class AugmentConfig(Checked):
     yaw: NotNegative = 180.0
     """Rotation about the vertical by up to +- this, degrees."""
     height: NotNegative = 0.0
-    """Shift of all points up or down by up to +- this, metres: sensors are not mounted alike (open)."""
+    """Vertical shift by up to +- this, metres: sensors are mounted at various heights (open)."""
     intensity: Annotated[float, Range(0, 0.99)] = 0.0
-    """Scaling of the intensity by 1 +- this, one factor a scan: sensors are not calibrated alike (open)."""
+    """Scaling of the intensity by 1 +- this, one factor per scan: calibrations differ (open)."""
     no_intensity: Share = 0.0
-    """Probability that a scan has no intensity at all (open)."""
+    """Probability of removing the intensity of a scan (open)."""
     drop: Annotated[float, Range(0, 0.99)] = 0.0
-    """Greatest share of the points that a scan loses at random (open)."""
+    """Largest share of the points that is dropped from a scan at random (open)."""
     mix: Share = 0.0
-    """Probability that a sector of the scan is taken from another training scan (PolarMix; open)."""
+    """Probability of replacing a sector by that of another training scan (PolarMix; open)."""
 
 
 @dataclass(frozen=True)
@@ -206,26 +218,27 @@ class NetworkTraining(Checked):
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the learning rate's peak (open)."""
     region: NotNegative = 1.0
-    """Weight of the region loss (Dice or Lovász-softmax) beside cross-entropy (open)."""
+    """Weight of the region loss (Dice or Lovász-softmax) relative to cross-entropy (open)."""
     class_weights: bool = True
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
     clip: Positive = 5.0
-    """Largest norm of the gradient (open)."""
+    """Largest norm of the gradient; larger ones are scaled down (open)."""
     accumulate: Count = 1
-    """Parts a batch is split into where it does not fit into memory; over several processes, that of each."""
+    """Parts that each process splits its batch into, if it does not fit into memory."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+
         self.check(
-            self.batch % self.accumulate == 0,
-            f"a batch of a multiple of {self.accumulate}",
-            str(self.batch),
+            holds=self.batch % self.accumulate == 0,
+            expected=f"a batch that is a multiple of {self.accumulate}",
+            found=str(self.batch),
         )
 
 
 @dataclass(frozen=True)
 class HeadTraining(Checked):
-    """Training of the point head: SGD, one-cycle, the networks frozen (section 4.1 of the paper)."""
+    """Training of the point head: SGD, one-cycle, frozen networks (section 4.1 of the paper)."""
 
     epochs: Count = 20
     """Passes over the uncertain points of the training scans."""
@@ -234,7 +247,7 @@ class HeadTraining(Checked):
     lr: Positive = 0.1
     """Peak of the one-cycle learning rate (open)."""
     momentum: Annotated[float, Range(0.1, 0.999)] = 0.95
-    """SGD's greatest momentum; the one-cycle schedule lowers it by 0.1 where the learning rate peaks (open)."""
+    """SGD's largest momentum; at the learning rate's peak it is lower by 0.1 (open)."""
     weight_decay: NotNegative = 1e-4
     """SGD's weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
@@ -242,12 +255,12 @@ class HeadTraining(Checked):
     class_weights: bool = False
     """Weight the classes as the networks' losses do (the paper has plain cross-entropy)."""
     views: Annotated[int, Range(0)] = 0
-    """Times that each training scan is scored for the head, each time augmented anew; 0: once, as it is."""
+    """Augmented copies of each training scan to score for the head; 0: the scan itself."""
     points: Count = 300_000
-    """Most uncertain points that are kept, as many of each scan, drawn at random; 1.3 kB of disk each (K = 19)."""
+    """Limit of uncertain points, an equal share per scan; 1.3 kB of disk each (K = 19)."""
     folds: Count = 1
-    """From 2: score each training scan by networks trained without its sequence (cross-fitting); 1: by the
-    final networks, as in the paper."""
+    """Folds of cross-fitting: networks score only scans of sequences that they were not trained on;
+    1: the final networks score all scans, as in the paper."""
 
 
 @dataclass(frozen=True)
@@ -263,17 +276,17 @@ class TrainingConfig(Checked):
     augment: AugmentConfig = AugmentConfig()
     """Augmentation of the points."""
     keep: Literal["best", "last"] = "best"
-    """Which weights of a stage are used in the end: of the highest validation mIoU, or of the last epoch."""
+    """Weights of a stage to use: of the epoch of highest validation mIoU, or of the last one."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
-    """Seed of the weights, of the order of the scans and of the augmentation."""
+    """Seed of the initial weights, the order of the scans and the augmentation."""
     workers: Annotated[int, Range(0)] = 0
-    """Processes that read and augment beside the training; 0: none."""
+    """Worker processes that read and augment scans; 0: none."""
     precision: Literal["32-true", "bf16-mixed", "16-mixed", "64-true"] = "32-true"
-    """Arithmetic of the forward and backward passes, in Lightning's words; 64 to compare trainings."""
+    """Lightning's precision of the forward and backward passes; 64 to compare trainings."""
     accelerator: str = "auto"
     """Lightning's accelerator: auto, cpu, gpu."""
     compile: bool = False
-    """Compile the network by torch.compile: a slow start, then faster steps."""
+    """Compile the network with torch.compile: a slow start, then faster steps."""
 
 
 @dataclass(frozen=True)
@@ -281,11 +294,11 @@ class Recipe:
     """What to train, and how."""
 
     taxonomy: Literal["semantickitti", "nuscenes"] = "semantickitti"
-    """The benchmark whose classes are learnt."""
+    """The benchmark that defines the classes."""
     sensor: str = "hdl64e"
-    """Name of the sensor of the scans, for the weights file."""
+    """Name of the scans' sensor, for the weights file."""
     stages: tuple[StageName, ...] = ("rv", "bev", "head")
-    """What is trained where no stage is named; a baseline is a part of the method."""
+    """The stages that are trained by default; a baseline is a part of the method."""
     model: ModelConfig = ModelConfig()
     """The networks and their sizes."""
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,10 +13,20 @@ import yaml
 
 from amvnet.errors import InputError
 
-INSTANCE_MASK = (
-    0xFFFF  # the lower half of a raw SemanticKITTI label is the class, the upper one the instance
+# The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
+INSTANCE_MASK = 0xFFFF
+UNKNOWN = -1  # in lookup tables: there is no train id for this raw id
+
+# The tables of a YAML label map, and its names of the splits.
+_YAML_TABLES = (
+    "labels",
+    "color_map",
+    "learning_map",
+    "learning_map_inv",
+    "learning_ignore",
+    "split",
 )
-UNKNOWN = -1
+_YAML_SPLITS = {"train": "train", "val": "valid", "test": "test"}
 
 
 @dataclass(frozen=True)
@@ -24,15 +34,15 @@ class Taxonomy:
     """The classes of one benchmark and how its files number them.
 
     Attributes:
-        name: "semantickitti", "nuscenes" or a name of the user's.
-        classes: K names in the official order; `classes[0]` is train id 1.
-        colors: K + 1 RGB triples in 0..255; the index is the train id (0 = ignored).
-        raw_to_train: raw id (int) -> train id, or category name (str) -> train id where a data
-            set numbers its categories in a table of its own (nuScenes).
-        train_to_raw: K + 1 raw ids, what a prediction file holds for each train id.
-        splits: official sequences of "train", "val" and "test"; empty where the reader knows them.
-        counts_absent: True where a class in neither truth nor prediction counts as 0 in the
-            mean (SemanticKITTI), False where it is left out (nuScenes).
+        name: "semantickitti", "nuscenes" or the user's own name.
+        classes: K names in the official order; `classes[0]` has train id 1.
+        colors: K + 1 RGB triples in 0..255, indexed by train id (0 = ignored).
+        raw_to_train: raw id (int) -> train id, or category name (str) -> train id if the dataset
+            numbers its categories in a table of its own (nuScenes).
+        train_to_raw: K + 1 raw ids, indexed by train id: what prediction files hold.
+        splits: official sequences of "train", "val" and "test"; empty if the reader knows them.
+        counts_absent: whether a class in neither ground truth nor prediction counts as 0 in the
+            mIoU (SemanticKITTI) or is left out of it (nuScenes).
     """
 
     name: str
@@ -44,20 +54,28 @@ class Taxonomy:
     counts_absent: bool
 
     def __post_init__(self) -> None:
-        for kind, found in (("colours", len(self.colors)), ("raw ids", len(self.train_to_raw))):
-            if found != self.size + 1:
-                raise InputError(
-                    f"taxonomy {self.name}: expected {self.size + 1} {kind} (ignored and {self.size} classes), "
-                    f"found {found}; give one per train id"
-                )
-        if bad := {train for train in self.raw_to_train.values() if not 0 <= train <= self.size}:
+        self._check_length("colours", len(self.colors))
+        self._check_length("raw ids", len(self.train_to_raw))
+
+        wrong_train_ids = set(self.raw_to_train.values()) - set(range(self.size + 1))
+        if wrong_train_ids:
             raise InputError(
-                f"taxonomy {self.name}: expected train ids 0..{self.size}, found {sorted(bad)}; correct the table"
+                f"taxonomy {self.name}: expected train ids 0..{self.size}, "
+                f"found {sorted(wrong_train_ids)}; correct the table"
             )
-        raws = [raw for raw in (*self.raw_to_train, *self.train_to_raw) if isinstance(raw, int)]
-        if large := [raw for raw in raws if not 0 <= raw <= INSTANCE_MASK]:
+
+        raw_ids = self.raw_ids
+        if raw_ids and (min(raw_ids) < 0 or max(raw_ids) > INSTANCE_MASK):
             raise InputError(
-                f"taxonomy {self.name}: expected raw ids 0..{INSTANCE_MASK}, found {large[:5]}; correct the table"
+                f"taxonomy {self.name}: expected raw ids 0..{INSTANCE_MASK}, "
+                f"found {min(raw_ids)}..{max(raw_ids)}; correct the table"
+            )
+
+    def _check_length(self, kind: str, length: int) -> None:
+        if length != self.size + 1:
+            raise InputError(
+                f"taxonomy {self.name}: expected {self.size + 1} {kind} "
+                f"(ignored and {self.size} classes), found {length}; give one per train id"
             )
 
     @property
@@ -66,15 +84,19 @@ class Taxonomy:
         return len(self.classes)
 
     @property
-    def _by_name(self) -> bool:
-        return any(isinstance(raw, str) for raw in self.raw_to_train)
+    def raw_ids(self) -> list[int]:
+        """The numeric raw ids of `raw_to_train`, then those of `train_to_raw`."""
+        return [raw for raw in (*self.raw_to_train, *self.train_to_raw) if isinstance(raw, int)]
 
     @cached_property
-    def _forward(self) -> np.ndarray:
-        """(65536,) int16: raw id -> train id, UNKNOWN where the table has none."""
+    def _raw_id_lookup(self) -> np.ndarray:
+        """(65536,) int16: raw id -> train id, UNKNOWN if the taxonomy has no such raw id."""
         table = np.full(INSTANCE_MASK + 1, UNKNOWN, dtype=np.int16)
-        if self._by_name:
+
+        # Categories that are known by name have no numbers but those of prediction files.
+        if any(isinstance(raw, str) for raw in self.raw_to_train):
             table[list(self.train_to_raw)] = np.arange(self.size + 1)
+
         for raw, train in self.raw_to_train.items():
             if isinstance(raw, int):
                 table[raw] = train
@@ -90,16 +112,19 @@ class Taxonomy:
             (N,) uint8 train ids in 0..K.
 
         Raises:
-            InputError: where a raw id is not in the table.
+            InputError: if a raw id is not in the table.
         """
         ids = np.asarray(raw).astype(np.uint32) & np.uint32(INSTANCE_MASK)
-        train = self._forward[ids]
+        train = self._raw_id_lookup[ids]
+
         if (train == UNKNOWN).any():
             unknown = np.unique(ids[train == UNKNOWN])
             raise InputError(
-                f"taxonomy {self.name}: expected only raw ids of its table, found {unknown[:5].tolist()}; "
-                "check that the file holds labels, or give the label map (YAML) that it was written with"
+                f"taxonomy {self.name}: expected only raw ids of its table, "
+                f"found {unknown[:5].tolist()}; check that the file holds labels, "
+                "or give the label map (YAML) that it was written with"
             )
+
         return train.astype(np.uint8)
 
     def to_raw(self, ids: np.ndarray) -> np.ndarray:
@@ -112,23 +137,24 @@ class Taxonomy:
             (N,) uint32 raw ids.
 
         Raises:
-            InputError: where an id is outside 0..K.
+            InputError: if an id is outside 0..K.
         """
         ids = np.asarray(ids)
         if ids.size and (ids.min() < 0 or ids.max() > self.size):
             raise InputError(
-                f"taxonomy {self.name}: expected train ids 0..{self.size}, found {ids.min()}..{ids.max()}; "
-                "give the ids that its own networks put out"
+                f"taxonomy {self.name}: expected train ids 0..{self.size}, "
+                f"found {ids.min()}..{ids.max()}; give train ids of this taxonomy"
             )
+
         return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
-        """What `from_dict` needs, in types that JSON has."""
+        """Return the fields in types that JSON has, for `from_dict`."""
         return {
             "name": self.name,
             "classes": list(self.classes),
-            "colors": [list(color) for color in self.colors],
-            "raw_to_train": [[raw, train] for raw, train in self.raw_to_train.items()],
+            "colors": list(map(list, self.colors)),
+            "raw_to_train": list(map(list, self.raw_to_train.items())),
             "train_to_raw": list(self.train_to_raw),
             "splits": {split: list(sequences) for split, sequences in self.splits.items()},
             "counts_absent": self.counts_absent,
@@ -136,16 +162,16 @@ class Taxonomy:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Taxonomy:
-        """The taxonomy that `to_dict` wrote, equal in every field.
+        """Return the taxonomy that `to_dict` described, equal in every field.
 
         Raises:
-            InputError: where a field is missing or of another kind.
+            InputError: if a field is missing or has the wrong type.
         """
         try:
             return cls(
                 name=values["name"],
                 classes=tuple(values["classes"]),
-                colors=tuple((int(r), int(g), int(b)) for r, g, b in values["colors"]),
+                colors=tuple(map(_rgb, values["colors"])),
                 raw_to_train={raw: int(train) for raw, train in values["raw_to_train"]},
                 train_to_raw=tuple(values["train_to_raw"]),
                 splits={split: tuple(sequences) for split, sequences in values["splits"].items()},
@@ -153,8 +179,8 @@ class Taxonomy:
             )
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
-                f"taxonomy: expected its fields as this package writes them, found {error!r}; "
-                "use a weights file of this package"
+                "taxonomy: expected its fields as this package writes them, "
+                f"found {error!r}; use a weights file of this package"
             ) from None
 
 
@@ -162,11 +188,11 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
     """Read a label map in the format of `semantic-kitti.yaml`.
 
     Args:
-        path: a YAML file with the keys labels, color_map (BGR, as the official file has it),
+        path: a YAML file with the keys labels, color_map (BGR, as in the official file),
             learning_map, learning_map_inv, learning_ignore and split (train, valid, test).
 
     Raises:
-        InputError: where the file is not there, is not YAML or lacks a key.
+        InputError: if the file does not exist, is not YAML or lacks a key.
     """
     path = Path(path)
     if not path.is_file():
@@ -178,28 +204,14 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
         raise InputError(
             f"{path}: expected a label map (YAML), found {reason}; correct the file"
         ) from None
-    required = (
-        "labels",
-        "color_map",
-        "learning_map",
-        "learning_map_inv",
-        "learning_ignore",
-        "split",
-    )
-    missing = [
-        key
-        for key in required
-        if not isinstance(config, dict) or not isinstance(config.get(key), dict)
-    ]
-    missing += (
-        []
-        if "split" in missing
-        else [f"split.{k}" for k in ("train", "valid", "test") if k not in config["split"]]
-    )
+
+    missing = _missing_tables(config)
     if missing:
         raise InputError(
-            f"{path}: expected the tables {', '.join(required)}, found no {', '.join(missing)}; add them"
+            f"{path}: expected the tables {', '.join(_YAML_TABLES)}, "
+            f"found no {', '.join(missing)}; add them"
         )
+
     try:
         return _from_config(path.stem, config)
     except InputError as error:
@@ -210,31 +222,73 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
         ) from None
 
 
+def _missing_tables(config: Any) -> list[str]:
+    """Return the names of the tables that a YAML label map lacks."""
+    if not isinstance(config, dict):
+        return list(_YAML_TABLES)
+
+    missing = []
+    for table in _YAML_TABLES:
+        if not isinstance(config.get(table), dict):
+            missing.append(table)
+
+    if "split" not in missing:
+        for split in _YAML_SPLITS.values():
+            if split not in config["split"]:
+                missing.append(f"split.{split}")
+
+    return missing
+
+
 def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
-    """Put the tables of a YAML label map in the order of its train ids."""
-    inverse, ignore = config["learning_map_inv"], config["learning_ignore"]
-    kept = sorted(train for train in inverse if train != 0 and not ignore[train])
-    order = {old: new for new, old in enumerate(kept, start=1)}
-    raws = [inverse[0], *(inverse[train] for train in kept)]
-    colors = [tuple(int(c) for c in reversed(config["color_map"][raw])) for raw in raws]
-    splits = {"train": "train", "val": "valid", "test": "test"}
+    """Build the taxonomy of a YAML label map.
+
+    Its learning ids are numbered without gaps; ignored ones become train id 0.
+    """
+    learning_to_raw = config["learning_map_inv"]
+    ignored = config["learning_ignore"]
+    learning_ids = []
+    for learning in learning_to_raw:
+        if learning != 0 and not ignored[learning]:
+            learning_ids.append(learning)
+
+    raw_ids = [learning_to_raw[0]]
+    train_ids = {}
+    for train, learning in enumerate(sorted(learning_ids), start=1):
+        raw_ids.append(learning_to_raw[learning])
+        train_ids[learning] = train
+
+    classes = []
+    colors = []
+    for raw in raw_ids:
+        classes.append(str(config["labels"][raw]))
+        colors.append(_rgb(reversed(config["color_map"][raw])))
+
+    raw_to_train: dict[int | str, int] = {}
+    for raw, learning in config["learning_map"].items():
+        raw_to_train[int(raw)] = train_ids.get(learning, 0)
+
+    splits = {}
+    for split, yaml_split in _YAML_SPLITS.items():
+        splits[split] = tuple(f"{int(sequence):02d}" for sequence in config["split"][yaml_split])
+
     return Taxonomy(
         name="semantickitti" if name == "semantic-kitti" else name,
-        classes=tuple(str(config["labels"][raw]) for raw in raws[1:]),
-        colors=tuple((r, g, b) for r, g, b in colors),
-        raw_to_train={
-            int(raw): order.get(train, 0) for raw, train in config["learning_map"].items()
-        },
-        train_to_raw=tuple(int(raw) for raw in raws),
-        splits={
-            ours: tuple(f"{int(s):02d}" for s in config["split"][theirs])
-            for ours, theirs in splits.items()
-        },
+        classes=tuple(classes[1:]),
+        colors=tuple(colors),
+        raw_to_train=raw_to_train,
+        train_to_raw=tuple(map(int, raw_ids)),
+        splits=splits,
         counts_absent=True,
     )
 
 
-# (train id, name, RGB colour, raw id of predictions, further raw ids that mean the same)
+def _rgb(values: Iterable[Any]) -> tuple[int, int, int]:
+    red, green, blue = values
+    return int(red), int(green), int(blue)
+
+
+# (train id, name, RGB colour, raw id in predictions, further raw ids of the class)
 _SEMANTICKITTI = (
     (0, "unlabeled", (0, 0, 0), 0, (1, 52, 99)),
     (1, "car", (100, 150, 245), 10, (252,)),
@@ -258,59 +312,94 @@ _SEMANTICKITTI = (
     (19, "traffic-sign", (255, 0, 0), 81, ()),
 )
 
-# (name, RGB colour, fine categories of category.json); the index is the train id
+# Categories of category.json that the lidarseg challenge ignores, and those of pedestrians.
 _IGNORED = (
-    "noise animal human.pedestrian.personal_mobility human.pedestrian.stroller human.pedestrian.wheelchair "
-    "movable_object.debris movable_object.pushable_pullable static.other static_object.bicycle_rack vehicle.ego "
-    "vehicle.emergency.ambulance vehicle.emergency.police"
+    "noise",
+    "animal",
+    "human.pedestrian.personal_mobility",
+    "human.pedestrian.stroller",
+    "human.pedestrian.wheelchair",
+    "movable_object.debris",
+    "movable_object.pushable_pullable",
+    "static.other",
+    "static_object.bicycle_rack",
+    "vehicle.ego",
+    "vehicle.emergency.ambulance",
+    "vehicle.emergency.police",
 )
-_PEDESTRIANS = "human.pedestrian.adult human.pedestrian.child human.pedestrian.construction_worker human.pedestrian.police_officer"
+_PEDESTRIANS = (
+    "human.pedestrian.adult",
+    "human.pedestrian.child",
+    "human.pedestrian.construction_worker",
+    "human.pedestrian.police_officer",
+)
+
+# (train id, name, RGB colour, categories of category.json)
 _NUSCENES = (
-    ("ignore", (0, 0, 0), _IGNORED),
-    ("barrier", (112, 128, 144), "movable_object.barrier"),
-    ("bicycle", (220, 20, 60), "vehicle.bicycle"),
-    ("bus", (255, 127, 80), "vehicle.bus.bendy vehicle.bus.rigid"),
-    ("car", (255, 158, 0), "vehicle.car"),
-    ("construction_vehicle", (233, 150, 70), "vehicle.construction"),
-    ("motorcycle", (255, 61, 99), "vehicle.motorcycle"),
-    ("pedestrian", (0, 0, 230), _PEDESTRIANS),
-    ("traffic_cone", (47, 79, 79), "movable_object.trafficcone"),
-    ("trailer", (255, 140, 0), "vehicle.trailer"),
-    ("truck", (255, 99, 71), "vehicle.truck"),
-    ("driveable_surface", (0, 207, 191), "flat.driveable_surface"),
-    ("other_flat", (175, 0, 75), "flat.other"),
-    ("sidewalk", (75, 0, 75), "flat.sidewalk"),
-    ("terrain", (112, 180, 60), "flat.terrain"),
-    ("manmade", (222, 184, 135), "static.manmade"),
-    ("vegetation", (0, 175, 0), "static.vegetation"),
+    (0, "ignore", (0, 0, 0), _IGNORED),
+    (1, "barrier", (112, 128, 144), ("movable_object.barrier",)),
+    (2, "bicycle", (220, 20, 60), ("vehicle.bicycle",)),
+    (3, "bus", (255, 127, 80), ("vehicle.bus.bendy", "vehicle.bus.rigid")),
+    (4, "car", (255, 158, 0), ("vehicle.car",)),
+    (5, "construction_vehicle", (233, 150, 70), ("vehicle.construction",)),
+    (6, "motorcycle", (255, 61, 99), ("vehicle.motorcycle",)),
+    (7, "pedestrian", (0, 0, 230), _PEDESTRIANS),
+    (8, "traffic_cone", (47, 79, 79), ("movable_object.trafficcone",)),
+    (9, "trailer", (255, 140, 0), ("vehicle.trailer",)),
+    (10, "truck", (255, 99, 71), ("vehicle.truck",)),
+    (11, "driveable_surface", (0, 207, 191), ("flat.driveable_surface",)),
+    (12, "other_flat", (175, 0, 75), ("flat.other",)),
+    (13, "sidewalk", (75, 0, 75), ("flat.sidewalk",)),
+    (14, "terrain", (112, 180, 60), ("flat.terrain",)),
+    (15, "manmade", (222, 184, 135), ("static.manmade",)),
+    (16, "vegetation", (0, 175, 0), ("static.vegetation",)),
 )
 
-SEMANTICKITTI = Taxonomy(
-    name="semantickitti",
-    classes=tuple(row[1] for row in _SEMANTICKITTI[1:]),
-    colors=tuple(row[2] for row in _SEMANTICKITTI),
-    raw_to_train={raw: row[0] for row in _SEMANTICKITTI for raw in (row[3], *row[4])},
-    train_to_raw=tuple(row[3] for row in _SEMANTICKITTI),
-    splits={
-        "train": ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10"),
-        "val": ("08",),
-        "test": tuple(f"{sequence}" for sequence in range(11, 22)),
-    },
-    counts_absent=True,
-)
 
-NUSCENES = Taxonomy(
-    name="nuscenes",
-    classes=tuple(name for name, _, _ in _NUSCENES[1:]),
-    colors=tuple(color for _, color, _ in _NUSCENES),
-    raw_to_train={
-        fine: train for train, (_, _, fines) in enumerate(_NUSCENES) for fine in fines.split()
-    },
-    train_to_raw=tuple(range(len(_NUSCENES))),
-    splits={},
-    counts_absent=False,
-)
+def _semantickitti() -> Taxonomy:
+    _, names, colors, raw_ids, _ = zip(*_SEMANTICKITTI, strict=True)
 
+    raw_to_train: dict[int | str, int] = {}
+    for train, _, _, raw, further_raw_ids in _SEMANTICKITTI:
+        raw_to_train[raw] = train
+        raw_to_train.update(dict.fromkeys(further_raw_ids, train))
+
+    return Taxonomy(
+        name="semantickitti",
+        classes=names[1:],
+        colors=colors,
+        raw_to_train=raw_to_train,
+        train_to_raw=raw_ids,
+        splits={
+            "train": ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10"),
+            "val": ("08",),
+            "test": ("11", "12", "13", "14", "15", "16", "17", "18", "19", "20", "21"),
+        },
+        counts_absent=True,
+    )
+
+
+def _nuscenes() -> Taxonomy:
+    train_ids, names, colors, _ = zip(*_NUSCENES, strict=True)
+
+    raw_to_train: dict[int | str, int] = {}
+    for train, _, _, categories in _NUSCENES:
+        raw_to_train.update(dict.fromkeys(categories, train))
+
+    return Taxonomy(
+        name="nuscenes",
+        classes=names[1:],
+        colors=colors,
+        raw_to_train=raw_to_train,
+        train_to_raw=train_ids,
+        splits={},
+        counts_absent=False,
+    )
+
+
+SEMANTICKITTI = _semantickitti()
+NUSCENES = _nuscenes()
 TAXONOMIES: Mapping[str, Taxonomy] = {
-    taxonomy.name: taxonomy for taxonomy in (SEMANTICKITTI, NUSCENES)
+    SEMANTICKITTI.name: SEMANTICKITTI,
+    NUSCENES.name: NUSCENES,
 }

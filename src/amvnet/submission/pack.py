@@ -1,4 +1,4 @@
-"""Archives for the benchmarks' servers: written from a folder of predictions, or checked, by the same rules."""
+"""Archives for the benchmarks' servers, packed from predictions or checked, by the same rules."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from amvnet.submission.zips import Archive, open_archive, write_archive
 
 ENDING = ".zip"
 SHOWN = 5  # folders in a message
-Progress = Callable[[int, int], None]  # done, in all
+Progress = Callable[[int, int], None]  # called with the number of files done, and of all
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,10 @@ class Submission:
     """An archive that keeps to the rules.
 
     Attributes:
-        predictions: how many are in it.
-        unmatched: how many of them are of scans that are not on disk, whose number of points is not known.
-        official: how many its server wants, or None where it has no such number.
+        predictions: number of predictions in it.
+        unmatched: how many of them belong to scans that are not on disk, whose number of points
+            is unknown.
+        official: how many predictions the server expects, or None if it has no fixed number.
     """
 
     predictions: int
@@ -31,17 +32,25 @@ class Submission:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know of an archive that keeps to the rules all the same."""
+        """What a user should know about an archive although it keeps to the rules."""
         notes = []
         if self.unmatched:
             notes.append(
-                f"{self.unmatched} predictions are of scans that are not on disk; their length is not checked"
+                f"{self.unmatched} predictions are of scans that are not on disk; "
+                "their length is not checked"
             )
+
         if self.official is not None and self.predictions < self.official:
             notes.append(
-                f"the benchmark has {self.official} scans in this split; its server refuses an archive of fewer"
+                f"the benchmark has {self.official} scans in this split; "
+                "its server refuses an archive of fewer"
             )
+
         return notes
+
+
+def _no_progress(done: int, total: int) -> None:
+    """Report nothing."""
 
 
 def write(
@@ -49,117 +58,154 @@ def write(
     folder: Path,
     out: Path,
     sources: Sources | None = None,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = _no_progress,
 ) -> Submission:
     """Check a folder of predictions and pack it; the same predictions give the same bytes.
 
-    What the archive has no place for (scores, other splits) is left out. One scan is in memory at a time.
+    Files that have no place in the archive (scores, other splits) are left out. One scan is in
+    memory at a time.
 
     Args:
-        folder: with the names of `rules` in it.
+        rules: the rules of the archive.
+        folder: predictions, under the file names of `rules`.
         out: NAME.zip; it appears whole or not at all.
-        sources: what the method was given, where the benchmark asks for it.
+        sources: the data that the method uses, if the benchmark asks for them.
+        progress: called before each file and at the end.
 
     Raises:
-        InputError: where a prediction is missing or breaks the rules.
+        InputError: if a prediction is missing or breaks the rules.
     """
     _check_ending(out)
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
+
     names = [name for name in (*rules.texts, *sorted(rules.points)) if (folder / name).is_file()]
     _check_missing(rules.required, set(names), str(folder))
     for name in names:
-        rules.check_size(name, (folder / name).stat().st_size, str(folder / name))
-    with write_archive(out) as add:
-        for entry in rules.folders:
-            add(entry, b"")
+        path = folder / name
+        rules.check_size(name, path.stat().st_size, str(path))
+
+    with write_archive(out) as archive:
+        for name in rules.folders:
+            archive.add(name, b"")
         if rules.meta is not None:
-            add(rules.meta, (sources or Sources()).to_json())
+            archive.add(rules.meta, (sources or Sources()).to_json())
+
         for done, name in enumerate(names):
             progress(done, len(names))
-            data = (folder / name).read_bytes()
-            rules.check_content(name, data, str(folder / name))
-            add(name, data)
+            path = folder / name
+            data = path.read_bytes()
+            rules.check_content(name, data, str(path))
+            archive.add(name, data)
+
     progress(len(names), len(names))
     return _submission(rules, names)
 
 
-def check(rules: Rules, path: Path, progress: Progress = lambda done, total: None) -> Submission:
-    """Check an archive of any tool; names and sizes first, then file by file, one in memory at a time.
+def check(rules: Rules, path: Path, progress: Progress = _no_progress) -> Submission:
+    """Check an archive of any tool: all names and sizes first, then the files one by one.
+
+    One file is in memory at a time.
 
     Raises:
-        InputError: at the first rule that it breaks.
+        InputError: at the first rule that the archive breaks.
     """
     _check_ending(path)
     with open_archive(path) as archive:
-        _check_tree(rules, archive)
+        _check_names(rules, archive)
         for name, size in archive.sizes.items():
             rules.check_size(name, size, f"{path}: {name}")
-        for done, name in enumerate(
-            sorted(archive.sizes, key=lambda name: name in rules.points)
-        ):  # short ones first
-            progress(done, len(archive.sizes))
+
+        # Texts before predictions: they are short.
+        names = sorted(archive.sizes, key=lambda name: name in rules.points)
+        for done, name in enumerate(names):
+            progress(done, len(names))
             rules.check_content(name, archive.read(name), f"{path}: {name}")
-        progress(len(archive.sizes), len(archive.sizes))
-        return _submission(rules, archive.sizes)
+
+        progress(len(names), len(names))
+        return _submission(rules, names)
 
 
 def _submission(rules: Rules, names: Iterable[str]) -> Submission:
     points = [rules.points[name] for name in names if name in rules.points]
-    return Submission(len(points), points.count(None), rules.official)
+    return Submission(len(points), unmatched=points.count(None), official=rules.official)
 
 
 def _check_ending(path: Path) -> None:
     if path.suffix != ENDING:
         raise InputError(
-            f"{path}: expected a name that ends in {ENDING}, found {path.suffix or 'no ending'}; name it so"
+            f"{path}: expected a name that ends in {ENDING}, "
+            f"found {path.suffix or 'no ending'}; name it so"
         )
 
 
-def _check_tree(rules: Rules, archive: Archive) -> None:
-    """Check names alone."""
-    names, path = set(archive.sizes), archive.path
-    top = {name.partition("/")[0] for name in (*names, *archive.folders)}
-    _check_top(rules, names, top, path)
-    if rules.needs_folders and (
-        lacking := [entry for entry in rules.folders if entry not in archive.folders]
-    ):
+def _check_names(rules: Rules, archive: Archive) -> None:
+    """Check which files and folders an archive has."""
+    path = archive.path
+    names = set(archive.sizes)
+    top_names = _parts(names | archive.folders, 0)
+    _check_not_nested(rules, names, top_names, path)
+
+    missing_folders = [name for name in rules.folders if name not in archive.folders]
+    if rules.needs_folders and missing_folders:
         raise InputError(
-            f"{path}: expected an entry for every folder, found none for {_one_of(lacking)}; pack folders as entries "
-            "of their own, as zip -r does"
+            f"{path}: expected an entry for every folder, found none for "
+            f"{_first_of(missing_folders)}; pack folders as entries of their own, as zip -r does"
         )
+
     if rules.meta is not None and rules.meta not in names:
+        listed = ", ".join(map(repr, sorted(top_names)[:SHOWN])) or "nothing"
         raise InputError(
-            f"{path}: expected {rules.meta}, found only {', '.join(map(repr, sorted(top)[:SHOWN])) or 'nothing'}; "
+            f"{path}: expected {rules.meta}, found only {listed}; "
             "add this file, or name the archive's split with --split"
         )
+
     _check_missing(rules.required, names, str(path))
-    if other := sorted(names - {*rules.points, *rules.others}):
+    unexpected = sorted(names - {*rules.points, *rules.others})
+    if unexpected:
         raise InputError(
-            f"{path}: expected predictions alone, found {_one_of(other)}; pack it without"
+            f"{path}: expected only predictions, found {_first_of(unexpected)}; pack it without"
         )
 
 
-def _check_top(rules: Rules, names: set[str], top: set[str], path: Path) -> None:
-    """Tell an archive of a folder from one of what is in it."""
-    wanted = {name.partition("/")[0] for name in rules.folders}
-    second = {name.split("/")[1] for name in names if "/" in name}
-    if len(top) == 1 and not top & wanted and second & wanted:
+def _check_not_nested(rules: Rules, names: set[str], top_names: set[str], path: Path) -> None:
+    """Check that the folders of the benchmark are not packed inside another folder."""
+    expected = _parts(rules.folders, 0)
+    if len(top_names) != 1 or top_names & expected:
+        return
+
+    (outer_folder,) = top_names
+    if _parts(names, 1) & expected:
         raise InputError(
-            f"{path}: expected {' and '.join(sorted(wanted))} at the top, found all below {top.pop()!r}; "
-            "pack what is in that folder, not the folder itself"
+            f"{path}: expected {' and '.join(sorted(expected))} at the top, "
+            f"found all below {outer_folder!r}; pack what is in that folder, not the folder itself"
         )
 
 
 def _check_missing(required: Collection[str], names: set[str], shown: str) -> None:
-    if missing := sorted(set(required) - names):
+    missing = sorted(set(required) - names)
+    if missing:
         raise InputError(
-            f"{shown}: expected a prediction for each of {len(required)} scans, found no {_one_of(missing)}; "
-            "predict these scans too, or name those that there are with --sequences or --split"
+            f"{shown}: expected a prediction for each of {len(required)} scans, "
+            f"found no {_first_of(missing)}; predict these scans too, "
+            "or name those that there are with --sequences or --split"
         )
 
 
-def _one_of(names: list[str]) -> str:
-    """The first of some names, and how many more there are."""
+def _parts(names: Iterable[str], index: int) -> set[str]:
+    """Return the parts of paths at one depth (0: the top), without the paths that end above it."""
+    parts = set()
+    for name in names:
+        path_parts = name.split("/")
+        if index < len(path_parts):
+            parts.add(path_parts[index])
+
+    return parts
+
+
+def _first_of(names: list[str]) -> str:
+    """Return the first of some names, and how many more there are."""
     first = names[0] if names[0].isprintable() else repr(names[0])
-    return first + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+    if len(names) == 1:
+        return first
+    return f"{first} and {len(names) - 1} more"

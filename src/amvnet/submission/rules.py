@@ -1,7 +1,8 @@
-"""What each benchmark's server wants in an archive: which files, how large, with which ids.
+"""What each benchmark's server expects in an archive: which files, of what size, with which ids.
 
-The rules are those of the official checkers: `validate_submission.py` (task "segmentation") and `evaluate_semantics.py`
-of PRBonn/semantic-kitti-api, `python-sdk/nuscenes/eval/lidarseg/validate_submission.py` of nutonomy/nuscenes-devkit.
+The rules are those of the official checkers: `validate_submission.py` (task "segmentation") and
+`evaluate_semantics.py` of PRBonn/semantic-kitti-api, and
+`python-sdk/nuscenes/eval/lidarseg/validate_submission.py` of nutonomy/nuscenes-devkit.
 """
 
 from __future__ import annotations
@@ -20,18 +21,28 @@ from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
-# Scans of SemanticKITTI's test sequences (KITTI odometry 11 to 21); its server wants every one.
-TEST_SCANS = {"11": 921, "12": 1061, "13": 3281, "14": 631, "15": 1901, "16": 1731, "17": 491, "18": 1801, "19": 4981,
-              "20": 831, "21": 2721}  # fmt: skip
-MOST_POINTS = (
-    1_000_000  # of a scan that is not on disk; a full turn of these sensors has 130,000 at most
-)
+# Scans of SemanticKITTI's test sequences (KITTI odometry 11 to 21); its server wants all of them.
+TEST_SCANS = {
+    "11": 921,
+    "12": 1061,
+    "13": 3281,
+    "14": 631,
+    "15": 1901,
+    "16": 1731,
+    "17": 491,
+    "18": 1801,
+    "19": 4981,
+    "20": 831,
+    "21": 2721,
+}
+# Of a scan that is not on disk. A full turn of these sensors has 130,000 points at most.
+MOST_POINTS = 1_000_000
 MOST_TEXT = 1_000_000  # bytes of a description or of submission.json
 
 
 @dataclass(frozen=True)
 class Sources:
-    """What a method was given, as nuScenes' submission.json says it."""
+    """The data that a method uses, as nuScenes' submission.json declares them."""
 
     use_camera: bool = False
     use_lidar: bool = True
@@ -40,25 +51,27 @@ class Sources:
     use_external: bool = False
 
     def to_json(self) -> bytes:
+        """Return the content of submission.json."""
         return json.dumps({"meta": asdict(self)}).encode()
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What an archive must have in it and what it may have.
+    """What an archive must contain and what it may contain.
 
     Attributes:
         taxonomy: the classes.
         what: the scans in words.
-        points: name of every prediction that may be there -> points of its scan, None where that is not on disk.
-        required: the names of those that must be there.
-        dtype: of the ids.
-        unlabelled: whether a point may go without a class.
-        folders: the folders, those above first, each with its last slash.
-        needs_folders: whether they must have entries of their own.
-        meta: name of the file of `Sources`, or None.
-        texts: names that may be there as well.
-        official: how many predictions the server wants, or None where it has no such number.
+        points: number of points by name of the prediction, for all predictions that the archive
+            may contain; None if the scan is not on disk.
+        required: names of the predictions that it must contain.
+        dtype: number type of the ids.
+        unlabelled: whether a point may be without a class.
+        folders: names of the folders, outer ones first, each with a trailing slash.
+        needs_folders: whether the folders need entries of their own.
+        meta: name of the file of `Sources`, or None if there is none.
+        texts: names of text files that the archive may contain.
+        official: how many predictions the server expects, or None if it has no fixed number.
     """
 
     taxonomy: Taxonomy
@@ -75,19 +88,20 @@ class Rules:
 
     @property
     def others(self) -> tuple[str, ...]:
-        """The names that are no predictions."""
+        """The names of the files that are not predictions."""
         return self.texts if self.meta is None else (*self.texts, self.meta)
 
     def check_size(self, name: str, size: int, shown: str) -> None:
-        """Check the bytes that a file has, or declares to have.
+        """Check the size of a file, before it is read.
 
         Args:
-            name: as the archive has it.
-            size: in bytes.
-            shown: what the message begins with.
+            name: of the file in the archive.
+            size: bytes that the file has or declares.
+            shown: the beginning of the message.
 
         Raises:
-            InputError: where a prediction has not one id per point, or another file is too large.
+            InputError: if a prediction does not have one id per point, or another file is too
+                large.
         """
         if name in self.others:
             if size > MOST_TEXT:
@@ -95,115 +109,158 @@ class Rules:
                     f"{shown}: expected at most {MOST_TEXT} bytes of text, found {size}; shorten it"
                 )
             return
-        count, width = self.points[name], np.dtype(self.dtype).itemsize
+
+        count = self.points[name]
         if count is not None:
             check_size(shown, size, count, self.dtype)
-        elif not 0 < size <= MOST_POINTS * width or size % width:
+            return
+
+        width = np.dtype(self.dtype).itemsize
+        if not 0 < size <= MOST_POINTS * width or size % width:
             raise InputError(
-                f"{shown}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; write a scan's ids"
+                f"{shown}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; "
+                "write a scan's ids"
             )
 
     def check_content(self, name: str, data: bytes, shown: str) -> None:
-        """Check what is in a file of the right size; the arguments are those of `check_size`.
+        """Check what is in a file of the right size.
+
+        Args:
+            name: of the file in the archive.
+            data: all of its bytes.
+            shown: the beginning of the message.
 
         Raises:
-            InputError: where an id is not the benchmark's, or submission.json does not say what it must.
+            InputError: if an id is not the benchmark's, or submission.json is not as it must be.
         """
         if name == self.meta:
             check_sources(data, shown)
-        elif name in self.points:
-            ids = train_ids(shown, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
-            if not self.unlabelled and not ids.all():
-                raise InputError(
-                    f"{shown}: expected a class 1..{self.taxonomy.size} for every point, found 0 for "
-                    f"{np.count_nonzero(ids == 0)} of {len(ids)}; give these points a class"
-                )
+            return
+        if name not in self.points:
+            return
+
+        ids = train_ids(shown, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
+        if not self.unlabelled and not ids.all():
+            raise InputError(
+                f"{shown}: expected a class 1..{self.taxonomy.size} for every point, "
+                f"found 0 for {np.count_nonzero(ids == 0)} of {len(ids)}; "
+                "give these points a class"
+            )
 
 
 def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = None) -> Rules:
-    """The rules for the archive of one split, or of some sequences.
+    """Return the rules for the archive of one split, or of some sequences.
 
     Args:
-        dataset: its scans are the reference for what must be there and how many points each has.
+        dataset: its scans determine which predictions there must be, and their sizes.
         split: "test" is what the servers score; the others are for trials.
-        sequences: of all scans, those of these sequences or scenes alone.
+        sequences: only these sequences or scenes, instead of a split.
 
     Raises:
-        InputError: where the data set is of no benchmark with a server, or has no such scans.
+        InputError: if the dataset belongs to no benchmark with a server, or has no such scans.
     """
     if type(dataset) not in RULES:
         raise InputError(
-            f"{dataset.root}: expected SemanticKITTI or nuScenes, found another data set; give one of them"
+            f"{dataset.root}: expected SemanticKITTI or nuScenes, found another data set; "
+            "give one of them"
         )
+
     return RULES[type(dataset)](dataset, split, sequences)
 
 
 def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] | None) -> Rules:
-    """SemanticKITTI: sequences/11 to 21, each with predictions/NNNNNN.label, raw ids as uint32.
+    """Return the rules of SemanticKITTI.
 
-    The official validator wants a name that ends in .zip, an entry for every folder, a file for every scan in the
-    `velodyne` folders, and 4 bytes a point. It does not look at ids, nor at what else is there; the server's
-    evaluation counts all label files, reads ids that it does not know as "unlabeled" and stops at those above 358, so
-    here both are faults. A point may be unlabelled (it counts as missed) and the upper 16 bits are free. The
+    The archive holds sequences/11 to 21, each with predictions/NNNNNN.label, raw ids as uint32.
+
+    The official validator wants a name that ends in .zip, an entry for every folder, a file for
+    every scan in the `velodyne` folders, and 4 bytes per point. It looks neither at the ids nor
+    at other files. The server's evaluation counts all label files, reads unknown ids as
+    "unlabeled" and stops at ids above 358; here, further label files and unknown ids are errors.
+    A point may be unlabelled (it counts as missed) and the upper 16 bits are free. The file
     description.txt is optional.
     """
-    wanted = dataset.taxonomy.splits[split] if sequences is None else tuple(sorted(set(sequences)))
     present = dataset.sequences("all")
-    away = [s for s in wanted if s in TEST_SCANS and s not in present] if sequences is None else []
-    records = dataset.records([s for s in wanted if s not in away])
-    points = {r.prediction: _points(r, files.KITTI_COLUMNS) for r in records}
-    official = {
-        s: [f"sequences/{s}/predictions/{i:06d}.label" for i in range(TEST_SCANS.get(s, 0))]
-        for s in wanted
-    }
-    required = {*points, *(name for s in away for name in official[s])}
-    folders = (
-        "sequences/",
-        *(f"sequences/{s}/{inner}" for s in wanted for inner in ("", "predictions/")),
-    )
+    absent: list[str] = []  # test sequences that are not on disk
+    if sequences is None:
+        wanted = dataset.taxonomy.splits[split]
+        absent = [name for name in wanted if name in TEST_SCANS and name not in present]
+    else:
+        wanted = tuple(sorted(set(sequences)))
+
+    records = dataset.records([name for name in wanted if name not in absent])
+
+    folders = ["sequences/"]
+    points: dict[str, int | None] = {}
+    required: set[str] = set()
+    for sequence in wanted:
+        folders += [f"sequences/{sequence}/", f"sequences/{sequence}/predictions/"]
+        for scan in range(TEST_SCANS.get(sequence, 0)):
+            name = f"sequences/{sequence}/predictions/{scan:06d}.label"
+            points[name] = None
+            if sequence in absent:
+                required.add(name)
+
+    for record in records:
+        points[record.prediction] = _count_points(record, files.KITTI_COLUMNS)
+        required.add(record.prediction)
+
+    is_whole_test = split == "test" and sequences is None
     return Rules(
         taxonomy=dataset.taxonomy,
-        what=_what(split, sequences),
-        points={name: None for names in official.values() for name in names} | points,
+        what=_describe(split, sequences),
+        points=points,
         required=required,
         dtype=np.uint32,
         unlabelled=True,
-        folders=folders,
+        folders=tuple(folders),
         needs_folders=True,
         texts=("description.txt", "sequences/description.txt"),
-        official=sum(TEST_SCANS.values()) if split == "test" and sequences is None else None,
+        official=sum(TEST_SCANS.values()) if is_whole_test else None,
     )
 
 
 def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) -> Rules:
-    """nuScenes-lidarseg: lidarseg/SPLIT/TOKEN_lidarseg.bin, classes 1..16 as uint8, and SPLIT/submission.json.
+    """Return the rules of nuScenes-lidarseg.
 
-    TOKEN is that of the sample_data of LIDAR_TOP. The official validator wants a file for every key frame that the
-    tables list in the split, a byte for every point, no byte 0 or above 16, and in submission.json a "meta" with
-    exactly the five keys of `Sources`, all true or false. It does not look at other files; here they are faults.
+    The archive holds lidarseg/SPLIT/TOKEN_lidarseg.bin, classes 1..16 as uint8, and
+    SPLIT/submission.json. TOKEN is the sample_data token of LIDAR_TOP.
+
+    The official validator wants a file for every key frame of the split in the tables, one byte
+    per point, no byte 0 or above 16, and in submission.json a "meta" with exactly the five keys
+    of `Sources`, all true or false. It does not look at other files; here they are errors.
     """
     scenes = dataset.scenes(split) if sequences is None else sequences
     if not scenes:
         raise InputError(
-            f"{dataset.root}: expected scenes of the {split} split, found none in {dataset.version}; give the data of "
-            "that split, or name another one with --split"
+            f"{dataset.root}: expected scenes of the {split} split, "
+            f"found none in {dataset.version}; give the data of that split, "
+            "or name another one with --split"
         )
-    points = {r.prediction: _points(r, files.NUSCENES_COLUMNS) for r in dataset.records(scenes)}
-    splits = sorted({name.split("/")[1] for name in points})
+
+    points: dict[str, int | None] = {}
+    splits: set[str] = set()
+    for record in dataset.records(scenes):
+        points[record.prediction] = _count_points(record, files.NUSCENES_COLUMNS)
+        splits.add(record.prediction.split("/")[1])
+
     if len(splits) != 1:
         raise InputError(
-            f"{dataset.root}: expected scenes of one split, found {', '.join(splits)}; name those of one"
+            f"{dataset.root}: expected scenes of one split, found {', '.join(sorted(splits))}; "
+            "name those of one"
         )
+
+    (only_split,) = splits
     return Rules(
         taxonomy=dataset.taxonomy,
-        what=_what(split, sequences),
+        what=_describe(split, sequences),
         points=points,
         required=points.keys(),
         dtype=np.uint8,
         unlabelled=False,
-        folders=("lidarseg/", f"lidarseg/{splits[0]}/", f"{splits[0]}/"),
+        folders=("lidarseg/", f"lidarseg/{only_split}/", f"{only_split}/"),
         needs_folders=False,
-        meta=f"{splits[0]}/submission.json",
+        meta=f"{only_split}/submission.json",
     )
 
 
@@ -211,38 +268,46 @@ RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuS
 
 
 def check_sources(data: bytes, shown: str) -> None:
-    """Check a submission.json; `shown` is what the message begins with.
+    """Check a submission.json.
+
+    Args:
+        data: all of its bytes.
+        shown: the beginning of the message.
 
     Raises:
-        InputError: where it is no JSON, or its "meta" has not just the five flags.
+        InputError: if it is not JSON, or its "meta" does not have exactly the five flags.
     """
     try:
-        found = json.loads(data.decode("utf-8"))
+        content = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{shown}: expected JSON, found {reason}; write it again") from None
-    meta = found.get("meta") if isinstance(found, dict) else None
-    wanted = asdict(Sources())
-    if not isinstance(meta, dict) or set(meta) != set(wanted):
-        keys = (
-            "no such object"
-            if not isinstance(meta, dict)
-            else ", ".join(map(repr, meta)) or "nothing"
-        )
+
+    flags = content.get("meta") if isinstance(content, dict) else None
+    keys = list(asdict(Sources()))
+    if not isinstance(flags, dict) or set(flags) != set(keys):
+        found = "no such object"
+        if isinstance(flags, dict):
+            found = ", ".join(map(repr, flags)) or "nothing"
         raise InputError(
-            f'{shown}: expected {", ".join(wanted)} in the object "meta", found {keys[:200]}; write these five'
-        )
-    if wrong := [key for key in wanted if not isinstance(meta[key], bool)]:
-        kind = type(meta[wrong[0]]).__name__
-        raise InputError(
-            f"{shown}: expected true or false for {wrong[0]}, found a value of type {kind}; write a flag"
+            f'{shown}: expected {", ".join(keys)} in the object "meta", '
+            f"found {found[:200]}; write these five"
         )
 
+    for key in keys:
+        if not isinstance(flags[key], bool):
+            raise InputError(
+                f"{shown}: expected true or false for {key}, "
+                f"found a value of type {type(flags[key]).__name__}; write a flag"
+            )
 
-def _points(record: ScanRecord, columns: int) -> int | None:
+
+def _count_points(record: ScanRecord, columns: int) -> int | None:
+    """Return the number of points of a scan, or None if it is not on disk."""
     path = record.points_path
     return files.count_rows(path, np.float32, columns) if path.is_file() else None
 
 
-def _what(split: str, sequences: Sequence[str] | None) -> str:
+def _describe(split: str, sequences: Sequence[str] | None) -> str:
+    """Return the scans of an archive in words."""
     return f"the {split} split" if sequences is None else ", ".join(sorted(set(sequences)))

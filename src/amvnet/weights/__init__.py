@@ -1,1 +1,20 @@
-"""Weights files, the hub and model cards."""
+"""Weights files, the hub and model cards.
+
+`load` and `Weights` are imported when they are first used: they need torch, the hub does not.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from amvnet.weights.file import Weights, load
+
+__all__ = ["Weights", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'amvnet.weights' has no attribute {name!r}")
+    return getattr(import_module("amvnet.weights.file"), name)

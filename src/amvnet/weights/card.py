@@ -1,8 +1,11 @@
-"""The card of a weights file: what it is, what it was trained on, what it reaches, and how to use it, as Markdown."""
+"""The model card of a weights file, as Markdown.
+
+It says what the weights are, what they were trained on, what they reach and how to use them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import yaml
@@ -17,122 +20,166 @@ TITLES = {
 LISTED = 12  # names that are listed in full
 METRICS = {"val/miou": "mIoU", "val/miou_present": "mIoU, classes present", "val/acc": "accuracy"}
 DATA = {"scans": "scans", "sequences": "sequences", "validated_on": "validated on"}
-OURS = "apache-2.0"  # of the built-in weights, as of the package
+OURS = "apache-2.0"  # licence of the built-in weights, as of the package
 NO_LICENCE = (
-    "The file names no licence. Weights may be bound by the terms of the data that they were trained on: "
-    "SemanticKITTI's and nuScenes' do not allow commercial use."
+    "The file names no licence. Weights may be bound by the terms of the data that they were "
+    "trained on: SemanticKITTI's and nuScenes' do not allow commercial use."
 )
 
 
 def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
-    """Markdown for people.
+    """Return the card of some weights, for people to read.
 
     Args:
-        name: by which `amvnet.load` finds the weights.
-        licence: under which they may be used, as their owner says.
+        weights: what the card describes.
+        name: the name by which `amvnet.load` finds the weights.
+        licence: the licence that their owner grants.
     """
-    said = NO_LICENCE if licence is None else f"{licence}, as the owner of the weights says."
     sections = [
         f"# {name}\n\n{_summary(weights)}",
-        "## How to use\n\n" + _use(weights, name),
-        f"## Classes\n\n{weights.taxonomy.size} of {weights.taxonomy.name}: {', '.join(weights.taxonomy.classes)}.",
-        "## Sizes\n\n" + _list(_sizes(weights)),
+        f"## How to use\n\n{_usage(weights, name)}",
+        f"## Classes\n\n{_classes(weights)}",
+        f"## Sizes\n\n{_list(_sizes(weights))}",
         f"## Metrics\n\n{_metrics(weights)}",
-        *(f"## Training: {part}\n\n{_training(weights, part)}" for part in weights.parts),
-        f"## Licence\n\n{said}",
     ]
+    for part in weights.parts:
+        sections.append(f"## Training: {part}\n\n{_training(weights, part)}")
+
+    terms = NO_LICENCE if licence is None else f"{licence}, as the owner of the weights says."
+    sections.append(f"## Licence\n\n{terms}")
     return "\n\n".join(sections) + "\n"
 
 
 def front_matter(weights: Weights, licence: str | None = None) -> str:
-    """What the hub reads of a card, before the Markdown."""
-    known = {
+    """Return the metadata that the hub reads at the top of a card, as YAML."""
+    metadata = {
         "library_name": "amvnet",
         "tags": ["lidar", "point-cloud", "semantic-segmentation", weights.taxonomy.name],
-        **({} if licence is None else {"license": licence}),
     }
-    return f"---\n{yaml.safe_dump(known, sort_keys=False)}---\n\n"
+
+    if licence is not None:
+        metadata["license"] = licence
+
+    return f"---\n{yaml.safe_dump(metadata, sort_keys=False)}---\n\n"
 
 
 def _summary(weights: Weights) -> str:
-    parts = ", ".join(f"{TITLES[part].lower()} (`{part}`)" for part in weights.parts) or "nothing"
     sensor = f" of the sensor {weights.sensor}" if weights.sensor else ""
-    return f"LiDAR semantic segmentation (AMVNet, arXiv 2012.04934) for scans{sensor}. In this file: {parts}."
+    parts = []
+    for part in weights.parts:
+        parts.append(f"{TITLES[part].lower()} (`{part}`)")
 
-
-def _use(weights: Weights, name: str) -> str:
-    if weights.parts == ("point_head",):
-        call = f'labels = amvnet.fuse(points, f, g, head="{name}")  # f, g: the two models\' class probabilities'
-    else:
-        method = "" if "point_head" in weights.parts else f', method="{_method(weights.parts)}"'
-        call = f'segmenter = amvnet.load("{name}"{method})\nresult = segmenter(points)'
-    lines = "import amvnet\n\n" + call
     return (
-        f"```python\n{lines}\n```\n\n`points` is (N, 4): x, y, z in metres and intensity in [0, 1]."
+        f"LiDAR semantic segmentation (AMVNet, arXiv 2012.04934) for scans{sensor}. "
+        f"In this file: {', '.join(parts) or 'nothing'}."
     )
 
 
-def _method(parts: Sequence[str]) -> str:
-    """The most that networks without a head can do."""
-    return "ensemble" if len(parts) > 1 else "rv" if "range_net" in parts else "bev"
+def _usage(weights: Weights, name: str) -> str:
+    """Return a few lines of Python that use the weights."""
+    if weights.parts == ("point_head",):
+        call = (
+            f'labels = amvnet.fuse(points, f, g, head="{name}")'
+            "  # f, g: the two models' class probabilities"
+        )
+    else:
+        method = ""
+        if "point_head" not in weights.parts:
+            method = f', method="{_best_method(weights.parts)}"'
+        call = f'segmenter = amvnet.load("{name}"{method})\nresult = segmenter(points)'
+
+    return (
+        f"```python\nimport amvnet\n\n{call}\n```\n\n"
+        "`points` is (N, 4): x, y, z in metres and intensity in [0, 1]."
+    )
 
 
-def _sizes(weights: Weights) -> Iterator[tuple[str, str]]:
-    model, parts = weights.model, weights.parts
-    if "range_net" in parts:
+def _best_method(parts: Sequence[str]) -> str:
+    """Return the best method for networks without a point head."""
+    if len(parts) > 1:
+        return "ensemble"
+    return "rv" if "range_net" in parts else "bev"
+
+
+def _classes(weights: Weights) -> str:
+    taxonomy = weights.taxonomy
+    return f"{taxonomy.size} of {taxonomy.name}: {', '.join(taxonomy.classes)}."
+
+
+def _sizes(weights: Weights) -> list[tuple[str, str]]:
+    """Return what the views of the networks cover, and which points are uncertain."""
+    model = weights.model
+    rows = []
+    if "range_net" in weights.parts:
         view = model.range_view
-        field = (
-            "by ring" if view.rows == "ring" else f"{view.fov_up:+g} to {view.fov_down:+g} degrees"
-        )
-        yield "range view", f"{view.height} x {view.width}, {field}"
-    if "polar_net" in parts:
+        field_of_view = f"{view.fov_up:+g} to {view.fov_down:+g} degrees"
+        if view.rows == "ring":
+            field_of_view = "by ring"
+        rows.append(("range view", f"{view.height} x {view.width}, {field_of_view}"))
+
+    if "polar_net" in weights.parts:
         grid = model.polar_view
-        yield (
-            "polar view",
-            f"{grid.radial} x {grid.angular} x {grid.vertical}, {grid.radius_min:g} to {grid.radius_max:g} m, "
-            f"height {grid.z_min:g} to {grid.z_max:g} m",
-        )
-    yield "uncertain points", f"{model.assertion.name}, threshold {model.assertion.threshold:g}"
+        cells = f"{grid.radial} x {grid.angular} x {grid.vertical}"
+        radius = f"{grid.radius_min:g} to {grid.radius_max:g} m"
+        height = f"height {grid.z_min:g} to {grid.z_max:g} m"
+        rows.append(("polar view", f"{cells}, {radius}, {height}"))
+
+    assertion = model.assertion
+    rows.append(("uncertain points", f"{assertion.name}, threshold {assertion.threshold:g}"))
+    return rows
 
 
 def _metrics(weights: Weights) -> str:
-    """Of validation, in percent: of each network alone, and of the whole method with the head."""
-    rows = ["| | " + " | ".join(METRICS.values()) + " |", "|---" * (len(METRICS) + 1) + "|"]
+    """Return a table of the validation metrics in percent.
+
+    Its rows are the networks alone, and for the head the whole method.
+    """
+    lines = [f"| | {' | '.join(METRICS.values())} |", "|---" * (len(METRICS) + 1) + "|"]
     for part in weights.parts:
-        reached = weights.metrics.get(part, {})
-        shown = [
-            f"{100 * reached[key]:.1f}" if isinstance(reached.get(key), float) else "–"
-            for key in METRICS
-        ]
-        rows.append(f"| {TITLES[part]} | {' | '.join(shown)} |")
-    return "On the scans named below as validated on, %:\n\n" + "\n".join(rows)
+        metrics = weights.metrics.get(part, {})
+        cells = [TITLES[part]]
+        for key in METRICS:
+            cells.append(_percent(metrics.get(key)))
+        lines.append(f"| {' | '.join(cells)} |")
+
+    return "On the scans named below as validated on, %:\n\n" + "\n".join(lines)
+
+
+def _percent(value: Any) -> str:
+    return f"{100 * value:.1f}" if isinstance(value, float) else "–"
 
 
 def _training(weights: Weights, part: str) -> str:
-    """What a part learnt from, and how."""
-    known, count = (
-        weights.training.get(part, {}),
-        sum(v.numel() for v in weights.part(part).values()),
-    )
-    data = [(title, known[key]) for key, title in DATA.items() if key in known]
-    rest = [(key, value) for key, value in known.items() if key not in DATA]
-    return _list(
-        [("values", f"{count:,}"), *((key, _plain(value)) for key, value in (*data, *rest))]
-    )
+    """Return a list of what a part was trained on, and how."""
+    count = 0
+    for tensor in weights.part(part).values():
+        count += tensor.numel()
+
+    rows = [("values", f"{count:,}")]
+
+    # The data come first, then the settings in their own order.
+    record = weights.training.get(part, {})
+    for key, title in DATA.items():
+        if key in record:
+            rows.append((title, _plain(record[key])))
+    for key, value in record.items():
+        if key not in DATA:
+            rows.append((key, _plain(value)))
+
+    return _list(rows)
 
 
-def _list(rows: Iterator[tuple[str, str]] | Sequence[tuple[str, str]]) -> str:
+def _list(rows: Iterable[tuple[str, str]]) -> str:
     return "\n".join(f"- {key}: {value}" for key, value in rows)
 
 
 def _plain(value: Any) -> str:
+    """Return a value of the training record as text; long lists are abridged."""
     if isinstance(value, Mapping):
-        return ", ".join(f"{k} {_plain(v)}" for k, v in value.items())
+        return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
     if isinstance(value, list):
-        names = [str(one) for one in value]
-        return (
-            ", ".join(names)
-            if len(names) <= LISTED
-            else f"{len(names)}, from {names[0]} to {names[-1]}"
-        )
+        if len(value) > LISTED:
+            return f"{len(value)}, from {value[0]} to {value[-1]}"
+        return ", ".join(map(str, value))
+
     return f"{value:.4g}" if isinstance(value, float) else str(value)

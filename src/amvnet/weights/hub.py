@@ -1,4 +1,4 @@
-"""Weights from the Hugging Face hub, by name. Safetensors only."""
+"""Weights from the Hugging Face hub, by name. Only safetensors are read."""
 
 from __future__ import annotations
 
@@ -14,44 +14,74 @@ FILE = "model.safetensors"
 
 
 def fetch(name: str) -> Path:
-    """The file of `hf-hub:OWNER/NAME`, or of `hf-hub:OWNER/NAME@REVISION`; the hub's client keeps it on disk.
+    """Download a weights file, or find it in the cache of the hub's client.
+
+    Args:
+        name: `hf-hub:OWNER/NAME` or `hf-hub:OWNER/NAME@REVISION`.
+
+    Returns:
+        The path of the file in the cache.
 
     Raises:
-        InputError: where there are no such weights, the hub cannot be reached, or its client is not installed.
+        InputError: if there are no such weights, the hub cannot be reached, or its client is not
+            installed.
     """
-    place, _, revision = name.removeprefix(PREFIX).partition("@")
-    check_name(place, name)
+    repository, _, revision = name.removeprefix(PREFIX).partition("@")
+    check_name(repository, name)
     hub = client()
+
     with hub_errors(name, f"check the name and the network, and that {FILE} is there"):
-        return Path(hub.hf_hub_download(repo_id=place, filename=FILE, revision=revision or None))
+        path = hub.hf_hub_download(repo_id=repository, filename=FILE, revision=revision or None)
+        return Path(path)
 
 
 def check_name(place: str, name: str) -> None:
-    """Raises InputError where a place on the hub is not OWNER/NAME."""
+    """Check that a repository of the hub has the form OWNER/NAME.
+
+    Args:
+        place: the repository.
+        name: what the user wrote, for the message.
+
+    Raises:
+        InputError: if it has another form.
+    """
     if place.count("/") != 1 or not all(place.split("/")):
         raise InputError(f"expected {PREFIX}OWNER/NAME, found {name!r}; name both")
 
 
 def client() -> Any:
-    """The hub's own client; raises InputError where it is not installed."""
+    """Return the hub's own client, the module `huggingface_hub`.
+
+    Raises:
+        InputError: if it is not installed.
+    """
     try:
         import huggingface_hub
     except ImportError:
         raise InputError(
             "expected huggingface_hub for the hub, found none; pip install 'amvnet[hub]'"
         ) from None
+
     return huggingface_hub
 
 
 @contextmanager
 def hub_errors(name: str, cure: str) -> Iterator[None]:
-    """What the hub's client complains of as one line, with what to do."""
+    """Turn any error of the hub's client into one line that says what to do.
+
+    Args:
+        name: the beginning of the message.
+        cure: what to do.
+
+    Raises:
+        InputError: if the block raises anything.
+    """
     try:
         yield
-    except (
-        Exception
-    ) as error:  # which kinds there are depends on its version, and that of its HTTP library
-        said = next((line.strip() for line in str(error).splitlines() if line.strip()), "no more")
+    # The types of the errors depend on the versions of the client and of its HTTP library.
+    except Exception as error:
+        message = str(error).strip()
+        reason = message.splitlines()[0].strip() if message else "no more"
         raise InputError(
-            f"{name}: expected an answer of the hub, found {type(error).__name__}: {said}; {cure}"
+            f"{name}: expected an answer of the hub, found {type(error).__name__}: {reason}; {cure}"
         ) from None

@@ -15,34 +15,40 @@ CARD = "README.md"
 def push(
     weights: Weights | Path | str, name: str, licence: str | None = None, private: bool = False
 ) -> str:
-    """Share weights as OWNER/NAME on the hub, as who is logged in there; with their card as README.md.
+    """Share weights on the hub from the account that is logged in, with their card as README.md.
 
     Args:
         weights: trained weights, or the name or path of a weights file.
-        name: OWNER/NAME; made where it is not there.
-        licence: the hub's name of one, such as "apache-2.0" or "cc-by-nc-sa-4.0": of data, mind their terms.
-        private: show it to nobody else.
+        name: OWNER/NAME; the repository is created if it does not exist.
+        licence: its name on the hub, such as "apache-2.0" or "cc-by-nc-sa-4.0". Mind the terms
+            of the data that the weights were trained on.
+        private: show the repository to nobody else.
 
     Returns:
         The address of the commit.
 
     Raises:
-        InputError: where there are no such weights, the hub refuses them, or its client is not installed.
+        InputError: if there are no such weights, the hub refuses them, or its client is not
+            installed.
     """
     name = name.removeprefix(PREFIX)
     check_name(name, name)
-    given = weights if isinstance(weights, Weights) else load(weights)
+    if not isinstance(weights, Weights):
+        weights = load(weights)
     hub = client()
+
     with TemporaryDirectory() as folder:
-        save(given, Path(folder) / FILE)
-        card = front_matter(given, licence) + model_card(given, f"{PREFIX}{name}", licence)
+        save(weights, Path(folder) / FILE)
+        card = front_matter(weights, licence) + model_card(weights, f"{PREFIX}{name}", licence)
         (Path(folder) / CARD).write_text(card, encoding="utf-8")
+
         with hub_errors(name, "check the name and the network, and log in by hf auth login"):
             hub.create_repo(repo_id=name, private=private, exist_ok=True)
-            made = hub.upload_folder(
+            commit = hub.upload_folder(
                 repo_id=name,
                 folder_path=folder,
                 allow_patterns=[FILE, CARD],
                 commit_message="AMVNet weights",
             )
-    return str(getattr(made, "commit_url", made))
+
+    return str(getattr(commit, "commit_url", commit))

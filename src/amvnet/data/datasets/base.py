@@ -1,4 +1,4 @@
-"""What every data set offers: a list of its scans, each read, and predictions written where its tools look."""
+"""What every dataset offers: its scans, their labels, and predictions in its official layout."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from amvnet.scan import Scan
 
 @dataclass(frozen=True)
 class ScanRecord:
-    """Where one scan of a data set lies.
+    """The files of one scan of a dataset.
 
     Attributes:
-        name: unique in its data set: "08/000001", or the sample_data token.
+        name: unique in its dataset: "08/000001", or the sample_data token.
         sequence: "08", or the name of the scene.
         points_path: the file of the points.
-        labels_path: the file of the labels, or None where the sequence has none.
-        prediction: where its prediction lies, relative to a folder of predictions.
+        labels_path: the file of the labels, or None if the sequence has none.
+        prediction: path of the scan's prediction, relative to a folder of predictions.
     """
 
     name: str
@@ -34,7 +34,7 @@ class ScanRecord:
 
 @runtime_checkable
 class Dataset(Protocol):
-    """One data set on disk; instances can be pickled, so that worker processes can read."""
+    """One dataset on disk; instances can be pickled, so that worker processes can read."""
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -45,38 +45,45 @@ class Dataset(Protocol):
         """The folder that was opened."""
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """The sequences of the official split ("train", "val" or "test") that are on disk; of "all", every one.
+        """Return the sequences of a split that are on disk.
+
+        Args:
+            split: an official split ("train", "val" or "test"), or "all".
 
         Raises:
-            InputError: where the split is unknown or none of its sequences is there.
+            InputError: if the split is unknown or none of its sequences is on disk.
         """
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
-        """The scans of these sequences, sorted by sequence and then by time.
+        """Return the scans of these sequences, sorted by sequence and then by time.
 
         Raises:
-            InputError: where a sequence is not there; the message lists those that are.
+            InputError: if a sequence does not exist; the message lists those that do.
         """
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
-        """Read one scan, with (N,) train ids where it has labels and they are wanted, else None.
+        """Read one scan.
+
+        Args:
+            record: the scan.
+            labels: whether to read its (N,) train ids, if it has any.
 
         Raises:
-            InputError: where a file is missing, truncated, empty or does not fit its scan.
+            InputError: if a file is missing, truncated, empty or does not fit its scan.
         """
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
-        """Read the (N,) uint8 train ids (0..K) that `folder` has for this scan.
+        """Read the (N,) uint8 train ids (0..K) that were predicted for a scan.
 
         Raises:
-            InputError: where the file is missing, has another number of points, or an unknown id.
+            InputError: if the file is missing, has another number of points or an unknown id.
         """
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids as the raw ids of the benchmark; the file appears whole or not at all.
+        """Write (N,) train ids as the benchmark's raw ids; the file appears whole or not at all.
 
         Raises:
-            InputError: where there is not one id per point, or an id is outside 0..K.
+            InputError: if there is not one id per point, or an id is outside 0..K.
         """
 
 

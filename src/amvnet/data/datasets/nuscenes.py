@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,31 +18,37 @@ from amvnet.errors import InputError
 from amvnet.scan import Scan
 
 CHANNEL = "LIDAR_TOP"
-MINI, TEST = "v1.0-mini", "v1.0-test"
-Row = dict[str, Any]
+MINI = "v1.0-mini"
+TEST = "v1.0-test"
+SHOWN = 20  # scenes in a message
+
+Row = dict[str, Any]  # of a table: its columns by name
 
 
 def _scenes(numbers: str) -> frozenset[str]:
-    """Scene names of "3 12-14": scene-0003, scene-0012, scene-0013, scene-0014."""
+    """Return the scene names of "3 12-14": scene-0003, scene-0012, scene-0013, scene-0014."""
     names: set[str] = set()
     for part in numbers.split():
         first, _, last = part.partition("-")
-        names.update(f"scene-{number:04d}" for number in range(int(first), int(last or first) + 1))
+        for number in range(int(first), int(last or first) + 1):
+            names.add(f"scene-{number:04d}")
+
     return frozenset(names)
 
 
 SPLITS = ("train", "val", "test", "all")
-# Official splits. A scene that none of them names is for training.
+# Official splits. A scene that is in none of them is for training.
 MINI_TRAIN = _scenes("61 553 655 757 796 1077 1094 1100")
 MINI_VAL = _scenes("103 916")
 VAL = _scenes(
-    "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 632-638 770-771 "
-    "775 777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 1059-1073"
+    "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 "
+    "632-638 770-771 775 777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 "
+    "1059-1073"
 )
 
 
 class NuScenes:
-    """The key-frame scans of LIDAR_TOP of one version; the interface is `records.Dataset`.
+    """The LIDAR_TOP key frames of one version; a `Dataset`, which describes arguments and errors.
 
     Attributes:
         root: the folder that holds `samples/` and `v1.0-*/`.
@@ -49,7 +56,8 @@ class NuScenes:
         taxonomy: the classes.
 
     Raises:
-        InputError: where `root` has no such layout, the version is not clear or a table is missing.
+        InputError: if `root` does not have this layout, the version is ambiguous, or a table is
+            missing.
     """
 
     def __init__(
@@ -58,183 +66,247 @@ class NuScenes:
         self.root = Path(root)
         self.version = self._find_version(version)
         self.taxonomy = taxonomy
-        self._labels = {
-            row["sample_data_token"]: row["filename"]
-            for row in self._table("lidarseg", required=False)
-        }
-        self._to_train = self._category_lookup() if self._labels else None
+
+        label_rows = self._table("lidarseg", required=False)
+        self._label_files = _columns(label_rows, "sample_data_token", "filename")
+        self._to_train = self._category_lookup() if label_rows else None
+
         try:
-            self._by_scene = self._index()
+            self._records_by_scene = self._index()
         except (KeyError, TypeError) as error:
             raise InputError(
-                f"{self.root / self.version}: expected the tables of nuScenes, found no entry {error}; unpack them"
+                f"{self.root / self.version}: expected the tables of nuScenes, "
+                f"found no entry {error}; unpack them"
             ) from None
 
     @staticmethod
     def matches(root: Path) -> bool:
-        """Whether a folder has this layout."""
+        """Return whether a folder has this layout."""
         return any(root.glob("v1.0-*/sample_data.json"))
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """The scenes of "train", "val", "test" or "all" that are on disk; raises as `records.Dataset`."""
+        """Return the scenes of "train", "val", "test" or "all" that are on disk."""
         scenes = self.scenes(split)
         folder = self.root / "samples" / CHANNEL
-        present = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-        if found := tuple(
-            s for s in scenes if any(r.points_path.name in present for r in self._by_scene[s])
-        ):
-            return found
-        raise InputError(
-            f"{folder}: expected scans of {split} scenes ({len(scenes)} in the tables of {self.version}), "
-            f"found none; name the scenes to use, such as {', '.join(sorted(self._by_scene)[:3])}"
-        )
+        file_names = set(os.listdir(folder)) if folder.is_dir() else set()
+
+        present = []
+        for scene in scenes:
+            records = self._records_by_scene[scene]
+            if any(record.points_path.name in file_names for record in records):
+                present.append(scene)
+
+        if not present:
+            examples = sorted(self._records_by_scene)[:3]
+            raise InputError(
+                f"{folder}: expected scans of {split} scenes "
+                f"({len(scenes)} in the tables of {self.version}), found none; "
+                f"name the scenes to use, such as {', '.join(examples)}"
+            )
+
+        return tuple(present)
 
     def scenes(self, split: str) -> tuple[str, ...]:
-        """The scenes of a split that the tables list, on disk or not.
+        """Return the scenes of a split that the tables list, whether on disk or not.
 
         Raises:
-            InputError: where the split is unknown.
+            InputError: if the split is unknown.
         """
         if split not in SPLITS:
             raise InputError(
-                f"{self.root}: expected a split of {', '.join(SPLITS)}, found {split!r}; give one of them"
+                f"{self.root}: expected a split of {', '.join(SPLITS)}, "
+                f"found {split!r}; give one of them"
             )
-        return tuple(
-            s
-            for s in sorted(self._by_scene)
-            if split in ("all", self._split(s).removeprefix("mini_"))
-        )
+
+        scenes = []
+        for scene in sorted(self._records_by_scene):
+            if split in ("all", self._split(scene).removeprefix("mini_")):
+                scenes.append(scene)
+        return tuple(scenes)
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
-        """The scans of these scenes in order; raises as `records.Dataset`."""
-        if missing := sorted(set(sequences) - set(self._by_scene)):
-            there = sorted(self._by_scene)
-            more = f" and {len(there) - 20} more" if len(there) > 20 else ""
+        """Return the scans of these scenes, in order."""
+        missing = sorted(set(sequences) - set(self._records_by_scene))
+        if missing:
+            scenes = sorted(self._records_by_scene)
+            more = f" and {len(scenes) - SHOWN} more" if len(scenes) > SHOWN else ""
             raise InputError(
-                f"{self.root}: expected the scene {missing[0]} in {self.version}, found it in no table; "
-                f"there is {', '.join(there[:20])}{more}"
+                f"{self.root}: expected the scene {missing[0]} in {self.version}, "
+                f"found it in no table; there is {', '.join(scenes[:SHOWN])}{more}"
             )
-        return [record for scene in sorted(set(sequences)) for record in self._by_scene[scene]]
+
+        records: list[ScanRecord] = []
+        for scene in sorted(set(sequences)):
+            records.extend(self._records_by_scene[scene])
+        return records
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
-        """Read one scan with its ring; raises as `records.Dataset`."""
+        """Read one scan, with the ring of every point."""
         points, ring = files.read_nuscenes(record.points_path)
         ids = None
         if labels and record.labels_path is not None:
-            ids = files.read_labels(record.labels_path, np.uint8, len(points), self._fine_to_train)
+            ids = files.read_labels(
+                record.labels_path, np.uint8, len(points), self._categories_to_train
+            )
+
         return Scan(points, labels=ids, ring=ring, name=record.name)
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
-        """Read (N,) uint8 train ids; raises as `records.Dataset`."""
-        return read_prediction(
-            Path(folder) / record.prediction, np.uint8, self._count(record), self.taxonomy
-        )
+        """Read the predicted (N,) uint8 train ids of one scan."""
+        path = Path(folder) / record.prediction
+        return read_prediction(path, np.uint8, self._count_points(record), self.taxonomy)
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids (uint8); raises as `records.Dataset`."""
-        ids = files.check_count(ids, record.points_path, self._count(record))
-        return files.write_labels(
-            Path(folder) / record.prediction, self.taxonomy.to_raw(ids), np.uint8
-        )
+        """Write (N,) train ids (uint8)."""
+        ids = files.check_count(ids, record.points_path, self._count_points(record))
+        path = Path(folder) / record.prediction
+        return files.write_labels(path, self.taxonomy.to_raw(ids), np.uint8)
 
     def _find_version(self, version: str | None) -> str:
+        """Return the version to read: the one asked for, or the only one in the folder."""
         present = sorted(path.name for path in self.root.glob("v1.0-*") if path.is_dir())
-        if version in present or (version is None and len(present) == 1):
-            return version or present[0]
-        wanted = version or ("one folder v1.0-*" if present else "a folder v1.0-*")
-        advice = (
-            f"give one of them as {self.root}@{present[0]}"
-            if present
-            else "give the folder that holds it"
-        )
+        if version is None and len(present) == 1:
+            return present[0]
+        if version is not None and version in present:
+            return version
+
+        if present:
+            expected = version or "one folder v1.0-*"
+            advice = f"give one of them as {self.root}@{present[0]}"
+        else:
+            expected = version or "a folder v1.0-*"
+            advice = "give the folder that holds it"
+
         raise InputError(
-            f"{self.root}: expected {wanted}, found {', '.join(present) or 'none'}; {advice}"
+            f"{self.root}: expected {expected}, found {', '.join(present) or 'none'}; {advice}"
         )
 
     def _table(self, name: str, required: bool = True) -> list[Row]:
+        """Read one table; return no rows if an optional one is missing."""
         path = self.root / self.version / f"{name}.json"
         if not path.is_file():
             if not required:
                 return []
             raise InputError(
-                f"{path}: expected a table of nuScenes, found no file; unpack the metadata of {self.version}"
+                f"{path}: expected a table of nuScenes, found no file; "
+                f"unpack the metadata of {self.version}"
             )
+
         try:
             rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise InputError(
                 f"{path}: expected a table in JSON, found {error}; unpack the file again"
             ) from None
+
         return rows
 
     def _category_lookup(self) -> np.ndarray:
-        """(256,) int16: index in category.json -> train id, by the name of the category."""
+        """Return (256,) int16: index in category.json -> train id, matched by category name."""
         path = self.root / self.version / "category.json"
         table = np.full(256, UNKNOWN, dtype=np.int16)
+
         for row in self._table("category"):
             if "index" not in row:
                 raise InputError(
-                    f"{path}: expected an index in every category, found none; unpack nuScenes-lidarseg over it"
+                    f"{path}: expected an index in every category, found none; "
+                    "unpack nuScenes-lidarseg over it"
                 )
+
             if row["name"] not in self.taxonomy.raw_to_train:
                 raise InputError(
-                    f"{path}: expected the categories of nuScenes, found {row['name']!r}; correct the table"
+                    f"{path}: expected the categories of nuScenes, found {row['name']!r}; "
+                    "correct the table"
                 )
+
             table[row["index"]] = self.taxonomy.raw_to_train[row["name"]]
+
         return table
 
-    def _fine_to_train(self, raw: np.ndarray) -> np.ndarray:
-        assert self._to_train is not None  # there are labels only where the table was read
-        train = self._to_train[raw]
+    def _categories_to_train(self, indices: np.ndarray) -> np.ndarray:
+        """Turn (N,) indices of category.json into (N,) uint8 train ids."""
+        assert self._to_train is not None  # records have labels only if the table was read
+        train = self._to_train[indices]
+
         if (train == UNKNOWN).any():
-            unknown = np.unique(raw[train == UNKNOWN])[:5].tolist()
+            unknown = np.unique(indices[train == UNKNOWN])[:5].tolist()
             raise InputError(
-                f"expected indices of category.json, found {unknown}; use the tables that came with the labels"
+                f"expected indices of category.json, found {unknown}; "
+                "use the tables that came with the labels"
             )
+
         return train.astype(np.uint8)
 
     def _index(self) -> dict[str, list[ScanRecord]]:
-        """The scans of every scene, in order of time."""
-        scenes = {row["token"]: row["name"] for row in self._table("scene")}
-        scene_of = {row["token"]: scenes[row["scene_token"]] for row in self._table("sample")}
-        lidars = self._lidar_sensors()
-        rows = [row for row in self._table("sample_data") if self._is_scan(row, lidars)]
-        index: dict[str, list[ScanRecord]] = {}
-        for row in sorted(rows, key=lambda row: (row["timestamp"], row["token"])):
-            scene = scene_of[row["sample_token"]]
-            index.setdefault(scene, []).append(self._record(row, scene))
-        return index
+        """Return the scans of every scene, in order of time."""
+        scene_names = _columns(self._table("scene"), "token", "name")
+        scene_of_sample = {}
+        for row in self._table("sample"):
+            scene_of_sample[row["token"]] = scene_names[row["scene_token"]]
+
+        is_lidar = self._lidar_sensors()
+        scans = []
+        for row in self._table("sample_data"):
+            if self._is_scan(row, is_lidar):
+                scans.append(row)
+        scans.sort(key=lambda row: (row["timestamp"], row["token"]))
+
+        records: dict[str, list[ScanRecord]] = {}
+        for row in scans:
+            scene = scene_of_sample[row["sample_token"]]
+            records.setdefault(scene, []).append(self._record(row, scene))
+        return records
 
     def _lidar_sensors(self) -> dict[str, bool]:
-        """Token of a calibrated sensor -> whether it is the LiDAR; empty where the tables lack it."""
-        channels = {row["token"]: row["channel"] for row in self._table("sensor", required=False)}
-        rows = self._table("calibrated_sensor", required=False)
-        return {row["token"]: channels.get(row["sensor_token"], CHANNEL) == CHANNEL for row in rows}
+        """Return for each calibrated sensor's token whether it is the LiDAR.
+
+        Empty if the tables of the sensors are missing.
+        """
+        channels = _columns(self._table("sensor", required=False), "token", "channel")
+        is_lidar = {}
+        for row in self._table("calibrated_sensor", required=False):
+            is_lidar[row["token"]] = channels.get(row["sensor_token"], CHANNEL) == CHANNEL
+        return is_lidar
 
     @staticmethod
-    def _is_scan(row: Row, lidars: dict[str, bool]) -> bool:
-        under = str(row["filename"]).startswith(f"samples/{CHANNEL}/")
-        return (
-            bool(row["is_key_frame"]) and under and lidars.get(row["calibrated_sensor_token"], True)
-        )
+    def _is_scan(row: Row, is_lidar: dict[str, bool]) -> bool:
+        """Return whether a row of sample_data is a key frame of the LiDAR."""
+        in_folder = str(row["filename"]).startswith(f"samples/{CHANNEL}/")
+        if not row["is_key_frame"] or not in_folder:
+            return False
+        return is_lidar.get(row["calibrated_sensor_token"], True)
 
     def _record(self, row: Row, scene: str) -> ScanRecord:
+        """Return the scan of a row of sample_data."""
         token = row["token"]
+        labels_path = None
+        if token in self._label_files:
+            labels_path = self.root / self._label_files[token]
+
         return ScanRecord(
             name=token,
             sequence=scene,
             points_path=self.root / row["filename"],
-            labels_path=self.root / self._labels[token] if token in self._labels else None,
+            labels_path=labels_path,
             prediction=f"lidarseg/{self._split(scene)}/{token}_lidarseg.bin",
         )
 
     def _split(self, scene: str) -> str:
-        """The name of the official split that a scene of this version belongs to."""
+        """Return the official split of a scene in this version."""
         if self.version == TEST:
             return "test"
-        if self.version == MINI and scene in MINI_VAL | MINI_TRAIN:
-            return "mini_val" if scene in MINI_VAL else "mini_train"
+        if self.version == MINI:
+            if scene in MINI_VAL:
+                return "mini_val"
+            if scene in MINI_TRAIN:
+                return "mini_train"
+
         return "val" if scene in VAL else "train"
 
-    def _count(self, record: ScanRecord) -> int:
+    def _count_points(self, record: ScanRecord) -> int:
         return files.count_rows(record.points_path, np.float32, files.NUSCENES_COLUMNS)
+
+
+def _columns(rows: list[Row], key: str, value: str) -> dict[str, Any]:
+    """Return one column of a table by the values of another."""
+    return {row[key]: row[value] for row in rows}

@@ -1,4 +1,7 @@
-"""Predicted labels as any tool may have written them: read, and told apart from what is usually written instead."""
+"""Predicted labels from any tool: read them and recognise the usual mistakes.
+
+The usual mistakes are another number type, another byte order, and train ids instead of raw ids.
+"""
 
 from __future__ import annotations
 
@@ -15,73 +18,99 @@ SHOWN = 5  # unknown ids in a message
 
 
 def read_prediction(path: Path, dtype: DTypeLike, count: int, taxonomy: Taxonomy) -> np.ndarray:
-    """Read `count` raw ids of `dtype`; (N,) uint8 train ids in 0..K.
+    """Read the predicted labels of one scan.
+
+    Args:
+        path: the file, raw ids of `dtype`.
+        dtype: number type of the ids.
+        count: points of the scan.
+        taxonomy: the classes.
+
+    Returns:
+        (N,) uint8 train ids in 0..K.
 
     Raises:
-        InputError: where the file is missing, and as `check_size` and `train_ids`.
+        InputError: if the file is missing, or as `check_size` and `train_ids` raise it.
     """
     if not path.is_file():
         raise InputError(
             f"{path}: expected the prediction of a scan, found no file; predict this scan, too"
         )
+
     check_size(path, path.stat().st_size, count, dtype)
     return train_ids(path, np.fromfile(path, dtype=dtype, count=count), taxonomy)
 
 
 def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> None:
-    """Tell a file of other labels from one of another number type, by its size alone.
+    """Check the size of a file of labels; the message recognises another number type.
 
     Args:
-        name: what the message begins with.
+        name: the beginning of the message.
         size: bytes in the file.
         count: points of the scan.
+        dtype: number type of the ids.
 
     Raises:
-        InputError: where the size is not `count` labels of `dtype`.
+        InputError: if the size is not that of `count` labels of `dtype`.
     """
-    wanted, width = np.dtype(dtype), np.dtype(dtype).itemsize
-    if size == count * width:
+    dtype = np.dtype(dtype)
+    if size == count * dtype.itemsize:
         return
-    if size in [count * other for other in WIDTHS]:
+
+    if count and size % count == 0 and size // count in WIDTHS:
         raise InputError(
-            f"{name}: expected {wanted} ids, found ids of {8 * size // count} bits; write the ids as {wanted}"
+            f"{name}: expected {dtype} ids, found ids of {8 * size // count} bits; "
+            f"write the ids as {dtype}"
         )
-    found = f"{size // width}" if size % width == 0 else f"{size} bytes"
+
+    is_whole = size % dtype.itemsize == 0
+    found = f"{size // dtype.itemsize}" if is_whole else f"{size} bytes"
     raise InputError(
-        f"{name}: expected {count} labels ({wanted}), one per point, found {found}; give the file of this scan"
+        f"{name}: expected {count} labels ({dtype}), one per point, found {found}; "
+        "give the file of this scan"
     )
 
 
 def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarray:
-    """Turn (N,) raw ids into (N,) uint8 train ids in 0..K; `name` is what the message begins with.
+    """Turn raw ids into train ids; the message recognises another number type.
+
+    Args:
+        name: the beginning of the message.
+        raw: (N,) raw ids, unsigned integers.
+        taxonomy: the classes.
+
+    Returns:
+        (N,) uint8 train ids in 0..K.
 
     Raises:
-        InputError: where an id is none of the benchmark's raw ids, or all look like another number type.
+        InputError: if an id is not one of the benchmark's raw ids, or if all of them look like
+            float32 or big-endian ids.
     """
     classes = raw.astype(np.uint32) & np.uint32(INSTANCE_MASK)
-    if (
-        raw.any() and not classes.any()
-    ):  # 40.0 and a big-endian 40 have all of their bits in the upper half
+
+    # The float 40.0 and a big-endian 40 have all of their bits in the upper half.
+    if raw.any() and not classes.any():
         raise InputError(
-            f"{name}: expected little-endian {raw.dtype} ids, found the class 0 with other bits, as float32 and "
-            f"big-endian ids read; write the ids as little-endian {raw.dtype}"
+            f"{name}: expected little-endian {raw.dtype} ids, found the class 0 with other bits, "
+            f"as float32 and big-endian ids read; write the ids as little-endian {raw.dtype}"
         )
+
     try:
         return taxonomy.to_train(raw)
     except InputError:
-        raise InputError(f"{name}: {_unknown(classes, taxonomy)}") from None
+        raise InputError(f"{name}: {_describe_unknown(classes, taxonomy)}") from None
 
 
-def _unknown(classes: np.ndarray, taxonomy: Taxonomy) -> str:
-    """What to say of ids that are not all in the table."""
-    table = {
-        *taxonomy.train_to_raw,
-        *(raw for raw in taxonomy.raw_to_train if isinstance(raw, int)),
-    }
-    found = sorted(set(np.unique(classes).tolist()) - table)
-    shown = ", ".join(map(str, found[:SHOWN])) + (
-        f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+def _describe_unknown(classes: np.ndarray, taxonomy: Taxonomy) -> str:
+    """Return the message for (N,) raw ids that are not all in the taxonomy."""
+    unknown = sorted(set(np.unique(classes).tolist()) - set(taxonomy.raw_ids))
+    listed = ", ".join(map(str, unknown[:SHOWN]))
+    if len(unknown) > SHOWN:
+        listed += f" and {len(unknown) - SHOWN} more"
+    if classes.max() <= taxonomy.size:
+        listed += " (train ids, it seems)"
+
+    expected = ", ".join(map(str, taxonomy.train_to_raw[1:]))
+    return (
+        f"expected the raw ids of {taxonomy.name} ({expected}), found {listed}; write its raw ids"
     )
-    train = " (train ids, it seems)" if classes.max() <= taxonomy.size else ""
-    wanted = ", ".join(map(str, taxonomy.train_to_raw[1:]))
-    return f"expected the raw ids of {taxonomy.name} ({wanted}), found {shown}{train}; write its raw ids"

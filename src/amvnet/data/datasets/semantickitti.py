@@ -18,14 +18,14 @@ from amvnet.scan import Scan
 
 @dataclass(frozen=True)
 class SemanticKitti:
-    """The scans below one folder; the interface is `records.Dataset`.
+    """The scans in one folder; a `Dataset`, whose methods describe arguments and errors.
 
     Attributes:
         root: the folder that holds `sequences/`, or `sequences` itself.
-        taxonomy: the classes; another one than the official where the labels were written with it.
+        taxonomy: the classes that the labels were written with.
 
     Raises:
-        InputError: where `root` has no such layout.
+        InputError: if `root` does not have this layout.
     """
 
     root: Path
@@ -41,79 +41,94 @@ class SemanticKitti:
 
     @staticmethod
     def matches(root: Path) -> bool:
-        """Whether a folder has this layout."""
+        """Return whether a folder has this layout."""
         return any(root.glob("sequences/*/velodyne")) or any(root.glob("*/velodyne"))
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """The sequences of "train", "val", "test" or "all" that are on disk; raises as `records.Dataset`."""
+        """Return the sequences of "train", "val", "test" or "all" that are on disk."""
         present = self._present()
         splits = {**self.taxonomy.splits, "all": present}
         if split not in splits:
             raise InputError(
-                f"{self.root}: expected a split of {', '.join(splits)}, found {split!r}; give one of them"
+                f"{self.root}: expected a split of {', '.join(splits)}, "
+                f"found {split!r}; give one of them"
             )
-        if found := tuple(sequence for sequence in splits[split] if sequence in present):
-            return found
-        raise InputError(
-            f"{self.root}: expected a sequence of the {split} split ({', '.join(splits[split])}), "
-            f"found {', '.join(present)}; name the sequences to use"
-        )
+
+        sequences = tuple(sequence for sequence in splits[split] if sequence in present)
+        if not sequences:
+            raise InputError(
+                f"{self.root}: expected a sequence of the {split} split "
+                f"({', '.join(splits[split])}), found {', '.join(present)}; "
+                "name the sequences to use"
+            )
+
+        return sequences
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
-        """The scans of these sequences in order; raises as `records.Dataset`."""
-        return [record for sequence in sorted(set(sequences)) for record in self._records(sequence)]
+        """Return the scans of these sequences, in order."""
+        records: list[ScanRecord] = []
+        for sequence in sorted(set(sequences)):
+            records.extend(self._records(sequence))
+        return records
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
-        """Read one scan; raises as `records.Dataset`."""
+        """Read one scan."""
         points = files.read_kitti(record.points_path)
         ids = None
         if labels and record.labels_path is not None:
             ids = files.read_labels(
                 record.labels_path, np.uint32, len(points), self.taxonomy.to_train
             )
+
         return Scan(points, labels=ids, name=record.name)
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
-        """Read (N,) uint8 train ids; raises as `records.Dataset`."""
-        return read_prediction(
-            Path(folder) / record.prediction, np.uint32, self._count(record), self.taxonomy
-        )
+        """Read the predicted (N,) uint8 train ids of one scan."""
+        path = Path(folder) / record.prediction
+        return read_prediction(path, np.uint32, self._count_points(record), self.taxonomy)
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids as raw ids (uint32); raises as `records.Dataset`."""
-        ids = files.check_count(ids, record.points_path, self._count(record))
+        """Write (N,) train ids as raw ids (uint32)."""
+        ids = files.check_count(ids, record.points_path, self._count_points(record))
         return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids))
 
     @property
     def _folder(self) -> Path:
+        """The folder of the sequences."""
         inner = self.root / "sequences"
         return inner if inner.is_dir() else self.root
 
     def _present(self) -> tuple[str, ...]:
+        """Return the names of the sequences on disk."""
         return tuple(sorted(path.parent.name for path in self._folder.glob("*/velodyne")))
 
-    def _count(self, record: ScanRecord) -> int:
+    def _count_points(self, record: ScanRecord) -> int:
         return files.count_rows(record.points_path, np.float32, files.KITTI_COLUMNS)
 
     def _records(self, sequence: str) -> list[ScanRecord]:
+        """Return the scans of one sequence."""
         folder = self._folder / sequence
-        # What a killed program had begun to write has a name that begins with a dot.
-        scans = sorted(
-            path for path in (folder / "velodyne").glob("*.bin") if not path.name.startswith(".")
-        )
-        if not scans:
-            raise InputError(
-                f"{folder / 'velodyne'}: expected the scans *.bin of sequence {sequence}, found none; "
-                f"there is {', '.join(self._present())}"
-            )
-        labelled = any((folder / "labels").glob("*.label"))
-        return [
-            ScanRecord(
-                name=f"{sequence}/{scan.stem}",
+        has_labels = any((folder / "labels").glob("*.label"))
+
+        records = []
+        for path in sorted((folder / "velodyne").glob("*.bin")):
+            # A program that was killed leaves its unfinished file, hidden by a leading dot.
+            if path.name.startswith("."):
+                continue
+            labels_path = folder / "labels" / f"{path.stem}.label"
+            record = ScanRecord(
+                name=f"{sequence}/{path.stem}",
                 sequence=sequence,
-                points_path=scan,
-                labels_path=folder / "labels" / f"{scan.stem}.label" if labelled else None,
-                prediction=f"sequences/{sequence}/predictions/{scan.stem}.label",
+                points_path=path,
+                labels_path=labels_path if has_labels else None,
+                prediction=f"sequences/{sequence}/predictions/{path.stem}.label",
             )
-            for scan in scans
-        ]
+            records.append(record)
+
+        if not records:
+            raise InputError(
+                f"{folder / 'velodyne'}: expected the scans *.bin of sequence {sequence}, "
+                f"found none; there is {', '.join(self._present())}"
+            )
+
+        return records
