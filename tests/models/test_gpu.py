@@ -302,7 +302,8 @@ def test_tf32_is_used_only_if_it_was_asked_for(setting: str, allowed: bool) -> N
 
 @pytest.mark.parametrize("precision", ["float16", "float64", ""])
 def test_a_precision_that_a_cpu_lacks_is_refused(precision: str) -> None:
-    fails(lambda: Segmenter(fresh_weights(), precision=precision), "expected", precision)  # type: ignore[arg-type]
+    weights = fresh_weights()
+    fails(lambda: Segmenter(weights, "cpu", precision=precision), "expected", precision)
 
 
 def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
