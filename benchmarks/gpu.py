@@ -1,7 +1,11 @@
-"""Scans a second, TFLOP/s, memory and waits of the whole method on a GPU, at the paper's size.
+"""Measure the whole method on a GPU at the paper's size: scans/s, TFLOP/s, memory and waits.
 
-python benchmarks/gpu.py [--scan FILE] [--precision bfloat16,float32] [--batch 1,4] [--part 8] [--compile]
-python benchmarks/gpu.py --device cpu --size tiny --runs 1    whether it works, where there is no GPU
+python benchmarks/gpu.py [--scan FILE] [--precision bfloat16,float32] [--batch 1,4] [--part 8]
+                         [--compile]
+
+Without a GPU, check that the benchmark itself works:
+
+python benchmarks/gpu.py --device cpu --size tiny --runs 1
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
@@ -61,8 +66,8 @@ def recipe_of(size: str) -> Recipe:
     return replace(recipe, model=TINY) if size == "tiny" else recipe
 
 
-def seconds(work: Callable[[], object], runs: int, device: str) -> float:
-    """The median of some runs, after others that only warm up."""
+def median_seconds(work: Callable[[], object], runs: int, device: str) -> float:
+    """Return the median time of some runs, after others that only warm up."""
     times = []
     for _ in range(WARM_UP + runs):
         started = time.perf_counter()
@@ -74,139 +79,150 @@ def seconds(work: Callable[[], object], runs: int, device: str) -> float:
 
 
 def matrix_limit(device: str, runs: int) -> float:
-    """FLOP/s of a large product in bfloat16: what this device gives at best."""
+    """Return the FLOP/s of a large product in bfloat16, the most that the device reaches."""
     n = 512 if device == "cpu" else 8192
     a, b = torch.randn(2, n, n, device=device).bfloat16()
-    return 2 * n**3 / seconds(lambda: a @ b, max(runs, 10), device)
+    return 2 * n**3 / median_seconds(lambda: a @ b, max(runs, 10), device)
 
 
-def flops_of(work: Callable[[], object]) -> int:
+def count_flops(work: Callable[[], object]) -> int:
     with FlopCounterMode(display=False) as counter:
         work()
     return counter.get_total_flops()
 
 
-def fresh(model: ModelConfig) -> Weights:
-    """Weights that have learnt nothing: times do not depend on them, but for how many points are uncertain."""
+def untrained_weights(config: ModelConfig) -> Weights:
+    """Return untrained weights.
+
+    Times do not depend on the weights, except on how many points are uncertain.
+    """
     torch.manual_seed(0)
-    built = build_amvnet(model, CLASSES)
-    parts = {name: getattr(built, name) for name in ("range_net", "polar_net", "point_head")}
-    tensors = {
-        key: value for name, part in parts.items() for key, value in part_state(name, part).items()
-    }
-    return Weights(model, SEMANTICKITTI, "hdl64e", tensors)
+    model = build_amvnet(config, CLASSES)
+    tensors: dict[str, torch.Tensor] = {}
+    for name in ("range_net", "polar_net", "point_head"):
+        tensors |= part_state(name, getattr(model, name))
+    return Weights(config, SEMANTICKITTI, "hdl64e", tensors)
 
 
-def segmenter_of(
-    weights: Weights, scan: Scan, device: str, precision: str, uncertain: float
-) -> Segmenter:
-    """One for which such a share of the scan's points is uncertain, as with trained weights."""
-    segmenter = Segmenter(weights, device, precision=precision)  # type: ignore[arg-type]
-    found = segmenter(scan)
-    likeness = cosine_similarity(
-        *map(torch.from_numpy, (found.rv[scan.valid], found.bev[scan.valid]))
-    )
-    segmenter.model.assertion = Disagreement(
-        float(likeness.sort().values[int(uncertain * (len(likeness) - 1))])
-    )
+def make_segmenter(weights: Weights, scan: Scan, precision: str, options: Options) -> Segmenter:
+    """Return a segmenter for which the given share of the scan's points is uncertain.
+
+    Untrained networks would disagree on another share than trained ones.
+    """
+    segmenter = Segmenter(weights, options.device, precision=precision)  # type: ignore[arg-type]
+    segmentation = segmenter(scan)
+    f = torch.from_numpy(segmentation.rv[scan.valid])
+    g = torch.from_numpy(segmentation.bev[scan.valid])
+
+    similarity = cosine_similarity(f, g).sort().values
+    tau = similarity[int(options.uncertain * (len(similarity) - 1))]
+    segmenter.model.assertion = Disagreement(float(tau))
     return segmenter
 
 
-def memory(device: str) -> str:
-    """The most that was taken since the last call."""
+def peak_memory(device: str) -> str:
+    """Return the most memory that was in use since the last call."""
     if device == "cpu":
         return "not measured"
-    most = torch.cuda.max_memory_allocated(device)
+    peak = torch.cuda.max_memory_allocated(device)
     torch.cuda.reset_peak_memory_stats(device)
-    return f"{most / 2**30:.1f} GiB"
+    return f"{peak / 2**30:.1f} GiB"
 
 
-def whole(segmenter: Segmenter, scan: Scan, batch: int, runs: int) -> None:
-    taken = seconds(lambda: segmenter.many([scan] * batch), runs, segmenter.device)
+def time_method(segmenter: Segmenter, scan: Scan, batch: int, runs: int) -> None:
+    seconds = median_seconds(lambda: segmenter.many([scan] * batch), runs, segmenter.device)
     print(
-        f"points to labels, {segmenter.precision}, {batch} at a time: {batch / taken:.1f} scans/s "
-        f"({taken / batch * 1e3:.1f} ms a scan), memory {memory(segmenter.device)}"
+        f"points to labels, {segmenter.precision}, {batch} at a time: "
+        f"{batch / seconds:.1f} scans/s ({seconds / batch * 1e3:.1f} ms a scan), "
+        f"memory {peak_memory(segmenter.device)}"
     )
 
 
 @torch.inference_mode()
-def networks(segmenter: Segmenter, scan: Scan, batch: int, runs: int, limit: float) -> None:
-    model, device = segmenter.model, segmenter.device
-    points = PointBatch.of([scan] * batch).to(device)
-    image, grid = model.range_view.project(points).image, model.polar_view.project(points)
+def time_networks(segmenter: Segmenter, scan: Scan, batch: int, runs: int, limit: float) -> None:
+    model = segmenter.model
+    points = PointBatch.of([scan] * batch).to(segmenter.device)
+    image = model.range_view.project(points).image
+    grid = model.polar_view.project(points)
+
     for name, net, view in (("RV", model.range_net, image), ("BEV", model.polar_net, grid)):
-        work = flops_of(lambda net=net, view=view: net(view))
-        rate = work / seconds(lambda net=net, view=view: net(view), runs, device)
+        forward = partial(net, view)
+        flops = count_flops(forward)
+        rate = flops / median_seconds(forward, runs, segmenter.device)
         share = f"{rate / 1e12:.2f} TFLOP/s, {rate / limit:.0%} of the limit"
-        print(f"  {name}: {work / batch / 1e9:.2f} GFLOP a scan, {share}")
+        print(f"  {name}: {flops / batch / 1e9:.2f} GFLOP a scan, {share}")
 
 
 @torch.inference_mode()
-def neighbours(segmenter: Segmenter, scan: Scan, runs: int) -> None:
-    model, device = segmenter.model, segmenter.device
+def time_neighbour_search(segmenter: Segmenter, scan: Scan, runs: int) -> None:
+    model = segmenter.model
+    device = segmenter.device
     assert model.point_head is not None
-    xyz, n = scan.points[scan.valid][:, :3].copy(), model.point_head.config.neighbours
-    own = segmenter(scan).uncertain[scan.valid].nonzero()[0]
-    there, asked = torch.from_numpy(xyz).to(device), torch.from_numpy(own).to(device)
-    blocks = seconds(lambda: nearest_others_by_blocks(there, asked, n), runs, device)
-    tree = seconds(lambda: nearest_others(xyz, own, n), runs, "cpu")
+    n = model.point_head.config.neighbours
+    xyz = scan.points[scan.valid][:, :3].copy()
+    uncertain = segmenter(scan).uncertain[scan.valid].nonzero()[0]
+    device_xyz = torch.from_numpy(xyz).to(device)
+    device_uncertain = torch.from_numpy(uncertain).to(device)
+
+    blocks = median_seconds(
+        lambda: nearest_others_by_blocks(device_xyz, device_uncertain, n), runs, device
+    )
+    tree = median_seconds(lambda: nearest_others(xyz, uncertain, n), runs, "cpu")
     print(
-        f"neighbours of {len(own)} points: {blocks * 1e3:.1f} ms by blocks, {tree * 1e3:.1f} ms by the tree on the CPU"
+        f"neighbours of {len(uncertain)} points: {blocks * 1e3:.1f} ms by blocks, "
+        f"{tree * 1e3:.1f} ms by the tree on the CPU"
     )
 
 
-def waits(segmenter: Segmenter, scan: Scan) -> None:
-    """Where the processor waits for the GPU in one pass."""
+def print_waits(segmenter: Segmenter, scan: Scan) -> None:
+    """Print where the CPU waits for the GPU in one pass."""
     torch.cuda.set_sync_debug_mode("warn")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         segmenter(scan)
     torch.cuda.set_sync_debug_mode("default")
-    places = Counter(
-        f"{Path(w.filename).name}:{w.lineno}" for w in caught if "synchronizing" in str(w.message)
-    )
-    print(
-        "waits for the GPU in a scan:",
-        ", ".join(f"{place} ({n})" for place, n in places.items()) or "none",
-    )
+
+    counts: Counter[str] = Counter()
+    for warning in caught:
+        if "synchronizing" in str(warning.message):
+            counts[f"{Path(warning.filename).name}:{warning.lineno}"] += 1
+    places = ", ".join(f"{place} ({count})" for place, count in counts.items())
+    print("waits for the GPU in a scan:", places or "none")
 
 
-def training(
-    stage: NetworkStage,
-    scan: Scan,
-    batch: int,
-    part: int,
-    runs: int,
-    limit: float,
-    options: Options,
-) -> None:
-    """A step of AdamW over a batch in parts, as `amvnet train` takes it with bf16-mixed."""
+def time_training(stage: NetworkStage, scan: Scan, limit: float, options: Options) -> None:
+    """Time a step of AdamW over a batch in parts, as `amvnet train` takes it with bf16-mixed."""
     device = options.device
+    batch = stage.config.batch
+    part = min(options.part, batch)
     stage.to(device).train()
     optimizer = torch.optim.AdamW(stage.trained.parameters(), lr=1e-4)
     points = PointBatch.of([scan] * part).to(device)
     labels = torch.randint(1, CLASSES + 1, (len(points.points),), device=device)
 
-    def once() -> None:
+    def backward() -> None:
         with torch.autocast(torch.device(device).type, torch.bfloat16):
-            scores, truth, _ = stage.logits(points, labels)
-            loss = torch.stack([stage.loss(*one) for one in zip(scores, truth, strict=True)]).mean()
+            logits, truth, _ = stage.logits(points, labels)
+            losses = [stage.loss(*pair) for pair in zip(logits, truth, strict=True)]
+            loss = torch.stack(losses).mean()
         loss.backward()
 
     def step() -> None:
         for _ in range(batch // part):
-            once()
+            backward()
         optimizer.step()
         optimizer.zero_grad()
 
-    work = flops_of(once) * (batch // part)
-    if options.compile:  # what is compiled cannot be counted
+    flops = count_flops(backward) * (batch // part)
+    if options.compile:  # after counting: compiled networks cannot be counted
         stage.trained.compile()
-    memory(device)
-    taken = seconds(step, runs, device)
+    peak_memory(device)
+    seconds = median_seconds(step, options.runs, device)
+    rate = flops / seconds
     print(
-        f"training {stage.name}, bfloat16, {batch} scans in parts of {part}: {taken:.3g} s a step, {batch / taken:.3g} "
-        f"scans/s, {work / taken / 1e12:.2f} TFLOP/s, {work / taken / limit:.0%} of the limit, memory {memory(device)}"
+        f"training {stage.name}, bfloat16, {batch} scans in parts of {part}: "
+        f"{seconds:.3g} s a step, {batch / seconds:.3g} scans/s, {rate / 1e12:.2f} TFLOP/s, "
+        f"{rate / limit:.0%} of the limit, memory {peak_memory(device)}"
     )
 
 
@@ -222,7 +238,7 @@ class Options(argparse.Namespace):
     compile: bool
 
 
-def options() -> Options:
+def parse_options() -> Options:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -240,36 +256,48 @@ def options() -> Options:
     return parser.parse_args(namespace=Options())
 
 
-def main() -> None:
-    given = options()
-    device, runs, recipe = given.device, given.runs, recipe_of(given.size)
+def load_scan(path: Path | None) -> Scan:
+    """Read a scan, or simulate one if no path is given."""
+    if path is not None:
+        return read_scan(path)
     with TemporaryDirectory() as folder:
-        if given.scan is None:
-            simulate(Path(folder), scans=1)
-        scan = read_scan(given.scan or Path(folder) / "sequences/00/velodyne/000000.bin")
+        simulate(Path(folder), scans=1)
+        return read_scan(Path(folder) / "sequences/00/velodyne/000000.bin")
+
+
+def main() -> None:
+    options = parse_options()
+    device = options.device
+    runs = options.runs
+    recipe = recipe_of(options.size)
+    scan = load_scan(options.scan)
+
     limit = matrix_limit(device, runs)
     name = "CPU" if device == "cpu" else torch.cuda.get_device_name(device)
     print(
-        f"{name}, torch {torch.__version__}: {limit / 1e12:.2f} TFLOP/s in a bfloat16 matrix product"
+        f"{name}, torch {torch.__version__}: "
+        f"{limit / 1e12:.2f} TFLOP/s in a bfloat16 matrix product"
     )
-    print(f"{given.size} size, {scan.valid.sum()} points, {given.uncertain:.0%} uncertain")
-    weights = fresh(recipe.model)
-    for precision in given.precision.split(","):
-        segmenter = segmenter_of(weights, scan, device, precision, given.uncertain)
-        for batch in map(int, given.batch.split(",")):
-            whole(segmenter, scan, batch, runs)
-            networks(segmenter, scan, batch, runs, limit)
-    neighbours(segmenter, scan, runs)
+    print(f"{options.size} size, {scan.valid.sum()} points, {options.uncertain:.0%} uncertain")
+
+    weights = untrained_weights(recipe.model)
+    for precision in options.precision.split(","):
+        segmenter = make_segmenter(weights, scan, precision, options)
+        for batch in map(int, options.batch.split(",")):
+            time_method(segmenter, scan, batch, runs)
+            time_networks(segmenter, scan, batch, runs, limit)
+
+    time_neighbour_search(segmenter, scan, runs)
     if device != "cpu":
-        waits(segmenter, scan)
+        print_waits(segmenter, scan)
+
     model = build_amvnet(recipe.model, CLASSES)
     stages: list[NetworkStage] = [
         RangeStage(model.range_view, model.range_net, recipe.training.rv, SEMANTICKITTI, None),
         PolarStage(model.polar_view, model.polar_net, recipe.training.bev, SEMANTICKITTI, None),
     ]
     for stage in stages:
-        batch = stage.config.batch
-        training(stage, scan, batch, min(given.part, batch), runs, limit, given)
+        time_training(stage, scan, limit, options)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Graphs in int8 beside those in float32, both in ONNX Runtime: time of each graph and of a scan, and mIoU by method.
+"""Compare graphs in int8 with those in float32, both in ONNX Runtime.
+
+Prints the mIoU of each method, and the time of each graph and of a whole scan.
 
 amvnet export --weights W --out FLOAT && amvnet export --weights W --out INT8 --int8 simulated
 python benchmarks/int8.py FLOAT INT8 DATA [THREADS]
@@ -9,6 +11,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -16,6 +19,7 @@ from typing import Any
 import numpy as np
 import onnxruntime
 
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.onnx_runner import OnnxSegmenter, disagree
@@ -23,86 +27,109 @@ from amvnet.scan import Scan
 
 GRAPHS = ("range_net", "polar_map")
 RUNS = 15
+WARM_UP = 2
 
 
 class Runner(OnnxSegmenter):
-    """With so many threads; knows what its graphs were given last, and all methods' labels."""
+    """A segmenter with a number of threads, which keeps the last inputs of its graphs."""
 
     def __init__(self, folder: str, threads: int) -> None:
         super().__init__(folder)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        files = {
-            name: str(Path(folder) / self.description["graphs"][name]["file"])
-            for name in self._graphs
-        }
-        self._graphs = {
-            name: onnxruntime.InferenceSession(file, options) for name, file in files.items()
-        }
-        self.given: dict[str, tuple[np.ndarray, ...]] = {}
+        for name in self._graphs:
+            path = Path(folder) / self.description["graphs"][name]["file"]
+            self._graphs[name] = onnxruntime.InferenceSession(str(path), options)
+        self.last_inputs: dict[str, tuple[np.ndarray, ...]] = {}
 
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
-        self.given[name] = inputs
+        self.last_inputs[name] = inputs
         return super()._run(name, *inputs)
 
-    def by_method(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Labels by method, and which points are uncertain, of the finite points."""
-        points, ring = scan.points[scan.valid], None if scan.ring is None else scan.ring[scan.valid]
-        f, g = self.score_range_view(points, ring), self.score_polar_view(points)
-        found = {"rv": f, "bev": g, "ensemble": np.sqrt(f * g)}
+    def label(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Return the finite points' labels by method, and which of them are uncertain."""
+        points = scan.points[scan.valid]
+        ring = None if scan.ring is None else scan.ring[scan.valid]
+        f = self.score_range_view(points, ring)
+        g = self.score_polar_view(points)
         uncertain = disagree(self.assertion, f, g)
-        if self.method == "amvnet":
-            found["amvnet"] = found["ensemble"].copy()
-            found["amvnet"][uncertain] = self._settle(points, f, g, uncertain)
-        return {name: scores.argmax(axis=1) + 1 for name, scores in found.items()}, uncertain
 
-    def run_graph(self, name: str, inputs: tuple[np.ndarray, ...]) -> Callable[[], Any]:
-        return lambda: super(Runner, self)._run(name, *inputs)
+        scores = {"rv": f, "bev": g, "ensemble": np.sqrt(f * g)}
+        if self.method == "amvnet":
+            merged = scores["ensemble"].copy()
+            merged[uncertain] = self._settle(points, f, g, uncertain)
+            scores["amvnet"] = merged
+
+        labels = {name: values.argmax(axis=1) + 1 for name, values in scores.items()}
+        return labels, uncertain
+
+    def run_again(self, name: str) -> np.ndarray:
+        """Run a graph on its last inputs."""
+        return super()._run(name, *self.last_inputs[name])
 
 
 def race(float32: Callable[[], Any], int8: Callable[[], Any]) -> tuple[float, float]:
-    """Median milliseconds of both, run by turns, after two runs that only warm up."""
+    """Return the median milliseconds of both, run by turns, after runs that only warm up."""
     times: tuple[list[float], list[float]] = ([], [])
-    for _ in range(RUNS + 2):
-        for call, kept in zip((float32, int8), times, strict=True):
-            start = time.perf_counter()
+    for _ in range(WARM_UP + RUNS):
+        for call, milliseconds in zip((float32, int8), times, strict=True):
+            started = time.perf_counter()
             call()
-            kept.append(1000 * (time.perf_counter() - start))
-    return median(times[0][2:]), median(times[1][2:])
+            milliseconds.append(1000 * (time.perf_counter() - started))
+    return median(times[0][WARM_UP:]), median(times[1][WARM_UP:])
+
+
+def compare_labels(float32: Runner, int8: Runner, dataset: Dataset, data: str) -> None:
+    evaluations = {"float32": Evaluation(dataset.taxonomy), "int8": Evaluation(dataset.taxonomy)}
+    equal: list[float] = []
+    for record in dataset.records(dataset.sequences("all")):
+        scan = dataset.read(record)
+        assert scan.labels is not None
+        points = scan.points[scan.valid]
+        truth = scan.labels[scan.valid]
+
+        last_labels = []
+        for name, runner in (("float32", float32), ("int8", int8)):
+            labels, uncertain = runner.label(scan)
+            evaluations[name].add(points, truth, labels, uncertain)
+            last_labels.append(list(labels.values())[-1])
+        equal.append(float((last_labels[0] == last_labels[1]).mean()))
+
+    for name, evaluation in evaluations.items():
+        report = evaluation.report(data)
+        figures = []
+        for method, scores in report["methods"].items():
+            figures.append(f"{method} {100 * scores['miou']:.2f} ({100 * scores['accuracy']:.2f})")
+        uncertain_share = f"uncertain {report['uncertain_fraction']:.1%}"
+        print(f"{name}: mIoU (accuracy) {', '.join(figures)}; {uncertain_share}")
+    print(f"labels of the last method that are the same: {np.mean(equal):.1%}")
+
+
+def compare_times(float32: Runner, int8: Runner, scan: Scan) -> None:
+    float32.label(scan)
+    int8.label(scan)
+    for name in GRAPHS:
+        int8.last_inputs[name] = float32.last_inputs[name]
+        print_race(name, partial(float32.run_again, name), partial(int8.run_again, name))
+
+    print_race(
+        "scan", partial(float32, scan.points, scan.ring), partial(int8, scan.points, scan.ring)
+    )
+
+
+def print_race(name: str, float32: Callable[[], Any], int8: Callable[[], Any]) -> None:
+    slow, fast = race(float32, int8)
+    print(f"{name}: float32 {slow:.1f} ms, int8 {fast:.1f} ms, {slow / fast:.2f} times as fast")
 
 
 def main(float32: str, int8: str, data: str, threads: str = "2") -> None:
-    runners = {"float32": Runner(float32, int(threads)), "int8": Runner(int8, int(threads))}
+    float32_runner = Runner(float32, int(threads))
+    int8_runner = Runner(int8, int(threads))
     dataset = open_dataset(data)
-    records = dataset.records(dataset.sequences("all"))
-    found = {name: Evaluation(dataset.taxonomy) for name in runners}
-    same: list[float] = []
-    for record in records:
-        scan = dataset.read(record)
-        assert scan.labels is not None
-        labels = {name: runner.by_method(scan) for name, runner in runners.items()}
-        for name, (by_method, uncertain) in labels.items():
-            found[name].add(scan.points[scan.valid], scan.labels[scan.valid], by_method, uncertain)
-        last = [list(by_method.values())[-1] for by_method, _ in labels.values()]
-        same.append(float((last[0] == last[1]).mean()))
-    for name, evaluation in found.items():
-        report = evaluation.report(data)
-        figures = (f"{key} {100 * one['miou']:.2f} ({100 * one['accuracy']:.2f})"
-                   for key, one in report["methods"].items())  # fmt: skip
-        print(
-            f"{name}: mIoU (accuracy) {', '.join(figures)}; uncertain {report['uncertain_fraction']:.1%}"
-        )
-    print(f"labels of the last method that are the same: {np.mean(same):.1%}")
-    first, second = runners.values()
-    scan = dataset.read(records[0])
-    first.by_method(scan)
-    rows = {
-        name: [one.run_graph(name, first.given[name]) for one in (first, second)] for name in GRAPHS
-    }
-    rows["scan"] = [lambda one=one: one(scan.points, scan.ring) for one in (first, second)]  # type: ignore[misc]
-    for name, (one, other) in rows.items():
-        a, b = race(one, other)
-        print(f"{name}: float32 {a:.1f} ms, int8 {b:.1f} ms, {a / b:.2f} times as fast")
+    compare_labels(float32_runner, int8_runner, dataset, data)
+
+    first = dataset.records(dataset.sequences("all"))[0]
+    compare_times(float32_runner, int8_runner, dataset.read(first))
 
 
 if __name__ == "__main__":

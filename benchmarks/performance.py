@@ -1,6 +1,9 @@
-"""What a scan costs on this machine's CPU, beside SalsaNext, and what each measure for speed gives: by taking it away.
+"""Measure what a scan costs on this machine's CPU, next to SalsaNext.
 
-python benchmarks/performance.py [--scan FILE] [--rounds N] [--runs N] [--engines torch,onnx] [--uncertain SHARE]
+Also measure what each optimisation gives, by taking it away.
+
+python benchmarks/performance.py [--scan FILE] [--rounds N] [--runs N] [--engines torch,onnx]
+                                 [--uncertain SHARE]
 """
 
 from __future__ import annotations
@@ -10,7 +13,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -33,7 +36,8 @@ from amvnet.models.layers import upsample
 from amvnet.models.point_head import head_features, point_table
 from amvnet.simulation import simulate
 
-WIDTH, HEIGHT = 2048, 64  # of the range image that SalsaNext is timed on
+HEIGHT = 64  # of the range image that SalsaNext is timed on
+WIDTH = 2048
 WARM_UP = 2
 
 
@@ -46,7 +50,8 @@ def without_folding() -> None:
 
 
 def without_convolved_rows() -> None:
-    amvnet.models.layers.linear = amvnet.models.polar_net.linear = F.linear
+    amvnet.models.layers.linear = F.linear
+    amvnet.models.polar_net.linear = F.linear
 
 
 def without_pykdtree() -> None:
@@ -54,7 +59,7 @@ def without_pykdtree() -> None:
 
 
 def without_occupied_pillars() -> None:
-    """Score every voxel of every pillar, and take those of the occupied ones."""
+    """Score every voxel of every pillar, and select those of the occupied pillars."""
 
     def forward(self, grid):  # type: ignore[no-untyped-def]
         pillars = self.compress(self.pool(grid))
@@ -68,70 +73,94 @@ def without_parts() -> None:
 
 
 def without_joining() -> None:
-    """Upsample the coarse maps, and convolve them at full size."""
+    """Upsample the coarse maps and convolve them at full size."""
 
     def joined(block, coarse, fine):  # type: ignore[no-untyped-def]
         return block(torch.cat([upsample(coarse, fine), fine], dim=1))
 
-    amvnet.models.polar_net.joined = amvnet.models.range_net.joined = joined
+    amvnet.models.polar_net.joined = joined
+    amvnet.models.range_net.joined = joined
 
 
 def without_sharing() -> None:
-    """The head's first layer for every neighbour of every uncertain point."""
+    """Compute the head's first layer for every neighbour of every uncertain point."""
 
     def settle(head, points, f, g, index, near):  # type: ignore[no-untyped-def]
         table = point_table(points, f, g)
-        parts = zip(index.split(2048), near.split(2048), strict=True)
-        return torch.cat(
-            [head(*head_features(head.config, table, i, n)) for i, n in parts]
-        ).softmax(dim=1)
+        logits = []
+        for uncertain, neighbours in zip(index.split(2048), near.split(2048), strict=True):
+            point, rows = head_features(head.config, table, uncertain, neighbours)
+            logits.append(head(point, rows))
+        return torch.cat(logits).softmax(dim=1)
 
     amvnet.inference.timing.settle = settle
 
 
-TAKEN_AWAY: dict[str, tuple[Callable[[], None], ...]] = {
-    "as it is": (),
-    "freed memory goes back to the system": (without_memory,),
-    "batch norms not folded": (without_folding,),
-    "linear layers by matrix products": (without_convolved_rows,),
-    "every voxel scored, occupied or not": (without_occupied_pillars,),
-    "points of pillars encoded at once": (without_parts,),
-    "coarse maps upsampled before convolutions": (without_joining,),
-    "neighbours by SciPy": (without_pykdtree,),
-    "head's first layer once a neighbour": (without_sharing,),
+UNCHANGED = "as it is"
+ALL = "all of these"
+REMOVALS: dict[str, Callable[[], None]] = {
+    "freed memory goes back to the system": without_memory,
+    "batch norms not folded": without_folding,
+    "linear layers by matrix products": without_convolved_rows,
+    "every voxel scored, occupied or not": without_occupied_pillars,
+    "points of pillars encoded at once": without_parts,
+    "coarse maps upsampled before convolutions": without_joining,
+    "neighbours by SciPy": without_pykdtree,
+    "head's first layer once a neighbour": without_sharing,
 }
-TAKEN_AWAY["all of these"] = tuple(taken for some in TAKEN_AWAY.values() for taken in some)
 
 
-def measure(
-    variant: str, engine: str, scan: Path, runs: int, recipe: str | None, share: float | None
-) -> dict[str, float]:
-    """Median seconds of each stage and of SalsaNext's forward pass, in turn, in this process."""
-    for take_away in TAKEN_AWAY[variant]:
-        take_away()
-    segmenter = Segmenter(untrained(load_recipe(recipe)) if recipe else "sim-hdl64e")
-    use_engine(segmenter, engine)
-    salsanext, image = yardstick(engine)
+def remove_optimisations(variant: str) -> None:
+    for name, remove in REMOVALS.items():
+        if variant in (name, ALL):
+            remove()
+
+
+def measure(options: argparse.Namespace) -> dict[str, float]:
+    """Measure one variant in one engine, in this process.
+
+    Returns:
+        The median seconds of each stage and of SalsaNext's forward pass, timed in turn.
+    """
+    remove_optimisations(options.variant)
+    weights = untrained(load_recipe(options.recipe)) if options.recipe else "sim-hdl64e"
+    segmenter = Segmenter(weights)
+    use_engine(segmenter, options.engines)
+    salsanext, image = build_salsanext(options.engines)
+
+    times: list[dict[str, float]] = []
     with TemporaryDirectory() as folder:
         target = Path(folder) / "labels.label"
         job = Job(
-            segmenter, lambda: read_scan(scan), lambda ids: write_labels(target, ids), engine, share
+            segmenter,
+            read=lambda: read_scan(options.scan),
+            write=lambda ids: write_labels(target, ids),
+            name=options.engines,
+            share=options.uncertain,
         )
-        times: list[dict[str, float]] = []
-        for _ in range(runs + WARM_UP):
+        for _ in range(WARM_UP + options.runs):
             started = time.perf_counter()
             with torch.inference_mode():
                 salsanext(image)
             seconds = time.perf_counter() - started
+
             run = run_once(job)
-            rest = {"points": run.points, "uncertain": run.uncertain / run.points, "all": run.all}
-            times.append({**run.seconds, "SalsaNext": seconds, **rest})
-    median = {key: float(np.median([some[key] for some in times[WARM_UP:]])) for key in times[0]}
-    return {**median, "limit": product_limits("cpu")["float32"]}
+            figures = {**run.seconds, "SalsaNext": seconds, "all": run.all}
+            figures["points"] = run.points
+            figures["uncertain"] = run.uncertain / run.points
+            times.append(figures)
+
+    medians = {key: median_of(times[WARM_UP:], key) for key in times[0]}
+    medians["limit"] = product_limits("cpu")["float32"]
+    return medians
 
 
-def yardstick(engine: str) -> tuple[nn.Module, torch.Tensor]:
-    """SalsaNext in an engine, and an image for it."""
+def median_of(rows: Sequence[dict[str, float]], key: str) -> float:
+    return float(np.median([row[key] for row in rows]))
+
+
+def build_salsanext(engine: str) -> tuple[nn.Module, torch.Tensor]:
+    """Return SalsaNext in an engine, and an image for it."""
     net = SalsaNext().eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     image = torch.randn(1, CHANNELS, HEIGHT, WIDTH).contiguous(memory_format=torch.channels_last)
     if engine == "compile":
@@ -153,22 +182,14 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--engines", default="torch")
     parser.add_argument("--recipe")
-    parser.add_argument(
-        "--uncertain", type=float
-    )  # share of the points; by default as the weights find
+    # Share of the points; by default as the networks disagree
+    parser.add_argument("--uncertain", type=float)
     parser.add_argument("--short", action="store_true")  # the engines alone
-    parser.add_argument("--variant")  # of one process of ours
+    parser.add_argument("--variant")  # to measure in this process; for `run_variant`
     options = parser.parse_args()
+
     if options.variant:
-        what = (
-            options.variant,
-            options.engines,
-            options.scan,
-            options.runs,
-            options.recipe,
-            options.uncertain,
-        )
-        print(json.dumps(measure(*what)))
+        print(json.dumps(measure(options)))
         return
     with TemporaryDirectory() as folder:
         if options.scan is None:
@@ -177,44 +198,61 @@ def main() -> None:
 
 
 def compare(options: argparse.Namespace, scan: Path) -> None:
-    """Every variant of each engine in processes of their own, round by round; the tables of docs/performance.md."""
-    variants = [("as it is", engine) for engine in options.engines.split(",")]
-    variants += [(name, "torch") for name in TAKEN_AWAY if name != "as it is" and not options.short]
-    found: dict[tuple[str, str], list[dict[str, float]]] = {key: [] for key in variants}
+    """Measure every variant of each engine and print the tables of docs/performance.md.
+
+    Each measurement is a process of its own. The variants take turns, round by round.
+    """
+    variants = [(UNCHANGED, engine) for engine in options.engines.split(",")]
+    if not options.short:
+        variants += [(name, "torch") for name in (*REMOVALS, ALL)]
+
+    results: dict[tuple[str, str], list[dict[str, float]]] = {key: [] for key in variants}
     for number in range(options.rounds):
         for variant, engine in variants:
-            command = [sys.executable, __file__, "--scan", str(scan), "--runs", str(options.runs)]
-            command += ["--variant", variant, "--engines", engine]
-            command += ["--recipe", options.recipe] if options.recipe else []
-            command += (
-                ["--uncertain", str(options.uncertain)] if options.uncertain is not None else []
-            )
-            printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-            found[variant, engine].append(json.loads(printed.splitlines()[-1]))
+            results[variant, engine].append(run_variant(variant, engine, scan, options))
             print(f"round {number + 1}: {engine}, {variant}", file=sys.stderr)
-    whole = found[variants[0]]
+
+    first = results[variants[0]][0]
     print(
-        f"{whole[0]['points']:,.0f} points, {whole[0]['uncertain']:.1%} of them uncertain; ms, medians of rounds\n"
+        f"{first['points']:,.0f} points, {first['uncertain']:.1%} of them uncertain; "
+        "ms, medians of rounds\n"
     )
     columns = (*STAGES, "all", "fusion", "SalsaNext", "all / SalsaNext")
     print("| |", " | ".join(columns), "|\n|---|" + "---|" * len(columns))
-    for (variant, engine), rounds in found.items():
-        print(
-            f"| {variant if engine == 'torch' else engine} |",
-            " | ".join(cells(rounds, columns)),
-            "|",
-        )
+    for (variant, engine), rounds in results.items():
+        name = variant if engine == "torch" else engine
+        print(f"| {name} |", " | ".join(cells(rounds, columns)), "|")
+
+
+def run_variant(
+    variant: str, engine: str, scan: Path, options: argparse.Namespace
+) -> dict[str, float]:
+    """Run `measure` in a process of its own."""
+    command = [sys.executable, __file__, "--scan", str(scan), "--runs", str(options.runs)]
+    command += ["--variant", variant, "--engines", engine]
+    if options.recipe:
+        command += ["--recipe", options.recipe]
+    if options.uncertain is not None:
+        command += ["--uncertain", str(options.uncertain)]
+
+    output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    return json.loads(output.splitlines()[-1])
 
 
 def cells(rounds: list[dict[str, float]], columns: tuple[str, ...]) -> list[str]:
-    shown = {
-        key: f"{1e3 * np.median([r[key] for r in rounds]):.1f}"
-        for key in (*STAGES, MEAN, "all", "SalsaNext")
-    }
-    shares = [sum(r[stage] for stage in FUSION) / r["all"] for r in rounds]
-    ratios = [r["all"] / r["SalsaNext"] for r in rounds]
-    shown |= {"fusion": f"{np.median(shares):.1%}", "all / SalsaNext": f"{np.median(ratios):.2f}"}
-    return [shown[column] for column in columns]
+    """Return a row of the table, without its name."""
+    texts = {}
+    for key in (*STAGES, MEAN, "all", "SalsaNext"):
+        texts[key] = f"{1e3 * median_of(rounds, key):.1f}"
+
+    fusion_shares = []
+    ratios = []
+    for row in rounds:
+        fusion_shares.append(sum(row[stage] for stage in FUSION) / row["all"])
+        ratios.append(row["all"] / row["SalsaNext"])
+    texts["fusion"] = f"{np.median(fusion_shares):.1%}"
+    texts["all / SalsaNext"] = f"{np.median(ratios):.2f}"
+    return [texts[column] for column in columns]
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""SalsaNext's network by its paper's description, with random weights: a yardstick for times, not for accuracy.
+"""SalsaNext's network as its paper describes it, with random weights, to compare times with.
 
-Cortinhas, Tzelepis, Aksoy: SalsaNext: Fast, Uncertainty-aware Semantic Segmentation of LiDAR Point Clouds (2020).
+Cortinhas, Tzelepis, Aksoy: SalsaNext: Fast, Uncertainty-aware Semantic Segmentation of LiDAR Point
+Clouds (2020).
 """
 
 from __future__ import annotations
@@ -11,11 +12,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-CHANNELS, CLASSES = 5, 20
+CHANNELS = 5
+CLASSES = 20
 
 
 class Unit(nn.Sequential):
-    """Convolution, leaky ReLU, batch norm: in this order no norm can be folded into its convolution."""
+    """Convolution, leaky ReLU, batch norm.
+
+    In this order the norm cannot be folded into the convolution.
+    """
 
     def __init__(
         self, channels: int, out: int, kernel: int, padding: int = 0, dilation: int = 1
@@ -25,12 +30,13 @@ class Unit(nn.Sequential):
 
 
 class Context(nn.Module):
-    """The contextual module at full resolution: 3 x 3, and 3 x 3 dilated, beside a shortcut."""
+    """The contextual module at full resolution: 3 x 3 and 3 x 3 dilated, added to a shortcut."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
         self.shortcut = nn.Sequential(nn.Conv2d(channels, out, 1), nn.LeakyReLU(inplace=True))
-        self.near, self.far = Unit(out, out, 3, 1), Unit(out, out, 3, 2, 2)
+        self.near = Unit(out, out, 3, padding=1)
+        self.far = Unit(out, out, 3, padding=2, dilation=2)
 
     def forward(self, x: Tensor) -> Tensor:
         shortcut = self.shortcut(x)
@@ -38,15 +44,16 @@ class Context(nn.Module):
 
 
 class Dilated(nn.Module):
-    """Three convolutions one after the other (3 x 3, 3 x 3 dilated, 2 x 2 dilated), and a 1 x 1 over all three."""
+    """Three convolutions in sequence, and a 1 x 1 convolution over the results of all three.
+
+    The three are 3 x 3, 3 x 3 dilated, and 2 x 2 dilated.
+    """
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
-        self.first, self.second, self.third = (
-            Unit(channels, out, 3, 1),
-            Unit(out, out, 3, 2, 2),
-            Unit(out, out, 2, 1, 2),
-        )
+        self.first = Unit(channels, out, 3, padding=1)
+        self.second = Unit(out, out, 3, padding=2, dilation=2)
+        self.third = Unit(out, out, 2, padding=1, dilation=2)
         self.joined = Unit(3 * out, out, 1)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -56,7 +63,7 @@ class Dilated(nn.Module):
 
 
 class Encoder(nn.Module):
-    """A dilated block with a shortcut; its output before pooling goes to the decoder."""
+    """A dilated block with a shortcut. The decoder takes its output before pooling."""
 
     def __init__(self, channels: int, out: int) -> None:
         super().__init__()
@@ -68,27 +75,35 @@ class Encoder(nn.Module):
 
 
 class SalsaNext(nn.Module):
-    """Range image (B, 5, H, W) -> scores (B, 20, H, W).
+    """Range image (B, 5, H, W) -> logits (B, 20, H, W).
 
-    6.7 million parameters, and 62.3 billion multiply-adds at 64 x 2048, as the paper's.
+    Like the paper's network it has 6.7 million parameters, and takes 62.3 billion multiply-adds at
+    64 x 2048.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.context = nn.Sequential(Context(CHANNELS, 32), Context(32, 32), Context(32, 32))
-        widths = (32, 64, 128, 256, 256, 256)
-        self.encoders = nn.ModuleList(Encoder(a, b) for a, b in pairwise(widths))
-        # Of each decoder: channels from below after the pixel shuffle, of the skip, and out.
+
+        self.encoders = nn.ModuleList()
+        for channels, out in pairwise((32, 64, 128, 256, 256, 256)):
+            self.encoders.append(Encoder(channels, out))
+
+        # The channels from the coarser map after its pixel shuffle, of the skip, and of the output
         sizes = ((64, 256, 128), (32, 256, 128), (32, 128, 64), (16, 64, 32))
-        self.decoders = nn.ModuleList(Dilated(below + skip, out) for below, skip, out in sizes)
+        self.decoders = nn.ModuleList()
+        for coarse, skip, out in sizes:
+            self.decoders.append(Dilated(coarse + skip, out))
         self.scores = nn.Conv2d(32, CLASSES, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        x, skips = self.context(image), []
+        x = self.context(image)
+        skips = []
         for encoder in self.encoders[:-1]:
             full = encoder(x)
             skips.append(full)
             x = F.avg_pool2d(full, 3, 2, 1)
+
         x = self.encoders[-1](x)
         for decoder, skip in zip(self.decoders, reversed(skips), strict=True):
             x = decoder(torch.cat([F.pixel_shuffle(x, 2), skip], dim=1))

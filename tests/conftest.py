@@ -15,11 +15,12 @@ LASERS = 16
 
 
 def _random_scan(count: int, seed: int = 0) -> Scan:
-    """Points all around the sensor, some outside every field of view, with labels and rings."""
+    """Draw points all around the sensor, some outside any field of view, with labels and rings."""
     rng = np.random.default_rng(seed)
     xyz = rng.normal(0, (20, 20, 3), (count, 3))
     points = np.column_stack([xyz, rng.random(count)]).astype(np.float32)
-    return Scan(points, rng.integers(0, 20, count).astype(np.uint8), rng.integers(0, LASERS, count))
+    labels = rng.integers(0, 20, count).astype(np.uint8)
+    return Scan(points, labels, rng.integers(0, LASERS, count))
 
 
 @pytest.fixture
@@ -29,7 +30,7 @@ def random_scan() -> Callable[..., Scan]:
 
 @pytest.fixture(scope="session")
 def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
-    """Submissions to both benchmarks; nothing may change them."""
+    """Submissions to both benchmarks, which no test may change."""
     return {name: make(tmp_path_factory.mktemp(name)) for name, make in MAKERS.items()}
 
 

@@ -233,7 +233,7 @@ def test_a_broken_folder_is_one_line(
     folder: Path, breaks: Callable[[Path], object], word: str
 ) -> None:
     breaks(folder)
-    fails(lambda: OnnxSegmenter(folder), word, "export anew" if word != "height" else "height")
+    fails(lambda: OnnxSegmenter(folder), word, "export again" if word != "height" else "height")
 
 
 def test_wrong_scans_are_one_line(exported: dict[str, tuple[Weights, Path]]) -> None:

@@ -1,4 +1,4 @@
-"""The point head, the assertions, the merge and the whole of AMVNet equal plain loops over their formulas."""
+"""The point head, the assertions, the merge and all of AMVNet equal loops over their formulas."""
 
 from __future__ import annotations
 
@@ -12,16 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config.schema import (
-    AssertionConfig,
-    PointHeadConfig,
-)
-from amvnet.models.amvnet import (
-    arithmetic_mean,
-    geometric_mean,
-    maximum,
-    merge,
-)
+from amvnet.config.schema import AssertionConfig, PointHeadConfig
+from amvnet.models.amvnet import arithmetic_mean, geometric_mean, maximum, merge
 from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
 from amvnet.models.layers import fold_batch_norms
 from amvnet.models.point_head import (
@@ -34,28 +26,31 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid
 from amvnet.scan import Scan
 
-from fixtures.networks import GRID, TINY, K, point_head, whole_model
+from fixtures.networks import GRID, TINY, K, trained_head, whole_model
 
 RandomScan = Callable[..., Scan]
 
 
 def test_the_papers_point_head_has_18500_parameters_and_costs_one_gmac_for_10000_points() -> None:
-    head, width = point_head(PointHeadConfig(), 19), 2 * 19 + 4
+    head = trained_head(PointHeadConfig(), 19)
     assert sum(p.numel() for p in head.parameters()) == pytest.approx(18_500, abs=100)
+
+    width = 2 * 19 + 4
     with torch.inference_mode(), FlopCounterMode(display=False) as counter:
-        assert head(torch.zeros(10_000, width), torch.zeros(10_000, 15, width)).shape == (
-            10_000,
-            19,
-        )
+        logits = head(torch.zeros(10_000, width), torch.zeros(10_000, 15, width))
+    assert logits.shape == (10_000, 19)
     assert counter.get_total_flops() / 2 == pytest.approx(1e9, rel=0.05)
 
 
 def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> None:
-    head = point_head(TINY.point_head, K)
-    point, rows = torch.randn(5, 2 * K + 4), torch.randn(5, 3, 2 * K + 4)
+    head = trained_head(TINY.point_head, K)
+    point = torch.randn(5, 2 * K + 4)
+    rows = torch.randn(5, 3, 2 * K + 4)
     expected = head(point, rows)
+
     for order in permutations(range(3)):
         torch.testing.assert_close(head(point, rows[:, order]), expected)
+
     for neighbour in range(3):
         changed = rows.clone()
         changed[:, neighbour] += 10
@@ -65,34 +60,41 @@ def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> No
 
 def test_folded_batch_norms_change_no_output_of_the_point_head() -> None:
     torch.manual_seed(0)
-    head = point_head(TINY.point_head, K)
-    point, rows = torch.randn(20, 2 * K + 4), torch.randn(20, 3, 2 * K + 4)
-    head.train()(point, rows)  # statistics that are not the initial ones
+    head = trained_head(TINY.point_head, K)
+    point = torch.randn(20, 2 * K + 4)
+    rows = torch.randn(20, 3, 2 * K + 4)
+    head.train()(point, rows)  # changes the norms' initial statistics
     before = head.eval()(point, rows)
+
     fold_batch_norms(head)
     torch.testing.assert_close(head(point, rows), before, rtol=1e-4, atol=1e-5)
     assert not any(isinstance(m, nn.BatchNorm1d) for m in head.modules())
 
 
 def neighbours_by_loop(points: Tensor, own: int) -> list[tuple[float, int]]:
-    """(distance, index) of every other point, nearest first."""
-    rows = points[:, :3].tolist()
-    return sorted((math.dist(row, rows[own]), i) for i, row in enumerate(rows) if i != own)
+    """Return (distance, index) of every other point, nearest first."""
+    xyz = points[:, :3].tolist()
+    others = []
+    for index, position in enumerate(xyz):
+        if index != own:
+            others.append((math.dist(position, xyz[own]), index))
+    return sorted(others)
 
 
 @pytest.fixture(params=["pykdtree", "scipy"])
 def tree(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Both libraries that find neighbours."""
+    """Search for neighbours by each of the two libraries."""
     if request.param == "scipy":
         monkeypatch.setitem(sys.modules, "pykdtree.kdtree", None)  # as if it were not installed
 
 
 @pytest.mark.usefixtures("tree")
 def test_nearest_neighbours_equal_a_search_through_all_points() -> None:
-    points, index = torch.randn(200, 4), torch.tensor([0, 7, 199, 42])
-    found = nearest_neighbours(points, index, 15)
-    for own, row in zip(index.tolist(), found.tolist(), strict=True):
-        assert row == [i for _, i in neighbours_by_loop(points, own)[:15]]
+    points = torch.randn(200, 4)
+    index = torch.tensor([0, 7, 199, 42])
+    nearest = nearest_neighbours(points, index, 15)
+    for own, row in zip(index.tolist(), nearest.tolist(), strict=True):
+        assert row == [neighbour for _, neighbour in neighbours_by_loop(points, own)[:15]]
 
 
 @pytest.mark.parametrize("n", [1, 3, 12])
@@ -101,14 +103,15 @@ def test_nearest_neighbours_equal_a_search_through_all_points() -> None:
 def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(
     places: int, n: int
 ) -> None:
-    points = torch.randn(places, 4, generator=torch.Generator().manual_seed(0))[
-        torch.arange(40) % places
-    ]
+    positions = torch.randn(places, 4, generator=torch.Generator().manual_seed(0))
+    points = positions[torch.arange(40) % places]
     for own, row in enumerate(nearest_neighbours(points, torch.arange(40), n).tolist()):
         assert own not in row
         assert len(set(row)) == n
-        nearest = [distance for distance, _ in neighbours_by_loop(points, own)[:n]]
-        assert [math.dist(points[i, :3].tolist(), points[own, :3].tolist()) for i in row] == nearest
+
+        others = neighbours_by_loop(points, own)
+        distance_of = {index: distance for distance, index in others}
+        assert [distance_of[index] for index in row] == [distance for distance, _ in others[:n]]
 
 
 @pytest.mark.usefixtures("tree")
@@ -127,55 +130,61 @@ def test_a_lone_point_is_its_own_neighbour() -> None:
 
 @pytest.mark.parametrize("points", [0, 5])
 def test_without_an_uncertain_point_there_are_no_neighbours(points: int) -> None:
-    found = nearest_neighbours(torch.randn(points, 4), torch.zeros(0, dtype=torch.long), 3)
-    assert found.shape == (0, 3)
-    assert found.dtype == torch.long
+    nearest = nearest_neighbours(torch.randn(points, 4), torch.zeros(0, dtype=torch.long), 3)
+    assert nearest.shape == (0, 3)
+    assert nearest.dtype == torch.long
 
 
 def head_features_by_loop(
     points: Tensor, f: Tensor, g: Tensor, own: int
 ) -> tuple[list[float], list[list[float]]]:
-    """p_i and S_i of a point, with the neighbours of `TINY`."""
-    x, y, z, intensity = here = points[own].tolist()
+    """Return p_i and S_i of a point, with the configuration of `TINY`."""
+    x, y, z, intensity = points[own].tolist()
     scale = TINY.point_head.position_scale
     point = [*f[own].tolist(), *g[own].tolist(), x * scale, y * scale, z * scale, intensity]
-    near = [i for _, i in neighbours_by_loop(points, own)[: TINY.point_head.neighbours]]
-    offsets = {
-        k: [there - own_value for there, own_value in zip(points[k].tolist(), here, strict=True)]
-        for k in near
-    }
-    return point, [[*f[k].tolist(), *g[k].tolist(), *offsets[k]] for k in near]
+
+    rows = []
+    for _, k in neighbours_by_loop(points, own)[: TINY.point_head.neighbours]:
+        offset = (points[k] - points[own]).tolist()
+        rows.append([*f[k].tolist(), *g[k].tolist(), *offset])
+    return point, rows
 
 
 def test_head_features_equal_a_loop() -> None:
-    points, (f, g), index = torch.randn(12, 4) * 10, torch.rand(2, 12, K), torch.tensor([3, 11])
+    points = torch.randn(12, 4) * 10
+    f, g = torch.rand(2, 12, K)
+    index = torch.tensor([3, 11])
     near = nearest_neighbours(points, index, TINY.point_head.neighbours)
-    found = head_features(TINY.point_head, point_table(points, f, g), index, near)
-    expected = [head_features_by_loop(points, f, g, own) for own in index.tolist()]
-    torch.testing.assert_close(found[0], torch.tensor([point for point, _ in expected]))
-    torch.testing.assert_close(found[1], torch.tensor([rows for _, rows in expected]))
+    point, rows = head_features(TINY.point_head, point_table(points, f, g), index, near)
+
+    for i, own in enumerate(index.tolist()):
+        expected_point, expected_rows = head_features_by_loop(points, f, g, own)
+        torch.testing.assert_close(point[i], torch.tensor(expected_point))
+        torch.testing.assert_close(rows[i], torch.tensor(expected_rows))
 
 
 def random_scores(count: int = 200) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Two (P, K) scores, (P, 4) points and (P,) labels of which some are 0."""
+    """Draw two (P, K) probabilities, (P, 4) points and (P,) labels, some of them 0."""
     torch.manual_seed(0)
     f, g = (torch.randn(2, count, K) * 2).softmax(dim=2)
     return f, g, torch.randn(count, 4), torch.randint(0, K + 1, (count,))
 
 
 def cosine(a: list[float], b: list[float]) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True)) / (math.hypot(*a) * math.hypot(*b))
+    product = sum(x * y for x, y in zip(a, b, strict=True))
+    return product / (math.hypot(*a) * math.hypot(*b))
 
 
 def test_disagreement_equals_a_loop_of_its_formula() -> None:
     f, g, points, _ = random_scores()
-    expected = [cosine(a, b) <= 0.7 for a, b in zip(f.tolist(), g.tolist(), strict=True)]
+    expected = [cosine(f[i].tolist(), g[i].tolist()) <= 0.7 for i in range(len(f))]
     assert Disagreement(0.7)(f, g, points).tolist() == expected
     assert set(expected) == {False, True}
 
 
 def test_at_the_threshold_a_point_is_uncertain() -> None:
-    f, points = torch.eye(2), torch.zeros(2, 4)
+    f = torch.eye(2)
+    points = torch.zeros(2, 4)
     assert Disagreement(0.0)(f, f.flip(0), points).all()
     assert HighEntropy(0.0)(f, f, points).all()
     assert HighLoss(0.0)(f, f, points, torch.tensor([1, 2])).all()
@@ -183,21 +192,25 @@ def test_at_the_threshold_a_point_is_uncertain() -> None:
 
 def test_entropy_equals_a_loop_of_its_formula() -> None:
     f, g, points, _ = random_scores()
-    means = [
-        [(x + y) / 2 for x, y in zip(a, b, strict=True)]
-        for a, b in zip(f.tolist(), g.tolist(), strict=True)
-    ]
-    expected = [-sum(p * math.log(p) for p in mean) >= 0.9 for mean in means]
+    expected = []
+    for i in range(len(f)):
+        entropy = 0.0
+        for k in range(K):
+            mean = (f[i, k].item() + g[i, k].item()) / 2
+            entropy -= mean * math.log(mean)
+        expected.append(entropy >= 0.9)
+
     assert HighEntropy(0.9)(f, g, points).tolist() == expected
     assert set(expected) == {False, True}
 
 
 def test_loss_equals_a_loop_of_its_formula_and_leaves_unlabelled_points_certain() -> None:
     f, g, points, labels = random_scores()
-    expected = [
-        label > 0 and max(-math.log(a[label - 1]), -math.log(b[label - 1])) >= 0.9
-        for a, b, label in zip(f.tolist(), g.tolist(), labels.tolist(), strict=True)
-    ]
+    expected = []
+    for i, label in enumerate(labels.tolist()):
+        lower = min(f[i, label - 1].item(), g[i, label - 1].item())
+        expected.append(label > 0 and -math.log(lower) >= 0.9)
+
     assert HighLoss(0.9)(f, g, points, labels.to(torch.uint8)).tolist() == expected
     assert set(expected) == {False, True}
 
@@ -209,7 +222,8 @@ def test_the_loss_assertion_without_labels_raises() -> None:
 
 
 def test_assertions_stay_finite_at_certainty() -> None:
-    f, points = torch.eye(3), torch.zeros(3, 4)
+    f = torch.eye(3)
+    points = torch.zeros(3, 4)
     assert not HighEntropy(0.1)(f, f, points).any()
     assert HighLoss(0.1)(f, f.roll(1, 0), points, torch.tensor([1, 2, 3])).all()
 
@@ -225,7 +239,8 @@ def test_the_ensembles_equal_their_formulas() -> None:
     f, g, _, _ = random_scores(20)
     for i in range(20):
         for k in range(K):
-            a, b = f[i, k].item(), g[i, k].item()
+            a = f[i, k].item()
+            b = g[i, k].item()
             assert geometric_mean(f, g)[i, k].item() == pytest.approx(math.sqrt(a * b), rel=1e-6)
             assert arithmetic_mean(f, g)[i, k].item() == pytest.approx((a + b) / 2, rel=1e-6)
             assert maximum(f, g)[i, k].item() == max(a, b)
@@ -233,15 +248,17 @@ def test_the_ensembles_equal_their_formulas() -> None:
 
 def test_merging_takes_the_heads_scores_for_uncertain_points_only() -> None:
     f, g, points, _ = random_scores(20)
-    uncertain, h = points[:, 0] > 0, torch.rand(20, K)
-    found = merge(f, g, uncertain, h[uncertain])
+    uncertain = points[:, 0] > 0
+    h = torch.rand(20, K)
+    merged = merge(f, g, uncertain, h[uncertain])
+
     for i, from_head in enumerate(uncertain.tolist()):
-        assert torch.equal(found[i], h[i] if from_head else geometric_mean(f, g)[i])
+        assert torch.equal(merged[i], h[i] if from_head else geometric_mean(f, g)[i])
     assert torch.equal(merge(f, g, uncertain, None), geometric_mean(f, g))
 
 
 class Constant(nn.Module):
-    """Stands in for a network: the same scores everywhere, for each voxel or pixel."""
+    """A stand-in for a network, with the same logits for each pixel or voxel."""
 
     def __init__(self, *scores: float) -> None:
         super().__init__()
@@ -256,11 +273,13 @@ class Constant(nn.Module):
 def test_agreement_leaves_the_scores_alone(random_scan: RandomScan) -> None:
     model = whole_model()
     model.assertion = Disagreement()
-    model.range_net, model.polar_net = Constant(1, 0, 2, -1), Constant(1, 0, 2, -1)
-    found = model(PointBatch.of([random_scan(30)]))
-    assert not found.uncertain.any()
-    torch.testing.assert_close(found.merged, found.rv)
-    torch.testing.assert_close(found.rv[0], torch.tensor([1.0, 0, 2, -1]).softmax(0))
+    model.range_net = Constant(1, 0, 2, -1)
+    model.polar_net = Constant(1, 0, 2, -1)
+    scores = model(PointBatch.of([random_scan(30)]))
+    assert not scores.uncertain.any()
+    torch.testing.assert_close(scores.merged, scores.rv)
+    torch.testing.assert_close(scores.rv[0], torch.tensor([1.0, 0, 2, -1]).softmax(0))
+
     model.polar_net = Constant(1, 0, -2, -1)
     assert model(PointBatch.of([random_scan(30)])).uncertain.all()
 
@@ -270,22 +289,27 @@ def test_agreement_leaves_the_scores_alone(random_scan: RandomScan) -> None:
 def test_scoring_points_from_the_table_equals_scoring_their_features(
     uncertain: int, folded: bool
 ) -> None:
-    head = point_head(PointHeadConfig(), 19)
+    head = trained_head(PointHeadConfig(), 19)
     if folded:
         fold_batch_norms(head)
+
     points = torch.cat([20 * torch.randn(3000, 3), torch.rand(3000, 1)], dim=1)
-    table = point_table(points, *(3 * torch.randn(2, 3000, 19)).softmax(dim=2))
-    index, near = torch.randperm(3000)[:uncertain], torch.randint(3000, (uncertain, 15))
+    f, g = (3 * torch.randn(2, 3000, 19)).softmax(dim=2)
+    table = point_table(points, f, g)
+    index = torch.randperm(3000)[:uncertain]
+    near = torch.randint(3000, (uncertain, 15))
+
     expected = head(*head_features(head.config, table, index, near))
     torch.testing.assert_close(head.score(table, index, near), expected, rtol=1e-4, atol=1e-5)
 
 
-def test_only_the_points_that_are_asked_for_are_taken() -> None:
-    a, b = torch.tensor([7, 3]), torch.tensor([[3, 9, 9], [0, 7, 3]])
-    asked, (of_a, of_b) = select_used_points(12, a, b)
-    assert asked.tolist() == [0, 3, 7, 9]
-    assert torch.equal(asked[of_a], a)
-    assert torch.equal(asked[of_b], b)
+def test_only_the_points_that_occur_are_selected() -> None:
+    uncertain = torch.tensor([7, 3])
+    near = torch.tensor([[3, 9, 9], [0, 7, 3]])
+    selected, (uncertain_index, near_index) = select_used_points(12, uncertain, near)
+    assert selected.tolist() == [0, 3, 7, 9]
+    assert torch.equal(selected[uncertain_index], uncertain)
+    assert torch.equal(selected[near_index], near)
 
 
 @pytest.mark.parametrize("brightest", [0, 1, 5])
@@ -293,41 +317,42 @@ def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(
     random_scan: RandomScan, brightest: int
 ) -> None:
     batch = PointBatch.of([random_scan(30)])
-    model = whole_model(dull=batch.points[:, 3].sort(descending=True).values[brightest].item())
-    found = model(batch)
-    assert found.uncertain.sum() == brightest
+    intensity = batch.points[:, 3].sort(descending=True).values
+    model = whole_model(dull=intensity[brightest].item())
+    scores = model(batch)
+    assert scores.uncertain.sum() == brightest
+
     for i in range(30):
-        expected = torch.sqrt(found.rv[i] * found.bev[i])
-        if found.uncertain[i]:
-            point, rows = head_features_by_loop(batch.points, found.rv, found.bev, i)
+        expected = torch.sqrt(scores.rv[i] * scores.bev[i])
+        if scores.uncertain[i]:
+            point, rows = head_features_by_loop(batch.points, scores.rv, scores.bev, i)
             expected = model.point_head(torch.tensor([point]), torch.tensor([rows]))[0].softmax(0)
-        torch.testing.assert_close(found.merged[i], expected, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(scores.merged[i], expected, rtol=1e-4, atol=1e-5)
 
 
 def test_the_networks_scores_are_those_of_each_points_pixel_and_voxel(
     random_scan: RandomScan,
 ) -> None:
-    model, batch = whole_model(), PointBatch.of([random_scan(30)])
-    found, image, grid = (
-        model(batch),
-        model.range_view.project(batch),
-        model.polar_view.project(batch),
-    )
-    pixels, voxels = (
-        model.range_net(image.image)[0].flatten(1),
-        grid.to_map(model.polar_net(grid))[0].flatten(1),
-    )
+    model = whole_model()
+    batch = PointBatch.of([random_scan(30)])
+    scores = model(batch)
+    image = model.range_view.project(batch)
+    grid = model.polar_view.project(batch)
+    pixels = model.range_net(image.image)[0].flatten(1)
+    voxels = grid.to_map(model.polar_net(grid))[0].flatten(1)
+
     for i in range(30):
-        torch.testing.assert_close(found.rv[i], pixels[:, image.pixel[i]].softmax(0))
+        torch.testing.assert_close(scores.rv[i], pixels[:, image.pixel[i]].softmax(0))
         first = int(grid.voxel[i]) * K
-        torch.testing.assert_close(
-            found.bev[i], voxels[first : first + K, grid.pillar[i]].softmax(0)
-        )
+        expected = voxels[first : first + K, grid.pillar[i]].softmax(0)
+        torch.testing.assert_close(scores.bev[i], expected)
 
 
 def test_without_a_head_the_result_is_the_ensemble(random_scan: RandomScan) -> None:
-    model, batch = whole_model(), PointBatch.of([random_scan(30)])
+    model = whole_model()
+    batch = PointBatch.of([random_scan(30)])
     before = model(batch)
+
     model.point_head = None
     after = model(batch)
     assert torch.equal(after.merged, geometric_mean(before.rv, before.bev))
@@ -339,22 +364,23 @@ def test_without_a_head_the_result_is_the_ensemble(random_scan: RandomScan) -> N
 def test_a_batch_of_scans_equals_each_alone(
     random_scan: RandomScan, counts: tuple[int, ...]
 ) -> None:
-    model, scans = whole_model(), [random_scan(count, seed) for seed, count in enumerate(counts)]
+    model = whole_model()
+    scans = [random_scan(count, seed) for seed, count in enumerate(counts)]
     batch = PointBatch.of(scans)
     together = model(batch)
     assert together.uncertain.any()
-    for scan, where in zip(scans, batch.slices(), strict=True):
+
+    for scan, rows in zip(scans, batch.slices(), strict=True):
         alone = model(PointBatch.of([scan]))
         for name in ("rv", "bev", "merged", "uncertain"):
-            torch.testing.assert_close(
-                getattr(together, name)[where], getattr(alone, name), rtol=1e-4, atol=1e-5
-            )
+            values = getattr(together, name)[rows]
+            torch.testing.assert_close(values, getattr(alone, name), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3])
 def test_scans_with_fewer_points_than_neighbours_get_scores(
     random_scan: RandomScan, count: int
 ) -> None:
-    found = whole_model(dull=-1.0)(PointBatch.of([random_scan(count)]))
-    assert found.uncertain.sum() == count
-    torch.testing.assert_close(found.merged.sum(dim=1), torch.ones(count))
+    scores = whole_model(dull=-1.0)(PointBatch.of([random_scan(count)]))
+    assert scores.uncertain.sum() == count
+    torch.testing.assert_close(scores.merged.sum(dim=1), torch.ones(count))

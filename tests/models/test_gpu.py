@@ -1,4 +1,4 @@
-"""What a GPU does otherwise, on tensors of the CPU where there is none: neighbours by blocks, streams, precision."""
+"""What differs on a GPU: neighbours by blocks, streams, precision. Without one, tested on a CPU."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,15 @@ from torch import Tensor, nn
 
 from amvnet import Scan, Segmenter, simulate
 from amvnet.data.scan_files import read_scan
+from amvnet.inference.journal import Journal
 from amvnet.inference.pipeline import AHEAD, Task, stream
+from amvnet.inference.predict import ScanAdapter
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import merge
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
 from amvnet.models.precision import InPrecision
-from amvnet.models.streams import SideBySide
+from amvnet.models.streams import Score, SideBySide
 from amvnet.models.views.points import PointBatch
 from amvnet.weights.file import save
 
@@ -37,8 +40,8 @@ DEVICES = [
 
 
 @pytest.fixture(scope="module")
-def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
-    """A simulated scan of an HDL-64E."""
+def simulated_scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    """Simulate a scan of an HDL-64E."""
     folder = tmp_path_factory.mktemp("streets")
     simulate(folder, scans=1, seed=3)
     return read_scan(folder / "sequences/00/velodyne/000000.bin")
@@ -47,53 +50,61 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
 def clouds() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     random = rng.normal(0, (20, 20, 2), (5000, 3))
-    clusters = rng.normal(0, 100, (20, 3))[rng.integers(0, 20, 5000)] + rng.normal(
-        0, 0.01, (5000, 3)
-    )
+    centres = rng.normal(0, 100, (20, 3))[rng.integers(0, 20, 5000)]
+    clusters = rng.normal(0, 0.01, (5000, 3))
     line = np.zeros((4000, 3))
     line[:, 1] = rng.random(4000) * 50
     sphere = random / np.linalg.norm(random, axis=1, keepdims=True)
+    far = random[2000:4000] + np.array([9900, -9900, 0])
+
     return {
         "random": random,
-        "clusters": clusters,
+        "clusters": centres + clusters,
         "on a line": line,
         "each thrice": np.repeat(random[:1500], 3, axis=0),
         "each eighty times": np.repeat(random[:40], 80, axis=0),
         "in one place": np.ones((3000, 3)),
         "on a lattice": np.stack(np.meshgrid(*[np.arange(16.0)] * 3), axis=-1).reshape(-1, 3),
-        "10 km apart": np.concatenate(
-            [random[:2000], random[2000:4000] + np.array([9900, -9900, 0]), [[-9999, 9999, 9999]]]
-        ),
-        "nearly in one place": 9000
-        + rng.normal(0, 0.004, (3000, 3)),  # where float32 knows a millimetre
-        "hardly apart": rng.normal(0, 1e-22, (3000, 3)),  # whose squares are 0 in float32
-        # Nearly as far from the centre, each of them: float32 does not know which are the nearest.
+        "10 km apart": np.concatenate([random[:2000], far, [[-9999, 9999, 9999]]]),
+        # At 9 km float32 resolves a millimetre.
+        "nearly in one place": 9000 + rng.normal(0, 0.004, (3000, 3)),
+        # The squares of these distances are 0 in float32.
+        "hardly apart": rng.normal(0, 1e-22, (3000, 3)),
+        # Nearly equally far from the centre: float32 cannot tell which are the nearest.
         "on a sphere": np.concatenate([np.zeros((10, 3)), sphere[:300], random[:2000] * 10]),
         "few": random[:40],
     }
 
 
 def check_nearest(xyz: Tensor, own: Tensor, n: int = N) -> None:
-    """The distances are those of the n nearest others by a k-d tree in double precision, and the points different."""
-    found = nearest_others_by_blocks(xyz, own, n).cpu().numpy()
-    points, mine = xyz.double().cpu().numpy(), own.cpu().numpy()
-    distance = np.linalg.norm(points[found] - points[mine][:, None], axis=2)
+    """Check the neighbours by blocks against a k-d tree in double precision.
+
+    The distances have to be those of the n nearest others, and the neighbours different points.
+    """
+    nearest = nearest_others_by_blocks(xyz, own, n).cpu().numpy()
+    index = own.cpu().numpy()
+    points = xyz.double().cpu().numpy()
     others = min(n, len(points) - 1)
-    # Of the nearest, itself among them, one has the distance 0: itself, or who stands where it does.
-    expected = cKDTree(points).query(points[mine], k=others + 1)[0][:, 1:]
+
+    # The tree's first result has the distance 0: it is the point itself, or one in its place.
+    distance = np.linalg.norm(points[nearest] - points[index][:, None], axis=2)
+    expected = cKDTree(points).query(points[index], k=others + 1)[0][:, 1:]
     np.testing.assert_allclose(distance[:, :others], expected, rtol=1e-12, atol=0)
-    assert not (found[:, :others] == mine[:, None]).any()
-    assert all(len(set(row)) == others for row in found[:, :others].tolist())
-    assert (found[:, others:] == found[:, [others - 1]]).all()
+
+    assert not (nearest[:, :others] == index[:, None]).any()
+    assert (np.diff(np.sort(nearest[:, :others], axis=1), axis=1) > 0).all()
+    assert (nearest[:, others:] == nearest[:, [others - 1]]).all()
+
+
+def permutation(count: int) -> Tensor:
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("name", clouds())
 def test_neighbours_by_blocks_are_the_nearest_others(name: str, device: str) -> None:
     xyz = torch.from_numpy(clouds()[name].astype(np.float32)).to(device)
-    check_nearest(
-        xyz, torch.randperm(len(xyz), generator=torch.Generator().manual_seed(0)).to(device)[:1000]
-    )
+    check_nearest(xyz, permutation(len(xyz)).to(device)[:1000])
 
 
 @pytest.mark.parametrize("device", DEVICES)
@@ -105,11 +116,8 @@ def test_neighbours_by_blocks_of_any_number_of_points(points: int, device: str) 
 
 @pytest.mark.parametrize("n", [1, 40, 500, 2000])
 def test_any_number_of_neighbours_by_blocks(n: int) -> None:
-    check_nearest(
-        torch.randn(1500, 3, generator=torch.Generator().manual_seed(0)),
-        torch.arange(0, 1500, 50),
-        n,
-    )
+    xyz = torch.randn(1500, 3, generator=torch.Generator().manual_seed(0))
+    check_nearest(xyz, torch.arange(0, 1500, 50), n)
 
 
 def test_neighbours_by_blocks_keep_to_the_rules_for_few_points() -> None:
@@ -119,35 +127,34 @@ def test_neighbours_by_blocks_keep_to_the_rules_for_few_points() -> None:
         [3, 2, 0, 0, 0, 0],
     ]
     assert nearest_others_by_blocks(torch.ones(1, 3), torch.tensor([0]), 3).tolist() == [[0, 0, 0]]
-    assert nearest_others_by_blocks(
-        torch.randn(5, 3), torch.zeros(0, dtype=torch.long), 3
-    ).shape == (0, 3)
+
+    nobody = torch.zeros(0, dtype=torch.long)
+    assert nearest_others_by_blocks(torch.randn(5, 3), nobody, 3).shape == (0, 3)
 
 
 def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compared(
-    scan: Scan, monkeypatch: pytest.MonkeyPatch
+    simulated_scan: Scan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    xyz = torch.from_numpy(scan.points[:, :3].copy())
-    own = torch.randperm(len(xyz), generator=torch.Generator().manual_seed(0))[:4000]
-    asked: list[int] = []
-    search = block_search._among_all
-    monkeypatch.setattr(
-        block_search,
-        "_among_all",
-        lambda xyz, own, n: (asked.append(len(own)), search(xyz, own, n))[1],
-    )
-    found = nearest_others_by_blocks(xyz, own, N)
-    equal = np.sort(found.numpy(), axis=1) == np.sort(
-        nearest_others(xyz.numpy(), own.numpy(), N), axis=1
-    )
-    assert equal.all(axis=1).mean() > 0.999  # pykdtree rounds distances to float32
+    xyz = torch.from_numpy(simulated_scan.points[:, :3].copy())
+    own = permutation(len(xyz))[:4000]
+    searched_among_all: list[int] = []
+    nearest_of_all = block_search._nearest_of_all
+
+    def counted(xyz: Tensor, own: Tensor, n: int) -> Tensor:
+        searched_among_all.append(len(own))
+        return nearest_of_all(xyz, own, n)
+
+    monkeypatch.setattr(block_search, "_nearest_of_all", counted)
+    by_blocks = np.sort(nearest_others_by_blocks(xyz, own, N).numpy(), axis=1)
+    by_tree = np.sort(nearest_others(xyz.numpy(), own.numpy(), N), axis=1)
+    # pykdtree rounds distances to float32.
+    assert (by_blocks == by_tree).all(axis=1).mean() > 0.999
+
+    # Distances for each point: to all boxes, to points in blocks, and for some to all points
     blocks = split_into_blocks(xyz)
-    compared = (
-        len(blocks.index)
-        + block_search.NEAREST * blocks.index.shape[1]
-        + sum(asked) / len(own) * len(xyz)
-    )
-    assert compared < 0.03 * len(xyz)
+    in_blocks = block_search.NEAREST * blocks.index.shape[1]
+    in_all = sum(searched_among_all) / len(own) * len(xyz)
+    assert len(blocks.index) + in_blocks + in_all < 0.03 * len(xyz)
 
 
 def test_parts_of_little_memory_change_no_neighbour(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,59 +167,70 @@ def test_parts_of_little_memory_change_no_neighbour(monkeypatch: pytest.MonkeyPa
 def test_blocks_hold_every_point_once_within_their_boxes() -> None:
     xyz = torch.randn(3001, 3)
     blocks = split_into_blocks(xyz)
-    kept = blocks.index < len(xyz)
-    assert torch.equal(blocks.index[kept].sort().values, torch.arange(3001))
+    used = blocks.index < len(xyz)
+    assert torch.equal(blocks.index[used].sort().values, torch.arange(3001))
     assert blocks.index.shape[1] <= block_search.BLOCK
+
     points = blocks.points.transpose(1, 2)  # (M, B, 3)
-    assert torch.equal(points[kept], xyz[blocks.index[kept]])
-    assert points[~kept].isinf().all()
+    assert torch.equal(points[used], xyz[blocks.index[used]])
+    assert points[~used].isinf().all()
     inside = (points >= blocks.low[:, None]) & (points <= blocks.high[:, None])
-    assert inside.all(dim=2)[kept].all()
+    assert inside.all(dim=2)[used].all()
 
 
-class Streams:
-    """Stands in for CUDA's streams: keeps what is done, in order."""
+@dataclass
+class StandInStream:
+    """A stand-in for a CUDA stream, which adds its waits to a log."""
+
+    name: str
+    log: list[str]
+
+    def wait_stream(self, other: StandInStream) -> None:
+        self.log.append(f"{self.name} waits for {other.name}")
+
+
+class StandInCuda:
+    """A stand-in for CUDA's streams; the log says what is done, in order."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.done: list[str] = []
-        self.current = "main"
-        monkeypatch.setattr(torch.cuda, "Stream", lambda device: Streams.One(self, "side"))
-        monkeypatch.setattr(
-            torch.cuda, "current_stream", lambda device: Streams.One(self, self.current)
-        )
-        monkeypatch.setattr(torch.cuda, "stream", self.on)
-        monkeypatch.setattr(
-            Tensor, "record_stream", lambda _, stream: self.done.append(f"kept for {stream.name}")
-        )
-
-    class One:
-        def __init__(self, streams: Streams, name: str) -> None:
-            self.streams, self.name = streams, name
-
-        def wait_stream(self, other: Streams.One) -> None:
-            self.streams.done.append(f"{self.name} waits for {other.name}")
+        self.log: list[str] = []
+        self.current = StandInStream("main", self.log)
+        monkeypatch.setattr(torch.cuda, "Stream", lambda device: StandInStream("side", self.log))
+        monkeypatch.setattr(torch.cuda, "current_stream", lambda device: self.current)
+        monkeypatch.setattr(torch.cuda, "stream", self.switch_to)
+        monkeypatch.setattr(Tensor, "record_stream", self.record_stream)
 
     @contextlib.contextmanager
-    def on(self, stream: Streams.One) -> Iterator[None]:
-        self.current, before = stream.name, self.current
+    def switch_to(self, stream: StandInStream) -> Iterator[None]:
+        before = self.current
+        self.current = stream
         yield
         self.current = before
 
+    def record_stream(self, stream: StandInStream) -> None:
+        self.log.append(f"kept for {stream.name}")
+
+    def logged(self, name: str, score: Score) -> Score:
+        """Return the scorer such that it also logs its name and stream."""
+
+        def score_and_log(batch: PointBatch) -> Tensor:
+            self.log.append(f"{name} on {self.current.name}")
+            return score(batch)
+
+        return score_and_log
+
 
 def test_side_by_side_waits_before_and_after(monkeypatch: pytest.MonkeyPatch) -> None:
-    streams = Streams(monkeypatch)
-    model, batch = whole_model(), PointBatch.of([Scan(street(0)[0])])
+    cuda = StandInCuda(monkeypatch)
+    model = whole_model()
+    batch = PointBatch.of([Scan(street(0)[0])])
     before = model(batch)
+
     for name in ("score_range_view", "score_polar_view"):
-        score = getattr(model, name)
-        monkeypatch.setattr(
-            model,
-            name,
-            lambda b, s=score, n=name: (streams.done.append(f"{n} on {streams.current}"), s(b))[1],
-        )
+        monkeypatch.setattr(model, name, cuda.logged(name, getattr(model, name)))
     model.run = SideBySide("cuda")
     after = model(batch)
-    assert streams.done == [
+    assert cuda.log == [
         "side waits for main",
         "score_range_view on side",
         "score_polar_view on main",
@@ -224,19 +242,20 @@ def test_side_by_side_waits_before_and_after(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_the_merge_of_a_gpu_is_that_of_a_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
     f, g = torch.rand(2, 30, 4)
-    uncertain = torch.arange(30) % 3 == 1
     h = torch.rand(10, 4)
-    expected = [merge(f, g, uncertain, h), merge(f, g, torch.zeros(30, dtype=torch.bool), h[:0])]
+    uncertain = torch.arange(30) % 3 == 1
+    nothing = torch.zeros(30, dtype=torch.bool)
+    some_refined = merge(f, g, uncertain, h)
+    none_refined = merge(f, g, nothing, h[:0])
+
     monkeypatch.setattr(Tensor, "is_cpu", False)
-    found = [merge(f, g, uncertain, h), merge(f, g, torch.zeros(30, dtype=torch.bool), h[:0])]
-    assert all(map(torch.equal, found, expected))
+    assert torch.equal(merge(f, g, uncertain, h), some_refined)
+    assert torch.equal(merge(f, g, nothing, h[:0]), none_refined)
 
 
-def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points(scan: Scan) -> None:
-    exact, lower = (
-        Segmenter("sim-hdl64e")(scan),
-        Segmenter("sim-hdl64e", precision="bfloat16")(scan),
-    )
+def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points(simulated_scan: Scan) -> None:
+    exact = Segmenter("sim-hdl64e")(simulated_scan)
+    lower = Segmenter("sim-hdl64e", precision="bfloat16")(simulated_scan)
     for name in ("scores", "rv", "bev"):
         assert getattr(lower, name).dtype == np.float32
         assert not np.array_equal(getattr(lower, name), getattr(exact, name))
@@ -244,85 +263,89 @@ def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points(scan: Scan) -
     assert (lower.uncertain == exact.uncertain).mean() > 0.97
 
 
-class Seen(nn.Module):
-    """Says in which precision it multiplied, and whether TF32 was allowed."""
+class PrecisionProbe(nn.Module):
+    """Records in which precision it multiplied, and whether TF32 was allowed."""
 
     def forward(self, x: Tensor) -> Tensor:
-        self.kind, self.tf32 = (x @ x).dtype, torch.backends.cudnn.allow_tf32
+        self.dtype = (x @ x).dtype
+        self.tf32 = torch.backends.cudnn.allow_tf32
         return x @ x
 
 
 @pytest.mark.parametrize(
-    ("precision", "kind"), [("float32", torch.float32), ("bfloat16", torch.bfloat16)]
+    ("precision", "dtype"), [("float32", torch.float32), ("bfloat16", torch.bfloat16)]
 )
 def test_a_network_multiplies_in_its_precision_and_scores_in_float32(
-    precision: str, kind: torch.dtype
+    precision: str, dtype: torch.dtype
 ) -> None:
-    net = Seen()
+    net = PrecisionProbe()
     assert InPrecision(net, "cpu", precision)(torch.ones(2, 2)).dtype == torch.float32
-    assert net.kind == kind
+    assert net.dtype == dtype
     assert not torch.is_autocast_enabled("cpu")
 
 
-@pytest.mark.parametrize(("asked", "allowed"), [("highest", False), ("high", True)])
-def test_tf32_is_used_only_where_it_was_asked_for(asked: str, allowed: bool) -> None:
-    net, before, convolutions = (
-        Seen(),
-        torch.get_float32_matmul_precision(),
-        torch.backends.cudnn.allow_tf32,
-    )
-    torch.set_float32_matmul_precision(asked)
+@pytest.mark.parametrize(("setting", "allowed"), [("highest", False), ("high", True)])
+def test_tf32_is_used_only_if_it_was_asked_for(setting: str, allowed: bool) -> None:
+    net = PrecisionProbe()
+    before = torch.get_float32_matmul_precision()
+    tf32_before = torch.backends.cudnn.allow_tf32
+
+    torch.set_float32_matmul_precision(setting)
     try:
         InPrecision(net, "cpu", "float32")(torch.ones(2, 2))
     finally:
         torch.set_float32_matmul_precision(before)
+
     assert net.tf32 == allowed
-    assert torch.backends.cudnn.allow_tf32 == convolutions
+    assert torch.backends.cudnn.allow_tf32 == tf32_before
 
 
 @pytest.mark.parametrize("precision", ["float16", "float64", ""])
-def test_a_precision_that_a_cpu_has_not_is_refused(precision: str) -> None:
-    fails(lambda: Segmenter(fresh_weights(), precision=precision), "expected", precision)  # type: ignore[arg-type]
+def test_a_precision_that_a_cpu_lacks_is_refused(precision: str) -> None:
+    weights = fresh_weights()
+    fails(lambda: Segmenter(weights, "cpu", precision=precision), "expected", precision)
 
 
 def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
-    scans = [Scan(street(place, 100 + place)[0]) for place in range(3)]
+    scans = [Scan(street(seed, 100 + seed)[0]) for seed in range(3)]
     scans[1].points[7] = np.nan
     batch = PointBatch.of(scans)
+
     expected = [slice(0, 100), slice(100, 200), slice(200, 302)]
-    assert batch.slices() == batch.to("cpu").slices() == expected
+    assert batch.slices() == expected
+    assert batch.to("cpu").slices() == expected
     assert PointBatch(batch.points, batch.scan, 3).slices() == expected
-
-
-def near(a: object, b: object) -> None:
-    np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
 def test_several_scans_at_a_time_are_segmented_as_each_alone() -> None:
     segmenter = Segmenter(fresh_weights())
-    scans = [Scan(street(place, 300 + 50 * place)[0], name=str(place)) for place in range(3)]
+    scans = [Scan(street(seed, 300 + 50 * seed)[0], name=str(seed)) for seed in range(3)]
     scans[1].points[[0, 9]] = np.nan
-    for together, alone in zip(segmenter.many(scans), map(segmenter, scans), strict=True):
+
+    for scan, together in zip(scans, segmenter.many(scans), strict=True):
+        alone = segmenter(scan)
         assert (together.labels == alone.labels).mean() > 0.995
-        assert np.array_equal(together.labels == 0, alone.labels == 0)
-        near(together.rv, alone.rv)
-        near(together.bev, alone.bev)
-        assert np.array_equal(
-            together.labels[together.labels > 0], together.scores.argmax(1)[together.labels > 0] + 1
-        )
+        np.testing.assert_allclose(together.rv, alone.rv, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(together.bev, alone.bev, rtol=1e-4, atol=1e-5)
+
+        labelled = together.labels > 0
+        assert np.array_equal(labelled, alone.labels > 0)
+        best = together.scores.argmax(axis=1) + 1
+        assert np.array_equal(together.labels[labelled], best[labelled])
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights, seven lone scans of which two are broken, one has no finite point, and a data set."""
+    """Write weights, a dataset, and seven lone scans, one broken and one without a finite point."""
     root = tmp_path_factory.mktemp("world")
     save(fresh_weights(), root / "w.safetensors")
+    make_streets(root / "data")
+
     (root / "scans").mkdir()
-    for place in range(7):
-        street(place, 400 + 10 * place)[0].tofile(root / f"scans/{place:06d}.bin")
+    for seed in range(7):
+        street(seed, 400 + 10 * seed)[0].tofile(root / f"scans/{seed:06d}.bin")
     (root / "scans/000002.bin").write_bytes(b"123")
     np.full((5, 4), np.nan, np.float32).tofile(root / "scans/000004.bin")
-    make_streets(root / "data")
     return root
 
 
@@ -334,23 +357,27 @@ def test_predicting_three_at_a_time_writes_what_one_at_a_time_does(
 ) -> None:
     errors = []
     for batch in (1, 3):
-        names = [world / name for name in inputs]
-        arguments = (*names, "--weights", world / "w.safetensors", "--scores", "--batch", batch)
-        found, error = run_cli("predict", *arguments, "--out", tmp_path / str(batch))
-        assert found == code
+        paths = [world / name for name in inputs]
+        options = ("--weights", world / "w.safetensors", "--scores", "--batch", batch)
+        exit_code, error = run_cli("predict", *paths, *options, "--out", tmp_path / str(batch))
+        assert exit_code == code
         errors.append(sorted(error.splitlines()))
     assert errors[0] == errors[1]
+
     names = files(tmp_path / "1")
     assert names == files(tmp_path / "3")
-    labels = [name for name in names if name.endswith(".label")]
-    assert len(labels) == written
-    for name in labels:
-        one, three = (np.fromfile(tmp_path / batch / name, np.uint32) for batch in "13")
-        assert (one == three).mean() > 0.99
-    for name in names - set(labels):
-        one, three = (np.load(tmp_path / batch / name) for batch in "13")
-        np.testing.assert_allclose(one["rv"], three["rv"], atol=2e-3)  # float16
-        np.testing.assert_allclose(one["bev"], three["bev"], atol=2e-3)
+    assert sum(name.endswith(".label") for name in names) == written
+    for name in names:
+        first = tmp_path / "1" / name
+        second = tmp_path / "3" / name
+        if name.endswith(".label"):
+            equal = np.fromfile(first, np.uint32) == np.fromfile(second, np.uint32)
+            assert equal.mean() > 0.99
+            continue
+
+        for view in ("rv", "bev"):
+            scores = np.load(first)[view]
+            np.testing.assert_allclose(scores, np.load(second)[view], atol=2e-3)  # float16
 
 
 def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_precision(
@@ -358,9 +385,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
 ) -> None:
     arguments = ("predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path)
     assert run_cli(*arguments) == (0, "")
-    whole = {name: (tmp_path / name).read_bytes() for name in files(tmp_path)}
-    from amvnet.inference.journal import Journal
-    from amvnet.inference.predict import ScanAdapter
+    names = files(tmp_path)
 
     weights = Segmenter(world / "w.safetensors").weights
     settings = {
@@ -372,56 +397,62 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
         "format": "label",
     }
     Journal(tmp_path, settings)
+
     code, error = run_cli(*arguments, "--resume", "--precision", "bfloat16")
     assert (code, error.count("\n")) == (2, 1)
     assert "precision" in error
     assert run_cli(*arguments, "--resume", "--batch", 2) == (0, "")
-    assert files(tmp_path) == set(whole)
+    assert files(tmp_path) == names
 
 
 @pytest.mark.parametrize("batch", [0, -1])
 def test_a_batch_of_no_scans_is_refused(world: Path, tmp_path: Path, batch: int) -> None:
-    code, error = run_cli(
-        "predict",
-        world / "data",
-        "--weights",
-        world / "w.safetensors",
-        "--out",
-        tmp_path,
-        "--batch",
-        batch,
-    )
+    arguments = ("predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path)
+    code, error = run_cli(*arguments, "--batch", batch)
     assert (code, error.count("\n")) == (2, 1)
     assert not files(tmp_path)
+
+
+class HeldScans:
+    """The scans of tasks that are read but not yet written."""
+
+    def __init__(self) -> None:
+        self.numbers: set[int] = set()
+        self.most = 0
+
+    def task(self, seed: int, segmenter: Segmenter) -> Task:
+        def read() -> Scan:
+            self.numbers.add(seed)
+            self.most = max(self.most, len(self.numbers))
+            return Scan(street(seed)[0])
+
+        def write(_: object) -> Path:
+            self.numbers.remove(seed)
+            return Path()
+
+        return Task(str(seed), read, segmenter, write, Path())
 
 
 def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    held, most, sizes = set(), [], []
+    held = HeldScans()
+    sizes = []
     segmenter = Segmenter(fresh_weights())
     many = Segmenter.many
-    monkeypatch.setattr(
-        Segmenter, "many", lambda self, scans: (sizes.append(len(scans)), many(self, scans))[1]
-    )
 
-    def task(place: int) -> Task:
-        def read() -> Scan:
-            held.add(place)
-            most.append(len(held))
-            return Scan(street(place)[0])
+    def counted(self: Segmenter, scans: list[Scan]) -> object:
+        sizes.append(len(scans))
+        return many(self, scans)
 
-        return Task(str(place), read, segmenter, lambda _: (held.remove(place), Path())[1], Path())
-
-    done = [
-        one.name
-        for one, fault in stream([task(place) for place in range(23)], False, False, 4)
-        if not fault
-    ]
-    assert done == [str(place) for place in range(23)]
+    monkeypatch.setattr(Segmenter, "many", counted)
+    tasks = [held.task(seed, segmenter) for seed in range(23)]
+    results = list(stream(tasks, False, False, 4))
+    assert [task.name for task, _ in results] == [str(seed) for seed in range(23)]
+    assert not any(fault for _, fault in results)
     assert sizes == [4, 4, 4, 4, 4, 3]
-    assert max(most) <= 2 * 4 + AHEAD + 2
-    assert not held
+    assert held.most <= 2 * 4 + AHEAD + 2
+    assert not held.numbers
 
 
 @pytest.mark.parametrize("verb", ["predict", "evaluate", "bench"])
@@ -431,15 +462,14 @@ def test_every_verb_that_segments_takes_a_precision(world: Path, tmp_path: Path,
         "evaluate": (world / "data",),
         "bench": ("--runs", 1, "--scan", world / "scans/000000.bin"),
     }
-    assert run_cli(
-        verb, *inputs[verb], "--weights", world / "w.safetensors", "--precision", "bfloat16"
-    ) == (0, "")
+    options = ("--weights", world / "w.safetensors", "--precision", "bfloat16")
+    assert run_cli(verb, *inputs[verb], *options) == (0, "")
 
 
 def test_the_commands_of_the_page_run(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a CPU; the benchmark, which is for other places, in its smallest size."""
+    """Run them on a CPU, and the benchmark in its smallest size."""
     monkeypatch.chdir(world)
     stand_ins = {
         "cuda": "cpu",
@@ -447,24 +477,24 @@ def test_the_commands_of_the_page_run(
         "runs/kitti": "w.safetensors",
         "predictions": str(tmp_path),
     }
-    *ours, _, _, smallest = commands_of("docs/gpu.md")
-    assert [words[:2] for words in ours] == [["amvnet", "predict"], ["amvnet", "evaluate"]]
-    for words in ours:
+    *commands, _, _, benchmark = commands_of("docs/gpu.md")
+    assert [words[:2] for words in commands] == [["amvnet", "predict"], ["amvnet", "evaluate"]]
+    for words in commands:
         assert run_cli(*[stand_ins.get(word, word) for word in words[1:]]) == (0, "")
-    script = Path(__file__).parents[2] / smallest[1]
-    less = ["--batch", "1,2", "--part", "1", "--scan", "scans/000000.bin"]
-    done = subprocess.run(
-        [sys.executable, script, *smallest[2:], *less], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert [line.split()[0] for line in done.stdout.splitlines()].count("training") == 2
+
+    script = Path(__file__).parents[2] / benchmark[1]
+    options = ["--batch", "1,2", "--part", "1", "--scan", "scans/000000.bin"]
+    command = [sys.executable, script, *benchmark[2:], *options]
+    process = subprocess.run(command, capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.count("\ntraining ") == 2
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 @pytest.mark.parametrize("precision", ["float32", "bfloat16", "float16"])
-def test_a_gpu_gives_the_labels_of_a_cpu(scan: Scan, precision: str) -> None:
-    expected = Segmenter("sim-hdl64e")(scan)
-    for found in Segmenter("sim-hdl64e", "cuda", precision=precision).many([scan, scan]):  # type: ignore[arg-type]
-        assert (found.labels == expected.labels).mean() > (
-            0.999 if precision == "float32" else 0.98
-        )
+def test_a_gpu_gives_the_labels_of_a_cpu(simulated_scan: Scan, precision: str) -> None:
+    expected = Segmenter("sim-hdl64e")(simulated_scan)
+    segmenter = Segmenter("sim-hdl64e", "cuda", precision=precision)  # type: ignore[arg-type]
+    least = 0.999 if precision == "float32" else 0.98
+    for segmentation in segmenter.many([simulated_scan, simulated_scan]):
+        assert (segmentation.labels == expected.labels).mean() > least

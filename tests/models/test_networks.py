@@ -1,4 +1,4 @@
-"""Both networks pass one suite; their layers equal plain loops over their formulas."""
+"""Both networks pass one suite, and their layers equal plain loops over their formulas."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config.schema import (
-    RangeNetConfig,
-)
+from amvnet.config.schema import RangeNetConfig
 from amvnet.models.layers import (
     AzimuthGRU,
     PointLinear,
@@ -42,7 +40,8 @@ def test_a_network_keeps_the_shape_of_odd_sizes(case: Case) -> None:
 
 
 def test_a_network_loads_its_state_to_equal_outputs(case: Case) -> None:
-    net, other = case.in_eval(), case.in_eval(seed=1)
+    net = case.in_eval()
+    other = case.in_eval(seed=1)
     assert not torch.equal(case.run(net, 3), case.run(other, 3))
     other.load_state_dict(net.state_dict())
     assert torch.equal(case.run(net, 3), case.run(other, 3))
@@ -53,10 +52,11 @@ def test_the_gradient_reaches_every_parameter_of_a_network(case: Case, training:
     net = case.in_eval().train(training)
     scores = case.run(net, 3, 4)
     (scores * torch.randn_like(scores)).sum().backward()
+
     for name, parameter in net.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name
-        # A bias before a norm has a gradient only where the norm's statistics are fixed.
+        # A bias before a norm has a gradient only if the norm's statistics are fixed.
         assert parameter.grad.any() or (training and name.endswith("bias")), name
 
 
@@ -70,12 +70,15 @@ def test_a_network_gives_the_same_with_gradients_and_without(case: Case) -> None
 @pytest.mark.parametrize("rows", [0, 1, 500])
 @pytest.mark.parametrize("sizes", [(1, 1), (9, 32), (42, 64)])
 def test_a_point_linear_layer_is_a_linear_layer(rows: int, sizes: tuple[int, int]) -> None:
-    layer, x = PointLinear(*sizes), torch.randn(rows, sizes[0], requires_grad=True)
-    found, expected = layer(x), F.linear(x, layer.weight, layer.bias)
-    torch.testing.assert_close(found, expected)
-    torch.testing.assert_close(
-        *(torch.autograd.grad(y.square().sum(), x)[0] for y in (found, expected))
-    )
+    layer = PointLinear(*sizes)
+    x = torch.randn(rows, sizes[0], requires_grad=True)
+    output = layer(x)
+    expected = F.linear(x, layer.weight, layer.bias)
+    torch.testing.assert_close(output, expected)
+
+    gradient = torch.autograd.grad(output.square().sum(), x)[0]
+    expected_gradient = torch.autograd.grad(expected.square().sum(), x)[0]
+    torch.testing.assert_close(gradient, expected_gradient)
 
 
 def test_a_network_is_deterministic_in_eval(case: Case) -> None:
@@ -85,25 +88,26 @@ def test_a_network_is_deterministic_in_eval(case: Case) -> None:
 
 def test_a_batch_of_two_equals_each_alone_in_eval(case: Case) -> None:
     net = case.in_eval()
-    together, alone = case.run(net, 3, 4), torch.cat([case.run(net, 3), case.run(net, 4)])
+    together = case.run(net, 3, 4)
+    alone = torch.cat([case.run(net, 3), case.run(net, 4)])
     torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-5)
     assert not torch.allclose(together[0], together[1])
 
 
 @pytest.mark.parametrize("steps", [8, -16])
 def test_range_net_without_gru_is_equivariant_to_a_shift_by_its_stride(steps: int) -> None:
-    net, image = CASES["range"].in_eval(), torch.randn(1, 6, 7, 40)
-    torch.testing.assert_close(
-        net(image.roll(steps, 3)), net(image).roll(steps, 3), rtol=1e-4, atol=1e-5
-    )
-    assert not torch.allclose(net(image), net(image).roll(steps, 3))
+    net = CASES["range"].in_eval()
+    image = torch.randn(1, 6, 7, 40)
+    shifted = net(image).roll(steps, 3)
+    torch.testing.assert_close(net(image.roll(steps, 3)), shifted, rtol=1e-4, atol=1e-5)
+    assert not torch.allclose(net(image), shifted)
 
 
 def test_the_unet_of_polar_net_is_equivariant_to_a_shift_by_its_stride() -> None:
-    net, pillars = CASES["polar"].in_eval(), torch.randn(1, 5, 9, 20)
-    torch.testing.assert_close(
-        net.unet(pillars.roll(4, 3)), net.unet(pillars).roll(4, 3), rtol=1e-4, atol=1e-5
-    )
+    net = CASES["polar"].in_eval()
+    pillars = torch.randn(1, 5, 9, 20)
+    shifted = net.unet(pillars).roll(4, 3)
+    torch.testing.assert_close(net.unet(pillars.roll(4, 3)), shifted, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -114,55 +118,54 @@ def test_a_joined_convolution_equals_one_over_the_upsampled_map(
     sizes: tuple[int, int, int, int], bias: bool
 ) -> None:
     h, w, full_h, full_w = sizes
-    convolution, coarse, fine = (
-        RingConv2d(5, 4),
-        torch.randn(2, 3, h, w),
-        torch.randn(2, 2, full_h, full_w),
-    )
+    convolution = RingConv2d(5, 4)
     convolution.bias = nn.Parameter(torch.randn(4)) if bias else None
-    together = torch.cat([upsample(coarse, fine), fine], dim=1)
-    expected = convolution(together)
+    coarse = torch.randn(2, 3, h, w)
+    fine = torch.randn(2, 2, full_h, full_w)
+    expected = convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
+
     with torch.inference_mode():
-        torch.testing.assert_close(
-            convolve_joined(convolution, coarse, fine), expected, rtol=1e-4, atol=1e-5
-        )
+        output = convolve_joined(convolution, coarse, fine)
+    torch.testing.assert_close(output, expected, rtol=1e-4, atol=1e-5)
     assert torch.equal(convolve_joined(convolution, coarse, fine), expected)
 
 
 def test_a_joined_convolution_costs_less() -> None:
-    convolution, coarse, fine = (
-        RingConv2d(96, 32),
-        torch.randn(1, 64, 40, 60),
-        torch.randn(1, 32, 80, 120),
-    )
+    convolution = RingConv2d(96, 32)
+    coarse = torch.randn(1, 64, 40, 60)
+    fine = torch.randn(1, 32, 80, 120)
+
     costs = []
     for gradients in (True, False):
         with torch.set_grad_enabled(gradients), FlopCounterMode(display=False) as counter:
             convolve_joined(convolution, coarse, fine)
         costs.append(counter.get_total_flops())
+
     assert costs[1] < 0.65 * costs[0]  # (4 / 9 * 64 + 32) / 96, and the edges
 
 
 def test_the_unet_of_polar_net_halves_odd_sizes_upwards() -> None:
-    net, seen = CASES["polar"].in_eval(), []
+    net = CASES["polar"].in_eval()
+    sizes = []
     for down in net.down:
-        down.register_forward_hook(lambda _, __, output: seen.append(tuple(output.shape[2:])))
+        down.register_forward_hook(lambda _, __, output: sizes.append(tuple(output.shape[2:])))
+
     net.unet(torch.randn(1, 5, 9, 11))
-    assert seen == [(5, 6), (3, 3)]
+    assert sizes == [(5, 6), (3, 3)]
 
 
 def test_the_paper_size_range_net_costs_500_gflops_and_decodes_the_strides_4_to_128() -> None:
-    net, image = RangeNet(RangeNetConfig(), 19).eval(), torch.zeros(1, 6, 64, 4096)
-    seen: list[int] = []
+    net = RangeNet(RangeNetConfig(), 19).eval()
+    strides: list[int] = []
     for lateral in net.lateral:
         lateral.register_forward_hook(
-            lambda _, inputs, __: seen.append(4096 // inputs[0].shape[-1])
+            lambda _, inputs, __: strides.append(4096 // inputs[0].shape[-1])
         )
-    with FlopCounterMode(
-        display=False
-    ) as counter:  # with gradients, and so the plain way of `joined`
-        assert net(image).shape == (1, 19, 64, 4096)
-    assert sorted(seen) == [4, 8, 16, 32, 64, 128]
+
+    # With gradients, so that `joined` upsamples as the paper's network does
+    with FlopCounterMode(display=False) as counter:
+        assert net(torch.zeros(1, 6, 64, 4096)).shape == (1, 19, 64, 4096)
+    assert sorted(strides) == [4, 8, 16, 32, 64, 128]
     assert counter.get_total_flops() == pytest.approx(500e9, rel=0.1)
 
 
@@ -174,52 +177,58 @@ def test_wrap_width_continues_circularly_and_has_its_gradient(
 ) -> None:
     x = torch.randn(2, 2, 3, width, dtype=torch.double, requires_grad=True)
     columns = [x[..., (column - left) % width] for column in range(left + width + right)]
-    assert torch.equal(wrap_width(x, left, right), torch.stack(columns, dim=-1))
-    assert torch.equal(wrap_width(x.detach(), left, right), torch.stack(columns, dim=-1))
+    expected = torch.stack(columns, dim=-1)
+    assert torch.equal(wrap_width(x, left, right), expected)
+    assert torch.equal(wrap_width(x.detach(), left, right), expected)
     assert torch.autograd.gradcheck(lambda x: wrap_width(x, left, right), x)
 
 
 @pytest.mark.parametrize("width", [1, 2, 7, 8])
 @pytest.mark.parametrize("kernel", [1, 3, 5])
 def test_a_ring_convolution_is_equivariant_to_a_shift(kernel: int, width: int) -> None:
-    conv, x = RingConv2d(2, 3, kernel).double(), torch.randn(1, 2, 4, width).double()
-    torch.testing.assert_close(conv(x.roll(1, 3)), conv(x).roll(1, 3))
-    assert conv(x).shape == (1, 3, 4, width)
+    convolution = RingConv2d(2, 3, kernel).double()
+    x = torch.randn(1, 2, 4, width).double()
+    torch.testing.assert_close(convolution(x.roll(1, 3)), convolution(x).roll(1, 3))
+    assert convolution(x).shape == (1, 3, 4, width)
 
 
 @pytest.mark.parametrize(("height", "width"), [(5, 7), (4, 8), (1, 1)])
 def test_a_strided_ring_convolution_rounds_up(height: int, width: int) -> None:
-    found = RingConv2d(2, 3, stride=(2, 2))(torch.randn(1, 2, height, width))
-    assert found.shape == (1, 3, (height + 1) // 2, (width + 1) // 2)
+    output = RingConv2d(2, 3, stride=(2, 2))(torch.randn(1, 2, height, width))
+    assert output.shape == (1, 3, (height + 1) // 2, (width + 1) // 2)
 
 
 def gru_by_cells(layer: AzimuthGRU, x: Tensor, padding: int) -> Tensor:
-    """One cell after the other: column by column, from top to bottom, the padding's columns first."""
+    """Run a GRU cell by cell: the padding's columns first, each column from top to bottom."""
     _, channels, height, width = x.shape
     cell = nn.GRUCell(channels, channels)
-    cell.load_state_dict(
-        {name.removesuffix("_l0"): value for name, value in layer.gru.state_dict().items()}
-    )
-    hidden, out = torch.zeros(len(x), channels), torch.zeros_like(x)
+    for name, parameter in cell.named_parameters():
+        parameter.data = layer.gru.state_dict()[f"{name}_l0"]
+
+    hidden = torch.zeros(len(x), channels)
+    output = torch.zeros_like(x)
     for column in range(-padding, width):
         for row in range(height):
             hidden = cell(x[:, :, row, column % width], hidden)
-            out[:, :, row, max(column, 0)] = hidden
-    return out
+            output[:, :, row, max(column, 0)] = hidden
+    return output
 
 
 @pytest.mark.parametrize(("share", "padding"), [(0.0, 0), (0.4, 2), (1.0, 5), (1.4, 7)])
 def test_the_gru_equals_a_loop_over_the_cells(share: float, padding: int) -> None:
-    layer, x = AzimuthGRU(3, share), torch.randn(2, 3, 4, 5)
+    layer = AzimuthGRU(3, share)
+    x = torch.randn(2, 3, 4, 5)
     assert layer(x).shape == x.shape
     torch.testing.assert_close(layer(x), gru_by_cells(layer, x, padding))
 
 
 @pytest.mark.parametrize(("share", "seen"), [(0.0, False), (0.25, True)])
 def test_the_gru_has_seen_the_other_end_if_padded(share: float, seen: bool) -> None:
-    layer, x = AzimuthGRU(3, share), torch.randn(1, 3, 2, 8)
+    layer = AzimuthGRU(3, share)
+    x = torch.randn(1, 3, 2, 8)
     changed = x.clone()
     changed[..., -1] += 1
+
     assert torch.equal(layer(x)[..., 0], layer(changed)[..., 0]) != seen
     assert not torch.equal(layer(x)[..., -1], layer(changed)[..., -1])
 
@@ -231,25 +240,27 @@ def test_upsample_gives_each_value_to_the_cells_it_stands_for(
     height: int, width: int, factor: int
 ) -> None:
     coarse = torch.randn(1, 2, math.ceil(height / factor), math.ceil(width / factor))
-    found = upsample(coarse, torch.zeros(1, 9, height, width))
-    assert found.shape == (1, 2, height, width)
+    fine = upsample(coarse, torch.zeros(1, 9, height, width))
+    assert fine.shape == (1, 2, height, width)
+
     for row in range(height):
         for column in range(width):
-            assert torch.equal(
-                found[:, :, row, column], coarse[:, :, row // factor, column // factor]
-            )
+            expected = coarse[:, :, row // factor, column // factor]
+            assert torch.equal(fine[:, :, row, column], expected)
 
 
-def norms_of(net: nn.Module) -> int:
+def count_norms(net: nn.Module) -> int:
     return sum(isinstance(m, nn.BatchNorm1d | nn.BatchNorm2d) for m in net.modules())
 
 
 def test_folded_batch_norms_change_no_output_of_a_network(case: Case) -> None:
     net = case.in_eval()
-    before, norms = case.run(net, 3), norms_of(net)
+    before = case.run(net, 3)
+    assert count_norms(net) > 1
+
     fold_batch_norms(net)
     torch.testing.assert_close(case.run(net, 3), before, rtol=1e-4, atol=1e-4)
-    assert norms_of(net) == 1 < norms  # that of the input stays: no layer is before it
+    assert count_norms(net) == 1  # the norm of the input stays: no layer is before it
 
 
 def test_dropblock_is_identity_in_eval_and_at_probability_zero() -> None:
@@ -262,11 +273,11 @@ def test_dropblock_is_identity_in_eval_and_at_probability_zero() -> None:
 @pytest.mark.parametrize("size", [1, 4, 7])
 def test_dropblock_drops_its_share_and_keeps_the_mean(probability: float, size: int) -> None:
     torch.manual_seed(0)
-    found = DropBlock(probability, size).train()(torch.ones(16, 2, 80, 80))
-    assert (found == 0).float().mean().item() == pytest.approx(probability, rel=0.15)
-    assert found.mean().item() == pytest.approx(1, abs=1e-4)
-    assert found.unique().numel() == 2
-    assert torch.equal(found[:, 0], found[:, 1])
+    dropped = DropBlock(probability, size).train()(torch.ones(16, 2, 80, 80))
+    assert (dropped == 0).float().mean().item() == pytest.approx(probability, rel=0.15)
+    assert dropped.mean().item() == pytest.approx(1, abs=1e-4)
+    assert dropped.unique().numel() == 2
+    assert torch.equal(dropped[:, 0], dropped[:, 1])
 
 
 @pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float32])
@@ -280,10 +291,10 @@ def test_dropblock_drops_squares() -> None:
     torch.manual_seed(0)
     dropped = (DropBlock(0.02, 5).train()(torch.ones(1, 1, 60, 60)) == 0)[0, 0]
     assert dropped.any()
+
+    # The cells that lie in some square of nothing but dropped cells
     covered = torch.zeros_like(dropped)
-    for row, column in (
-        dropped[2:-2, 2:-2].nonzero().tolist()
-    ):  # a square of nothing but dropped cells around it
+    for row, column in dropped[2:-2, 2:-2].nonzero().tolist():
         if dropped[row : row + 5, column : column + 5].all():
             covered[row : row + 5, column : column + 5] = True
     assert torch.equal(covered[5:-5, 5:-5], dropped[5:-5, 5:-5])

@@ -1,4 +1,4 @@
-"""The two views equal plain loops over the points; batches, borders, seams and lost points."""
+"""The two views equal plain loops over the points, also for batches, borders and lost points."""
 
 from __future__ import annotations
 
@@ -27,17 +27,20 @@ POLAR = PolarViewConfig(
 
 
 def scan_of(*rows: tuple[float, float, float], ring: int = 0) -> Scan:
-    points = np.array([[*row, 0.1 * (i + 1)] for i, row in enumerate(rows)], np.float32)
+    intensity = 0.1 * np.arange(1, len(rows) + 1)
+    points = np.column_stack([rows, intensity]).astype(np.float32)
     return Scan(points, ring=np.full(len(rows), ring))
 
 
 def degenerate_scans() -> dict[str, Scan]:
-    west = math.nextafter(0.0, -1.0)
+    below_zero = math.nextafter(0.0, -1.0)
     return {
         "one point": scan_of((3, -4, 1)),
         "origin": scan_of((0, 0, 0), (5, 0, 0)),
         "only the origin": scan_of((0, 0, 0)),
-        "seam": scan_of((-5, 0.0, 0), (-5, -0.0, 0), (-7, 1e-6, 0), (-7, -1e-6, 0), (-9, west, 0)),
+        "seam": scan_of(
+            (-5, 0.0, 0), (-5, -0.0, 0), (-7, 1e-6, 0), (-7, -1e-6, 0), (-9, below_zero, 0)
+        ),
         "straight up and down": scan_of((0, 0, 4), (0, 0, -4)),
         "far away": scan_of((1e3, 2e3, 3e3), (-1e3, 2e2, -3e3)),
         "no point": Scan(np.zeros((0, 4), np.float32), ring=np.zeros(0, np.int64)),
@@ -45,31 +48,38 @@ def degenerate_scans() -> dict[str, Scan]:
 
 
 def on_half_metres(scan: Scan) -> Scan:
-    """The scan on a grid of 0.5 m, off the borders: distances are often equal, and all are exact in float32."""
+    """Put the points on a grid of 0.5 m, off the borders of cells.
+
+    So distances are often equal, and all are exact in float32.
+    """
     points = scan.points.copy()
     points[:, :3] = np.round(points[:, :3] * 2) / 2 + np.float32(1 / 16)
     return replace(scan, points=points)
 
 
-def part(position: float, parts: int) -> int:
-    return min(max(math.floor(position * parts), 0), parts - 1)
+def cell_of(share: float, cells: int) -> int:
+    return min(max(math.floor(share * cells), 0), cells - 1)
 
 
 def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[int], np.ndarray]:
-    """(P,) pixels, (H * W,) nearest points, (6, H, W) image."""
-    pixels, nearest = [], [-1] * (c.height * c.width)
+    """Return (P,) pixels, (H * W,) nearest points, (6, H, W) image."""
+    pixels = []
+    nearest = [-1] * (c.height * c.width)
     least = [math.inf] * len(nearest)
     image = np.zeros((6, c.height, c.width))
     for i, (x, y, z, intensity) in enumerate(scan.points.tolist()):
         degrees = math.degrees(math.atan2(z, math.sqrt(x * x + y * y)))
-        row = part((c.fov_up - degrees) / (c.fov_up - c.fov_down), c.height)
+        row = cell_of((c.fov_up - degrees) / (c.fov_up - c.fov_down), c.height)
         if c.rows == "ring":
             row = c.height - 1 - int(scan.ring[i])
-        column = part((math.pi - math.atan2(y, x)) / (2 * math.pi), c.width)
-        pixels.append(row * c.width + column)
+        column = cell_of((math.pi - math.atan2(y, x)) / (2 * math.pi), c.width)
+        pixel = row * c.width + column
+        pixels.append(pixel)
+
         distance = math.sqrt(x * x + y * y + z * z)
-        if np.float32(distance) < least[pixels[-1]]:
-            least[pixels[-1]], nearest[pixels[-1]] = np.float32(distance), i
+        if np.float32(distance) < least[pixel]:
+            least[pixel] = np.float32(distance)
+            nearest[pixel] = i
             image[:, row, column] = x, y, z, intensity, distance, 1
     return pixels, nearest, image
 
@@ -77,36 +87,43 @@ def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[
 def polar_view_by_loop(
     scan: Scan, c: PolarViewConfig
 ) -> tuple[list[tuple[int, int, int]], list[list[float]]]:
-    """(P,) cells (radius, angle, height) and (P, 9) features."""
-    cells, features = [], []
+    """Return (P,) cells (radius, angle, height) and (P, 9) features."""
+    axes = (
+        (c.radius_min, c.radius_max, c.radial),
+        (-math.pi, math.pi, c.angular),
+        (c.z_min, c.z_max, c.vertical),
+    )
+    cells = []
+    features = []
     for x, y, z, intensity in scan.points.tolist():
         polar = (math.hypot(x, y), math.atan2(y, x), z)
-        low, high = (c.radius_min, -math.pi, c.z_min), (c.radius_max, math.pi, c.z_max)
-        counts = (c.radial, c.angular, c.vertical)
-        sizes = [(b - a) / n for a, b, n in zip(low, high, counts, strict=True)]
-        cell = tuple(
-            part((p - a) / (b - a), n) for p, a, b, n in zip(polar, low, high, counts, strict=True)
-        )
-        offset = [p - a - (k + 0.5) * s for p, a, k, s in zip(polar, low, cell, sizes, strict=True)]
-        cells.append(cell)
+        cell = []
+        offset = []
+        for value, (low, high, count) in zip(polar, axes, strict=True):
+            index = cell_of((value - low) / (high - low), count)
+            centre = low + (index + 0.5) * (high - low) / count
+            cell.append(index)
+            offset.append(value - centre)
+
+        cells.append(tuple(cell))
         features.append([*offset, *polar, x, y, intensity])
     return cells, features
 
 
-def range_image(scan: Scan, config: RangeViewConfig = SPHERICAL) -> RangeImage:
+def project_to_image(scan: Scan, config: RangeViewConfig = SPHERICAL) -> RangeImage:
     return RangeView(config).project(PointBatch.of([scan]))
 
 
-def polar_grid(*scans: Scan) -> PolarGrid:
+def project_to_grid(*scans: Scan) -> PolarGrid:
     return PolarView(POLAR).project(PointBatch.of(scans))
 
 
 def assert_equals_the_loop(scan: Scan, config: RangeViewConfig) -> None:
-    found = range_image(scan, config)
+    view = project_to_image(scan, config)
     pixels, nearest, image = range_view_by_loop(scan, config)
-    assert found.pixel.tolist() == pixels
-    assert found.nearest.tolist() == nearest
-    np.testing.assert_allclose(found.image[0].numpy(), image, rtol=1e-6, atol=1e-6)
+    assert view.pixel.tolist() == pixels
+    assert view.nearest.tolist() == nearest
+    np.testing.assert_allclose(view.image[0].numpy(), image, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("config", [SPHERICAL, BY_RING], ids=["elevation", "ring"])
@@ -135,32 +152,26 @@ def test_range_image_at_the_paper_size_equals_a_loop(random_scan: RandomScan) ->
 
 
 def test_the_nearest_point_represents_a_pixel_and_the_first_of_equals() -> None:
-    found = range_image(scan_of((8, 0, 0), (6, 0, 0), (6, 0, 0), (7, 0, 0)))
-    assert found.pixel.unique().numel() == 1
-    assert found.nearest[found.pixel[0]] == 1
+    view = project_to_image(scan_of((8, 0, 0), (6, 0, 0), (6, 0, 0), (7, 0, 0)))
+    assert view.pixel.unique().numel() == 1
+    assert view.nearest[view.pixel[0]] == 1
 
 
 def test_points_outside_the_field_of_view_get_the_border_rows() -> None:
-    found = range_image(scan_of((1, 0, 5), (1, 0, -5), (0, 0, 1), (0, 0, -1)))
-    assert (found.pixel // SPHERICAL.width).tolist() == [0, 15, 0, 15]
+    view = project_to_image(scan_of((1, 0, 5), (1, 0, -5), (0, 0, 1), (0, 0, -1)))
+    assert (view.pixel // SPHERICAL.width).tolist() == [0, 15, 0, 15]
 
 
 def test_azimuth_runs_from_behind_over_left_front_and_right() -> None:
-    columns = (
-        range_image(
-            scan_of((-5, 1e-3, 0), (0, 5, 0), (5, -1e-3, 0), (0, -5, 0), (-5, -1e-3, 0))
-        ).pixel
-        % 250
-    )
+    scan = scan_of((-5, 1e-3, 0), (0, 5, 0), (5, -1e-3, 0), (0, -5, 0), (-5, -1e-3, 0))
+    columns = project_to_image(scan).pixel % 250
     assert columns.tolist() == [0, 62, 125, 187, 249]
 
 
 def test_ring_zero_is_the_last_row() -> None:
-    rows = [
-        int(range_image(scan_of((5, 0, 0), ring=r), BY_RING).pixel // BY_RING.width)
-        for r in (0, 15)
-    ]
-    assert rows == [15, 0]
+    for ring, row in ((0, 15), (15, 0)):
+        view = project_to_image(scan_of((5, 0, 0), ring=ring), BY_RING)
+        assert view.pixel // BY_RING.width == row
 
 
 def test_a_batch_of_range_images_equals_one_by_one(random_scan: RandomScan) -> None:
@@ -173,26 +184,31 @@ def test_a_batch_of_range_images_equals_one_by_one(random_scan: RandomScan) -> N
     batch = PointBatch.of(scans)
     together = RangeView(BY_RING).project(batch)
     pixels = BY_RING.height * BY_RING.width
-    for b, (scan, where) in enumerate(zip(scans, batch.slices(), strict=True)):
-        alone = range_image(scan, BY_RING)
+    for b, (scan, rows) in enumerate(zip(scans, batch.slices(), strict=True)):
+        alone = project_to_image(scan, BY_RING)
         assert torch.equal(together.image[b], alone.image[0])
-        assert torch.equal(together.pixel[where] - b * pixels, alone.pixel)
+        assert torch.equal(together.pixel[rows] - b * pixels, alone.pixel)
+
         nearest = together.nearest[b * pixels : (b + 1) * pixels]
-        assert torch.equal(torch.where(nearest < 0, -1, nearest - where.start), alone.nearest)
+        assert torch.equal(torch.where(nearest < 0, -1, nearest - rows.start), alone.nearest)
 
 
 @pytest.mark.parametrize("steps", [1, -1, 37])
 def test_a_yaw_rotation_by_columns_is_a_circular_shift_of_the_range_image(steps: int) -> None:
     rng = np.random.default_rng(6)
-    column, step = rng.integers(0, 250, 3000), 2 * math.pi / 250
-    azimuth = math.pi - (column + rng.uniform(0.1, 0.9, 3000)) * step
-    z, radius = rng.uniform(-3, 1, 3000), rng.uniform(5, 40, 3000)
+    step = 2 * math.pi / 250
+    azimuth = math.pi - (rng.integers(0, 250, 3000) + rng.uniform(0.1, 0.9, 3000)) * step
+    z = rng.uniform(-3, 1, 3000)
+    radius = rng.uniform(5, 40, 3000)
 
-    def turned(yaw: float) -> torch.Tensor:
-        x, y = radius * np.cos(azimuth + yaw), radius * np.sin(azimuth + yaw)
-        return range_image(Scan(np.stack([x, y, z, radius / 40], 1).astype(np.float32))).image[0]
+    def image_after(yaw: float) -> torch.Tensor:
+        x = radius * np.cos(azimuth + yaw)
+        y = radius * np.sin(azimuth + yaw)
+        points = np.stack([x, y, z, radius / 40], axis=1)
+        return project_to_image(Scan(points.astype(np.float32))).image[0]
 
-    before, after = turned(0.0), turned(steps * step)
+    before = image_after(0.0)
+    after = image_after(steps * step)
     shifted = before.roll(-steps, dims=2)
     assert torch.equal(after[[2, 3, 5]], shifted[[2, 3, 5]])  # z, intensity, mask
     torch.testing.assert_close(after[4], shifted[4], rtol=1e-5, atol=0)
@@ -203,37 +219,37 @@ def test_every_point_gets_the_scores_of_its_pixel(random_scan: RandomScan) -> No
     batch = PointBatch.of([random_scan(300, 1), random_scan(200, 2)])
     view = RangeView(SPHERICAL).project(batch)
     scores = torch.randn(2, 3, 16, 250)
-    found = view.to_points(scores)
-    assert found.shape == (500, 3)
-    rows, columns = (
-        RangeView(SPHERICAL).rows(batch).tolist(),
-        RangeView(SPHERICAL).columns(batch).tolist(),
-    )
-    for i, (b, row, column) in enumerate(zip(batch.scan.tolist(), rows, columns, strict=True)):
-        assert torch.equal(found[i], scores[b, :, row, column])
+    point_scores = view.to_points(scores)
+    assert point_scores.shape == (500, 3)
+
+    rows = RangeView(SPHERICAL).rows(batch)
+    columns = RangeView(SPHERICAL).columns(batch)
+    for i in range(500):
+        assert torch.equal(point_scores[i], scores[batch.scan[i], :, rows[i], columns[i]])
 
 
 @pytest.mark.parametrize("ring", [-1, 16, 1000])
 def test_a_ring_out_of_range_is_an_input_error(ring: int) -> None:
     with pytest.raises(InputError, match=f"0 to 15, found {ring}"):
-        range_image(scan_of((1, 0, 0), ring=ring), BY_RING)
+        project_to_image(scan_of((1, 0, 0), ring=ring), BY_RING)
 
 
 def test_rows_by_ring_without_a_ring_is_an_input_error() -> None:
     with pytest.raises(InputError, match="ring index, found none"):
-        range_image(Scan(np.ones((3, 4), np.float32)), BY_RING)
+        project_to_image(Scan(np.ones((3, 4), np.float32)), BY_RING)
 
 
 def assert_polar_equals_the_loop(scan: Scan) -> None:
-    grid = polar_grid(scan)
+    grid = project_to_grid(scan)
     cells, features = polar_view_by_loop(scan, POLAR)
-    assert [
-        (p // 17, p % 17, v) for p, v in zip(grid.pillar.tolist(), grid.voxel.tolist(), strict=True)
-    ] == cells
-    np.testing.assert_allclose(
-        grid.features.numpy(), np.reshape(features, (-1, 9)), rtol=1e-6, atol=1e-5
-    )
-    assert grid.occupied.tolist() == sorted({r * 17 + a for r, a, _ in cells})
+    radius, angle, voxel = np.reshape(np.array(cells, np.int64), (-1, 3)).T
+    pillars = radius * 17 + angle
+    assert grid.pillar.tolist() == pillars.tolist()
+    assert grid.voxel.tolist() == voxel.tolist()
+
+    expected = np.reshape(features, (-1, 9))
+    np.testing.assert_allclose(grid.features.numpy(), expected, rtol=1e-6, atol=1e-5)
+    assert grid.occupied.tolist() == sorted(set(pillars.tolist()))
     assert grid.occupied[grid.slot].tolist() == grid.pillar.tolist()
 
 
@@ -250,38 +266,37 @@ def test_polar_view_equals_a_loop_on_degenerate_scans(case: str) -> None:
 
 
 def test_points_outside_the_polar_grid_go_to_the_nearest_cell() -> None:
-    grid = polar_grid(scan_of((0.5, 0, 0), (100, 0, 0), (10, 0, -50), (10, 0, 50), (-10, 0.0, 0)))
+    scan = scan_of((0.5, 0, 0), (100, 0, 0), (10, 0, -50), (10, 0, 50), (-10, 0.0, 0))
+    grid = project_to_grid(scan)
     assert (grid.pillar // 17).tolist() == [0, 12, 2, 2, 2]
     assert grid.voxel.tolist() == [3, 3, 0, 4, 3]
     assert (grid.pillar % 17).tolist() == [8, 8, 8, 8, 16]
 
 
 def test_pool_is_the_maximum_over_each_pillar(random_scan: RandomScan) -> None:
-    grid = polar_grid(random_scan(400, 1), random_scan(300, 2))
-    features = torch.randn(700, 3) - 5  # all negative, so that a 0 that slips in shows
+    grid = project_to_grid(random_scan(400, 1), random_scan(300, 2))
+    features = torch.randn(700, 3) - 5  # nearly all negative, so that a wrong 0 shows
     pooled = grid.pool(features)
-    for row, pillar in zip(pooled.tolist(), grid.occupied.tolist(), strict=True):
-        members = [features[i].tolist() for i, p in enumerate(grid.pillar.tolist()) if p == pillar]
-        assert row == [max(values) for values in zip(*members, strict=True)]
+    for row, pillar in zip(pooled, grid.occupied, strict=True):
+        assert torch.equal(row, features[grid.pillar == pillar].amax(dim=0))
 
 
 @pytest.mark.parametrize("part", [1, 100, 1000])
 def test_pooling_by_parts_is_pooling_of_all(random_scan: RandomScan, part: int) -> None:
-    grid = polar_grid(random_scan(400, 1), random_scan(300, 2))
-    assert torch.equal(
-        grid.pool_by_parts(lambda x: 2 * x[:, :5] - 30, part),
-        grid.pool(2 * grid.features[:, :5] - 30),
-    )
+    grid = project_to_grid(random_scan(400, 1), random_scan(300, 2))
+    pooled = grid.pool_by_parts(lambda x: 2 * x[:, :5] - 30, part)
+    assert torch.equal(pooled, grid.pool(2 * grid.features[:, :5] - 30))
 
 
 def test_maps_hold_the_pillars_where_they_belong_and_zero_elsewhere(
     random_scan: RandomScan,
 ) -> None:
-    grid = polar_grid(random_scan(100, 1), random_scan(100, 2))
+    grid = project_to_grid(random_scan(100, 1), random_scan(100, 2))
     pillars = torch.randn(len(grid.occupied), 3)
     expected = torch.zeros(2, 3, 13, 17)
     for values, pillar in zip(pillars, grid.occupied.tolist(), strict=True):
         expected[pillar // (13 * 17), :, pillar // 17 % 13, pillar % 17] = values
+
     assert torch.equal(grid.to_map(pillars), expected)
     assert torch.equal(grid.at_pillars(expected), pillars)
     assert (expected == 0).all(dim=1).any()
@@ -289,24 +304,27 @@ def test_maps_hold_the_pillars_where_they_belong_and_zero_elsewhere(
 
 def test_every_point_gets_the_scores_of_its_voxel(random_scan: RandomScan) -> None:
     scans = [random_scan(80, 1), random_scan(60, 2)]
-    scores, grid = torch.randn(2, 5 * 3, 13, 17), polar_grid(*scans)
-    found = grid.to_points(grid.at_pillars(scores))
+    scores = torch.randn(2, 5 * 3, 13, 17)
+    grid = project_to_grid(*scans)
+    point_scores = grid.to_points(grid.at_pillars(scores))
+
     expected = []
     for b, scan in enumerate(scans):
         for radius, angle, voxel in polar_view_by_loop(scan, POLAR)[0]:
-            expected.append([scores[b, voxel * 3 + k, radius, angle].item() for k in range(3)])
-    assert found.tolist() == expected
+            expected.append(scores[b, voxel * 3 : voxel * 3 + 3, radius, angle])
+    assert torch.equal(point_scores, torch.stack(expected))
 
 
 def test_a_batch_of_polar_grids_equals_one_by_one(random_scan: RandomScan) -> None:
     scans = [random_scan(200, 1), degenerate_scans()["no point"], random_scan(150, 2)]
-    together, batch = polar_grid(*scans), PointBatch.of(scans)
+    slices = PointBatch.of(scans).slices()
+    together = project_to_grid(*scans)
     maps = together.to_map(together.pool(together.features))
-    for b, (scan, where) in enumerate(zip(scans, batch.slices(), strict=True)):
-        alone = polar_grid(scan)
-        assert torch.equal(together.features[where], alone.features)
-        assert torch.equal(together.pillar[where] - b * 13 * 17, alone.pillar)
-        assert torch.equal(together.voxel[where], alone.voxel)
+    for b, (scan, rows) in enumerate(zip(scans, slices, strict=True)):
+        alone = project_to_grid(scan)
+        assert torch.equal(together.features[rows], alone.features)
+        assert torch.equal(together.pillar[rows] - b * 13 * 17, alone.pillar)
+        assert torch.equal(together.voxel[rows], alone.voxel)
         assert torch.equal(maps[b], alone.to_map(alone.pool(alone.features))[0])
 
 
@@ -315,11 +333,12 @@ def test_a_point_batch_leaves_lost_points_out(random_scan: RandomScan, lost: flo
     scan = random_scan(10, 1)
     for row, column in ((2, 0), (5, 3), (9, 2)):
         scan.points[row, column] = lost
-    kept = [0, 1, 3, 4, 6, 7, 8]
+
+    valid = [0, 1, 3, 4, 6, 7, 8]
     batch = PointBatch.of([scan])
-    assert batch.points.tolist() == scan.points[kept].tolist()
+    assert batch.points.tolist() == scan.points[valid].tolist()
     assert batch.ring is not None
-    assert batch.ring.tolist() == scan.ring[kept].tolist()
+    assert batch.ring.tolist() == scan.ring[valid].tolist()
 
 
 def test_slices_say_where_each_scan_stands(random_scan: RandomScan) -> None:

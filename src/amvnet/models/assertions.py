@@ -1,4 +1,4 @@
-"""Assertions: functions of two networks' scores that say which points are uncertain (section 3.2 of the paper)."""
+"""Assertions: functions of the two networks' scores that find uncertain points (section 3.2)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,16 @@ TINY = 1e-12  # keeps the logarithm of a probability finite
 
 
 class Assertion(Protocol):
-    """f, g: (P, K) class probabilities of the two networks; points: (P, 4); labels: (P,) train ids or None.
+    """A function that finds the uncertain points.
 
-    Returns (P,) bool: True where a point is uncertain.
+    Args:
+        f: (P, K) class probabilities of the range-view network.
+        g: (P, K) class probabilities of the bird's-eye-view network.
+        points: (P, 4) x, y, z in metres and intensity in [0, 1].
+        labels: (P,) train ids, or None.
+
+    Returns:
+        (P,) bool: True if a point is uncertain.
     """
 
     def __call__(
@@ -27,7 +34,7 @@ class Assertion(Protocol):
 
 @dataclass(frozen=True)
 class Disagreement:
-    """Uncertain where the cosine similarity of the two scores is at most tau: the paper's assertion."""
+    """The paper's assertion: uncertain if the cosine similarity of f and g is at most tau."""
 
     tau: float = 0.85
 
@@ -38,14 +45,15 @@ class Disagreement:
 
 
 def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
-    """(P,) of two networks' scores (P, K): from 0, they have no class in common, to 1, they are the same."""
-    both, length = torch.linalg.vecdot(f, g), torch.linalg.vecdot(f, f) * torch.linalg.vecdot(g, g)
-    return both / length.clamp_min(TINY).sqrt()
+    """Return the (P,) similarity of class probabilities (P, K): 0 if disjoint, 1 if the same."""
+    product = torch.linalg.vecdot(f, g)
+    squared_lengths = torch.linalg.vecdot(f, f) * torch.linalg.vecdot(g, g)
+    return product / squared_lengths.clamp_min(TINY).sqrt()
 
 
 @dataclass(frozen=True)
 class HighEntropy:
-    """Uncertain where the entropy of the mean score is at least so many nats."""
+    """Uncertain if the entropy of the mean of f and g is at least `nats`."""
 
     nats: float = 0.7
 
@@ -58,7 +66,10 @@ class HighEntropy:
 
 @dataclass(frozen=True)
 class HighLoss:
-    """Uncertain where a network's cross-entropy is at least so many nats; needs labels, so for training only."""
+    """Uncertain if either network's cross-entropy is at least `nats`.
+
+    Needs labels, and so serves training only. Points without a label are never uncertain.
+    """
 
     nats: float = 0.7
 
@@ -67,11 +78,12 @@ class HighLoss:
     ) -> Tensor:
         if labels is None:
             raise ValueError(
-                "expected labels for the loss assertion, found none; it is for training"
+                "expected labels for the loss assertion, found none; use it in training only"
             )
-        column = (labels.long() - 1).clamp_min(0)[:, None]
-        worst = torch.minimum(f.gather(1, column), g.gather(1, column))[:, 0]
-        return (-worst.clamp_min(TINY).log() >= self.nats) & (labels > 0)
+
+        column = (labels.long() - 1).clamp_min(0)[:, None]  # label 0 has no column
+        lower = torch.minimum(f.gather(1, column), g.gather(1, column))[:, 0]
+        return (-lower.clamp_min(TINY).log() >= self.nats) & (labels > 0)
 
 
 KINDS: dict[str, Callable[[float], Assertion]] = {
@@ -82,5 +94,5 @@ KINDS: dict[str, Callable[[float], Assertion]] = {
 
 
 def build_assertion(config: AssertionConfig) -> Assertion:
-    """The assertion that a configuration names."""
+    """Return the assertion that a configuration names."""
     return KINDS[config.name](config.threshold)

@@ -1,7 +1,8 @@
-"""Layers that the two networks share: convolutions that wrap around the sensor."""
+"""Layers that the two networks share, among them convolutions that wrap around the sensor."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -11,9 +12,10 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
 
 class RingConv2d(nn.Conv2d):
-    """A convolution whose last axis is the azimuth: padded circularly there, with zeros on the other.
+    """A convolution over maps whose last axis is the azimuth.
 
-    Input (B, C, H, W), output (B, C', ceil(H / stride), ceil(W / stride)).
+    The azimuth is padded circularly, the other axis with zeros. Input (B, C, H, W), output
+    (B, C', ceil(H / stride), ceil(W / stride)).
     """
 
     def __init__(
@@ -27,57 +29,66 @@ class RingConv2d(nn.Conv2d):
 
 
 def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
-    """(B, C, H, W) -> (B, C, H, left + W + right), continued circularly; the pads may be wider than W."""
+    """Pad the width circularly: (B, C, H, W) -> (B, C, H, left + W + right).
+
+    The pads may be wider than W.
+    """
     if not left and not right:
         return x
-    return _WrapWidth.apply(x, left, right) if x.requires_grad else _wrapped(x, left, right)
+    return _WrapWidth.apply(x, left, right) if x.requires_grad else _pad_width(x, left, right)
 
 
-def _wrapped(x: Tensor, left: int, right: int) -> Tensor:
+def _pad_width(x: Tensor, left: int, right: int) -> Tensor:
     width = x.shape[-1]
-    if max(left, right) <= width:  # keeps the memory format, which a gather by index does not
+
+    # Unlike indexing, concatenating keeps the memory format.
+    if max(left, right) <= width:
         return torch.cat([x[..., width - left :], x, x[..., :right]], dim=-1)
     return x[..., torch.arange(-left, width + right, device=x.device) % width]
 
 
 class _WrapWidth(torch.autograd.Function):
-    """`_wrapped` with a gradient that adds the pads in place: autograd's own took a third of a training step."""
+    """`_pad_width` with a gradient that adds up the pads in place.
+
+    The gradient that autograd derives took a third of a training step.
+    """
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, left: int, right: int) -> Tensor:
         ctx.sizes = x.shape[-1], left, right
-        return _wrapped(x, left, right)
+        return _pad_width(x, left, right)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
         width, left, right = ctx.sizes
-        grad = grads[0]
+        grad = grads[0]  # (B, C, H, left + W + right)
+
         inner = grad[..., left : left + width].clone(memory_format=torch.preserve_format)
-        for pad in [*range(left), *range(left + width, left + width + right)]:
-            inner[..., (pad - left) % width] += grad[..., pad]
+        for column in [*range(left), *range(left + width, left + width + right)]:
+            inner[..., (column - left) % width] += grad[..., column]
         return inner, None, None
 
 
 class PointLinear(nn.Linear):
-    """A linear layer over rows, by `linear`."""
+    """A linear layer over rows (N, C), computed by `linear`."""
 
     def forward(self, input: Tensor) -> Tensor:
         return linear(input, self.weight, self.bias)
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """Rows (N, C) and weight (C', C) -> (N, C'): `F.linear`, on a CPU as a convolution of one cell.
+    """Apply `F.linear` to rows (N, C) with a weight (C', C) -> (N, C').
 
-    torch multiplies matrices on a CPU by MKL, which leaves half and more of an AMD processor's float32 unused. Its
-    convolutions, by oneDNN, do not.
+    On a CPU it is computed as a convolution with kernels of one cell. torch multiplies matrices
+    by MKL there, which leaves half or more of an AMD processor's float32 performance unused.
+    Convolutions, by oneDNN, do not.
     """
-    if (
-        torch.compiler.is_compiling() or not x.is_cpu or not len(x)
-    ):  # there is no convolution of nothing
+    # A convolution does not take an empty image.
+    if torch.compiler.is_compiling() or not x.is_cpu or not len(x):
         return F.linear(x, weight, bias)
-    image = x.reshape(1, len(x), 1, x.shape[1]).permute(
-        0, 3, 1, 2
-    )  # (1, C, N, 1), its channels last
+
+    # (1, C, N, 1), with the channels last in memory
+    image = x.reshape(1, len(x), 1, x.shape[1]).permute(0, 3, 1, 2)
     return F.conv2d(image, weight[:, :, None, None], bias).permute(0, 2, 3, 1).flatten(0, 2)
 
 
@@ -87,8 +98,11 @@ class ConvBlock(nn.Sequential):
     def __init__(
         self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)
     ) -> None:
-        norm, activation = nn.BatchNorm2d(out), nn.LeakyReLU(0.01, inplace=True)
-        super().__init__(RingConv2d(channels, out, kernel, stride), norm, activation)
+        super().__init__(
+            RingConv2d(channels, out, kernel, stride),
+            nn.BatchNorm2d(out),
+            nn.LeakyReLU(0.01, inplace=True),
+        )
 
 
 class ResidualBlock(nn.Module):
@@ -104,18 +118,22 @@ class ResidualBlock(nn.Module):
         self.stride = stride
 
     def forward(self, x: Tensor) -> Tensor:  # (B, C, H, W) -> (B, C', H / stride, W / stride)
-        # Strided here and not in the convolution: torch's own of one cell on few channels writes out of bounds
-        # on a CPU.
-        kept = x[..., :: self.stride[0], :: self.stride[1]]
-        return F.leaky_relu_(self.second(self.first(x)) + self.skip(kept), 0.01)
+        # Subsampled here and not by a strided convolution: on a CPU, torch's strided convolution
+        # with kernels of one cell over few channels writes out of bounds.
+        subsampled = x[..., :: self.stride[0], :: self.stride[1]]
+        return F.leaky_relu_(self.second(self.first(x)) + self.skip(subsampled), 0.01)
 
 
 class AzimuthGRU(nn.Module):
-    """A GRU that runs once around the sensor over the cells of a map (section 3.1 of the paper).
+    """A GRU that runs once around the sensor over the cells of a map (section 3.1).
 
-    The map (B, C, H, W) is read column by column, each from top to bottom, by a unidirectional GRU of hidden
-    size C; its outputs are put back as a map (B, C, H, W). The columns before the first are the last ones, so
-    that the hidden state has seen the other end of the scan; the outputs there are dropped.
+    A unidirectional GRU of hidden size C reads the map (B, C, H, W) column by column, each from
+    top to bottom. Its outputs form a map (B, C, H, W) again. The last columns are also put before
+    the first, so that the hidden state has seen the other end of the scan; their outputs are
+    dropped.
+
+    Args:
+        padding: the columns put before the first, as a share of the width.
     """
 
     def __init__(self, channels: int, padding: float) -> None:
@@ -127,23 +145,31 @@ class AzimuthGRU(nn.Module):
         b, c, h, w = x.shape
         padding = round(self.padding * w)
         columns = wrap_width(x, padding, 0).permute(0, 3, 2, 1)  # (B, padding + W, H, C)
-        with torch.autocast(
-            x.device.type, enabled=False
-        ):  # a recurrence in bfloat16 loses its state
+
+        # In bfloat16 the recurrence would lose its state.
+        with torch.autocast(x.device.type, enabled=False):
             outputs, _ = self.gru(columns.reshape(b, -1, c).to(next(self.gru.parameters()).dtype))
         return outputs.view(b, -1, h, c)[:, padding:].permute(0, 3, 2, 1)  # (B, C, H, W)
 
 
 def upsample(x: Tensor, like: Tensor) -> Tensor:
-    """(B, C, h, w) -> (B, C, H, W) of `like`, each value to the cells that it stands for."""
+    """Repeat the values of a coarse map (B, C, h, w) to the size (B, C, H, W) of `like`."""
     return F.interpolate(x, size=like.shape[-2:], mode="nearest")
 
 
 def fold_batch_norms(module: nn.Module) -> None:
-    """Put the batch norms of a module that is in evaluation into the layers before them: as exact, and faster."""
-    for layers in [m for m in module.modules() if isinstance(m, nn.Sequential)]:
-        for place, (layer, norm) in enumerate(zip(list(layers), list(layers)[1:], strict=False)):
+    """Fold the batch norms of a module in evaluation mode into the layers before them.
+
+    The result is as exact, and faster.
+    """
+    for layers in list(module.modules()):
+        if not isinstance(layers, nn.Sequential):
+            continue
+
+        for index, (layer, norm) in enumerate(pairwise(list(layers))):
             if isinstance(layer, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
-                layers[place], layers[place + 1] = fuse_conv_bn_eval(layer, norm), nn.Identity()
+                layers[index] = fuse_conv_bn_eval(layer, norm)
+                layers[index + 1] = nn.Identity()
             elif isinstance(layer, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
-                layers[place], layers[place + 1] = fuse_linear_bn_eval(layer, norm), nn.Identity()
+                layers[index] = fuse_linear_bn_eval(layer, norm)
+                layers[index + 1] = nn.Identity()

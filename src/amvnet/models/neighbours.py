@@ -1,60 +1,70 @@
-"""The nearest other points of some points of a scan, by a k-d tree; knows nothing of torch."""
+"""The nearest neighbours of points of a scan, found by a k-d tree, without torch."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-SOME = 0.001  # of all points: in one place by chance are fewer
+FREQUENT_TIES = 0.001  # share of the points; ties by chance are rarer
 
 
 def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
-    """(U, n) int64 indices of the n nearest other points of each point in `own`.
+    """Return (U, n) int64 indices of the n nearest other points of each point in `own`.
 
-    Of a scan with fewer than n other points the last one is repeated; a lone point is its own neighbour.
+    If a scan has fewer than n other points, the last one is repeated. A lone point is its own
+    neighbour.
 
     Args:
         xyz: (P, 3) metres.
-        own: (U,) indices of the points whose neighbours are asked for.
+        own: (U,) indices of the points whose neighbours are searched for.
     """
     if not len(own):
         return np.zeros((0, n), dtype=np.int64)
-    found = _nearest(np.ascontiguousarray(xyz), xyz[own], min(n + 1, len(xyz)))
-    return _without_own(found, own, n)
+
+    nearest = _nearest(np.ascontiguousarray(xyz), xyz[own], min(n + 1, len(xyz)))
+    return _without_own(nearest, own, n)
 
 
-def _nearest(xyz: np.ndarray, asked: np.ndarray, n: int) -> np.ndarray:
-    """(U, n) indices of the nearest points, the point itself among them.
+def _nearest(xyz: np.ndarray, queries: np.ndarray, n: int) -> np.ndarray:
+    """Return (U, n) indices of the points nearest to the queries (U, 3), themselves among them.
 
-    By pykdtree, which takes half of SciPy's time. Where several points are as near as the last one, SciPy chooses: so
-    labels do not depend on which of the two is installed. (Of the real nuScenes points at hand a sixth are doubled.)
+    pykdtree takes half of SciPy's time. If several points are as near as the last one, SciPy
+    chooses among them, so that labels do not depend on which library is installed. (A sixth of
+    the points of the real nuScenes scans at hand occur twice.)
     """
     try:
         from pykdtree.kdtree import KDTree
-    except ImportError:  # the runner of exported graphs does without
-        return _nearest_by_scipy(xyz, asked, n)
-    distance, found = KDTree(xyz).query(asked, k=n + 1)
-    tied, found = distance[:, -1] == distance[:, -2], found[:, :n].astype(np.int64)
-    if tied.mean() > SOME:
-        found[tied] = _nearest_by_scipy(xyz, asked[tied], n)
-    return found
+    except ImportError:  # the runner of exported graphs does not need it
+        return _nearest_by_scipy(xyz, queries, n)
+
+    # One neighbour more than needed shows whether the last one is tied.
+    distance, nearest = KDTree(xyz).query(queries, k=n + 1)
+    tied = distance[:, -1] == distance[:, -2]
+    nearest = nearest[:, :n].astype(np.int64)
+    if tied.mean() > FREQUENT_TIES:
+        nearest[tied] = _nearest_by_scipy(xyz, queries[tied], n)
+    return nearest
 
 
-def _nearest_by_scipy(xyz: np.ndarray, asked: np.ndarray, n: int) -> np.ndarray:
-    # A tree that is not balanced costs a third to build, and a tenth more to ask.
+def _nearest_by_scipy(xyz: np.ndarray, queries: np.ndarray, n: int) -> np.ndarray:
+    # An unbalanced tree takes a third of the time to build, and a tenth more to query.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
-    return np.asarray(tree.query(asked, k=np.arange(1, n + 1), workers=-1)[1])
+    return np.asarray(tree.query(queries, k=np.arange(1, n + 1), workers=-1)[1])
 
 
-def _without_own(found: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
-    """Drop each point from its own neighbours; the farthest where, among points in one place, it is not found."""
-    if (found[:, 0] == own).all() and found.shape[
-        1
-    ] > 1:  # as it is where no two points are in one place
-        found = found[:, 1:]
-    elif found.shape[1] > 1:
-        is_own = found == own[:, None]
-        is_own[~is_own.any(axis=1), -1] = True
-        found = found[~is_own].reshape(len(own), -1)
-    missing = n - found.shape[1]
-    return np.pad(found, ((0, 0), (0, missing)), mode="edge") if missing > 0 else found
+def _without_own(nearest: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
+    """Drop each point from its own neighbours (U, m), and fill them up to (U, n).
+
+    Among many points in one place a point may be missing from its own neighbours. Then the
+    farthest is dropped.
+    """
+    if nearest.shape[1] > 1:
+        if (nearest[:, 0] == own).all():  # the usual case: no two points in one place
+            nearest = nearest[:, 1:]
+        else:
+            dropped = nearest == own[:, None]
+            dropped[~dropped.any(axis=1), -1] = True
+            nearest = nearest[~dropped].reshape(len(own), -1)
+
+    missing = n - nearest.shape[1]
+    return np.pad(nearest, ((0, 0), (0, missing)), mode="edge") if missing > 0 else nearest

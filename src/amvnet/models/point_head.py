@@ -1,4 +1,4 @@
-"""The point head: settles the uncertain points by their neighbourhood (section 3.2 of the paper)."""
+"""The point head: classifies uncertain points from their neighbourhood (section 3.3)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import occurring
 
 POINT_VALUES = 4  # x, y, z, intensity
-# Uncertain points that are scored at a time: what a processor's cache holds; what keeps a GPU busy.
-PART, PART_ON_GPU = 1024, 2**16
+PART = 1024  # uncertain points scored at a time: they fit into a CPU's cache
+PART_ON_GPU = 2**16  # as above, on a GPU: enough to keep it busy
 
 
 class PointHead(nn.Module):
-    """Uncertain points with their neighbours -> scores before softmax (U, K).
+    """Uncertain points and their neighbours -> logits (U, K).
 
-    Input: of U uncertain points their features p_i (U, 2 K + 4) and S_i (U, n, 2 K + 4), as `head_features` makes them.
+    The inputs are the features p_i (U, 2 K + 4) of U uncertain points and the rows S_i
+    (U, n, 2 K + 4) of their neighbours, as `head_features` returns them.
     """
 
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
@@ -36,41 +37,54 @@ class PointHead(nn.Module):
 
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
-        pooled = (
-            self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1]).amax(dim=1)
-        )  # (U, hidden)
+        encoded = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1])
+        pooled = encoded.amax(dim=1)  # (U, hidden)
         return self.fc(torch.cat([pooled, point], dim=1))
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
-        """The same as `forward(*head_features(...))`, with the first layer once a point and not once a neighbour.
+        """Return the logits of `forward(*head_features(...))` at less cost.
 
-        W [f_k, g_k, x_k - x_i] = W [f_k, g_k, x_k] - W [0, 0, x_i]. The arguments are those of `head_features`.
+        The first layer is computed once for each point instead of once for each neighbour:
+        W [f_k, g_k, x_k - x_i] = W [f_k, g_k, x_k] - W [0, 0, x_i].
+
+        Args:
+            table: (P, 2 K + 4) of one scan, from `point_table`.
+            uncertain: (U,) indices of the uncertain points.
+            near: (U, n) indices of their nearest neighbours.
         """
-        first, middle, last = self.mlp[0], self.mlp[1:-1], self.mlp[-1]
+        first = self.mlp[0]
+        middle = self.mlp[1:-1]
+        activation = self.mlp[-1]
         assert isinstance(first, nn.Linear)
-        done, found, part = first(table), [], PART if table.is_cpu else PART_ON_GPU
+
+        first_of_all = first(table)  # (P, hidden[0])
+        part = PART if table.is_cpu else PART_ON_GPU
+        logits = []
         for index, k in zip(uncertain.split(part), near.split(part), strict=True):
             point = table.index_select(0, index)
             shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
-            rows = (
-                done.index_select(0, k.flatten()).unflatten(0, k.shape).sub_(shift[:, None])
-            )  # (part, n, hidden[0])
-            # The last ReLU leaves the order as it is: a fifteenth of the work after the maximum.
-            pooled = last(middle(rows.flatten(0, 1)).unflatten(0, k.shape).amax(dim=1))
+            rows = first_of_all.index_select(0, k.flatten()).unflatten(0, k.shape)
+            rows = rows.sub_(shift[:, None])  # (part, n, hidden[0])
+
+            # A ReLU keeps the order: after the maximum it costs a fifteenth and changes nothing.
+            pooled = activation(middle(rows.flatten(0, 1)).unflatten(0, k.shape).amax(dim=1))
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
-            found.append(self.fc(torch.cat([pooled, point], dim=1)))
-        return torch.cat(found)
+            logits.append(self.fc(torch.cat([pooled, point], dim=1)))
+        return torch.cat(logits)
 
 
 def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
-    """[f, g, x] of all points of a scan, (P, 2 K + 4), from which `head_features` takes its rows."""
+    """Return [f, g, x] of all points of a scan, (P, 2 K + 4), the table for `head_features`."""
     return torch.cat([f, g, points], dim=1)
 
 
 def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """The points, of so many, that occur in some tensors of indices: (M,), and the tensors as places among these.
+    """Select those of `count` points that occur in some tensors of indices.
 
-    On a GPU all of them: it would be waited for to count them.
+    On a GPU all points are selected: to count those that occur, the CPU would have to wait.
+
+    Returns:
+        The selected points (M,), ascending, and the tensors with indices into these.
     """
     if not indices[0].is_cpu:
         return torch.arange(count, device=indices[0].device), list(indices)
@@ -80,7 +94,7 @@ def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tenso
 def head_features(
     config: PointHeadConfig, table: Tensor, uncertain: Tensor, near: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """p_i = [f_i, g_i, x_i] of the uncertain points, and the rows [f_k, g_k, x_k - x_i] of their S_i.
+    """Return p_i = [f_i, g_i, x_i] of uncertain points and the rows [f_k, g_k, x_k - x_i] of S_i.
 
     Args:
         table: (P, 2 K + 4) of one scan, from `point_table`.
@@ -90,21 +104,24 @@ def head_features(
     Returns:
         (U, 2 K + 4) and (U, n, 2 K + 4).
     """
-    point, rows = table[uncertain], table[near]
+    point = table[uncertain]
+    rows = table[near]
     rows[..., -POINT_VALUES:] -= point[:, None, -POINT_VALUES:]
     point[:, -POINT_VALUES:-1] *= config.position_scale
     return point, rows
 
 
 def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
-    """(U, n) indices of the n nearest other points of each point in `index`, by x, y, z.
+    """Return (U, n) indices of the n nearest other points of each point in `index`, by x, y, z.
 
-    Of a scan with fewer than n other points the last one is repeated; a lone point is its own neighbour.
+    If a scan has fewer than n other points, the last one is repeated. A lone point is its own
+    neighbour.
     """
     if points.is_cuda:
         return nearest_others_by_blocks(points[:, :3], index, n)
-    found = nearest_others(points[:, :3].cpu().numpy(), index.cpu().numpy(), n)
-    return torch.from_numpy(found).to(points.device)
+
+    nearest = nearest_others(points[:, :3].cpu().numpy(), index.cpu().numpy(), n)
+    return torch.from_numpy(nearest).to(points.device)
 
 
 def _mlp(widths: tuple[int, ...]) -> nn.Sequential:

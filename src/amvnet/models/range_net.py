@@ -1,4 +1,4 @@
-"""The range-view network: a fully convolutional ResNet with recurrent layers (section 3.1 of the paper)."""
+"""The range-view network: a fully convolutional ResNet with recurrent layers (section 3.1)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
 from amvnet.models.upsampled_conv import joined
 from amvnet.models.views.range_view import CHANNELS
 
-FIRST_DECODED = 1  # the decoder takes the stages from the second on: width stride 4
-RECURRENT = 2  # so many of the last stages are followed by a GRU
+FIRST_DECODED = 1  # the decoder uses the stages from the second on: width strides of 4 and more
+RECURRENT = 2  # number of the last stages that are followed by a GRU
 
 
 class RangeNet(nn.Module):
-    """Range image (B, 6, H, W) -> scores before softmax (B, K, H, W)."""
+    """Range image (B, 6, H, W) -> logits (B, K, H, W)."""
 
     def __init__(self, config: RangeNetConfig, classes: int) -> None:
         super().__init__()
@@ -23,9 +23,11 @@ class RangeNet(nn.Module):
         self.input_norm = nn.BatchNorm2d(CHANNELS)
         self.stem = ConvBlock(CHANNELS, c.stem)
         self.stages = nn.ModuleList(_stages(c))
-        self.recurrent = nn.ModuleList(
-            AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT:] if c.gru
-        )
+
+        self.recurrent = nn.ModuleList()
+        if c.gru:
+            self.recurrent.extend(AzimuthGRU(w, c.gru_padding) for w in c.widths[-RECURRENT:])
+
         decoded = c.widths[FIRST_DECODED:]
         self.lateral = nn.ModuleList(ConvBlock(w, c.decoder, 1) for w in decoded)
         self.decoder = nn.ModuleList(ConvBlock(c.decoder, c.decoder) for _ in decoded)
@@ -34,15 +36,17 @@ class RangeNet(nn.Module):
         self.scores = nn.Conv2d(c.head, classes, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        # In bfloat16 a coordinate of 20 m is known to 0.1 m: what tells a hedge from a wall would be lost.
+        # bfloat16 resolves a coordinate of 20 m to 0.1 m only: too coarse to tell a hedge from a
+        # wall.
         with torch.autocast(image.device.type, enabled=False):
             full = self.stem(self.input_norm(image))  # (B, stem, H, W)
+
         maps = self.encode(full)
         decoded = self.decode(maps[FIRST_DECODED:])  # (B, decoder, H, W / 4)
         return self.scores(joined(self.last, decoded, full))
 
     def encode(self, x: Tensor) -> list[Tensor]:
-        """The maps of width strides 2, 4, 8, ...; the last two have gone around the sensor."""
+        """Return the maps of width strides 2, 4, 8, ...; the last two after their GRUs."""
         maps = []
         first_recurrent = len(self.stages) - len(self.recurrent)
         for index, stage in enumerate(self.stages):
@@ -53,17 +57,20 @@ class RangeNet(nn.Module):
         return maps
 
     def decode(self, maps: list[Tensor]) -> Tensor:
-        """From the coarsest map to the finest: upsample, add the lateral map, convolve."""
-        top: Tensor | None = None
+        """Upsample from the coarsest map to the finest; add the lateral map, convolve at each."""
+        decoded: Tensor | None = None
         for x, lateral, conv in reversed(list(zip(maps, self.lateral, self.decoder, strict=True))):
             side = lateral(x)
-            top = self.drop(conv(side if top is None else side + upsample(top, side)))
-        assert top is not None
-        return top
+            if decoded is not None:
+                side = side + upsample(decoded, side)
+            decoded = self.drop(conv(side))
+
+        assert decoded is not None
+        return decoded
 
 
 def _stages(c: RangeNetConfig) -> list[nn.Module]:
-    """One stage a width stride; its first block strides, its others do not."""
+    """Return the stages, each of which halves the width in its first block."""
     stages: list[nn.Module] = []
     channels = c.stem
     for width, blocks, stride in zip(c.widths, c.blocks, c.height_strides, strict=True):

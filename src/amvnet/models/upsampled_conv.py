@@ -1,4 +1,4 @@
-"""A convolution over a fine map beside an upsampled coarse one, of which the coarse one stays coarse."""
+"""A convolution over a coarse map joined with a fine one, without upsampling the coarse map."""
 
 from __future__ import annotations
 
@@ -10,62 +10,74 @@ from amvnet.models.layers import RingConv2d, upsample, wrap_width
 
 
 def joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
-    """As `block(torch.cat([upsample(coarse, fine), fine], dim=1))`, for a `ConvBlock`."""
+    """Return `block(torch.cat([upsample(coarse, fine), fine], dim=1))`, for a `ConvBlock`."""
     convolution, norm, activation = block.children()
     assert isinstance(convolution, RingConv2d)
     return activation(norm(convolve_joined(convolution, coarse, fine)))
 
 
 def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Tensor:
-    """As `convolution(torch.cat([upsample(coarse, fine), fine], dim=1))`, for kernels of 3 x 3.
+    """Return `convolution(torch.cat([upsample(coarse, fine), fine], dim=1))`, for 3 x 3 kernels.
 
-    A convolution is linear, so that each map can have its own. And where s neighbouring values are the same, 3 taps are
-    2 with summed weights: the coarse map is convolved as it is, by other kernels for each of the s places between its
-    values. That is half of the work. Training takes the plain way, and so do exported and compiled networks.
+    A convolution is linear, so that each map can be convolved alone and the results added. The
+    upsampled map repeats each value s times along an axis, so that 3 taps see at most 2 different
+    values: 2 taps on the coarse map with summed weights do the same, with another kernel for each
+    of the s positions within a coarse cell. This is half of the work. Training, exported and
+    compiled networks upsample.
 
     Args:
-        coarse: (B, C, h, w), its values for cells of whole numbers of `fine`'s, or the plain way is taken.
+        coarse: (B, C, h, w). If H or W is not a multiple of h or w, the map is upsampled.
         fine: (B, C', H, W).
     """
-    scale = fine.shape[2] // coarse.shape[2], fine.shape[3] // coarse.shape[3]
-    whole = fine.shape[2:] == (coarse.shape[2] * scale[0], coarse.shape[3] * scale[1])
-    if not whole or torch.is_grad_enabled() or torch.compiler.is_compiling():
+    scale = (fine.shape[2] // coarse.shape[2], fine.shape[3] // coarse.shape[3])
+    is_multiple = fine.shape[2:] == (coarse.shape[2] * scale[0], coarse.shape[3] * scale[1])
+    if not is_multiple or torch.is_grad_enabled() or torch.compiler.is_compiling():
         return convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
-    of_coarse, of_fine = convolution.weight.split([coarse.shape[1], fine.shape[1]], dim=1)
-    found = F.conv2d(wrap_width(fine, 1, 1), of_fine, convolution.bias, padding=(1, 0))
-    return found.add_(_convolve_upsampled(coarse, of_coarse, scale))
+
+    coarse_weight, fine_weight = convolution.weight.split([coarse.shape[1], fine.shape[1]], dim=1)
+    result = F.conv2d(wrap_width(fine, 1, 1), fine_weight, convolution.bias, padding=(1, 0))
+    return result.add_(_convolve_upsampled(coarse, coarse_weight, scale))
 
 
 def _convolve_upsampled(x: Tensor, weight: Tensor, scale: tuple[int, int]) -> Tensor:
-    """(B, C, h, w) and weight (C', C, 3, 3) -> (B, C', h * scale, w * scale), the width continued circularly.
+    """Convolve (B, C, h, w) upsampled, by (C', C, 3, 3), into (B, C', h * scale, w * scale).
 
-    Output cell s * t + p sees the inputs t - 1 and t, for p from -1 to s - 2: one kernel for each p, and the cells that
-    they find for a t, in a row, begin one cell before the first.
+    The width is continued circularly. Fine cell s * t + p, with p from -1 to s - 2, sees the coarse
+    cells t - 1 and t. So there is one kernel of 2 taps for each p. The fine cells of all t in a row
+    begin one cell before the first.
     """
     rows, columns = scale
-    with torch.autocast(
-        x.device.type, enabled=False
-    ):  # sums of weights are exact enough in their own type only
-        taps = _taps(rows, weight), _taps(columns, weight)
-        kernels = torch.einsum("pak,qbl,oikl->pqoiab", *taps, weight).flatten(0, 2)
-    found = F.conv2d(wrap_width(x, 1, 1), kernels, padding=(1, 0)).permute(
-        0, 2, 3, 1
-    )  # (B, h + 1, w + 1, s * s * C')
-    b, h, w, _ = found.shape
-    cells = (
-        found.view(b, h, w, rows, columns, -1).transpose(2, 3).reshape(b, h * rows, w * columns, -1)
-    )
-    top, left = int(rows > 1), int(columns > 1)
-    size = x.shape[2] * rows, x.shape[3] * columns
-    return cells[:, top : top + size[0], left : left + size[1]].permute(0, 3, 1, 2)
+
+    # The sums of weights are exact enough only in the weights' own type.
+    with torch.autocast(x.device.type, enabled=False):
+        row_taps = _taps(rows, weight)
+        column_taps = _taps(columns, weight)
+        kernels = torch.einsum("pak,qbl,oikl->pqoiab", row_taps, column_taps, weight).flatten(0, 2)
+
+    output = F.conv2d(wrap_width(x, 1, 1), kernels, padding=(1, 0))
+    output = output.permute(0, 2, 3, 1)  # (B, h + 1, w + 1, s * s * C')
+    b, h, w, _ = output.shape
+    cells = output.view(b, h, w, rows, columns, -1).transpose(2, 3)
+    cells = cells.reshape(b, h * rows, w * columns, -1)
+
+    # Without the cells before the first, and after the last
+    top = int(rows > 1)
+    left = int(columns > 1)
+    height = x.shape[2] * rows
+    width = x.shape[3] * columns
+    return cells[:, top : top + height, left : left + width].permute(0, 3, 1, 2)
 
 
 def _taps(scale: int, like: Tensor) -> Tensor:
-    """(scale, taps on the coarse map, 3): which of the three weights each kernel sums for each of its taps."""
+    """Return (scale, taps, 3) ones and zeros: which of the 3 weights are summed for each tap.
+
+    The first axis is the position of a fine cell within a coarse one, the second the taps on the
+    coarse map.
+    """
     if scale == 1:
         return torch.eye(3, dtype=like.dtype, device=like.device)[None]
-    place, k = torch.arange(-1, scale - 1)[:, None], torch.arange(-1, 2)
-    second = (place + k >= 0).to(
-        like
-    )  # (scale, 3): else the fine cell lies in the coarse cell before
+
+    position = torch.arange(-1, scale - 1)[:, None]
+    offset = torch.arange(-1, 2)
+    second = (position + offset >= 0).to(like)  # (scale, 3): 1 for coarse cell t, 0 for t - 1
     return torch.stack([1 - second, second], dim=1)

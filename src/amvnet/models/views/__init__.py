@@ -1,1 +1,1 @@
-"""Projections of a scan, and the way of the scores back to its points."""
+"""Projections of scans, and the mapping of scores back to the points."""

@@ -1,4 +1,4 @@
-"""The points of one or more scans as the views and networks take them."""
+"""The points of one or more scans in the form that the views and networks take."""
 
 from __future__ import annotations
 
@@ -14,28 +14,31 @@ from amvnet.scan import Scan
 
 
 def occurring(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Which of 0..count - 1 occur in some tensors of indices, ascending (M,), and the tensors as places among these.
+    """Find which of 0..count - 1 occur in some tensors of indices, as `unique` but without a sort.
 
-    As `unique`, without a sort.
+    Returns:
+        Those that occur (M,), ascending, and the tensors with indices into these.
     """
-    seen = torch.zeros(count, dtype=torch.bool, device=indices[0].device)
-    for some in indices:
-        seen[some.flatten()] = True
-    place = seen.cumsum(0) - 1
-    return seen.nonzero()[:, 0], [place[some] for some in indices]
+    occurs = torch.zeros(count, dtype=torch.bool, device=indices[0].device)
+    for index in indices:
+        occurs[index.flatten()] = True
+
+    position = occurs.cumsum(0) - 1
+    return occurs.nonzero()[:, 0], [position[index] for index in indices]
 
 
 @dataclass(frozen=True)
 class PointBatch:
-    """The points of B scans, one after the other.
+    """The points of B scans, one scan after the other.
 
     Attributes:
         points: (P, 4) float32: x, y, z in metres, intensity in [0, 1]; all finite.
-        scan: (P,) int64: which of the B scans a point belongs to; ascending.
+        scan: (P,) int64: the scan that each point belongs to, 0..B - 1; ascending.
         count: B.
         ring: (P,) int64: index of the laser, or None.
-        names: of the scans.
-        sizes: points of each scan, where the processor knows them: it need not ask a GPU then.
+        names: the names of the scans.
+        sizes: the number of points of each scan, or empty if unknown. If it is known, the CPU need
+            not wait for a GPU to count them.
     """
 
     points: Tensor
@@ -46,44 +49,57 @@ class PointBatch:
     sizes: tuple[int, ...] = ()
 
     def to(self, where: torch.device | torch.dtype | str) -> PointBatch:
-        """On a device, or with points of a floating-point type; from pinned memory to a GPU without waiting."""
+        """Return the batch on a device, or with points of a floating-point type.
+
+        Copies from pinned memory to a GPU do not block.
+        """
         if isinstance(where, torch.dtype):
             return replace(self, points=self.points.to(where))
-        to_gpu = (
-            torch.device(where).type == "cuda"
-        )  # the other way, what comes could be read before it is there
-        return self._each(lambda values: values.to(where, non_blocking=to_gpu))
+
+        # From a GPU the copy has to block: else it could be read before it is complete.
+        to_gpu = torch.device(where).type == "cuda"
+        return self._map(lambda values: values.to(where, non_blocking=to_gpu))
 
     def pin_memory(self) -> PointBatch:
-        """In memory that a GPU copies from by itself; torch's loaders call it, too."""
-        return self._each(Tensor.pin_memory)
+        """Return the batch in pinned memory; torch's data loaders call this too."""
+        return self._map(Tensor.pin_memory)
 
-    def _each(self, move: Callable[[Tensor], Tensor]) -> PointBatch:
-        ring = None if self.ring is None else move(self.ring)
-        return replace(self, points=move(self.points), scan=move(self.scan), ring=ring)
+    def _map(self, function: Callable[[Tensor], Tensor]) -> PointBatch:
+        ring = None if self.ring is None else function(self.ring)
+        return replace(self, points=function(self.points), scan=function(self.scan), ring=ring)
 
     def slices(self) -> list[slice]:
-        """Where each scan's points stand."""
+        """Return the slice of each scan's points."""
         sizes = self.sizes or torch.bincount(self.scan, minlength=self.count).tolist()
         ends = list(accumulate(sizes))
         return [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
 
     @classmethod
     def of(cls, scans: Sequence[Scan]) -> PointBatch:
-        """The valid points of some scans (`Scan.valid`), in order."""
-        kept = [scan.valid for scan in scans]
-        points = np.concatenate([s.points[k] for s, k in zip(scans, kept, strict=True)]).astype(
-            np.float32, copy=False
-        )
-        sizes = tuple(int(k.sum()) for k in kept)
+        """Return the valid points (`Scan.valid`) of some scans, in order.
+
+        The batch has rings only if all scans have.
+        """
+        parts = []
+        rings = []
+        for scan in scans:
+            valid = scan.valid
+            parts.append(scan.points[valid])
+            if scan.ring is not None:
+                rings.append(scan.ring[valid])
+
+        points = np.concatenate(parts).astype(np.float32, copy=False)
+        sizes = tuple(len(part) for part in parts)
         index = np.repeat(np.arange(len(scans)), sizes)
-        rings = [s.ring[k] for s, k in zip(scans, kept, strict=True) if s.ring is not None]
-        ring = (
-            torch.from_numpy(np.concatenate(rings).astype(np.int64))
-            if len(rings) == len(scans)
-            else None
-        )
-        names = tuple(scan.name for scan in scans)
+
+        ring = None
+        if len(rings) == len(scans):
+            ring = torch.from_numpy(np.concatenate(rings).astype(np.int64))
         return cls(
-            torch.from_numpy(points), torch.from_numpy(index), len(scans), ring, names, sizes
+            points=torch.from_numpy(points),
+            scan=torch.from_numpy(index),
+            count=len(scans),
+            ring=ring,
+            names=tuple(scan.name for scan in scans),
+            sizes=sizes,
         )
