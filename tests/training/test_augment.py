@@ -11,7 +11,7 @@ import pytest
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.scan import Scan
-from amvnet.training.augment import augment, mix, rotation
+from amvnet.training.augment import augment, mix, yaw_rotation
 
 RandomScan = Callable[..., Scan]
 STILL = AugmentConfig(scale=0.0, flip=0.0, jitter=0.0, yaw=0.0)
@@ -70,7 +70,7 @@ def test_turning_is_by_one_angle_within_its_limits(random_scan: RandomScan) -> N
 
 
 def test_a_rotation_by_a_quarter_turn_brings_front_to_left() -> None:
-    np.testing.assert_allclose(rotation(math.pi / 2) @ [1, 0], [0, 1], atol=1e-12)
+    np.testing.assert_allclose(yaw_rotation(math.pi / 2) @ [1, 0], [0, 1], atol=1e-12)
 
 
 def test_all_four_mirrorings_occur_and_none_else(random_scan: RandomScan) -> None:
