@@ -166,7 +166,7 @@ def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: 
     keep = KeepWeights.on_train_epoch_end
 
     def stop(self: KeepWeights, trainer: Any, module: Any) -> None:
-        if self.kept.last.parent.name == stage and trainer.current_epoch == epoch:
+        if self.last.parent.name == stage and trainer.current_epoch == epoch:
             raise RuntimeError("the power is gone")
         keep(self, trainer, module)
 
