@@ -16,7 +16,7 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
     Points are dropped, scaled, mirrored, jittered, rotated about the vertical and lifted.
     Intensities are scaled, or all set to zero.
     """
-    # A seed gives the same scan only as long as the order of the draws stays as it is.
+    # The order of the random draws decides which scan a seed gives: keep it.
     if config.drop:
         scan = _drop_points(scan, config.drop, rng)
 

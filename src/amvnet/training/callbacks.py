@@ -22,18 +22,18 @@ from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 
-PICTURE_ROUNDS = 10  # pictures are drawn about this often in a training of more epochs
+PICTURE_ROUNDS = 10  # pictures are drawn after about this many epochs of a training
 PICTURE_DPI = 60
 
 
 class KeepWeights(Callback):
-    """Writes the part being trained after each epoch: as the last, and as the best if its mIoU is.
+    """Writes the weights of a stage after each epoch, and keeps those with the highest mIoU.
 
-    Without validation the last weights are the best.
+    Without validation the last weights are kept as the best.
 
     Args:
-        write: writes a part to a path, given the part, the path and its validation metrics.
-        folder: receives best.safetensors and last.safetensors.
+        write: writes the trained part of the model to a path, with its validation metrics.
+        folder: receives last.safetensors and best.safetensors.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Curves(Callback):
         if not trainer.is_global_zero:
             return
 
-        # A resumed run repeats an epoch that had been written, but not yet been checkpointed.
+        # A resumed run repeats an epoch that was written here, but not yet in a checkpoint.
         epoch = trainer.current_epoch
         rows = [row for row in self._read() if int(row["epoch"]) < epoch]
         rows.append({"epoch": epoch, **_metrics(trainer)})
@@ -111,8 +111,9 @@ class SeedBatches(Callback):
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, index: int
     ) -> None:
         entropy = [self.seed, trainer.current_epoch, index]
-        if self.rank > 0:
+        if self.rank > 0:  # the first process draws the same numbers as a single process
             entropy.append(self.rank)
+
         torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
 
@@ -170,6 +171,7 @@ class Speed(Callback):
         """Peak memory in bytes: of the CUDA device if one is in use, else of this process."""
         if torch.cuda.is_available() and torch.cuda.max_memory_allocated():
             return torch.cuda.max_memory_allocated()
+
         return peak_memory()
 
 
@@ -183,7 +185,7 @@ class Bar(RichProgressBar):
 
 
 class EpochLines(Callback):
-    """Prints one line per epoch, if there is no terminal for a progress bar.
+    """Prints one line per epoch; used if there is no terminal for a progress bar.
 
     Args:
         say: prints a line.
@@ -196,6 +198,7 @@ class EpochLines(Callback):
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         metrics = _metrics(trainer)
+
         loss = metrics.get("train/loss", float("nan"))
         results = f"loss {loss:.3f}"
         if "val/miou" in metrics:
@@ -204,13 +207,13 @@ class EpochLines(Callback):
             results += f", val mIoU {miou:.4f} (classes present {miou_present:.4f})"
 
         speed = _speed_of(trainer)
-        epoch = f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
         pace = f"{speed.rate:.3g} {pl_module.unit}/s, {speed.time_left(trainer)} left"
+        epoch = f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
         self.say(f"{epoch}: {results}; {pace}")
 
 
 class Pictures(Callback):
-    """Draws predictions for some validation scans, seen from above, into TensorBoard.
+    """Draws predictions of some validation scans, seen from above, into TensorBoard.
 
     Args:
         scans: with labels.

@@ -27,14 +27,15 @@ from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighb
 from amvnet.training.head_scores import Scorer, ScoreSource
 from amvnet.training.loaders import ScanSet, collate
 
-# p_i (U, 2 K + 4), S_i (U, n, 2 K + 4), train ids (U,), and how many points of its scan each point
-# stands for (U,)
+# Features p_i (U, 2 K + 4), features of the neighbours S_i (U, n, 2 K + 4), train ids (U,), and how
+# many uncertain points of its scan each point stands for (U,), as only some are drawn.
 HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def point_dtype(classes: int, neighbours: int) -> np.dtype:
     """Return the type of a point on disk, for K classes and n neighbours; see `HeadBatch`."""
     width = 2 * classes + POINT_VALUES
+
     return np.dtype(
         [
             ("point", np.float16, width),
@@ -69,8 +70,11 @@ class HeadPoints:
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
         """Return the points with these (U,) indices, in this order."""
         points = np.memmap(self.path, self.dtype, "r", shape=(self.size,))[index]
-        names = self.dtype.names or ()
-        point, rows, labels, stands_for = (torch.from_numpy(points[name].copy()) for name in names)
+
+        point = torch.from_numpy(points["point"].copy())
+        rows = torch.from_numpy(points["rows"].copy())
+        labels = torch.from_numpy(points["labels"].copy())
+        stands_for = torch.from_numpy(points["stands_for"].copy())
         return point.float(), rows.float(), labels.long(), stands_for
 
 
@@ -81,8 +85,8 @@ class PointSampler(data.Sampler[np.ndarray]):
         size: number of points.
         batch: points in a batch of all processes.
         seed: of the order.
-        shuffle: whether to shuffle the points, as in training. Then the last batch is left out if
-            it would be smaller, as batch norm learns nothing good from a few points.
+        shuffle: whether to shuffle the points, as in training. A smaller last batch is then left
+            out, as batch norm learns nothing good from a few points.
         processes: those that share the batches.
     """
 
@@ -111,8 +115,8 @@ class PointSampler(data.Sampler[np.ndarray]):
         else:
             order = np.arange(self.size)
 
-        for i in range(len(self)):
-            batch = order[i * self.batch : (i + 1) * self.batch]
+        for number in range(len(self)):
+            batch = order[number * self.batch : (number + 1) * self.batch]
             yield batch[self.processes.rank :: self.processes.size]
 
 
@@ -126,7 +130,7 @@ def make_head_loader(
 
 @dataclass(frozen=True)
 class _Job:
-    """One scan to score, in one of its views.
+    """A scan to score, in one of its views.
 
     Attributes:
         source: scores the scan.
@@ -173,7 +177,7 @@ class PointGatherer:
             sources: the scans, and what scores them.
             folder: receives the points; its earlier content is removed.
             views: how often each scan is scored, each time augmented differently; 0 to score it
-                once, without augmentation. Sources that cannot score augmented scans count as 0.
+                once, without augmentation. Taken as 0 if a source cannot score augmented scans.
             say: told the progress, line by line.
 
         Raises:
@@ -181,6 +185,7 @@ class PointGatherer:
         """
         if not all(source.augmented for source in sources):
             views = 0
+
         jobs = self._jobs(sources, views)
         least = max(2, self.processes.size)  # batch norm needs two, and each process one
 
@@ -188,6 +193,7 @@ class PointGatherer:
         if len(points) < least:
             say("head: the networks agree everywhere; it learns from points drawn from all")
             points = self._gather(jobs, folder, _everywhere, say)
+
         if len(points) < least:
             raise InputError(
                 f"{folder}: expected at least {least} labelled points for the head, "
@@ -198,11 +204,13 @@ class PointGatherer:
     def _jobs(self, sources: Sequence[ScoreSource], views: int) -> list[_Job]:
         """List every view of every scan of every source."""
         augment = self.training.augment if views > 0 else None
+
         jobs = []
         for source in sources:
             scans = ScanSet(self.dataset, source.records, augment, self.training.seed)
             for view in range(max(views, 1)):
-                jobs += [_Job(source, scans, view, index) for index in range(len(scans))]
+                for index in range(len(scans)):
+                    jobs.append(_Job(source, scans, view, index))
         return jobs
 
     def _gather(
@@ -214,15 +222,42 @@ class PointGatherer:
     ) -> HeadPoints:
         """Gather the points that an assertion finds uncertain."""
         _make_empty(folder, self.processes)
+        path = folder / str(self.processes.rank)
+        counts, matrices = self._score_share(jobs, path, assertion, say)
+
+        counts_by_rank = self.processes.gather(counts)
+        certain, uncertain = np.sum(self.processes.gather(matrices), axis=0)
+        labelled = certain[1:].sum() + uncertain.sum()
+
+        return HeadPoints(
+            path=_join(folder, counts_by_rank, self._dtype.itemsize, self.processes),
+            dtype=self._dtype,
+            size=sum(map(sum, counts_by_rank)),
+            certain=certain,
+            uncertain_share=float(uncertain.sum() / max(labelled, 1)),
+        )
+
+    def _score_share(
+        self,
+        jobs: Sequence[_Job],
+        path: Path,
+        assertion: Assertion,
+        say: Callable[[str], None],
+    ) -> tuple[list[int], np.ndarray]:
+        """Score this process's share of the scans, and write their points to a file.
+
+        Returns:
+            How many points each scan of the share has in the file, and the (2, K + 1, K + 1)
+            confusion matrices of the ensemble over their certain and their uncertain points.
+        """
         ids = self.dataset.taxonomy.size + 1
         matrices = np.zeros((2, ids, ids), dtype=np.int64)
-        counts = []  # points of each scan
+        counts = []
 
-        # Each process writes a file of its own.
         share = self.processes.share(jobs)
         most = -(-self.training.head.points // len(jobs))  # points of a scan, rounded up
         source = None
-        with (folder / str(self.processes.rank)).open("wb") as file:
+        with path.open("wb") as file:
             for number, job in enumerate(share, start=1):
                 if job.source is not source:
                     source = job.source
@@ -233,20 +268,11 @@ class PointGatherer:
                 counts.append(len(points))
                 matrices += scan_matrices
 
-                # Ten lines in all, over scans of all processes.
+                # A line after every tenth of the scans.
                 if number * 10 // len(share) > (number - 1) * 10 // len(share):
                     say(f"head: scored {number * len(jobs) // len(share)} of {len(jobs)} scans")
 
-        counts_by_rank = self.processes.gather(counts)
-        certain, uncertain = np.sum(self.processes.gather(matrices), axis=0)
-        labelled = certain[1:].sum() + uncertain.sum()
-        return HeadPoints(
-            path=_join(folder, counts_by_rank, self._dtype.itemsize, self.processes),
-            dtype=self._dtype,
-            size=sum(map(sum, counts_by_rank)),
-            certain=certain,
-            uncertain_share=float(uncertain.sum() / max(labelled, 1)),
-        )
+        return counts, matrices
 
     @torch.inference_mode()
     def _gather_scan(
@@ -255,8 +281,8 @@ class PointGatherer:
         """Score one scan, and draw at most `most` of its uncertain points.
 
         Returns:
-            (U,) points as on disk, and (2, K + 1, K + 1): the confusion matrices of the ensemble
-            over the certain and over the uncertain points.
+            (U,) points of `point_dtype`, and the (2, K + 1, K + 1) confusion matrices of the
+            ensemble over the certain and over all uncertain points of the scan.
         """
         device = self._device
         scan = job.scans[job.view, job.index]
@@ -303,7 +329,7 @@ def gather_points(
     say: Callable[[str], None] = lambda line: None,
     processes: Processes = ALONE,
 ) -> HeadPoints:
-    """Gather points by a `PointGatherer`."""
+    """Gather the points of the head; see `PointGatherer`."""
     gatherer = PointGatherer(dataset, model, training, processes)
     return gatherer.gather(sources, folder, views, say)
 
@@ -335,6 +361,7 @@ def _ensemble_matrices(f: Tensor, g: Tensor, labels: Tensor, uncertain: Tensor) 
 
 
 def _make_empty(folder: Path, processes: Processes) -> None:
+    """Remove a folder's content, before any process goes on."""
     if processes.first:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -348,19 +375,23 @@ def _join(
 
     Args:
         folder: has a file of each process, named by its rank.
-        counts_by_rank: the points of each scan of each process; the scans were dealt in turns.
+        counts_by_rank: for each process, the points of each of its scans; processes take the scans
+            in turns.
         point_bytes: bytes of a point.
-        processes: of which the first writes.
+        processes: those that share the folder.
     """
     path = folder / "points"
     if processes.first:
-        parts = [folder / str(rank) for rank in range(len(counts_by_rank))]
-        scans = sum(map(len, counts_by_rank))
+        parts = [folder / str(rank) for rank in range(processes.size)]
         with ExitStack() as stack, path.open("wb") as joined:
-            files = [stack.enter_context(part.open("rb")) for part in parts]
-            for scan in range(scans):
-                turn, rank = divmod(scan, len(parts))
-                joined.write(files[rank].read(counts_by_rank[rank][turn] * point_bytes))
+            files = []
+            for part in parts:
+                files.append(stack.enter_context(part.open("rb")))
+
+            for index in range(sum(map(len, counts_by_rank))):
+                turn, rank = divmod(index, processes.size)
+                count = counts_by_rank[rank][turn]
+                joined.write(files[rank].read(count * point_bytes))
 
         for part in parts:
             part.unlink()

@@ -16,7 +16,7 @@ from amvnet.training.stages import Stage
 
 
 class HeadStage(Stage):
-    """Stage `head`: the networks are frozen, as only their scores are used, gathered beforehand.
+    """Stage `head`: it learns from scores gathered beforehand, so that the networks stay frozen.
 
     Args:
         head: the point head.

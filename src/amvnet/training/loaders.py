@@ -159,7 +159,7 @@ def count_classes(
     """Count the points of each class in some scans, or read the counts of an earlier call.
 
     Args:
-        kept: an .npz file that keeps the counts; written if it has not those of these scans.
+        kept: an .npz file of counts; written unless it already has those of these scans.
 
     Returns:
         (K,) int64.
@@ -168,7 +168,8 @@ def count_classes(
         "scans": [record.name for record in records],
         "classes": list(dataset.taxonomy.classes),
     }
-    # The first process decides for all: the others might already see the file that it writes below.
+
+    # The first process reads for all, as others might already see the file that it writes below.
     earlier = processes.gather(_read_counts(kept, source))[0]
     if earlier is not None:
         return earlier
@@ -178,6 +179,7 @@ def count_classes(
         labels = dataset.read(record).labels
         if labels is not None:
             counts += np.bincount(labels, minlength=len(counts))
+
     totals = np.sum(processes.gather(counts), axis=0)[1:]
 
     if processes.first:
@@ -189,7 +191,7 @@ def count_classes(
 
 
 def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:
-    """Return the counts in a file, or None if it is missing, broken or of another source."""
+    """Return the counts in a file, or None if it is missing, broken or of other scans."""
     with (
         suppress(OSError, ValueError, KeyError, BadZipFile),
         np.load(path, allow_pickle=False) as file,

@@ -99,14 +99,15 @@ def lovasz_softmax(probabilities: Tensor, target: Tensor) -> Tensor:
 
 
 def _jaccard_increases(truth: Tensor, total: Tensor) -> Tensor:
-    """Return by how much each point increases the Jaccard loss, if added as mispredicted in turn.
+    """Return how much the Jaccard loss increases as each point in turn becomes mispredicted.
 
     Args:
-        truth: (M,) 1 for points of the class, 0 for others, by falling error.
+        truth: (M,) 1 for points of the class, 0 for others; sorted by falling error.
         total: () all points of the class, including those whose error is small.
     """
     intersection = total - truth.cumsum(0)
     union = total + (1 - truth).cumsum(0)
+
     loss = 1 - intersection / union
     return torch.cat([loss[:1], loss[1:] - loss[:-1]])
 

@@ -25,7 +25,7 @@ MOMENTUM_CYCLE = 0.1  # the one-cycle schedule lowers the momentum by this much
 
 
 class Stage(L.LightningModule):
-    """What all stages share: class weights, the validation's metrics and the one-cycle schedule.
+    """The base of all stages: class weights, metrics of the validation, the one-cycle schedule.
 
     Args:
         config: of this stage.
@@ -94,6 +94,7 @@ class Stage(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         values = metrics(self.whole_matrix(), self.taxonomy)
+
         self.log("val/miou", values["miou"] or 0.0, prog_bar=True)
         self.log("val/miou_present", values["miou_present"] or 0.0)
         self.log("val/acc", values["accuracy"] or 0.0)
@@ -134,7 +135,7 @@ class Stage(L.LightningModule):
 
 
 class NetworkStage(Stage):
-    """Training of one of the two networks; subclasses say how it scores, and its loss.
+    """The base of the two networks' stages, which define `logits` and `loss`.
 
     Args:
         view: projects the points to the input of the network.
@@ -169,8 +170,8 @@ class NetworkStage(Stage):
             labels: (P,) train ids.
 
         Returns:
-            Three values: for each scan the (M, K) logits that the loss is computed on, for each
-            scan their (M,) train ids, and the (P, K) logits of all points.
+            The (M, K) logits of each scan that the loss is computed on, the (M,) train ids of each
+            scan that belong to them, and the (P, K) logits of all points.
         """
         raise NotImplementedError
 
@@ -186,8 +187,10 @@ class NetworkStage(Stage):
         logits_by_scan, labels_by_scan, _ = self.logits(points, labels)
 
         # The mean over scans stays the same if a batch is split, over processes or to save memory.
-        by_scan = zip(logits_by_scan, labels_by_scan, strict=True)
-        loss = torch.stack([self.loss(*scan) for scan in by_scan]).mean()
+        losses = []
+        for scan_logits, scan_labels in zip(logits_by_scan, labels_by_scan, strict=True):
+            losses.append(self.loss(scan_logits, scan_labels))
+        loss = torch.stack(losses).mean()
 
         self.check_finite(loss, f"at the scans {', '.join(points.names)}")
         self.log("train/loss", loss, prog_bar=True, batch_size=points.count)

@@ -41,6 +41,7 @@ class SyncedBatchNorm(_BatchNorm):
         synced = cls(
             norm.num_features, norm.eps, norm.momentum, device=weight.device, dtype=weight.dtype
         )
+
         synced.load_state_dict(norm.state_dict())
         return synced
 
@@ -49,10 +50,10 @@ class SyncedBatchNorm(_BatchNorm):
             return super().forward(input)
 
         x = input.to(torch.promote_types(input.dtype, torch.float32))
-        shape = (1, -1, *[1] * (x.ndim - 2))  # of a value per channel, to broadcast over x
+        shape = (1, -1, *[1] * (x.ndim - 2))  # of one value per channel, to broadcast
         axes = (0, *range(2, x.ndim))  # all but the channels
 
-        # One exchange for both: the sums of the channels, and how many values each sum has.
+        # One exchange for two things: the sums of the channels, and the number of their values.
         count = x.new_tensor([x.numel() / x.shape[1]])
         sums = _sum_over_processes(torch.cat([x.sum(axes), count]))
         mean = sums[:-1] / sums[-1]
