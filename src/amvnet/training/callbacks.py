@@ -22,7 +22,7 @@ from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 
-PICTURE_ROUNDS = 10  # pictures are drawn after about this many epochs of a training
+PICTURE_ROUNDS = 10  # about how many times in a training pictures are drawn
 PICTURE_DPI = 60
 
 

@@ -86,7 +86,7 @@ class EpochSampler(data.Sampler[Key]):
     """Draws every scan once per epoch, in an order that depends on seed and epoch.
 
     With several processes, each takes its part of every batch. In training all processes draw
-    equally many scans: if the scans cannot be shared equally, the first ones are drawn twice.
+    equally many scans: if the scans cannot be shared equally, the first ones are drawn again.
 
     Args:
         size: number of scans.
@@ -103,7 +103,7 @@ class EpochSampler(data.Sampler[Key]):
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch; Lightning calls this."""
+        """Set the epoch, which the order depends on; Lightning calls this."""
         self.epoch = epoch
 
     def __len__(self) -> int:
