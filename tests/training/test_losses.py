@@ -1,4 +1,4 @@
-"""The losses equal plain loops from their definitions; ignored points have no part in them."""
+"""The losses equal plain loops over their definitions, and leave ignored points out."""
 
 from __future__ import annotations
 
@@ -25,75 +25,94 @@ Loss = Callable[[Tensor, Tensor, Tensor | None, float], Tensor]
 
 
 def example(points: int = 60, seed: int = 0, classes: int = K) -> tuple[Tensor, Tensor]:
-    """(P, K) logits and (P,) labels of which some are 0 and one class is absent."""
+    """Make (P, K) logits and (P,) labels; some labels are 0, and the last class is absent."""
     generator = torch.Generator().manual_seed(seed)
     logits = torch.randn(points, classes, generator=generator) * 2
     return logits, torch.randint(0, classes, (points,), generator=generator)
 
 
 def cross_entropy_by_loop(logits: Tensor, labels: Tensor, weights: list[float]) -> float:
-    total = weight = 0.0
+    total = 0.0
+    total_weight = 0.0
     for row, label in zip(logits.double().tolist(), labels.tolist(), strict=True):
-        if label:
-            own = math.exp(row[label - 1]) / sum(math.exp(v) for v in row)
-            total -= weights[label - 1] * math.log(own)
-            weight += weights[label - 1]
-    return total / weight
+        if label == 0:
+            continue
+        exponentials = [math.exp(logit) for logit in row]
+        probability = exponentials[label - 1] / sum(exponentials)
+        total -= weights[label - 1] * math.log(probability)
+        total_weight += weights[label - 1]
+    return total / total_weight
 
 
 def dice_by_loop(probabilities: list[list[float]], target: list[int]) -> float:
     scores = []
-    for c in set(target):
-        overlap = sum(row[c] for row, t in zip(probabilities, target, strict=True) if t == c)
-        scores.append(2 * overlap / (sum(row[c] for row in probabilities) + target.count(c)))
+    for index in set(target):
+        overlap = 0.0
+        size = float(target.count(index))
+        for row, truth in zip(probabilities, target, strict=True):
+            size += row[index]
+            if truth == index:
+                overlap += row[index]
+        scores.append(2 * overlap / size)
     return 1 - sum(scores) / len(scores)
 
 
 def jaccard_loss(wrong: set[int], members: set[int]) -> float:
-    """1 - |truth and prediction| / |truth or prediction| of a class whose points `wrong` are mispredicted."""
+    """Return 1 - |truth and prediction| / |truth or prediction| of a class.
+
+    Args:
+        wrong: indices of the points that are mispredicted.
+        members: indices of the points of the class.
+    """
     prediction = members ^ wrong
     return 1 - len(members & prediction) / len(members | prediction)
 
 
 def lovasz_by_sets(probabilities: list[list[float]], target: list[int]) -> float:
-    """The Lovász extension as it is defined: the errors, largest first, times what each adds to the set function."""
+    """Return the Lovász extension by its definition.
+
+    The errors are taken from the largest to the smallest; each is weighted by the increase of the
+    Jaccard loss if its point is mispredicted, too.
+    """
     losses = []
-    for c in set(target):
-        members = {i for i, t in enumerate(target) if t == c}
-        errors = [1 - row[c] if i in members else row[c] for i, row in enumerate(probabilities)]
+    for index in set(target):
+        members = {point for point, truth in enumerate(target) if truth == index}
+        errors = {point: row[index] for point, row in enumerate(probabilities)}
+        for point in members:
+            errors[point] = 1 - errors[point]
+
         wrong: set[int] = set()
         loss = 0.0
-        for i in sorted(range(len(errors)), key=lambda i, errors=errors: -errors[i]):
+        for point in sorted(errors, key=errors.__getitem__, reverse=True):
             before = jaccard_loss(wrong, members)
-            wrong.add(i)
-            loss += errors[i] * (jaccard_loss(wrong, members) - before)
+            wrong.add(point)
+            loss += errors[point] * (jaccard_loss(wrong, members) - before)
         losses.append(loss)
     return sum(losses) / len(losses)
 
 
 @LOSSES
 @pytest.mark.parametrize("weights", [None, [1.0, 0.2, 3.0, 0.7, 2.0]])
-def test_without_the_region_part_a_loss_is_weighted_cross_entropy(
+def test_without_the_region_loss_a_loss_is_weighted_cross_entropy(
     loss: Loss, weights: list[float] | None
 ) -> None:
     logits, labels = example()
-    found = loss(logits, labels, None if weights is None else torch.tensor(weights), 0.0)
-    assert found.item() == pytest.approx(
-        cross_entropy_by_loop(logits, labels, weights or [1.0] * K), rel=1e-5
-    )
+    tensor = None if weights is None else torch.tensor(weights)
+    expected = cross_entropy_by_loop(logits, labels, weights or [1.0] * K)
+    assert loss(logits, labels, tensor, 0.0).item() == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(
     ("loss", "region_loss"), [(range_view_loss, dice), (polar_view_loss, lovasz_softmax)]
 )
-def test_a_loss_is_cross_entropy_plus_its_region_part(
+def test_a_loss_is_cross_entropy_plus_the_weighted_region_loss(
     loss: Loss, region_loss: Callable[..., Tensor]
 ) -> None:
     logits, labels = example()
-    kept = labels > 0
-    region = region_loss(logits[kept].softmax(dim=1), labels[kept] - 1)
-    both = loss(logits, labels, None, 0.0) + 1.5 * region
-    torch.testing.assert_close(loss(logits, labels, None, 1.5), both)
+    labelled = labels > 0
+    region = region_loss(logits[labelled].softmax(dim=1), labels[labelled] - 1)
+    expected = loss(logits, labels, None, 0.0) + 1.5 * region
+    torch.testing.assert_close(loss(logits, labels, None, 1.5), expected)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -146,7 +165,7 @@ def test_ignored_points_carry_no_gradient_and_the_others_do(loss: Loss) -> None:
 
 
 @LOSSES
-def test_the_scores_of_ignored_points_do_not_change_the_loss(loss: Loss) -> None:
+def test_the_logits_of_ignored_points_do_not_change_the_loss(loss: Loss) -> None:
     logits, labels = example()
     changed = torch.where((labels == 0)[:, None], torch.randn_like(logits) * 50, logits)
     assert torch.equal(loss(logits, labels, None, 1.0), loss(changed, labels, None, 1.0))
@@ -154,24 +173,25 @@ def test_the_scores_of_ignored_points_do_not_change_the_loss(loss: Loss) -> None
 
 @LOSSES
 @pytest.mark.parametrize("points", [0, 7])
-def test_where_every_point_is_ignored_loss_and_gradient_are_zero(loss: Loss, points: int) -> None:
+def test_if_every_point_is_ignored_loss_and_gradient_are_zero(loss: Loss, points: int) -> None:
     logits = torch.randn(points, K, requires_grad=True)
-    found = loss(logits, torch.zeros(points, dtype=torch.uint8), torch.ones(K), 1.0)
-    found.backward()
-    assert found.item() == 0
+    labels = torch.zeros(points, dtype=torch.uint8)
+    value = loss(logits, labels, torch.ones(K), 1.0)
+    value.backward()
+    assert value.item() == 0
     assert torch.equal(logits.grad, torch.zeros(points, K))
 
 
 @LOSSES
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_for_extreme_scores_the_loss_is_in_float32_and_its_gradient_finite(
+def test_for_extreme_logits_the_loss_is_in_float32_and_its_gradient_finite(
     loss: Loss, dtype: torch.dtype
 ) -> None:
     logits, labels = example()
     logits = (logits * 1000).to(dtype).requires_grad_()
-    found = loss(logits, labels.to(torch.uint8), None, 1.0)
-    found.backward()
-    assert found.dtype == torch.float32
+    value = loss(logits, labels.to(torch.uint8), None, 1.0)
+    value.backward()
+    assert value.dtype == torch.float32
     assert logits.grad.isfinite().all()
 
 
@@ -184,7 +204,7 @@ def test_a_step_down_the_gradient_lowers_the_loss(loss: Loss) -> None:
     assert loss(logits - 0.5 * logits.grad, labels, None, 1.0) < before
 
 
-def test_class_weights_go_as_the_square_root_of_the_inverse_frequency() -> None:
+def test_class_weights_are_proportional_to_the_square_root_of_the_inverse_frequency() -> None:
     weights = class_weights(np.array([100, 400, 2500]))
     assert weights.dtype == np.float32
     assert weights[0] / weights[1] == pytest.approx(math.sqrt(400 / 100))
@@ -192,12 +212,12 @@ def test_class_weights_go_as_the_square_root_of_the_inverse_frequency() -> None:
     assert weights.mean() == pytest.approx(1)
 
 
-def test_a_class_that_is_absent_or_nearly_weighs_as_one_at_the_floor() -> None:
+def test_absent_and_very_rare_classes_weigh_as_much_as_one_at_the_floor() -> None:
     weights = class_weights(np.array([10**9, 0, 3, round(FREQUENCY_FLOOR * 10**9)]))
     assert np.isfinite(weights).all()
     np.testing.assert_allclose(weights[1:], weights[1], rtol=1e-3)
     assert weights[1] / weights[0] == pytest.approx(math.sqrt(1 / FREQUENCY_FLOOR), rel=1e-3)
 
 
-def test_class_weights_without_any_point_are_equal() -> None:
+def test_class_weights_are_equal_if_there_are_no_points() -> None:
     np.testing.assert_allclose(class_weights(np.zeros(4, np.int64)), 1, rtol=1e-6)

@@ -1,11 +1,10 @@
-"""What is done in the course of a training: weights, curves and pictures are kept, lines said, batches seeded."""
+"""Lightning callbacks of a training: weights, curves, seeds, speed, progress and pictures."""
 
 from __future__ import annotations
 
 import csv
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -23,29 +22,27 @@ from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 
-PICTURED = 10  # times in a training that the pictures are drawn, at most about
-PICTURE_DOTS = 60  # an inch
-
-
-@dataclass(frozen=True)
-class KeptWeights:
-    """Where a stage's run keeps its weights, and what they reached."""
-
-    best: Path
-    last: Path
+PICTURE_ROUNDS = 10  # about how many times in a training pictures are drawn
+PICTURE_DPI = 60
 
 
 class KeepWeights(Callback):
-    """After each epoch writes the trained part as `last`, and as `best` where its mIoU is the highest yet.
+    """Writes the weights of a stage after each epoch, and keeps those with the highest mIoU.
 
-    Where nothing is validated the last is the best.
+    Without validation the last weights are kept as the best.
+
+    Args:
+        write: writes the trained part of the model to a path, with its validation metrics.
+        folder: receives last.safetensors and best.safetensors.
     """
 
     def __init__(
         self, write: Callable[[nn.Module, Path, dict[str, float]], None], folder: Path
     ) -> None:
-        self.write, self.highest = write, -1.0
-        self.kept = KeptWeights(folder / "best.safetensors", folder / "last.safetensors")
+        self.write = write
+        self.best = folder / "best.safetensors"
+        self.last = folder / "last.safetensors"
+        self.highest = -1.0  # mIoU of the best weights so far
 
     def state_dict(self) -> dict[str, Any]:
         return {"highest": self.highest}
@@ -54,17 +51,26 @@ class KeepWeights(Callback):
         self.highest = state_dict["highest"]
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        reached = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("val/")}
-        miou, reached["epoch"] = reached.get("val/miou"), trainer.current_epoch
-        best = miou is None or miou > self.highest
-        self.highest = self.highest if miou is None or not best else miou
-        for path in (self.kept.last, *([self.kept.best] if best else [])):
-            if trainer.is_global_zero:
-                self.write(trained(pl_module), path, reached)
+        metrics = {}
+        for name, value in _metrics(trainer).items():
+            if name.startswith("val/"):
+                metrics[name] = value
+        metrics["epoch"] = trainer.current_epoch
+
+        miou = metrics.get("val/miou")
+        is_best = miou is None or miou > self.highest
+        if miou is not None:
+            self.highest = max(self.highest, miou)
+
+        if trainer.is_global_zero:
+            part = _trained_part(pl_module)
+            self.write(part, self.last, metrics)
+            if is_best:
+                self.write(part, self.best, metrics)
 
 
 class Curves(Callback):
-    """Keeps the figures of each epoch in a table, one row an epoch; those of a resumed run go on in it."""
+    """Keeps the metrics in a CSV file, one row per epoch; a resumed run extends it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -72,17 +78,22 @@ class Curves(Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         if not trainer.is_global_zero:
             return
-        now = {
-            "epoch": trainer.current_epoch,
-            **{k: float(v) for k, v in trainer.callback_metrics.items()},
-        }
-        rows = [row for row in self._kept() if int(row["epoch"]) < now["epoch"]] + [now]
+
+        # A resumed run repeats an epoch that was written here, but not yet in a checkpoint.
+        epoch = trainer.current_epoch
+        rows = [row for row in self._read() if int(row["epoch"]) < epoch]
+        rows.append({"epoch": epoch, **_metrics(trainer)})
+
+        columns: dict[str, None] = {}  # in the order in which they first appear
+        for row in rows:
+            columns.update(dict.fromkeys(row))
+
         with atomic_write(self.path) as part, part.open("w", newline="") as file:
-            table = csv.DictWriter(file, list(dict.fromkeys(key for row in rows for key in row)))
+            table = csv.DictWriter(file, list(columns))
             table.writeheader()
             table.writerows(rows)
 
-    def _kept(self) -> list[dict[str, Any]]:
+    def _read(self) -> list[dict[str, Any]]:
         if not self.path.is_file():
             return []
         with self.path.open(newline="") as file:
@@ -90,136 +101,174 @@ class Curves(Callback):
 
 
 class SeedBatches(Callback):
-    """Seeds torch anew for each batch, so that a resumed run draws what an uninterrupted one does."""
+    """Seeds PyTorch before each training batch, so that a resumed run repeats the random draws."""
 
     def __init__(self, seed: int, rank: int = 0) -> None:
-        self.seed, self.rank = seed, rank
+        self.seed = seed
+        self.rank = rank
 
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, index: int
     ) -> None:
-        place = [self.seed, trainer.current_epoch, index, *([self.rank] if self.rank else [])]
-        torch.manual_seed(int(np.random.SeedSequence(place).generate_state(1)[0]))
+        entropy = [self.seed, trainer.current_epoch, index]
+        if self.rank > 0:  # the first process draws the same numbers as a single process
+            entropy.append(self.rank)
+
+        torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
 
 class Speed(Callback):
-    """Measures how fast a training is, over the steps of an epoch so far, and the largest memory that it took.
+    """Measures the speed of the current epoch so far, and the peak memory of the training.
 
     Attributes:
-        seconds: of each optimizer step, of this epoch.
-        rate: scans (or points of the head) a second, of all processes together.
+        seconds: duration of each optimizer step.
+        rate: scans (or points, for the head) per second, over all processes.
     """
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
         self.rate = 0.0
-        self._units = self._steps = 0
-        self._begun = self._last = 0.0
+        self._units = 0  # scans or points so far
+        self._step = 0  # the last optimizer step that was timed
+        self._epoch_start = 0.0
+        self._step_start = 0.0
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self.seconds, self._units, self._steps = [], 0, trainer.global_step
-        self._begun = self._last = time.perf_counter()
+        self.seconds = []
+        self._units = 0
+        self._step = trainer.global_step
+        self._epoch_start = time.perf_counter()
+        self._step_start = self._epoch_start
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         now = time.perf_counter()
         self._units += pl_module.size_of(batch) * trainer.world_size
-        self.rate = self._units / (now - self._begun)
+        self.rate = self._units / (now - self._epoch_start)
         pl_module.log(f"{pl_module.unit}/s", self.rate, prog_bar=True, batch_size=1)
-        if trainer.global_step > self._steps:
-            self._steps = trainer.global_step
-            self.seconds.append(now - self._last)
-            self._last = now
 
-    def left(self, trainer: L.Trainer) -> str:
-        """The time that the rest of the training takes at this rate, as h:mm:ss."""
-        elapsed, epoch = time.perf_counter() - self._begun, trainer.current_epoch
-        done = trainer.fit_loop.epoch_loop.batch_progress.current.completed / max(
-            trainer.num_training_batches, 1
-        )
-        ahead = (trainer.max_epochs or epoch) - epoch - done
-        return str(timedelta(seconds=round(ahead * elapsed / done))) if done else "?"
+        # A step may take several batches, whose gradients are accumulated.
+        if trainer.global_step > self._step:
+            self.seconds.append(now - self._step_start)
+            self._step = trainer.global_step
+            self._step_start = now
+
+    def time_left(self, trainer: L.Trainer) -> str:
+        """Return how long the rest of the training takes at this rate, as h:mm:ss."""
+        batches = trainer.fit_loop.epoch_loop.batch_progress.current.completed
+        done = batches / max(trainer.num_training_batches, 1)  # share of the epoch
+        if not done:
+            return "?"
+
+        elapsed = time.perf_counter() - self._epoch_start
+        epochs = trainer.max_epochs or trainer.current_epoch
+        ahead = epochs - trainer.current_epoch - done
+        return str(timedelta(seconds=round(ahead * elapsed / done)))
 
     @property
     def memory(self) -> int:
-        """Bytes: the most that was taken on the CUDA device, or else by this process."""
+        """Peak memory in bytes: of the CUDA device if one is in use, else of this process."""
         if torch.cuda.is_available() and torch.cuda.max_memory_allocated():
             return torch.cuda.max_memory_allocated()
+
         return peak_memory()
 
 
 class Bar(RichProgressBar):
-    """Progress of an epoch with loss, mIoU, scans a second, and the time left of the whole training."""
+    """Progress bar of an epoch with loss, mIoU, speed and the time left of the whole training."""
 
     def get_metrics(self, trainer: L.Trainer, pl_module: L.LightningModule) -> dict[str, Any]:
-        found = super().get_metrics(trainer, pl_module)
-        found.pop("v_num", None)
-        return {**found, "left": speed_of(trainer).left(trainer)}
+        metrics = super().get_metrics(trainer, pl_module)
+        metrics.pop("v_num", None)
+        return {**metrics, "left": _speed_of(trainer).time_left(trainer)}
 
 
 class EpochLines(Callback):
-    """Says one line an epoch, where there is no terminal for a progress bar."""
+    """Prints one line per epoch; used if there is no terminal for a progress bar.
+
+    Args:
+        say: prints a line.
+        name: of the stage.
+    """
 
     def __init__(self, say: Callable[[str], None], name: str) -> None:
-        self.say, self.name = say, name
+        self.say = say
+        self.name = name
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
-        values = {k: float(v) for k, v in trainer.callback_metrics.items()}
-        reached = f"loss {values.get('train/loss', float('nan')):.3f}"
-        if "val/miou" in values:
-            reached += f", val mIoU {values['val/miou']:.4f} (classes present {values['val/miou_present']:.4f})"
-        speed = speed_of(trainer)
-        pace = f"{speed.rate:.3g} {pl_module.unit}/s, {speed.left(trainer)} left"
-        self.say(
-            f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: {reached}; {pace}"
-        )
+        metrics = _metrics(trainer)
+
+        loss = metrics.get("train/loss", float("nan"))
+        results = f"loss {loss:.3f}"
+        if "val/miou" in metrics:
+            miou = metrics["val/miou"]
+            miou_present = metrics["val/miou_present"]
+            results += f", val mIoU {miou:.4f} (classes present {miou_present:.4f})"
+
+        speed = _speed_of(trainer)
+        pace = f"{speed.rate:.3g} {pl_module.unit}/s, {speed.time_left(trainer)} left"
+        epoch = f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
+        self.say(f"{epoch}: {results}; {pace}")
 
 
 class Pictures(Callback):
-    """Draws some validation scans from above into TensorBoard, as the part that is trained would label them.
+    """Draws predictions of some validation scans, seen from above, into TensorBoard.
 
     Args:
         scans: with labels.
-        label: the (P,) train ids of a batch of one scan.
+        taxonomy: the classes and their colours.
+        label: returns the predicted (P,) train ids of a batch of one scan.
     """
 
     def __init__(
         self, scans: Sequence[Scan], taxonomy: Taxonomy, label: Callable[[PointBatch], Tensor]
     ) -> None:
-        self.scans, self.taxonomy, self.label = scans, taxonomy, label
+        self.scans = scans
+        self.taxonomy = taxonomy
+        self.label = label
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        every = max((trainer.max_epochs or 1) // PICTURED, 1)
-        if not trainer.is_global_zero or (trainer.current_epoch + 1) % every:
+        interval = max((trainer.max_epochs or 1) // PICTURE_ROUNDS, 1)
+        is_due = (trainer.current_epoch + 1) % interval == 0
+        if not (trainer.is_global_zero and is_due):
             return
-        part = trained(pl_module)
+
+        part = _trained_part(pl_module)
+        parameter = next(part.parameters())
         part.eval()
         for scan in self.scans:
-            self._draw(trainer, scan, next(part.parameters()))
+            batch = PointBatch.of([scan]).to(parameter.device).to(parameter.dtype)
+            self._draw(scan, batch, trainer)
         part.train()
 
     @torch.no_grad()
-    def _draw(self, trainer: L.Trainer, scan: Scan, like: Tensor) -> None:
-        ids = np.zeros(len(scan), dtype=np.uint8)
-        ids[scan.valid] = (
-            self.label(PointBatch.of([scan]).to(like.device).to(like.dtype)).cpu().numpy()
-        )
-        figure = scan_figure(
-            scan.points, self.taxonomy, {"prediction": ids}, scan.labels, title=scan.name
-        )
-        figure.set_dpi(PICTURE_DOTS)
+    def _draw(self, scan: Scan, batch: PointBatch, trainer: L.Trainer) -> None:
+        ids = np.zeros(len(scan), dtype=np.uint8)  # 0 for invalid points
+        ids[scan.valid] = self.label(batch).cpu().numpy()
+
+        predictions = {"prediction": ids}
+        figure = scan_figure(scan.points, self.taxonomy, predictions, scan.labels, title=scan.name)
+        figure.set_dpi(PICTURE_DPI)
+
         assert trainer.logger is not None
-        trainer.logger.experiment.add_figure(scan.name, figure, trainer.current_epoch)  # type: ignore[attr-defined]
+        writer = trainer.logger.experiment  # type: ignore[attr-defined]
+        writer.add_figure(scan.name, figure, trainer.current_epoch)
 
 
-def speed_of(trainer: L.Trainer) -> Speed:
-    """The callback that measures this training."""
-    return next(callback for callback in trainer.callbacks if isinstance(callback, Speed))  # type: ignore[attr-defined]
+def _metrics(trainer: L.Trainer) -> dict[str, float]:
+    """Return the logged metrics of the epoch as plain numbers."""
+    return {name: float(value) for name, value in trainer.callback_metrics.items()}
 
 
-def trained(module: L.LightningModule) -> nn.Module:
-    """The part that a stage trains."""
-    found = module.trained
-    assert isinstance(found, nn.Module)
-    return found
+def _speed_of(trainer: L.Trainer) -> Speed:
+    """Return the callback that measures the speed of this training."""
+    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    return next(callback for callback in callbacks if isinstance(callback, Speed))
+
+
+def _trained_part(module: L.LightningModule) -> nn.Module:
+    """Return the part of the model that a stage trains."""
+    part = module.trained
+    assert isinstance(part, nn.Module)
+    return part

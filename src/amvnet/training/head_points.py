@@ -1,8 +1,10 @@
-"""What the point head learns from: uncertain points gathered once, then batches of them drawn at random."""
+"""Training data of the point head: uncertain points gathered once, then loaded in random batches.
+
+Sections 3.2 and 3.3 of the paper.
+"""
 
 from __future__ import annotations
 
-import functools
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -14,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.utils import data
 
-from amvnet.config.schema import ModelConfig, PointHeadConfig, TrainingConfig
+from amvnet.config.schema import ModelConfig, TrainingConfig
 from amvnet.data.datasets.base import Dataset
 from amvnet.distributed import ALONE, Processes, device_of
 from amvnet.errors import InputError
@@ -22,18 +24,18 @@ from amvnet.evaluation.metrics import confusion
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
-from amvnet.models.views.points import PointBatch
-from amvnet.scan import Scan
-from amvnet.training.head_scores import ScoreSource
+from amvnet.training.head_scores import Scorer, ScoreSource
 from amvnet.training.loaders import ScanSet, collate
 
-# p_i (U, 2 K + 4), S_i (U, n, 2 K + 4), train ids (U,), and for how many points of its scan each stands (U,)
+# Features p_i (U, 2 K + 4), features of the neighbours S_i (U, n, 2 K + 4), train ids (U,), and how
+# many uncertain points of its scan each point stands for (U,), as only some are drawn.
 HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def row_of(classes: int, neighbours: int) -> np.dtype:
-    """What is kept of a point."""
+def point_dtype(classes: int, neighbours: int) -> np.dtype:
+    """Return the type of a point on disk, for K classes and n neighbours; see `HeadBatch`."""
     width = 2 * classes + POINT_VALUES
+
     return np.dtype(
         [
             ("point", np.float16, width),
@@ -46,68 +48,275 @@ def row_of(classes: int, neighbours: int) -> np.dtype:
 
 @dataclass(frozen=True)
 class HeadPoints:
-    """The labelled uncertain points of some scans as the head sees them, and what is known of the others.
+    """The labelled uncertain points of some scans in a file, and statistics of all their points.
 
     Attributes:
-        path: the file of U rows of `row_of`.
-        row: their type.
+        path: the file of U points.
+        dtype: of a point, from `point_dtype`.
         size: U.
-        certain: (K + 1, K + 1) confusion matrix of the ensemble over the points that are certain.
-        uncertain: share of the labelled points that are not.
+        certain: (K + 1, K + 1) confusion matrix of the ensemble over the certain points.
+        uncertain_share: share of the labelled points that are uncertain.
     """
 
     path: Path
-    row: np.dtype
+    dtype: np.dtype
     size: int
     certain: np.ndarray
-    uncertain: float
+    uncertain_share: float
 
     def __len__(self) -> int:
         return self.size
 
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
-        """The points of some indices, in this order."""
-        found = np.memmap(self.path, self.row, "r", shape=(self.size,))[index]
-        point, rows, labels, stands_for = (
-            torch.from_numpy(found[name].copy()) for name in self.row.names or ()
-        )
+        """Return the points with these (U,) indices, in this order."""
+        points = np.memmap(self.path, self.dtype, "r", shape=(self.size,))[index]
+
+        point = torch.from_numpy(points["point"].copy())
+        rows = torch.from_numpy(points["rows"].copy())
+        labels = torch.from_numpy(points["labels"].copy())
+        stands_for = torch.from_numpy(points["stands_for"].copy())
         return point.float(), rows.float(), labels.long(), stands_for
 
 
 class PointSampler(data.Sampler[np.ndarray]):
-    """Batches of indices; for training in an order drawn from (seed, epoch), and without a last small batch.
+    """Draws batches of indices; with several processes, each takes its part of every batch.
 
-    Of several processes each takes its part of every batch.
+    Args:
+        size: number of points.
+        batch: points in a batch of all processes.
+        seed: of the order.
+        shuffle: whether to shuffle the points, as in training. A smaller last batch is then left
+            out, as batch norm learns nothing good from a few points.
+        processes: those that share the batches.
     """
 
     def __init__(
         self, size: int, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
     ) -> None:
-        self.size, self.batch, self.seed, self.shuffle, self.epoch = size, batch, seed, shuffle, 0
+        self.size = size
+        self.batch = batch
+        self.seed = seed
+        self.shuffle = shuffle
         self.processes = processes
+        self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
+        """Set the epoch, which the order depends on; Lightning calls this."""
         self.epoch = epoch
 
     def __len__(self) -> int:
-        # Batch norm learns nothing good of a last batch of a few points.
-        return max(self.size // self.batch, 1) if self.shuffle else -(-self.size // self.batch)
+        if self.shuffle:
+            return max(self.size // self.batch, 1)
+        return -(-self.size // self.batch)  # rounded up
 
     def __iter__(self) -> Iterator[np.ndarray]:
-        rng = np.random.default_rng([self.seed, self.epoch])
-        order = rng.permutation(self.size) if self.shuffle else np.arange(self.size)
-        for i in range(len(self)):
-            yield order[i * self.batch : (i + 1) * self.batch][
-                self.processes.rank :: self.processes.size
-            ]
+        if self.shuffle:
+            order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
+        else:
+            order = np.arange(self.size)
+
+        for number in range(len(self)):
+            batch = order[number * self.batch : (number + 1) * self.batch]
+            yield batch[self.processes.rank :: self.processes.size]
 
 
 def make_head_loader(
     points: HeadPoints, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
 ) -> data.DataLoader[HeadBatch]:
-    """Batches of uncertain points, of each process its own part."""
+    """Make a loader of this process's parts of the batches; arguments are as for `PointSampler`."""
     sampler = PointSampler(len(points), batch, seed, shuffle, processes)
     return data.DataLoader(points, batch_size=None, sampler=sampler)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A scan to score, in one of its views.
+
+    Attributes:
+        source: scores the scan.
+        scans: reads the scans of the source, by view and index.
+        view: number of the augmented view; takes the place of the epoch.
+        index: of the scan in the source.
+    """
+
+    source: ScoreSource
+    scans: ScanSet
+    view: int
+    index: int
+
+
+@dataclass(frozen=True)
+class PointGatherer:
+    """Scores scans by two networks, and keeps their uncertain points on disk for the head.
+
+    Attributes:
+        dataset: reads the scans.
+        model: says which points are uncertain, and how the head sees them.
+        training: says how many points are kept, and how scans are augmented.
+        processes: those that share the scans; all must see the folder of the points.
+    """
+
+    dataset: Dataset
+    model: ModelConfig
+    training: TrainingConfig
+    processes: Processes = ALONE
+
+    def gather(
+        self,
+        sources: Sequence[ScoreSource],
+        folder: Path,
+        views: int = 0,
+        say: Callable[[str], None] = lambda line: None,
+    ) -> HeadPoints:
+        """Gather the labelled uncertain points of some scans.
+
+        If the networks agree everywhere, as they do before they have learnt anything, the points
+        are drawn from all labelled points instead.
+
+        Args:
+            sources: the scans, and what scores them.
+            folder: receives the points; its earlier content is removed.
+            views: how often each scan is scored, each time augmented differently; 0 to score it
+                once, without augmentation. Taken as 0 if a source cannot score augmented scans.
+            say: told the progress, line by line.
+
+        Raises:
+            InputError: if the scans have too few labelled points.
+        """
+        if not all(source.augmented for source in sources):
+            views = 0
+
+        jobs = self._jobs(sources, views)
+        least = max(2, self.processes.size)  # batch norm needs two, and each process one
+
+        points = self._gather(jobs, folder, build_assertion(self.model.assertion), say)
+        if len(points) < least:
+            say("head: the networks agree everywhere; it learns from points drawn from all")
+            points = self._gather(jobs, folder, _everywhere, say)
+
+        if len(points) < least:
+            raise InputError(
+                f"{folder}: expected at least {least} labelled points for the head, "
+                f"found {len(points)}; name other scans"
+            )
+        return points
+
+    def _jobs(self, sources: Sequence[ScoreSource], views: int) -> list[_Job]:
+        """List every view of every scan of every source."""
+        augment = self.training.augment if views > 0 else None
+
+        jobs = []
+        for source in sources:
+            scans = ScanSet(self.dataset, source.records, augment, self.training.seed)
+            for view in range(max(views, 1)):
+                for index in range(len(scans)):
+                    jobs.append(_Job(source, scans, view, index))
+        return jobs
+
+    def _gather(
+        self,
+        jobs: Sequence[_Job],
+        folder: Path,
+        assertion: Assertion,
+        say: Callable[[str], None],
+    ) -> HeadPoints:
+        """Gather the points that an assertion finds uncertain."""
+        _make_empty(folder, self.processes)
+        path = folder / str(self.processes.rank)
+        counts, matrices = self._score_share(jobs, path, assertion, say)
+
+        counts_by_rank = self.processes.gather(counts)
+        certain, uncertain = np.sum(self.processes.gather(matrices), axis=0)
+        labelled = certain[1:].sum() + uncertain.sum()
+
+        return HeadPoints(
+            path=_join(folder, counts_by_rank, self._dtype.itemsize, self.processes),
+            dtype=self._dtype,
+            size=sum(map(sum, counts_by_rank)),
+            certain=certain,
+            uncertain_share=float(uncertain.sum() / max(labelled, 1)),
+        )
+
+    def _score_share(
+        self,
+        jobs: Sequence[_Job],
+        path: Path,
+        assertion: Assertion,
+        say: Callable[[str], None],
+    ) -> tuple[list[int], np.ndarray]:
+        """Score this process's share of the scans, and write their points to a file.
+
+        Returns:
+            How many points each scan of the share has in the file, and the (2, K + 1, K + 1)
+            confusion matrices of the ensemble over their certain and their uncertain points.
+        """
+        ids = self.dataset.taxonomy.size + 1
+        matrices = np.zeros((2, ids, ids), dtype=np.int64)
+        counts = []
+
+        share = self.processes.share(jobs)
+        most = -(-self.training.head.points // len(jobs))  # points of a scan, rounded up
+        source = None
+        with path.open("wb") as file:
+            for number, job in enumerate(share, start=1):
+                if job.source is not source:
+                    source = job.source
+                    scorer = source.scorer(self._device)
+
+                points, scan_matrices = self._gather_scan(job, scorer, assertion, most)
+                points.tofile(file)
+                counts.append(len(points))
+                matrices += scan_matrices
+
+                # A line after every tenth of the scans.
+                if number * 10 // len(share) > (number - 1) * 10 // len(share):
+                    say(f"head: scored {number * len(jobs) // len(share)} of {len(jobs)} scans")
+
+        return counts, matrices
+
+    @torch.inference_mode()
+    def _gather_scan(
+        self, job: _Job, scorer: Scorer, assertion: Assertion, most: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Score one scan, and draw at most `most` of its uncertain points.
+
+        Returns:
+            (U,) points of `point_dtype`, and the (2, K + 1, K + 1) confusion matrices of the
+            ensemble over the certain and over all uncertain points of the scan.
+        """
+        device = self._device
+        scan = job.scans[job.view, job.index]
+        batch, labels = collate([scan])
+        batch = batch.to(device)
+        labels = labels.to(device)
+
+        f, g = scorer(job.source.records[job.index], scan, batch)
+        uncertain = assertion(f, g, batch.points, labels) & (labels > 0)
+        matrices = _ensemble_matrices(f, g, labels, uncertain)
+
+        candidates = uncertain.nonzero()[:, 0]
+        rng = np.random.default_rng([self.training.seed, job.view, job.index])
+        drawn = np.sort(rng.permutation(len(candidates))[:most])
+        index = candidates[torch.from_numpy(drawn).to(device)]
+
+        config = self.model.point_head
+        near = nearest_neighbours(batch.points, index, config.neighbours)
+        point, rows = head_features(config, point_table(batch.points, f, g), index, near)
+
+        points = np.empty(len(index), dtype=self._dtype)
+        points["point"] = point.cpu().numpy()
+        points["rows"] = rows.cpu().numpy()
+        points["labels"] = labels[index].cpu().numpy()
+        points["stands_for"] = len(candidates) / max(len(index), 1)
+        return points, matrices
+
+    @property
+    def _device(self) -> str:
+        return device_of(self.training.accelerator)
+
+    @property
+    def _dtype(self) -> np.dtype:
+        return point_dtype(self.dataset.taxonomy.size, self.model.point_head.neighbours)
 
 
 def gather_points(
@@ -120,94 +329,39 @@ def gather_points(
     say: Callable[[str], None] = lambda line: None,
     processes: Processes = ALONE,
 ) -> HeadPoints:
-    """Score scans by two models, and keep on disk what the head needs of their uncertain points.
-
-    Args:
-        sources: what scores which scans.
-        model: says which points are uncertain, and what the head sees of them.
-        views: how often each scan is scored, each time augmented anew; 0: once, as it is. Of sources that only
-            know the scans as they are: once.
-        folder: is made anew; all processes must see it.
-        say: told how far it is.
-
-    Where the networks agree everywhere, as they do before they have learnt anything, points are drawn from all.
-
-    Raises:
-        InputError: where the scans have no labelled points.
-    """
-    views = views if all(source.augmented for source in sources) else 0
-    gather = functools.partial(
-        _gather, sources, dataset, model.point_head, training, views, folder, say, processes
-    )
-    found, least = (
-        gather(build_assertion(model.assertion)),
-        max(2, processes.size),
-    )  # batch norm needs two
-    if len(found) < least:
-        say("head: the networks agree everywhere; it learns from points drawn from all")
-        found = gather(_everywhere)
-    if len(found) < least:
-        raise InputError(
-            f"{folder}: expected labelled points to train the head with, found none; name other scans"
-        )
-    return found
+    """Gather the points of the head; see `PointGatherer`."""
+    gatherer = PointGatherer(dataset, model, training, processes)
+    return gatherer.gather(sources, folder, views, say)
 
 
 def _everywhere(f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
-    """The assertion that doubts every point."""
+    """The assertion that finds every point uncertain."""
     return torch.ones(len(f), dtype=torch.bool, device=f.device)
 
 
-def _gather(
-    sources: Sequence[ScoreSource],
-    dataset: Dataset,
-    config: PointHeadConfig,
-    training: TrainingConfig,
-    views: int,
-    folder: Path,
-    say: Callable[[str], None],
-    processes: Processes,
-    assertion: Assertion,
-) -> HeadPoints:
-    """As `gather_points`, of the points that an assertion doubts."""
-    _empty(folder, processes)
-    classes, device = dataset.taxonomy.size, device_of(training.accelerator)
-    row, matrices = (
-        row_of(classes, config.neighbours),
-        np.zeros((2, classes + 1, classes + 1), dtype=np.int64),
-    )
-    jobs = [
-        (s, *job)
-        for s, one in enumerate(sources)
-        for job in np.ndindex(max(views, 1), len(one.records))
-    ]
-    sets = [
-        ScanSet(dataset, one.records, training.augment if views else None, training.seed)
-        for one in sources
-    ]
-    scorer_of = functools.lru_cache(1)(lambda s: sources[s].scorer(device))
-    most, counts, mine = -(-training.head.points // len(jobs)), [], processes.share(jobs)
-    with (folder / str(processes.rank)).open("wb") as file:
-        for done, (source, epoch, place) in enumerate(mine, start=1):
-            rng, scan = (
-                np.random.default_rng([training.seed, epoch, place]),
-                sets[source][epoch, place],
-            )
-            score = functools.partial(scorer_of(source), sources[source].records[place], scan)
-            rows, matrix = _gather_scan(score, config, assertion, scan, most, row, rng, device)
-            rows.tofile(file)
-            counts.append(len(rows))
-            matrices += matrix
-            if done * 10 // len(mine) != (done - 1) * 10 // len(mine):
-                say(f"head: scored {done * len(jobs) // len(mine)} of {len(jobs)} scans")
-    by_rank = processes.gather((counts, matrices))
-    path = _join(folder, [one for one, _ in by_rank], row, processes)
-    certain, uncertain = np.sum([one for _, one in by_rank], axis=0)
-    share = float(uncertain.sum() / max(certain[1:].sum() + uncertain.sum(), 1))
-    return HeadPoints(path, row, sum(sum(one) for one, _ in by_rank), certain, share)
+def _ensemble_matrices(f: Tensor, g: Tensor, labels: Tensor, uncertain: Tensor) -> np.ndarray:
+    """Return the ensemble's confusion matrices over the certain and over the uncertain points.
+
+    Args:
+        f, g: (P, K) probabilities of the two networks.
+        labels: (P,) train ids.
+        uncertain: (P,) bool.
+
+    Returns:
+        (2, K + 1, K + 1) int64.
+    """
+    prediction = (geometric_mean(f, g).argmax(dim=1) + 1).cpu().numpy()
+    truth = labels.cpu().numpy()
+    mask = uncertain.cpu().numpy()
+
+    classes = f.shape[1]
+    over_certain = confusion(truth[~mask], prediction[~mask], classes)
+    over_uncertain = confusion(truth[mask], prediction[mask], classes)
+    return np.stack([over_certain, over_uncertain])
 
 
-def _empty(folder: Path, processes: Processes) -> None:
+def _make_empty(folder: Path, processes: Processes) -> None:
+    """Remove a folder's content, before any process goes on."""
     if processes.first:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -215,53 +369,32 @@ def _empty(folder: Path, processes: Processes) -> None:
 
 
 def _join(
-    folder: Path, counts: Sequence[Sequence[int]], row: np.dtype, processes: Processes
+    folder: Path, counts_by_rank: Sequence[Sequence[int]], point_bytes: int, processes: Processes
 ) -> Path:
-    """One file of the rows of all processes, in the order of the scans, which they took in turns."""
+    """Join the files of all processes into one, with the points in the order of the scans.
+
+    Args:
+        folder: has a file of each process, named by its rank.
+        counts_by_rank: for each process, the points of each of its scans; processes take the scans
+            in turns.
+        point_bytes: bytes of a point.
+        processes: those that share the folder.
+    """
     path = folder / "points"
     if processes.first:
+        parts = [folder / str(rank) for rank in range(processes.size)]
         with ExitStack() as stack, path.open("wb") as joined:
-            parts = [
-                stack.enter_context((folder / str(rank)).open("rb")) for rank in range(len(counts))
-            ]
-            for place in range(sum(map(len, counts))):
-                turn, rank = divmod(place, len(counts))
-                joined.write(parts[rank].read(counts[rank][turn] * row.itemsize))
+            files = []
+            for part in parts:
+                files.append(stack.enter_context(part.open("rb")))
+
+            for index in range(sum(map(len, counts_by_rank))):
+                turn, rank = divmod(index, processes.size)
+                count = counts_by_rank[rank][turn]
+                joined.write(files[rank].read(count * point_bytes))
+
         for part in parts:
-            Path(part.name).unlink()
+            part.unlink()
+
     processes.wait()
     return path
-
-
-@torch.inference_mode()
-def _gather_scan(
-    score: Callable[[PointBatch], tuple[Tensor, Tensor]],
-    config: PointHeadConfig,
-    assertion: Assertion,
-    scan: Scan,
-    most: int,
-    row: np.dtype,
-    rng: np.random.Generator,
-    device: str,
-) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of one scan's kept points, and (2, K + 1, K + 1) of the ensemble: its certain points, and the others."""
-    batch, labels = collate([scan])
-    batch, labels = batch.to(device), labels.to(device)
-    f, g = score(batch)
-    uncertain = assertion(f, g, batch.points, labels) & (labels > 0)
-    agreed = (geometric_mean(f, g).argmax(dim=1) + 1).cpu().numpy()
-    truth, doubted = labels.cpu().numpy(), uncertain.cpu().numpy()
-    matrices = np.stack(
-        [confusion(truth[kept], agreed[kept], f.shape[1]) for kept in (~doubted, doubted)]
-    )
-    index = uncertain.nonzero()[:, 0]
-    chosen = rng.permutation(len(index))[:most]
-    stands_for = len(index) / max(len(chosen), 1)
-    index = index[torch.from_numpy(np.sort(chosen)).to(device)]
-    near = nearest_neighbours(batch.points, index, config.neighbours)
-    point, near_rows = head_features(config, point_table(batch.points, f, g), index, near)
-    found = np.empty(len(index), dtype=row)
-    for name, values in (("point", point), ("rows", near_rows), ("labels", labels[index])):
-        found[name] = values.cpu().numpy()
-    found["stands_for"] = stands_for
-    return found, matrices

@@ -1,4 +1,4 @@
-"""The training of the point head on gathered points, as a Lightning module."""
+"""The training stage of the point head, as a Lightning module (section 3.3 of the paper)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,15 @@ from amvnet.training.stages import Stage
 
 
 class HeadStage(Stage):
-    """Stage `head`: the networks are frozen, in that only their scores are here."""
+    """Stage `head`: it learns from scores gathered beforehand, so that the networks stay frozen.
+
+    Args:
+        head: the point head.
+        train: the points to train with.
+        val: the points to validate with, or None for no validation.
+
+    The other arguments are those of `Stage`.
+    """
 
     name = "head"
     unit = "points"
@@ -26,50 +34,59 @@ class HeadStage(Stage):
         self, head: PointHead, train: HeadPoints, val: HeadPoints | None, *args: Any
     ) -> None:
         super().__init__(*args)
-        self.trained, self.learnt, self.val = head, train, val
+        self.trained = head
+        self.train_points = train
+        self.val_points = val
 
     def size_of(self, batch: HeadBatch) -> int:
-        return len(batch[2])
+        _, _, labels, _ = batch
+        return len(labels)
 
     def training_step(self, batch: HeadBatch, index: int) -> Tensor:
         point, rows, labels, _ = batch
-        loss = F.cross_entropy(
-            self.trained(point, rows), labels - 1, self.class_weights, reduction="sum"
-        )
-        own = (
-            labels.new_tensor(len(labels))
-            if self.class_weights is None
-            else self.class_weights[labels - 1].sum()
-        )
-        # The mean over the batch of all processes, of which Lightning averages the gradients.
-        whole = self.trainer.strategy.reduce(own.float(), reduce_op="sum")
-        loss = loss * self.processes.size / whole
+        logits = self.trained(point, rows)
+        loss = F.cross_entropy(logits, labels - 1, self.class_weights, reduction="sum")
+
+        # The mean is over the batch of all processes; Lightning averages the processes' gradients.
+        total = self.trainer.strategy.reduce(self._weight(labels), reduce_op="sum")
+        loss = loss * self.processes.size / total
+
         self.check_finite(loss, "at points of the head")
         self.log("train/loss", loss, prog_bar=True, batch_size=len(labels))
         return loss
 
     def validation_step(self, batch: HeadBatch, index: int) -> None:
         point, rows, labels, stands_for = batch
-        found = self.trained(point, rows).argmax(dim=1) + 1
+        prediction = self.trained(point, rows).argmax(dim=1) + 1
+
+        # Each point counts for as many points of its scan as it stands for.
         size = len(self.matrix)
-        place = (labels * size + found).cpu().numpy()
-        self.matrix += np.bincount(place, stands_for.cpu().numpy(), size**2).reshape(size, size)
+        cells = (labels * size + prediction).cpu().numpy()
+        counts = np.bincount(cells, stands_for.cpu().numpy(), size**2)
+        self.matrix += counts.reshape(size, size)
 
     def whole_matrix(self) -> np.ndarray:
-        """With the points that are certain, whose classes the ensemble has settled."""
-        assert self.val is not None
-        return super().whole_matrix() + self.val.certain
+        """Return AMVNet's confusion matrix: the head's, plus the ensemble's of certain points."""
+        assert self.val_points is not None
+        return super().whole_matrix() + self.val_points.certain
 
     def on_validation_epoch_end(self) -> None:
         super().on_validation_epoch_end()
-        assert self.val is not None
-        self.log_dict(
-            {"train/uncertain": self.learnt.uncertain, "val/uncertain": self.val.uncertain}
-        )
+        assert self.val_points is not None
+        self.log("train/uncertain", self.train_points.uncertain_share)
+        self.log("val/uncertain", self.val_points.uncertain_share)
 
     def configure_optimizers(self) -> Any:
-        c = self.config
-        parameters = self.trained.parameters()
-        return self.one_cycle(
-            torch.optim.SGD(parameters, c.lr, c.momentum, weight_decay=c.weight_decay), c.momentum
+        optimizer = torch.optim.SGD(
+            self.trained.parameters(),
+            lr=self.config.lr,
+            momentum=self.config.momentum,
+            weight_decay=self.config.weight_decay,
         )
+        return self.one_cycle(optimizer, self.config.momentum)
+
+    def _weight(self, labels: Tensor) -> Tensor:
+        """Return the sum of the points' class weights, in float32."""
+        if self.class_weights is None:
+            return labels.new_tensor(len(labels)).float()
+        return self.class_weights[labels - 1].sum().float()

@@ -1,4 +1,4 @@
-"""Scans from disk to batches for training: read, augmented by seed, collated."""
+"""Batches of training scans: read from disk, augmented, collated."""
 
 from __future__ import annotations
 
@@ -21,11 +21,21 @@ from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.training.augment import augment, mix
 
-Key = tuple[int, int]  # epoch, place in the list of scans
+Key = tuple[int, int]  # epoch, index in the list of scans
 
 
 class ScanSet(data.Dataset[Scan]):
-    """Labelled scans, each augmented by (seed, epoch, place): the same on any number of processes."""
+    """Labelled scans by epoch and index.
+
+    The augmentation depends on nothing but seed, epoch and index: it is the same on any number of
+    processes.
+
+    Args:
+        dataset: reads the scans.
+        records: the scans.
+        augment: how they are augmented, or None for scans as they are.
+        seed: of the augmentation.
+    """
 
     def __init__(
         self,
@@ -34,73 +44,88 @@ class ScanSet(data.Dataset[Scan]):
         augment: AugmentConfig | None = None,
         seed: int = 0,
     ) -> None:
-        self.dataset, self.records, self.augment, self.seed = dataset, list(records), augment, seed
+        self.dataset = dataset
+        self.records = list(records)
+        self.augment = augment
+        self.seed = seed
 
     def __len__(self) -> int:
         return len(self.records)
 
     def __getitem__(self, key: Key) -> Scan:
-        epoch, place = key
-        scan = self._read(place)
+        epoch, index = key
+        scan = self._read(index)
         if self.augment is None:
             return scan
-        rng = np.random.default_rng([self.seed, epoch, place])
+
+        rng = np.random.default_rng([self.seed, epoch, index])
         scan = augment(scan, self.augment, rng)
         if rng.random() >= self.augment.mix:
             return scan
-        other = augment(self._read(int(rng.integers(len(self)))), self.augment, rng)
-        return mix(scan, other, rng)
 
-    def _read(self, place: int) -> Scan:
-        scan = self.dataset.read(self.records[place])
+        other = self._read(int(rng.integers(len(self))))
+        return mix(scan, augment(other, self.augment, rng), rng)
+
+    def _read(self, index: int) -> Scan:
+        scan = self.dataset.read(self.records[index])
         if scan.labels is None:
             raise InputError(
                 f"{scan.name}: expected labels to train with, found none; name labelled sequences"
             )
-        if scan.valid.sum() < 2:  # of one point batch norm has no variance
+
+        valid = scan.valid.sum()
+        if valid < 2:  # batch norm needs two points to compute a variance
             raise InputError(
-                f"{scan.name}: expected points to train with, found fewer than two; leave the scan out"
+                f"{scan.name}: expected at least two valid points to train with, found {valid}; "
+                "leave the scan out"
             )
         return scan
 
 
 class EpochSampler(data.Sampler[Key]):
-    """Every scan once an epoch, in an order drawn from (seed, epoch); Lightning tells the epoch.
+    """Draws every scan once per epoch, in an order that depends on seed and epoch.
 
-    Of several processes each takes its part of every batch. In training all have as many scans: where they cannot be
-    shared out evenly, the first ones of the order come again at its end.
+    With several processes, each takes its part of every batch. In training all processes draw
+    equally many scans: if the scans cannot be shared equally, the first ones are drawn again.
+
+    Args:
+        size: number of scans.
+        seed: of the order.
+        shuffle: whether to shuffle the scans, as in training.
+        processes: those that share the scans.
     """
 
     def __init__(self, size: int, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
-        self.size, self.seed, self.shuffle, self.processes, self.epoch = (
-            size,
-            seed,
-            shuffle,
-            processes,
-            0,
-        )
+        self.size = size
+        self.seed = seed
+        self.shuffle = shuffle
+        self.processes = processes
+        self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
+        """Set the epoch, which the order depends on; Lightning calls this."""
         self.epoch = epoch
 
     def __len__(self) -> int:
-        return len(self._mine())
+        return len(self._indices())
 
     def __iter__(self) -> Iterator[Key]:
-        return iter([(self.epoch, place) for place in self._mine()])
+        return iter([(self.epoch, index) for index in self._indices()])
 
-    def _mine(self) -> list[int]:
-        order = np.arange(self.size)
+    def _indices(self) -> Sequence[int]:
+        """Return this process's part of the epoch's scans."""
         if self.shuffle:
-            even = -(-self.size // self.processes.size) * self.processes.size
-            order = np.resize(
-                np.random.default_rng([self.seed, self.epoch]).permutation(self.size), even
-            )
-        return list(self.processes.share(order.tolist()))
+            rng = np.random.default_rng([self.seed, self.epoch])
+            scans_per_process = -(-self.size // self.processes.size)  # rounded up
+            total = scans_per_process * self.processes.size
+            order = np.resize(rng.permutation(self.size), total)  # repeats the first ones
+        else:
+            order = np.arange(self.size)
+        return self.processes.share(order.tolist())
 
 
 def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
-    """Scans -> their valid points, and (P,) int64 train ids."""
+    """Return the valid points of labelled scans, and their (P,) int64 train ids."""
     labels = [scan.labels[scan.valid] for scan in scans if scan.labels is not None]
     return PointBatch.of(scans), torch.from_numpy(np.concatenate(labels).astype(np.int64))
 
@@ -108,9 +133,17 @@ def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
 def make_loader(
     scans: ScanSet, batch: int, workers: int, shuffle: bool, processes: Processes = ALONE
 ) -> data.DataLoader[tuple[PointBatch, Tensor]]:
-    """Batches of scans, of each process its own; the last one of a training epoch may be smaller."""
+    """Make a loader of this process's batches; the last one of an epoch may be smaller.
+
+    Args:
+        scans: the scans of all processes.
+        batch: scans in a batch of one process.
+        workers: processes that read scans; 0 to read in this one.
+        shuffle: whether to shuffle the scans, as in training.
+        processes: those that share the scans.
+    """
     return data.DataLoader(
-        scans,  # type: ignore[arg-type]  # its keys are pairs, as the sampler gives them
+        scans,  # type: ignore[arg-type]  # the sampler gives keys instead of indices
         batch_size=batch,
         sampler=EpochSampler(len(scans), scans.seed, shuffle, processes),
         num_workers=workers,
@@ -123,34 +156,46 @@ def make_loader(
 def count_classes(
     dataset: Dataset, records: Sequence[ScanRecord], kept: Path, processes: Processes = ALONE
 ) -> np.ndarray:
-    """(K,) points of each class in some scans; counted once, and kept in a file beside the run."""
-    made = {"scans": [record.name for record in records], "classes": list(dataset.taxonomy.classes)}
-    # What the first process found counts for all, who might see the file when it is just being written.
-    if (counted := processes.gather(_counted(kept, made))[0]) is not None:
-        return counted
-    mine = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
+    """Count the points of each class in some scans, or read the counts of an earlier call.
+
+    Args:
+        kept: an .npz file of counts; written unless it already has those of these scans.
+
+    Returns:
+        (K,) int64.
+    """
+    source = {
+        "scans": [record.name for record in records],
+        "classes": list(dataset.taxonomy.classes),
+    }
+
+    # The first process reads for all, as others might already see the file that it writes below.
+    earlier = processes.gather(_read_counts(kept, source))[0]
+    if earlier is not None:
+        return earlier
+
+    counts = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
     for record in processes.share(records):
         labels = dataset.read(record).labels
         if labels is not None:
-            mine += np.bincount(labels, minlength=len(mine))
-    counts = np.sum(processes.gather(mine), axis=0)[1:]
+            counts += np.bincount(labels, minlength=len(counts))
+
+    totals = np.sum(processes.gather(counts), axis=0)[1:]
+
     if processes.first:
+        scans = np.array(source["scans"])
+        classes = np.array(source["classes"])
         with atomic_write(kept) as part:
-            np.savez(
-                part,
-                counts=counts,
-                scans=np.array(made["scans"]),
-                classes=np.array(made["classes"]),
-            )
-    return counts
+            np.savez(part, counts=totals, scans=scans, classes=classes)
+    return totals
 
 
-def _counted(kept: Path, made: dict[str, list[str]]) -> np.ndarray | None:
-    """The counts in a file, where they are of these scans and classes."""
+def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:
+    """Return the counts in a file, or None if it is missing, broken or of other scans."""
     with (
         suppress(OSError, ValueError, KeyError, BadZipFile),
-        np.load(kept, allow_pickle=False) as file,
+        np.load(path, allow_pickle=False) as file,
     ):
-        if all(file[key].tolist() == value for key, value in made.items()):
+        if all(file[name].tolist() == values for name, values in source.items()):
             return file["counts"]
     return None

@@ -1,4 +1,4 @@
-"""The losses of the two networks; points with train id 0 have no part in them."""
+"""The losses of the two networks (section 3.1 of the paper); train id 0 is ignored."""
 
 from __future__ import annotations
 
@@ -9,24 +9,23 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-FREQUENCY_FLOOR = 1e-4  # a class rarer than this weighs no more than one at it, so that few points cannot rule a step
+# A rarer class weighs as much as one of this frequency, so that a few points cannot rule a step.
+FREQUENCY_FLOOR = 1e-4
 
-SMALL = 1e-3  # of the errors that Lovász-softmax leaves out; the loss is exact within it
-
-
-def at_least_float(x: Tensor) -> Tensor:
-    """In float32 where it is in half precision."""
-    return x.to(torch.promote_types(x.dtype, torch.float32))
+# Lovász-softmax leaves out smaller errors; together they would add less than this to a class.
+MIN_ERROR = 1e-3
 
 
 def class_weights(counts: np.ndarray) -> np.ndarray:
-    """Square roots of inverse class frequencies (section 4.1 of the paper), their mean 1.
+    """Return the square roots of the inverse class frequencies, scaled to a mean of 1.
+
+    Section 4.2 of the paper.
 
     Args:
         counts: (K,) points of each class in the training data.
 
     Returns:
-        (K,) float32; classes rarer than `FREQUENCY_FLOOR`, or absent, weigh as one at the floor.
+        (K,) float32; frequencies below `FREQUENCY_FLOOR`, also of absent classes, count as that.
     """
     frequency = np.maximum(counts / max(counts.sum(), 1), FREQUENCY_FLOOR)
     weights = 1 / np.sqrt(frequency)
@@ -36,13 +35,16 @@ def class_weights(counts: np.ndarray) -> np.ndarray:
 def range_view_loss(
     logits: Tensor, labels: Tensor, weights: Tensor | None, region: float
 ) -> Tensor:
-    """Cross-entropy + Dice, the loss of the range-view network (section 3.1 of the paper).
+    """Return cross-entropy + Dice loss, the loss of the range-view network.
 
     Args:
-        logits: (P, K) scores before softmax.
-        labels: (P,) train ids, 0 = ignored.
-        weights: (K,) weights of the classes in cross-entropy, or None.
-        region: weight of Dice beside cross-entropy.
+        logits: (P, K).
+        labels: (P,) train ids; points with 0 are ignored.
+        weights: (K,) class weights of the cross-entropy, or None for equal weights.
+        region: weight of the Dice loss; that of the cross-entropy is 1.
+
+    Returns:
+        () in float32, or float64 for logits in float64; 0 if all points are ignored.
     """
     return _loss(logits, labels, weights, region, dice)
 
@@ -50,45 +52,62 @@ def range_view_loss(
 def polar_view_loss(
     logits: Tensor, labels: Tensor, weights: Tensor | None, region: float
 ) -> Tensor:
-    """Cross-entropy + Lovász-softmax, the loss of PolarNet; arguments as of `range_view_loss`."""
+    """Return cross-entropy + Lovász-softmax loss, the loss of PolarNet.
+
+    Arguments and result are as for `range_view_loss`.
+    """
     return _loss(logits, labels, weights, region, lovasz_softmax)
 
 
 def dice(probabilities: Tensor, target: Tensor) -> Tensor:
-    """1 - the mean over the classes present of 2 |p t| / (|p| + |t|), soft. (P, K), (P,) -> ()."""
+    """Return the soft Dice loss: 1 - the mean of 2 |p t| / (|p| + |t|) over the classes present.
+
+    Args:
+        probabilities: (P, K).
+        target: (P,) class indices in 0..K - 1.
+    """
     truth = F.one_hot(target, probabilities.shape[1]).to(probabilities.dtype)
-    overlap = (probabilities * truth).sum(dim=0)
     present = truth.sum(dim=0) > 0
+
+    overlap = (probabilities * truth).sum(dim=0)
     score = 2 * overlap / (probabilities.sum(dim=0) + truth.sum(dim=0)).clamp_min(1e-6)
     return 1 - score[present].mean()
 
 
 def lovasz_softmax(probabilities: Tensor, target: Tensor) -> Tensor:
-    """The Lovász extension of the Jaccard loss, mean over the classes present (Berman et al., CVPR 2018).
+    """Return the Lovász extension of the Jaccard loss, averaged over the classes present.
 
-    For each class the errors |t - p| are sorted, largest first; the loss is their sum weighted by how much
-    each one, added to the set of errors, lowers the Jaccard index. The errors below `SMALL` come last and
-    add less than that in all: they are left out, which spares most of the sorting. (P, K), (P,) -> ().
+    For each class the errors |t - p| are sorted, largest first. Each is weighted by the increase of
+    the Jaccard loss when its point joins the mispredicted ones. Errors up to `MIN_ERROR` are left
+    out, which saves most of the sorting (Berman et al., CVPR 2018).
+
+    Args:
+        probabilities: (P, K).
+        target: (P,) class indices in 0..K - 1.
     """
     losses = []
-    for c in target.unique():
-        truth = (target == c).to(probabilities.dtype)
-        errors = (truth - probabilities[:, c]).abs()
-        kept = (errors > SMALL).nonzero()[:, 0]
-        errors, order = errors[kept].sort(descending=True)
-        losses.append(errors @ _jaccard_steps(truth[kept][order], truth.sum()))
+    for index in target.unique():
+        truth = (target == index).to(probabilities.dtype)
+        errors = (truth - probabilities[:, index]).abs()
+
+        large = (errors > MIN_ERROR).nonzero()[:, 0]
+        errors, order = errors[large].sort(descending=True)
+        increases = _jaccard_increases(truth[large][order], truth.sum())
+        losses.append(errors @ increases)
+
     return torch.stack(losses).mean()
 
 
-def _jaccard_steps(truth: Tensor, total: Tensor) -> Tensor:
-    """What each further error adds to the Jaccard loss.
+def _jaccard_increases(truth: Tensor, total: Tensor) -> Tensor:
+    """Return how much the Jaccard loss increases as each point in turn becomes mispredicted.
 
     Args:
-        truth: (M,) in the order of the errors.
-        total: () points of the class, with those whose error is small.
+        truth: (M,) 1 for points of the class, 0 for others; sorted by falling error.
+        total: () all points of the class, including those whose error is small.
     """
     intersection = total - truth.cumsum(0)
     union = total + (1 - truth).cumsum(0)
+
     loss = 1 - intersection / union
     return torch.cat([loss[:1], loss[1:] - loss[:-1]])
 
@@ -100,11 +119,15 @@ def _loss(
     region: float,
     region_loss: Callable[[Tensor, Tensor], Tensor],
 ) -> Tensor:
-    """Weighted cross-entropy + region loss over the labelled points; 0 where there is none."""
-    kept = labels > 0
-    if not kept.any():
-        return logits.sum() * 0
-    logits, target = at_least_float(logits[kept]), labels[kept].long() - 1
-    return F.cross_entropy(logits, target, weights) + region * region_loss(
-        logits.softmax(dim=1), target
-    )
+    labelled = labels > 0
+    if not labelled.any():
+        return logits.sum() * 0  # with a gradient, of zeros
+
+    logits = _at_least_float32(logits[labelled])
+    target = labels[labelled].long() - 1
+    cross_entropy = F.cross_entropy(logits, target, weights)
+    return cross_entropy + region * region_loss(logits.softmax(dim=1), target)
+
+
+def _at_least_float32(x: Tensor) -> Tensor:
+    return x.to(torch.promote_types(x.dtype, torch.float32))

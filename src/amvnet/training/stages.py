@@ -1,4 +1,4 @@
-"""The training of the two networks, as Lightning modules."""
+"""The training stages of the two networks, as Lightning modules."""
 
 from __future__ import annotations
 
@@ -20,16 +20,23 @@ from amvnet.models.views.polar_view import PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.training.losses import polar_view_loss, range_view_loss
 
-Batch = tuple[PointBatch, Tensor]
-MOMENTUM_CYCLE = 0.1  # by so much the one-cycle schedule lowers the momentum
+Batch = tuple[PointBatch, Tensor]  # points, and their (P,) train ids
+MOMENTUM_CYCLE = 0.1  # the one-cycle schedule lowers the momentum by this much
 
 
 class Stage(L.LightningModule):
-    """What the stages share: class weights, the validation's confusion matrix, the one-cycle schedule."""
+    """The base of all stages: class weights, metrics of the validation, the one-cycle schedule.
 
-    name: str  # as --stage says it
-    trained: nn.Module
-    unit: str  # what a batch is made of
+    Args:
+        config: of this stage.
+        taxonomy: the K classes.
+        weights: (K,) class weights of the loss, or None for equal weights.
+        processes: those that share the training.
+    """
+
+    name: str  # the value of --stage
+    unit: str  # what a batch consists of
+    trained: nn.Module  # the part of the model that this stage trains
 
     def __init__(
         self,
@@ -39,63 +46,75 @@ class Stage(L.LightningModule):
         processes: Processes = ALONE,
     ) -> None:
         super().__init__()
-        self.config, self.taxonomy, self.processes = config, taxonomy, processes
+        self.config = config
+        self.taxonomy = taxonomy
+        self.processes = processes
+
         self.class_weights: Tensor | None
-        self.register_buffer(
-            "class_weights",
-            None if weights is None else torch.from_numpy(weights),
-            persistent=False,
-        )
+        tensor = None if weights is None else torch.from_numpy(weights)
+        self.register_buffer("class_weights", tensor, persistent=False)
+
         self.matrix = self._empty_matrix()
 
-    def _empty_matrix(self) -> np.ndarray:
-        return np.zeros((self.taxonomy.size + 1,) * 2)
-
     def size_of(self, batch: Any) -> int:
-        """How many units a batch has."""
+        """Return how many units a batch has."""
         raise NotImplementedError
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
-        """In the precision of the weights."""
-        return tuple(
-            x.to(self.dtype) if isinstance(x, PointBatch) or x.is_floating_point() else x
-            for x in batch
-        )
+        """Convert floating-point values of a batch to the precision of the weights."""
+        return tuple(self._in_precision(values) for values in batch)
+
+    def check_finite(self, loss: Tensor, where: str) -> None:
+        """Check a loss before it spoils the weights.
+
+        Raises:
+            InputError: if it is infinite or NaN.
+        """
+        if not torch.isfinite(loss):
+            option = f"--training.{self.name}.lr"
+            raise InputError(
+                f"expected a finite loss, found {loss:g} {where}; lower {option}, or leave them out"
+            )
+
+    def count(self, labels: Tensor, prediction: Tensor) -> None:
+        """Add points to the confusion matrix of the validation.
+
+        Args:
+            labels: (P,) train ids.
+            prediction: (P,) predicted train ids.
+        """
+        self.matrix += confusion(labels.cpu().numpy(), prediction.cpu().numpy(), self.taxonomy.size)
+
+    def whole_matrix(self) -> np.ndarray:
+        """Return the (K + 1, K + 1) confusion matrix of the validation, summed over processes."""
+        return np.sum(self.processes.gather(self.matrix), axis=0)
 
     def on_validation_epoch_start(self) -> None:
         self.matrix = self._empty_matrix()
 
-    def check_finite(self, loss: Tensor, where: str) -> None:
-        """Raises InputError where a loss is not finite, before it has spoiled the weights."""
-        if not torch.isfinite(loss):
-            rate = f"--training.{self.name}.lr"
-            raise InputError(
-                f"expected a finite loss, found {loss:g} {where}; lower {rate}, or leave them out"
-            )
-
-    def count(self, labels: Tensor, prediction: Tensor) -> None:
-        """Add points to the validation's confusion matrix."""
-        self.matrix += confusion(labels.cpu().numpy(), prediction.cpu().numpy(), self.taxonomy.size)
-
-    def whole_matrix(self) -> np.ndarray:
-        """The validation's confusion matrix over the scans of all processes."""
-        return np.sum(self.processes.gather(self.matrix), axis=0)
-
     def on_validation_epoch_end(self) -> None:
-        found = metrics(self.whole_matrix(), self.taxonomy)
-        self.log("val/miou", found["miou"] or 0.0, prog_bar=True)
-        self.log_dict(
-            {"val/miou_present": found["miou_present"] or 0.0, "val/acc": found["accuracy"] or 0.0}
-        )
-        self.log_dict(
-            {f"iou/{name}": value for name, value in found["iou"].items() if value is not None}
-        )
+        values = metrics(self.whole_matrix(), self.taxonomy)
+
+        self.log("val/miou", values["miou"] or 0.0, prog_bar=True)
+        self.log("val/miou_present", values["miou_present"] or 0.0)
+        self.log("val/acc", values["accuracy"] or 0.0)
+        for name, iou in values["iou"].items():
+            if iou is not None:
+                self.log(f"iou/{name}", iou)
 
     def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
-        """The schedule of the learning rate and, the other way round, of SGD's momentum or AdamW's first beta."""
-        # A run of very few steps has no room for the cycle, which needs two before its peak.
-        steps = max(int(self.trainer.estimated_stepping_batches), math.ceil(2 / self.config.warmup))
-        cycle = torch.optim.lr_scheduler.OneCycleLR(
+        """Return an optimizer with the one-cycle schedule, as Lightning expects it.
+
+        The learning rate rises to its peak and falls again, while the momentum does the opposite.
+
+        Args:
+            momentum: highest momentum of SGD, or highest first beta of AdamW.
+        """
+        # The schedule needs two steps before its peak, more than a very short training has.
+        least = math.ceil(2 / self.config.warmup)
+        steps = max(int(self.trainer.estimated_stepping_batches), least)
+
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer,
             max_lr=self.config.lr,
             total_steps=steps,
@@ -103,85 +122,132 @@ class Stage(L.LightningModule):
             base_momentum=momentum - MOMENTUM_CYCLE,
             max_momentum=momentum,
         )
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": cycle, "interval": "step"}}
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def _empty_matrix(self) -> np.ndarray:
+        ids = self.taxonomy.size + 1
+        return np.zeros((ids, ids))
+
+    def _in_precision(self, values: PointBatch | Tensor) -> PointBatch | Tensor:
+        if isinstance(values, PointBatch) or values.is_floating_point():
+            return values.to(self.dtype)
+        return values
 
 
 class NetworkStage(Stage):
-    """Training of one of the two networks; which one is said by `logits` and the loss."""
+    """The base of the two networks' stages, which define `logits` and `loss`.
 
-    config: NetworkTraining
+    Args:
+        view: projects the points to the input of the network.
+        net: the network.
+
+    The other arguments are those of `Stage`.
+    """
+
     unit = "scans"
+    config: NetworkTraining
+    view: RangeView | PolarView
 
-    def size_of(self, batch: Batch) -> int:
-        return batch[0].count
+    def __init__(
+        self,
+        view: RangeView | PolarView,
+        net: nn.Module,
+        config: NetworkTraining,
+        taxonomy: Taxonomy,
+        weights: np.ndarray | None,
+        processes: Processes = ALONE,
+    ) -> None:
+        super().__init__(config, taxonomy, weights, processes)
+        self.view = view
+        self.trained = net
 
     def logits(
         self, batch: PointBatch, labels: Tensor
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
-        """Of each scan the scores and labels (M, K), (M,) that the loss is over, and scores (P, K) of all points."""
+        """Run the network on a batch of B scans.
+
+        Args:
+            labels: (P,) train ids.
+
+        Returns:
+            The (M, K) logits of each scan that the loss is computed on, the (M,) train ids of each
+            scan that belong to them, and the (P, K) logits of all points.
+        """
         raise NotImplementedError
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
+        """Return the loss of one scan, given (M, K) logits and (M,) train ids."""
         raise NotImplementedError
 
+    def size_of(self, batch: Batch) -> int:
+        return batch[0].count
+
     def training_step(self, batch: Batch, index: int) -> Tensor:
-        logits, labels, _ = self.logits(*batch)
-        # Scan by scan: the same however a batch is split, over processes or into parts that fit into memory.
-        loss = torch.stack([self.loss(*scan) for scan in zip(logits, labels, strict=True)]).mean()
-        self.check_finite(loss, f"at the scans {', '.join(batch[0].names)}")
-        self.log("train/loss", loss, prog_bar=True, batch_size=batch[0].count)
+        points, labels = batch
+        logits_by_scan, labels_by_scan, _ = self.logits(points, labels)
+
+        # The mean over scans stays the same if a batch is split, over processes or to save memory.
+        losses = []
+        for scan_logits, scan_labels in zip(logits_by_scan, labels_by_scan, strict=True):
+            losses.append(self.loss(scan_logits, scan_labels))
+        loss = torch.stack(losses).mean()
+
+        self.check_finite(loss, f"at the scans {', '.join(points.names)}")
+        self.log("train/loss", loss, prog_bar=True, batch_size=points.count)
         return loss
 
     def validation_step(self, batch: Batch, index: int) -> None:
-        _, _, points = self.logits(*batch)
-        self.count(batch[1], points.argmax(dim=1) + 1)
+        points, labels = batch
+        _, _, logits = self.logits(points, labels)
+        self.count(labels, logits.argmax(dim=1) + 1)
 
     def configure_optimizers(self) -> Any:
-        c = self.config
-        return self.one_cycle(
-            torch.optim.AdamW(self.trained.parameters(), lr=c.lr, weight_decay=c.weight_decay)
+        optimizer = torch.optim.AdamW(
+            self.trained.parameters(), lr=self.config.lr, weight_decay=self.config.weight_decay
         )
+        return self.one_cycle(optimizer)
 
 
 class RangeStage(NetworkStage):
-    """Stage `rv`: the loss is over the pixels, each labelled as the point that represents it."""
+    """Stage `rv`: the loss is over pixels, each with the label of the point that represents it."""
 
     name = "rv"
-
-    def __init__(self, view: RangeView, net: nn.Module, *args: Any) -> None:
-        super().__init__(*args)
-        self.view, self.trained = view, net
+    view: RangeView
 
     def logits(
         self, batch: PointBatch, labels: Tensor
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         view = self.view.project(batch)
-        scores = self.trained(view.image)  # (B, K, H, W)
-        seen = view.nearest >= 0
-        sizes = seen.view(batch.count, -1).sum(dim=1).tolist()
-        pixels = scores.permute(0, 2, 3, 1).flatten(0, 2)
-        kept, truth = pixels[seen].split(sizes), labels[view.nearest[seen]].split(sizes)
-        return list(kept), list(truth), pixels[view.pixel]
+        image = self.trained(view.image)  # (B, K, H, W)
+        pixels = image.permute(0, 2, 3, 1).flatten(0, 2)  # (B * H * W, K)
+
+        # Pixels without a point have no label.
+        occupied = view.nearest >= 0
+        sizes = occupied.view(batch.count, -1).sum(dim=1).tolist()
+        pixel_logits = pixels[occupied].split(sizes)
+        pixel_labels = labels[view.nearest[occupied]].split(sizes)
+        return list(pixel_logits), list(pixel_labels), pixels[view.pixel]
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         return range_view_loss(logits, labels, self.class_weights, self.config.region)
 
 
 class PolarStage(NetworkStage):
-    """Stage `bev`: the loss is over the points, each scored as its voxel."""
+    """Stage `bev`: the loss is over points, each with the logits of its voxel."""
 
     name = "bev"
-
-    def __init__(self, view: PolarView, net: nn.Module, *args: Any) -> None:
-        super().__init__(*args)
-        self.view, self.trained = view, net
+    view: PolarView
 
     def logits(
         self, batch: PointBatch, labels: Tensor
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         view = self.view.project(batch)
         points = view.to_points(self.trained(view))  # (P, K)
-        return [points[s] for s in batch.slices()], [labels[s] for s in batch.slices()], points
+
+        slices = batch.slices()
+        point_logits = [points[part] for part in slices]
+        point_labels = [labels[part] for part in slices]
+        return point_logits, point_labels, points
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
         return polar_view_loss(logits, labels, self.class_weights, self.config.region)

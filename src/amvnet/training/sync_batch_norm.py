@@ -1,35 +1,88 @@
-"""Batch norm over the batches of all processes, on CPUs too."""
+"""Batch norm over the batches of all processes, on GPUs and CPUs."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch import distributed as dist
 from torch.nn.modules.batchnorm import _BatchNorm
 
-if TYPE_CHECKING:
-    pass
-
 
 def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
-    """The network with batch norms whose statistics are over the batches of all processes."""
+    """Replace the batch norms inside a network by ones with statistics over all processes.
+
+    Args:
+        net: changed in place.
+        cuda: whether it runs on GPUs; PyTorch's own synchronised batch norm does not run on CPUs.
+
+    Returns:
+        The network.
+    """
     if cuda:
         return nn.SyncBatchNorm.convert_sync_batchnorm(net)
+
     for name, child in net.named_children():
-        setattr(
-            net,
-            name,
-            SyncedBatchNorm.of(child)
-            if isinstance(child, _BatchNorm)
-            else synchronise_batch_norms(child, cuda),
-        )
+        if isinstance(child, _BatchNorm):
+            setattr(net, name, SyncedBatchNorm.of(child))
+        else:
+            synchronise_batch_norms(child, cuda)
     return net
 
 
-class _Sum(torch.autograd.Function):
-    """The sum over all processes; its gradient is the sum of theirs."""
+class SyncedBatchNorm(_BatchNorm):
+    """Batch norm over the batches of all processes, on CPUs; the batches may differ in size."""
+
+    @classmethod
+    def of(cls, norm: _BatchNorm) -> SyncedBatchNorm:
+        """Return one with the parameters and running statistics of another batch norm."""
+        weight = norm.weight
+        synced = cls(
+            norm.num_features, norm.eps, norm.momentum, device=weight.device, dtype=weight.dtype
+        )
+
+        synced.load_state_dict(norm.state_dict())
+        return synced
+
+    def forward(self, input: Tensor) -> Tensor:
+        if not self.training:
+            return super().forward(input)
+
+        x = input.to(torch.promote_types(input.dtype, torch.float32))
+        shape = (1, -1, *[1] * (x.ndim - 2))  # of one value per channel, to broadcast
+        axes = (0, *range(2, x.ndim))  # all but the channels
+
+        # One exchange for two things: the sums of the channels, and the number of their values.
+        count = x.new_tensor([x.numel() / x.shape[1]])
+        sums = _sum_over_processes(torch.cat([x.sum(axes), count]))
+        mean = sums[:-1] / sums[-1]
+        total = sums[-1].detach()
+
+        centred = x - mean.view(shape)
+        variance = _sum_over_processes(centred.square().sum(axes)) / total
+        self._update_statistics(mean.detach(), variance.detach() * total / (total - 1))
+
+        scale = self.weight * (variance + self.eps).rsqrt()
+        return (centred * scale.view(shape) + self.bias.view(shape)).to(input.dtype)
+
+    @torch.no_grad()
+    def _update_statistics(self, mean: Tensor, variance: Tensor) -> None:
+        assert self.running_mean is not None
+        assert self.running_var is not None
+        assert self.num_batches_tracked is not None
+        assert self.momentum is not None
+
+        self.running_mean.lerp_(mean, self.momentum)
+        self.running_var.lerp_(variance, self.momentum)
+        self.num_batches_tracked.add_(1)
+
+    def _check_input_dim(self, input: Tensor) -> None:
+        """Accept any number of dimensions."""
+
+
+class _ProcessSum(torch.autograd.Function):
+    """The sum over all processes; its gradient is the sum of their gradients."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor) -> Tensor:
@@ -39,50 +92,8 @@ class _Sum(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Tensor:
-        return _Sum.forward(ctx, grads[0])
+        return _ProcessSum.forward(ctx, grads[0])
 
 
-def _sum(x: Tensor) -> Tensor:
-    return _Sum.apply(x)
-
-
-class SyncedBatchNorm(_BatchNorm):
-    """Batch norm over the batches of all processes, which may differ in size; torch's own runs on accelerators only."""
-
-    @classmethod
-    def of(cls, norm: _BatchNorm) -> SyncedBatchNorm:
-        """One with the parameters of another."""
-        like = norm.weight
-        found = cls(
-            norm.num_features, norm.eps, norm.momentum, device=like.device, dtype=like.dtype
-        )
-        found.load_state_dict(norm.state_dict())
-        return found
-
-    def _check_input_dim(self, input: Tensor) -> None:
-        pass
-
-    def forward(self, input: Tensor) -> Tensor:
-        if not self.training:
-            return super().forward(input)
-        shape = (1, -1, *[1] * (input.ndim - 2))
-        over = [d for d in range(input.ndim) if d != 1]
-        x = input.to(torch.promote_types(input.dtype, torch.float32))
-        count = x.new_tensor([x.numel() / x.shape[1]])
-        sums = _sum(torch.cat([x.sum(over), count]))
-        mean, total = sums[:-1] / sums[-1], sums[-1].detach()
-        centred = x - mean.view(shape)
-        variance = _sum(centred.square().sum(over)) / total
-        self._remember(mean.detach(), variance.detach() * total / (total - 1))
-        scale = self.weight * (variance + self.eps).rsqrt()
-        return (centred * scale.view(shape) + self.bias.view(shape)).to(input.dtype)
-
-    @torch.no_grad()
-    def _remember(self, mean: Tensor, variance: Tensor) -> None:
-        assert self.running_mean is not None
-        assert self.running_var is not None
-        assert self.num_batches_tracked is not None
-        assert self.momentum is not None
-        self.running_mean.lerp_(mean, self.momentum)
-        self.running_var.lerp_(variance, self.momentum)
-        self.num_batches_tracked.add_(1)
+def _sum_over_processes(x: Tensor) -> Tensor:
+    return _ProcessSum.apply(x)
