@@ -19,7 +19,7 @@ from amvnet.evaluation import scoring as jobs
 from amvnet.evaluation.analysis import BINS, SWEPT, analyze
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.amvnet import arithmetic_mean, maximum
+from amvnet.models.methods import arithmetic_mean, maximum
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.worlds import (

@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.schema import AssertionConfig, PointHeadConfig
-from amvnet.models.amvnet import arithmetic_mean, geometric_mean, maximum, merge
+from amvnet.models.amvnet import merge
 from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
 from amvnet.models.layers import fold_batch_norms
+from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
 from amvnet.models.point_head import (
     head_features,
     nearest_neighbours,
