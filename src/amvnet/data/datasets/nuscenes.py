@@ -48,7 +48,9 @@ VAL = _scenes(
 
 
 class NuScenes:
-    """The LIDAR_TOP key frames of one version; a `Dataset`, which describes arguments and errors.
+    """The LIDAR_TOP key frames of one version of nuScenes.
+
+    `Dataset` documents the arguments and errors of the methods.
 
     Attributes:
         root: the folder that holds `samples/` and `v1.0-*/`.

@@ -18,7 +18,7 @@ from amvnet.scan import Scan
 
 @dataclass(frozen=True)
 class SemanticKitti:
-    """The scans in one folder; a `Dataset`, whose methods describe arguments and errors.
+    """A SemanticKITTI dataset. `Dataset` documents the arguments and errors of its methods.
 
     Attributes:
         root: the folder that holds `sequences/`, or `sequences` itself.
