@@ -100,7 +100,10 @@ class SemanticKitti:
 
     def _present(self) -> tuple[str, ...]:
         """Return the names of the sequences on disk."""
-        return tuple(sorted(path.parent.name for path in self._folder.glob("*/velodyne")))
+        names = []
+        for path in self._folder.glob("*/velodyne"):
+            names.append(path.parent.name)
+        return tuple(sorted(names))
 
     def _count_points(self, record: ScanRecord) -> int:
         return files.count_rows(record.points_path, np.float32, files.KITTI_COLUMNS)
