@@ -124,12 +124,13 @@ def peak_memory(device: str) -> str:
     """Return the most memory that was in use since the last call."""
     if device == "cpu":
         return "not measured"
+
     peak = torch.cuda.max_memory_allocated(device)
     torch.cuda.reset_peak_memory_stats(device)
     return f"{peak / 2**30:.1f} GiB"
 
 
-def time_method(segmenter: Segmenter, scan: Scan, batch: int, runs: int) -> None:
+def time_segmentation(segmenter: Segmenter, scan: Scan, batch: int, runs: int) -> None:
     seconds = median_seconds(lambda: segmenter.many([scan] * batch), runs, segmenter.device)
     print(
         f"points to labels, {segmenter.precision}, {batch} at a time: "
@@ -216,7 +217,8 @@ def time_training(stage: NetworkStage, scan: Scan, limit: float, options: Option
     flops = count_flops(backward) * (batch // part)
     if options.compile:  # after counting: compiled networks cannot be counted
         stage.trained.compile()
-    peak_memory(device)
+
+    peak_memory(device)  # forget the peak so far
     seconds = median_seconds(step, options.runs, device)
     rate = flops / seconds
     print(
@@ -260,6 +262,7 @@ def load_scan(path: Path | None) -> Scan:
     """Read a scan, or simulate one if no path is given."""
     if path is not None:
         return read_scan(path)
+
     with TemporaryDirectory() as folder:
         simulate(Path(folder), scans=1)
         return read_scan(Path(folder) / "sequences/00/velodyne/000000.bin")
@@ -284,7 +287,7 @@ def main() -> None:
     for precision in options.precision.split(","):
         segmenter = make_segmenter(weights, scan, precision, options)
         for batch in map(int, options.batch.split(",")):
-            time_method(segmenter, scan, batch, runs)
+            time_segmentation(segmenter, scan, batch, runs)
             time_networks(segmenter, scan, batch, runs, limit)
 
     time_neighbour_search(segmenter, scan, runs)
