@@ -75,6 +75,7 @@ def median_seconds(work: Callable[[], object], runs: int, device: str) -> float:
         if device != "cpu":
             torch.cuda.synchronize(device)
         times.append(time.perf_counter() - started)
+
     return median(times[WARM_UP:])
 
 
@@ -98,6 +99,7 @@ def untrained_weights(config: ModelConfig) -> Weights:
     """
     torch.manual_seed(0)
     model = build_amvnet(config, CLASSES)
+
     tensors: dict[str, torch.Tensor] = {}
     for name in ("range_net", "polar_net", "point_head"):
         tensors |= part_state(name, getattr(model, name))
@@ -110,6 +112,7 @@ def make_segmenter(weights: Weights, scan: Scan, precision: str, options: Option
     Untrained networks would disagree on another share than trained ones.
     """
     segmenter = Segmenter(weights, options.device, precision=precision)  # type: ignore[arg-type]
+
     segmentation = segmenter(scan)
     f = torch.from_numpy(segmentation.rv[scan.valid])
     g = torch.from_numpy(segmentation.bev[scan.valid])
@@ -160,6 +163,7 @@ def time_neighbour_search(segmenter: Segmenter, scan: Scan, runs: int) -> None:
     device = segmenter.device
     assert model.point_head is not None
     n = model.point_head.config.neighbours
+
     xyz = scan.points[scan.valid][:, :3].copy()
     uncertain = segmenter(scan).uncertain[scan.valid].nonzero()[0]
     device_xyz = torch.from_numpy(xyz).to(device)
@@ -196,6 +200,7 @@ def time_training(stage: NetworkStage, scan: Scan, limit: float, options: Option
     device = options.device
     batch = stage.config.batch
     part = min(options.part, batch)
+
     stage.to(device).train()
     optimizer = torch.optim.AdamW(stage.trained.parameters(), lr=1e-4)
     points = PointBatch.of([scan] * part).to(device)

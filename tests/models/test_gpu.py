@@ -147,6 +147,7 @@ def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compa
     monkeypatch.setattr(block_search, "_nearest_of_all", counted)
     by_blocks = np.sort(nearest_others_by_blocks(xyz, own, N).numpy(), axis=1)
     by_tree = np.sort(nearest_others(xyz.numpy(), own.numpy(), N), axis=1)
+
     # pykdtree rounds distances to float32.
     assert (by_blocks == by_tree).all(axis=1).mean() > 0.999
 
