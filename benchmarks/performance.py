@@ -13,7 +13,9 @@ import json
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -205,11 +207,11 @@ def compare(options: argparse.Namespace, scan: Path) -> None:
 
     Each measurement is a process of its own. The variants take turns, round by round.
     """
-    variants = [(UNCHANGED, engine) for engine in options.engines.split(",")]
+    variants = list(product([UNCHANGED], options.engines.split(",")))
     if not options.short:
-        variants += [(name, "torch") for name in (*REMOVALS, ALL)]
+        variants += product([*REMOVALS, ALL], ["torch"])
 
-    results: dict[tuple[str, str], list[dict[str, float]]] = {key: [] for key in variants}
+    results: defaultdict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
     for number in range(options.rounds):
         for variant, engine in variants:
             results[variant, engine].append(run_variant(variant, engine, scan, options))

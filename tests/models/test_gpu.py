@@ -150,6 +150,7 @@ def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compa
     monkeypatch.setattr(block_search, "_nearest_of_all", counted)
     by_blocks = np.sort(nearest_others_by_blocks(xyz, own, N).numpy(), axis=1)
     by_tree = np.sort(nearest_others(xyz.numpy(), own.numpy(), N), axis=1)
+
     # pykdtree rounds distances to float32.
     assert (by_blocks == by_tree).all(axis=1).mean() > 0.999
 
@@ -260,6 +261,7 @@ def test_the_merge_of_a_gpu_is_that_of_a_cpu(monkeypatch: pytest.MonkeyPatch) ->
 def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points(simulated_scan: Scan) -> None:
     exact = Segmenter("sim-hdl64e")(simulated_scan)
     lower = Segmenter("sim-hdl64e", precision="bfloat16")(simulated_scan)
+
     for name in ("scores", "rv", "bev"):
         assert getattr(lower, name).dtype == np.float32
         assert not np.array_equal(getattr(lower, name), getattr(exact, name))
@@ -310,8 +312,12 @@ def test_a_precision_that_a_cpu_lacks_is_refused(precision: str) -> None:
     fails(lambda: Segmenter(weights, "cpu", precision=precision), "expected", precision)
 
 
+def street_scans(*counts: int) -> list[Scan]:
+    return [Scan(street(seed, count)[0], name=str(seed)) for seed, count in enumerate(counts)]
+
+
 def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
-    scans = [Scan(street(seed, 100 + seed)[0]) for seed in range(3)]
+    scans = street_scans(100, 101, 102)
     scans[1].points[7] = np.nan
     batch = PointBatch.of(scans)
 
@@ -323,7 +329,7 @@ def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
 
 def test_several_scans_at_a_time_are_segmented_as_each_alone() -> None:
     segmenter = Segmenter(fresh_weights())
-    scans = [Scan(street(seed, 300 + 50 * seed)[0], name=str(seed)) for seed in range(3)]
+    scans = street_scans(300, 350, 400)
     scans[1].points[[0, 9]] = np.nan
 
     for scan, together in zip(scans, segmenter.many(scans), strict=True):
@@ -451,6 +457,7 @@ def test_every_verb_that_segments_takes_a_precision(world: Path, tmp_path: Path,
         "bench": ("--runs", 1, "--scan", world / "scans/000000.bin"),
     }
     options = ("--weights", world / "w.safetensors", "--precision", "bfloat16")
+
     assert run_cli(verb, *inputs[verb], *options) == (0, "")
 
 
@@ -465,9 +472,10 @@ def test_the_commands_of_the_page_run(
         "runs/kitti": "w.safetensors",
         "predictions": str(tmp_path),
     }
-    *commands, _, _, benchmark = commands_of("docs/gpu.md")
-    assert [words[:2] for words in commands] == [["amvnet", "predict"], ["amvnet", "evaluate"]]
-    for words in commands:
+    predict, evaluate, _, _, benchmark = commands_of("docs/gpu.md")
+    assert predict[:2] == ["amvnet", "predict"]
+    assert evaluate[:2] == ["amvnet", "evaluate"]
+    for words in (predict, evaluate):
         assert run_cli(*[stand_ins.get(word, word) for word in words[1:]]) == (0, "")
 
     script = Path(__file__).parents[2] / benchmark[1]
@@ -484,5 +492,6 @@ def test_a_gpu_gives_the_labels_of_a_cpu(simulated_scan: Scan, precision: str) -
     expected = Segmenter("sim-hdl64e")(simulated_scan)
     segmenter = Segmenter("sim-hdl64e", "cuda", precision=precision)  # type: ignore[arg-type]
     least = 0.999 if precision == "float32" else 0.98
+
     for segmentation in segmenter.many([simulated_scan, simulated_scan]):
         assert (segmentation.labels == expected.labels).mean() > least
