@@ -114,6 +114,7 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
         miou = _percent(reached["miou"])
         accuracy = _percent(reached["accuracy"])
         table.append(("yes" if gru else "no", "yes" if weighted else "no", miou, accuracy))
+
     return _write(path, ("GRU", "class weights", "mIoU %", "accuracy %"), table)
 
 
@@ -133,6 +134,7 @@ def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path
     axes.set(xlabel="cosine similarity of the two scores", xlim=(0, 1))
     axes.set(ylabel="points", yscale="log")
     axes.legend(frameon=False, loc="upper left")
+
     return _write(path, ("above", "up to", "points", "points %"), rows, figure)
 
 
@@ -145,13 +147,16 @@ def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
         table.append([extent["from_m"], extent["to_m"]])
         middles.append((extent["from_m"] + extent["to_m"]) / 2)
 
+    columns = ["from m", "to m"]
     figure, axes = _figure(f"mIoU by distance on {dataset}")
     for method, style in STYLES.items():
+        columns.append(f"{style.title} %")
         heights = []
         for row, extent in zip(table, methods[method]["by_distance"], strict=True):
             miou = _percent(extent["miou_present"])
             row.append(miou)
             heights.append(np.nan if miou is None else miou)
+
         axes.plot(
             middles,
             heights,
@@ -164,23 +169,21 @@ def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
 
     axes.set(xlabel="distance from the sensor (m)", ylabel="mIoU, classes present (%)")
     axes.legend(frameon=False)
-    columns = [f"{style.title} %" for style in STYLES.values()]
-    return _write(path, ("from m", "to m", *columns), table, figure)
+    return _write(path, columns, table, figure)
 
 
 def _write_classes(analysis: Analysis, path: Path) -> list[Path]:
     """Write Table 3 of the paper: IoU by class."""
-    reached = []
-    for method in STYLES:
-        matrix = analysis.evaluation.matrices[method][0]
-        reached.append(metrics(matrix, analysis.taxonomy))
+    rows: list[list[Cell]] = [[name] for name in (*analysis.taxonomy.classes, "mIoU", "fwIoU")]
+    columns = ["IoU %"]
+    for method, style in STYLES.items():
+        columns.append(style.title)
+        reached = metrics(analysis.evaluation.matrices[method][0], analysis.taxonomy)
+        values = (*reached["iou"].values(), reached["miou"], reached["fwiou"])
+        for row, value in zip(rows, values, strict=True):
+            row.append(_percent(value))
 
-    rows: list[Sequence[Cell]] = []
-    for name in analysis.taxonomy.classes:
-        rows.append((name, *(_percent(values["iou"][name]) for values in reached)))
-    rows.append(("mIoU", *(_percent(values["miou"]) for values in reached)))
-    rows.append(("fwIoU", *(_percent(values["fwiou"]) for values in reached)))
-    return _write(path, ("IoU %", *(style.title for style in STYLES.values())), rows)
+    return _write(path, columns, rows)
 
 
 def _write_methods(analysis: Analysis, path: Path) -> list[Path]:
@@ -242,8 +245,7 @@ def _write(
 
 
 def _markdown_row(cells: Sequence[Cell]) -> str:
-    texts = [_cell_text(cell) for cell in cells]
-    return f"| {' | '.join(texts)} |\n"
+    return f"| {' | '.join(map(_cell_text, cells))} |\n"
 
 
 def _cell_text(cell: Cell) -> str:

@@ -130,10 +130,12 @@ def rank(
     sizes = np.zeros(len(records), dtype=np.int64)
     for number, record in enumerate(records):
         progress(number, len(records))
+
         doubts = find_doubts(check_scan(dataset.read(record)), segmenter, by)
         rows, _ = find_clusters(doubts)
         rows["scan"] = number
         rows_by_scan.append(rows)
+
         mean_doubts[number] = doubts.doubt.mean()
         sizes[number] = len(doubts.doubt)
     progress(len(records), len(records))
@@ -167,6 +169,7 @@ def find_doubts(scan: Scan, segmenter: Segmenter, by: Criterion) -> Doubts:
 
     scores, uncertain = segmenter.scores_by_method(scan, ("rv", "bev"))
     assert uncertain is not None
+
     f = scores["rv"]  # (P, K) class probabilities of the P valid points
     g = scores["bev"]  # (P, K)
     valid = scan.valid
@@ -215,6 +218,7 @@ def _contradiction(
     """
     agreed = (f * g).argmax(dim=1)
     column = (label.long() - 1).clamp_min(0)
+
     for_label = torch.maximum(f, g).gather(1, column[:, None])[:, 0]
     for_agreed = torch.minimum(f, g).gather(1, agreed[:, None])[:, 0]
     contradiction = (for_agreed - for_label).clamp_min(0) * (label > 0)
@@ -265,6 +269,7 @@ def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.
     squared_distance = ((xyz - mean[group]) ** 2).sum(axis=1)
     order = np.lexsort((squared_distance, group))
     group_starts = np.cumsum(sizes) - sizes
+
     return order[group_starts]
 
 
@@ -298,6 +303,7 @@ def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
         The file of the scans, NAME-scans.csv.
     """
     _write(path, COLUMNS, _cluster_rows(ranking, taxonomy))
+
     scans_path = path.with_name(f"{path.stem}-scans{path.suffix}")
     _write(scans_path, SCAN_COLUMNS, _scan_rows(ranking))
     return scans_path

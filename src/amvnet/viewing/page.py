@@ -31,7 +31,18 @@ STOPS = 17  # colours between which the page interpolates a ramp
 # Matplotlib's colour map, and the part of it that is used.
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
 DOUBT = (RIGHT, (128, 104, 92), (190, 110, 50), UNCERTAIN, (255, 190, 60))
-SCRIPTS = ("scans", "camera", "shaders", "draw", "look", "panel", "point", "hands", "page")
+# In this order: later ones use what earlier ones define.
+SCRIPTS = (
+    "scans.js",
+    "camera.js",
+    "shaders.js",
+    "draw.js",
+    "look.js",
+    "panel.js",
+    "point.js",
+    "hands.js",
+    "page.js",
+)
 
 
 @dataclass(frozen=True)
@@ -93,9 +104,14 @@ def pack(frame: Frame) -> Packed:
     xyz = frame.points[indices, :3].astype(np.float64)
     center, step = _quantisation(xyz)
     steps = np.round((xyz - center) / step).astype(np.int16)
-    values = {name: plane[indices] for name, plane in _byte_planes(frame).items()}
-    planes = [_differences(axis) for axis in steps.T]
-    planes += [plane.tobytes() for plane in values.values()]
+
+    data = bytearray()
+    for axis in steps.T:
+        data += _differences(axis)
+    planes = {}
+    for name, values in _byte_planes(frame).items():
+        planes[name] = values[indices]
+        data += planes[name].tobytes()
 
     about = {
         "name": frame.name,
@@ -103,16 +119,15 @@ def pack(frame: Frame) -> Packed:
         "note": _note(left_out, stride),
         "center": center.tolist(),
         "step": step.tolist(),
-        "planes": list(values),
+        "planes": list(planes),
     }
-    deflated = zlib.compress(b"".join(planes), 9)
     height, ground = _heights(xyz[:, 2])
     return Packed(
         about=about,
-        planes=base64.b64encode(deflated).decode("ascii"),
-        present=_class_ids(values, (*frame.labels, "truth")),
+        planes=base64.b64encode(zlib.compress(data, 9)).decode("ascii"),
+        present=_class_ids(planes, (*frame.labels, "truth")),
         height=height,
-        intensity=_bright(values["intensity"]),
+        intensity=_bright(planes["intensity"]),
         ground=ground,
     )
 
@@ -120,7 +135,7 @@ def pack(frame: Frame) -> Packed:
 def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
     """Return the text of the page; the names of the user's files go in as JSON, or escaped."""
     style = _source("page.css")
-    script = "\n".join(_source(f"{name}.js") for name in SCRIPTS)
+    script = "\n".join(map(_source, SCRIPTS))
     policy = (
         f"default-src 'none'; style-src '{_hash(style)}'; script-src '{_hash(script)}'; "
         "img-src data:; base-uri 'none'; form-action 'none'"
@@ -157,6 +172,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     lowest = min(scan.height[0] for scan in packed)
     highest = max(scan.height[1] for scan in packed)
     brightest = max(scan.intensity for scan in packed)
+
     return {
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
@@ -182,6 +198,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
 def _byte_planes(frame: Frame) -> dict[str, np.ndarray]:
     """Return the values of the points other than positions, (N,) uint8 each."""
     planes = {"intensity": _to_bytes(np.nan_to_num(frame.points[:, 3]))}
+
     if frame.truth is not None:
         planes["truth"] = frame.truth.astype(np.uint8)
     for method, ids in frame.labels.items():
@@ -189,6 +206,7 @@ def _byte_planes(frame: Frame) -> dict[str, np.ndarray]:
     if frame.uncertain is not None and frame.disagreement is not None:
         planes["uncertain"] = frame.uncertain.astype(np.uint8)
         planes["disagreement"] = _to_bytes(frame.disagreement)
+
     return planes
 
 
@@ -201,6 +219,7 @@ def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the (3,) middle of the points, and the (3,) metres of one step of an int16."""
     if not len(xyz):
         return np.zeros(3), np.ones(3)
+
     low = xyz.min(axis=0)
     high = xyz.max(axis=0)
     return (low + high) / 2, np.maximum((high - low) / 2, 1e-3) / LEVELS
@@ -219,6 +238,7 @@ def _heights(z: np.ndarray) -> tuple[tuple[float, float], float]:
     """Return the range that most heights are in, and the height of the ground, in metres."""
     if not len(z):
         return (0.0, 1.0), 0.0
+
     low, high = np.percentile(z, (1, 99))
     return (float(low), float(high)), float(np.percentile(z, 10))
 
@@ -248,6 +268,7 @@ def _note(left_out: int, stride: int) -> str:
         notes.append(f"{left_out:,} without a place or beyond {REACH:g} m")
     if stride > 1:
         notes.append(f"one in {stride} of the scan")
+
     return "; ".join(notes)
 
 
