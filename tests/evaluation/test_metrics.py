@@ -64,6 +64,7 @@ def test_semantickitti_equals_the_official_tools() -> None:
 def test_nuscenes_equals_the_official_tool() -> None:
     figures = golden_report("nuscenes", "results")["methods"]["predictions"]
     expected = official_figures("nuscenes")
+
     assert figures["miou"] == pytest.approx(expected["miou"], abs=1e-9)
     assert figures["fwiou"] == pytest.approx(expected["freq_weighted_iou"], abs=1e-9)
 
@@ -130,6 +131,7 @@ def test_metrics_equal_plain_loops(taxonomy: Taxonomy) -> None:
         hits = pairs.count((class_id, class_id))
         ious[class_id] = hits / union if union else None
         total += ious[class_id] or 0.0
+
     assert ious[5] is None
 
     figures = metrics(confusion(truth, prediction, taxonomy.size), taxonomy)
@@ -159,6 +161,7 @@ def test_nothing_to_count_is_none_not_a_number() -> None:
     figures = metrics(np.zeros((17, 17), dtype=np.int64), NUSCENES)
     for key in ("miou", "miou_present", "accuracy", "fwiou"):
         assert figures[key] is None
+
     assert set(figures["iou"].values()) == {None}
     json.dumps(figures, allow_nan=False)
 
@@ -179,6 +182,7 @@ def test_halves_add_up() -> None:
     whole = evaluate(random_example(2), random_example(3))
     first = evaluate(random_example(2))
     second = evaluate(random_example(3))
+
     assert (first + second).report("x") == whole.report("x")
     assert first.scans == 1  # the sum left its parts alone
 
@@ -195,6 +199,7 @@ def test_order_of_the_points_changes_nothing() -> None:
 def test_report_has_the_keys_of_the_contract() -> None:
     example = random_example(5)
     report = evaluate(example).report("nuscenes:here")
+
     assert list(report) == ["dataset", "scans", "points", "uncertain_fraction", "methods"]
     assert report["dataset"] == "nuscenes:here"
     assert report["scans"] == 1
@@ -223,6 +228,7 @@ def test_distance_bins_are_open_at_both_ends() -> None:
     evaluation.add(points, ids, {"rv": ids})
 
     bins = evaluation.report("x")["methods"]["rv"]["by_distance"]
+
     assert [extent["points"] for extent in bins] == [1, 1, 0, 0, 0]
 
 

@@ -52,6 +52,7 @@ def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
     image = imread(path)
     for class_id in (3, 4, 11, 16):
         assert has_color(image, class_color(class_id))
+
     assert not has_color(image, class_color(7))
     assert has_color(image, WRONG)
     assert has_color(image, UNCERTAIN)
@@ -67,6 +68,7 @@ def test_every_part_is_optional(tmp_path: Path, with_truth: bool, with_uncertain
     uncertain = ids > 0 if with_uncertain else None
 
     path = tmp_path / "a.png"
+
     assert draw_scan(path, points, NUSCENES, {"p": ids}, truth, uncertain=uncertain).is_file()
 
 
@@ -81,4 +83,5 @@ def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
         draw_scan(tmp_path / "a.png", points, NUSCENES, {})
     with pytest.raises(InputError, match="'rv'"):
         draw_scan(tmp_path / "a.png", points, NUSCENES, {"rv": ids[1:]})
+
     assert not any(tmp_path.iterdir())

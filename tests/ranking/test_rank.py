@@ -27,7 +27,11 @@ from fixtures.worlds import files, fresh_weights, make_streets, run_cli, without
 
 DOCS = Path(__file__).parents[2] / "docs"
 WEIGHTS = fresh_weights()
-CAR, PERSON, ROAD, WALL = 1, 6, 9, 13  # train ids
+# Train ids of SemanticKITTI.
+CAR = 1
+PERSON = 6
+ROAD = 9
+WALL = 13
 
 
 # ---- clusters
@@ -60,6 +64,7 @@ def test_clusters_are_connected_points_of_one_kind() -> None:
     expected = clusters_by_flooding(xyz, kind)
 
     count = len(np.unique(ours))
+
     assert 5 < count < 150
     assert set(ours) == set(range(count))
 
@@ -127,6 +132,7 @@ def test_the_vehicle_that_carries_the_sensor_is_not_doubted() -> None:
     points[thing == 0, :3] *= (1, 0.1, 1)  # to half a metre from the sensor
     doubts = doubts_of(points, rv=np.full(301, CAR), bev=np.full(301, PERSON))
     _, cluster_ids = find_clusters(doubts)
+
     assert np.array_equal(cluster_ids >= 0, (thing == 1) | (thing == 2))
 
 
@@ -169,6 +175,7 @@ def test_a_whole_thing_is_more_doubtful_than_the_edge_of_one_and_many_points_tha
     rows, _ = find_clusters(doubts_of(points, ids, ids, labels))
 
     rows = rows[np.argsort(-rows["score"])]
+
     assert rows["points"][0] == 100
     assert rows["points"][-1] == 1
     assert rows["score"][0] > 2 * rows["score"][1]
@@ -187,6 +194,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save(fresh_weights(NUSCENES), root / "nuscenes.safetensors")
 
     command = ("rank", root / "data", "--weights", root / "w.safetensors")
+
     assert run_cli(*command, "--out", root / "disagreement.csv") == (0, "")
     labels = ("--by", "labels", "--out", root / "labels.csv", "--pictures", root / "labels")
     assert run_cli(*command, *labels) == (0, "")
@@ -202,6 +210,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
 def test_the_tables_are_in_order(world: Path, by: str) -> None:
     clusters = read_table(world / f"{by}.csv")
     scans = read_table(world / f"{by}-scans.csv")
+
     assert len(clusters) > 20
     assert len(scans) == 6
     for table in (clusters, scans):
@@ -248,6 +257,7 @@ def test_scans_without_labels_are_ranked_alike(world: Path, tmp_path: Path) -> N
         shutil.rmtree(folder / "labels")
     command = ("rank", tmp_path / "data", "--weights", world / "w.safetensors")
     command += ("--out", tmp_path / "next.csv")
+
     assert run_cli(*command) == (0, "")
 
     expected = read_table(world / "disagreement.csv")
@@ -270,6 +280,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(
 ) -> None:
     options = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path / "next.csv")
     code, error = run_cli("rank", world / "data", *options)
+
     assert code == 2
     assert error.count("\n") == 1
     assert word in error
@@ -290,6 +301,7 @@ def test_each_scan_is_read_only_in_its_turn(world: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(type(dataset), "read", recorded_read)
     rank(dataset, dataset.records(["00", "01"]), Segmenter(WEIGHTS), "labels", progress)
+
     assert events == ["progress", "read"] * 4 + ["progress"]
 
 
@@ -306,6 +318,7 @@ def test_every_command_of_the_page_runs_and_finds_most(
     commands: list[str] = []
     for block in re.findall(r"```bash\n(.*?)```", page, re.S):
         commands += block.splitlines()
+
     assert len(commands) == 5
 
     for command in commands:

@@ -52,6 +52,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save(fresh_weights(), root / "w.safetensors")
     street(7, 300)[0].tofile(root / "lone.bin")
     options = ("--weights", root / "w.safetensors", "--scans", 9, "--html", root / "p.html")
+
     assert run_cli("view", root / "data", *options) == (0, "")
     return root
 
@@ -85,6 +86,7 @@ def tags(page: Page) -> list[str]:
 def test_every_scan_is_in_the_page_as_it_is(world: Path, dataset: SemanticKitti) -> None:
     page = read_page(world / "p.html")
     records = dataset.records(dataset.sequences("all"))
+
     assert scan_names(page) == [record.name for record in records]
 
     for index, record in enumerate(records):
@@ -116,6 +118,7 @@ def test_disagreement_is_one_minus_the_cosine(world: Path, dataset: SemanticKitt
     segmentation = segmenter(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
     bev = segmentation.bev
+
     assert rv is not None
     assert bev is not None
 
@@ -130,6 +133,7 @@ def test_the_page_names_classes_and_colours_officially(world: Path) -> None:
     assert about["classes"][1:] == list(SEMANTICKITTI.classes)
     np.testing.assert_array_equal(about["colors"][1:], SEMANTICKITTI.colors[1:])
     keys = [source["key"] for source in about["sources"]]
+
     assert keys == ["truth", "rv", "bev", "ensemble", "amvnet"]
 
 
@@ -138,6 +142,7 @@ def test_points_without_a_place_are_left_out_and_counted(tmp_path: Path) -> None
     frame = make_frame(points, labels=np.array([1, 2, 3, 4]))
     page = write_and_read(tmp_path / "p.html", frame)
     xyz, planes = page.scan(0)
+
     np.testing.assert_allclose(xyz, points[[0, 2], :3], atol=1e-4)
     assert planes["labels"].tolist() == [1, 3]
     assert planes["intensity"].tolist() == [128, 255]
@@ -158,6 +163,7 @@ def test_a_huge_scan_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.Monke
     ids = np.arange(250) % 20
     page = write_and_read(tmp_path / "p.html", make_frame(points, labels=ids))
     _, planes = page.scan(0)
+
     assert planes["labels"].tolist() == ids[::3].tolist()
     assert "one in 3" in page.about["scans"][0]["note"]
 
@@ -174,6 +180,7 @@ def test_a_scan_of_120_thousand_points_takes_under_two_megabytes(tmp_path: Path)
     frame = make_frame(points, truth, **labels)
     frame = replace(frame, uncertain=disagreement > 0.1, disagreement=disagreement)
     path = pages.write_page(tmp_path / "p.html", [frame], SEMANTICKITTI, "")
+
     assert path.stat().st_size < 2e6
 
 
@@ -182,6 +189,7 @@ def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
     frame = make_frame(points, labels=SEMANTICKITTI.to_train(raw))
     first = pages.write_page(tmp_path / "a.html", [frame], SEMANTICKITTI, "t")
     second = pages.write_page(tmp_path / "b.html", [frame], SEMANTICKITTI, "t")
+
     assert first.read_bytes() == second.read_bytes()
 
 
@@ -217,6 +225,7 @@ def policy_of(page: Page) -> dict[str, str]:
 def test_no_script_runs_but_the_package_s_own(world: Path) -> None:
     page = read_page(world / "p.html")
     policy = policy_of(page)
+
     assert policy["default-src"] == "'none'"
     for tag in ("script", "style"):
         digest = hashlib.sha256(page.texts[f"<{tag}>"].encode()).digest()
@@ -237,6 +246,7 @@ def hostile_page(path: Path) -> Page:
 def test_names_stay_names(tmp_path: Path) -> None:
     page = hostile_page(tmp_path / "p.html")
     harmless = write_and_read(tmp_path / "q.html", make_frame(street(5)[0]))
+
     assert tags(page) == tags(harmless)
     assert page.texts["<title>"] == HOSTILE
     assert page.about["title"] == HOSTILE
@@ -270,7 +280,8 @@ def test_labels_that_predict_wrote_are_shown(world: Path, tmp_path: Path) -> Non
     assert run_cli("predict", world / "data", world / "lone.bin", *weights)[0] == 0
 
     expected = read_page(world / "p.html")
-    page = view_page(tmp_path, world / "data", "--labels", tmp_path / "labels", "--scans", 6)
+    options = ("--labels", tmp_path / "labels", "--scans", 6)
+    page = view_page(tmp_path, world / "data", *options)
     for index in range(6):
         _, planes = page.scan(index)
         _, expected_planes = expected.scan(index)
@@ -281,6 +292,7 @@ def test_labels_that_predict_wrote_are_shown(world: Path, tmp_path: Path) -> Non
 def test_a_lone_scan_takes_labels_from_a_folder_or_a_file(world: Path, tmp_path: Path) -> None:
     scan = world / "lone.bin"
     weights = ("--weights", world / "w.safetensors")
+
     assert run_cli("predict", scan, *weights, "--out", tmp_path / "labels")[0] == 0
 
     _, by_weights = view_page(tmp_path, scan, *weights).scan(0)
@@ -294,6 +306,7 @@ def test_labels_are_read_with_the_classes_that_are_named(world: Path, tmp_path: 
     ids.tofile(tmp_path / "lone.label")
     options = (world / "lone.bin", "--labels", tmp_path / "lone.label", "--taxonomy", "nuscenes")
     page = view_page(tmp_path, *options)
+
     assert page.about["classes"][1:] == list(NUSCENES.classes)
     _, planes = page.scan(0)
     assert planes["labels"].tolist() == ids.tolist()
@@ -309,6 +322,7 @@ def test_nuscenes_is_shown_with_its_truth(tmp_path: Path) -> None:
     name = f"nuscenes:{GOLDEN / 'nuscenes'}"
     page = view_page(tmp_path, name)
     golden = open_dataset(name)
+
     assert isinstance(golden, NuScenes)
     first = golden.records(golden.sequences("all"))[0]
     _, planes = page.scan(0)
@@ -346,6 +360,7 @@ def test_a_mistake_gets_one_line(line: str, world: Path, tmp_path: Path) -> None
     if "--html" not in arguments:
         arguments += ["--html", str(tmp_path / "p.html")]
     code, message = run_cli("view", *arguments)
+
     assert code == 2
     assert message.startswith("amvnet: ")
     assert message.count("\n") == 1
@@ -382,6 +397,7 @@ def test_the_browser_hides_classes(world: Path, browser: Browser) -> None:
     _, planes = read_page(page).scan(0)
     hidden = np.unique(planes["rv"])[:2].tolist()
     state = browser.state(page, f"color=error&labels=rv&hide={hidden[0]},{hidden[1]}")
+
     assert state["data-color"] == "error"
     assert state["drawn"] == count_by_class(planes["rv"], hidden)
 
@@ -391,6 +407,7 @@ def test_the_browser_draws_only_wrong_points(world: Path, browser: Browser) -> N
     _, planes = read_page(page).scan(0)
     wrong = (planes["truth"] > 0) & (planes["bev"] != planes["truth"])
     state = browser.state(page, "only=wrong&labels=bev&hide=99&size=nan&color=none")
+
     assert state["drawn"] == count_by_class(planes["bev"][wrong])
 
 
@@ -399,6 +416,7 @@ def test_the_browser_draws_only_uncertain_points(world: Path, browser: Browser) 
     _, planes = read_page(page).scan(3)
     uncertain = planes["uncertain"] > 0
     state = browser.state(page, "scan=4&labels=truth&only=uncertain&color=height")
+
     assert state["data-scan"] == "3"
     assert state["drawn"] == count_by_class(planes["truth"][uncertain])
 
@@ -413,6 +431,7 @@ def test_a_click_on_a_class_hides_it(world: Path, tmp_path: Path, browser: Brows
     (tmp_path / "p.html").write_text(text.replace("</body>", script + "</body>"))
 
     state = browser.state(tmp_path / "p.html", "labels=truth")
+
     assert state["drawn"] == count_by_class(planes["truth"], hidden=[road])
 
 
@@ -433,6 +452,7 @@ def test_the_picture_shows_what_is_asked_for_at_its_place(tmp_path: Path, browse
     car_rows, car_columns = pixels_of(picture, car)
     building_rows, _ = pixels_of(picture, building)
     _, green_columns = pixels_of(picture, green)
+
     assert car_columns.max() < green_columns.min() + 3
     assert car_rows.max() < building_rows.min() + 3
 
@@ -449,6 +469,7 @@ def test_the_picture_shows_what_is_asked_for_at_its_place(tmp_path: Path, browse
 def test_a_hostile_name_is_shown_and_not_run(tmp_path: Path, browser: Browser) -> None:
     hostile_page(tmp_path / "p.html")
     state = browser.state(tmp_path / "p.html")
+
     assert state["title"] == HOSTILE
     assert state["drawn"] is not None
     assert "img" not in tags(state["dom"])
@@ -483,6 +504,7 @@ def test_a_recording_reads_back(world: Path, tmp_path: Path, dataset: SemanticKi
     pytest.importorskip("rerun.chunk")
     command = ("view", world / "data", "--weights", world / "w.safetensors")
     command += ("--sequences", "08", "--save", tmp_path / "r.rrd")
+
     assert run_cli(*command)[0] == 0
 
     recording = Recording(tmp_path / "r.rrd")
@@ -516,6 +538,7 @@ def test_five_real_scans_take_a_few_megabytes(tmp_path: Path) -> None:
     assert len(page.about["scans"]) == 5
     for scan in page.about["scans"]:
         assert scan["count"] > 100_000
+
     assert (tmp_path / "out.html").stat().st_size < 5e6
 
 
@@ -536,4 +559,5 @@ def test_the_commands_of_the_documentation_run(
             if option in command:
                 path = tmp_path / command[command.index(option) + 1]
                 assert path.stat().st_size > 0
+
     assert windows

@@ -64,9 +64,9 @@ def write_sweep(
     """Write Figure 8 of the paper: mIoU and the share of uncertain points over a parameter.
 
     Args:
-        swept: the figures reached with each value.
+        swept: the scores reached with each value of the parameter.
         name: the parameter's name.
-        used: the value in the weights.
+        used: the parameter's value in the weights.
         dataset: the dataset as the user named it, for the title.
         path: the files to write, without an ending.
 
@@ -78,10 +78,12 @@ def write_sweep(
     shares = []
     rows: list[Sequence[Cell]] = []
     for result in swept:
+        miou = 100 * result.miou
+        share = 100 * result.uncertain
         values.append(result.value)
-        mious.append(100 * result.miou)
-        shares.append(100 * result.uncertain)
-        rows.append((values[-1], shares[-1], mious[-1], 100 * result.accuracy))
+        mious.append(miou)
+        shares.append(share)
+        rows.append((result.value, share, miou, 100 * result.accuracy))
 
     figure, axes = _figure(f"{name} on {dataset}")
     marker = "" if len(swept) > MOST_MARKED else "o"
@@ -103,7 +105,8 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
     """Write Table 5 of the paper, the ablation of the range-view network.
 
     Args:
-        rows: with the GRU or not, with class weights or not, and the metrics reached.
+        rows: for each network, whether it has the GRU, whether it was trained with class weights,
+            and the metrics it reached.
         path: the files to write, without an ending.
 
     Returns:
@@ -119,7 +122,7 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
 
 
 def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
-    """Write Figure 5 of the paper: a histogram of how well the two networks agree."""
+    """Write Figure 5 of the paper: a histogram of the similarity of the two networks' scores."""
     edges = np.arange(BINS + 1) / BINS
     total = max(analysis.points.sum(), 1)
     rows: list[Sequence[Cell]] = []
@@ -127,7 +130,7 @@ def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path
         rows.append((low, high, int(count), 100 * float(count / total)))
 
     figure, axes = _figure(f"agreement of the two networks on {dataset}")
-    # A logarithmic scale has no 0: empty bins end below one point.
+    # A logarithmic axis has no 0: empty bins are drawn as half a point.
     axes.stairs(np.maximum(analysis.points, 0.5), edges, fill=True, color="0.55")
     label = f"tau = {analysis.tau:g}"
     axes.axvline(analysis.tau, color="black", linewidth=0.8, linestyle=":", label=label)

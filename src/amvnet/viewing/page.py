@@ -22,9 +22,9 @@ from amvnet.files import atomic_write
 from amvnet.inference.methods import TITLES
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
-# Of one scan. Of a larger scan, every second or third point is drawn, so that phones can keep up.
+# In one scan; larger ones are thinned to every second or third point, so that phones keep up.
 MOST_POINTS = 400_000
-# Metres along each axis; farther points are left out, so that positions are exact to 1.6 cm.
+# Metres along each axis; farther points are left out, so that positions are off by 1.6 cm at most.
 REACH = 500.0
 LEVELS = 32_767  # int16
 STOPS = 17  # colours between which the page interpolates a ramp
@@ -47,14 +47,14 @@ SCRIPTS = (
 
 @dataclass(frozen=True)
 class Packed:
-    """One scan as the page carries it.
+    """One scan, packed for the page.
 
     Attributes:
-        about: what the page's JSON says about the scan.
-        planes: its points' values, deflated and in base64.
+        about: name, number of points and the like, for the page's JSON.
+        planes: the values of its points, deflated and in base64.
         present: ids of the classes in its truth and labels.
-        height: metres; almost all points are between these two.
-        intensity: almost all intensities are below this one.
+        height: metres, (low, high); almost all points are between the two.
+        intensity: in [0, 1]; almost all points are below it.
         ground: metres, height of the ground.
     """
 
@@ -122,18 +122,19 @@ def pack(frame: Frame) -> Packed:
         "planes": list(planes),
     }
     height, ground = _heights(xyz[:, 2])
+
     return Packed(
         about=about,
         planes=base64.b64encode(zlib.compress(data, 9)).decode("ascii"),
         present=_class_ids(planes, (*frame.labels, "truth")),
         height=height,
-        intensity=_bright(planes["intensity"]),
+        intensity=_highest_intensity(planes["intensity"]),
         ground=ground,
     )
 
 
 def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
-    """Return the text of the page; the names of the user's files go in as JSON, or escaped."""
+    """Return the text of the page; names of the user's files are escaped, in HTML or in JSON."""
     style = _source("page.css")
     script = "\n".join(map(_source, SCRIPTS))
     policy = (
@@ -243,13 +244,13 @@ def _heights(z: np.ndarray) -> tuple[tuple[float, float], float]:
     return (float(low), float(high)), float(np.percentile(z, 10))
 
 
-def _bright(intensity: np.ndarray) -> float:
-    """Return the intensity in [0, 1] that only a few points exceed, from bytes."""
+def _highest_intensity(intensity: np.ndarray) -> float:
+    """Return the intensity in [0, 1] that only a few points exceed, given (N,) bytes."""
     return float(np.percentile(intensity, 98)) / 255 if len(intensity) else 1.0
 
 
 def _class_ids(planes: Mapping[str, np.ndarray], names: Sequence[str]) -> frozenset[int]:
-    """Return the class ids in the planes that have one of these names."""
+    """Return the class ids that appear in the planes with these names."""
     ids: set[int] = set()
     for name in names:
         if name in planes:
@@ -287,7 +288,7 @@ def _source(name: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """Return what a content security policy says to allow this text and no other."""
+    """Return the name by which a content security policy allows this text and no other."""
     digest = hashlib.sha256(text.encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
 
@@ -300,6 +301,6 @@ def _json(tree: Any) -> str:
 def _fill(template: str, parts: Mapping[str, str]) -> str:
     """Replace each @@NAME@@ of a template by the part of that name.
 
-    Parts are not searched: one that contains @@NAME@@ itself stays as it is.
+    A part is never searched itself: any @@NAME@@ within it stays as it is.
     """
     return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], template)
