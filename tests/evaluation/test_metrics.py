@@ -228,7 +228,6 @@ def test_distance_bins_are_open_at_both_ends() -> None:
     evaluation.add(points, ids, {"rv": ids})
 
     bins = evaluation.report("x")["methods"]["rv"]["by_distance"]
-
     assert [extent["points"] for extent in bins] == [1, 1, 0, 0, 0]
 
 

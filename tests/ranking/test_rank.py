@@ -44,6 +44,7 @@ def clusters_by_flooding(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
     for start in range(len(cells)):
         if cluster_ids[start] >= 0:
             continue
+
         number = cluster_ids.max() + 1
         waiting = [start]
         while waiting:
@@ -64,11 +65,10 @@ def test_clusters_are_connected_points_of_one_kind() -> None:
     expected = clusters_by_flooding(xyz, kind)
 
     count = len(np.unique(ours))
-
     assert 5 < count < 150
     assert set(ours) == set(range(count))
 
-    # Each of ours is one of the expected, and the other way round.
+    # Each of our clusters is exactly one of the expected ones.
     pairs = np.unique(np.stack([ours, expected]), axis=1)
     assert pairs.shape[1] == count
     assert len(np.unique(expected)) == count
@@ -107,7 +107,10 @@ def confident(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
 def doubts_of(
     points: np.ndarray, rv: np.ndarray, bev: np.ndarray, labels: np.ndarray | None = None
 ) -> Doubts:
-    """Return what is doubted if the views predict these ids: labels if given, or disagreement."""
+    """Return the doubts about a scan for which the two views predict these ids.
+
+    The labels are doubted if they are given; without labels, it is the views' disagreement.
+    """
     segmenter = FixedScores(confident(rv), confident(bev))
     by: Criterion = "disagreement" if labels is None else "labels"
     return find_doubts(Scan(points, labels), segmenter, by)
@@ -175,7 +178,6 @@ def test_a_whole_thing_is_more_doubtful_than_the_edge_of_one_and_many_points_tha
     rows, _ = find_clusters(doubts_of(points, ids, ids, labels))
 
     rows = rows[np.argsort(-rows["score"])]
-
     assert rows["points"][0] == 100
     assert rows["points"][-1] == 1
     assert rows["score"][0] > 2 * rows["score"][1]
@@ -194,7 +196,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save(fresh_weights(NUSCENES), root / "nuscenes.safetensors")
 
     command = ("rank", root / "data", "--weights", root / "w.safetensors")
-
     assert run_cli(*command, "--out", root / "disagreement.csv") == (0, "")
     labels = ("--by", "labels", "--out", root / "labels.csv", "--pictures", root / "labels")
     assert run_cli(*command, *labels) == (0, "")

@@ -51,8 +51,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     make_streets(root / "data")
     save(fresh_weights(), root / "w.safetensors")
     street(7, 300)[0].tofile(root / "lone.bin")
-    options = ("--weights", root / "w.safetensors", "--scans", 9, "--html", root / "p.html")
 
+    options = ("--weights", root / "w.safetensors", "--scans", 9, "--html", root / "p.html")
     assert run_cli("view", root / "data", *options) == (0, "")
     return root
 
@@ -86,7 +86,6 @@ def tags(page: Page) -> list[str]:
 def test_every_scan_is_in_the_page_as_it_is(world: Path, dataset: SemanticKitti) -> None:
     page = read_page(world / "p.html")
     records = dataset.records(dataset.sequences("all"))
-
     assert scan_names(page) == [record.name for record in records]
 
     for index, record in enumerate(records):
@@ -118,7 +117,6 @@ def test_disagreement_is_one_minus_the_cosine(world: Path, dataset: SemanticKitt
     segmentation = segmenter(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
     bev = segmentation.bev
-
     assert rv is not None
     assert bev is not None
 
@@ -132,8 +130,8 @@ def test_the_page_names_classes_and_colours_officially(world: Path) -> None:
     about = read_page(world / "p.html").about
     assert about["classes"][1:] == list(SEMANTICKITTI.classes)
     np.testing.assert_array_equal(about["colors"][1:], SEMANTICKITTI.colors[1:])
-    keys = [source["key"] for source in about["sources"]]
 
+    keys = [source["key"] for source in about["sources"]]
     assert keys == ["truth", "rv", "bev", "ensemble", "amvnet"]
 
 
@@ -292,7 +290,6 @@ def test_labels_that_predict_wrote_are_shown(world: Path, tmp_path: Path) -> Non
 def test_a_lone_scan_takes_labels_from_a_folder_or_a_file(world: Path, tmp_path: Path) -> None:
     scan = world / "lone.bin"
     weights = ("--weights", world / "w.safetensors")
-
     assert run_cli("predict", scan, *weights, "--out", tmp_path / "labels")[0] == 0
 
     _, by_weights = view_page(tmp_path, scan, *weights).scan(0)
@@ -322,8 +319,8 @@ def test_nuscenes_is_shown_with_its_truth(tmp_path: Path) -> None:
     name = f"nuscenes:{GOLDEN / 'nuscenes'}"
     page = view_page(tmp_path, name)
     golden = open_dataset(name)
-
     assert isinstance(golden, NuScenes)
+
     first = golden.records(golden.sequences("all"))[0]
     _, planes = page.scan(0)
     np.testing.assert_array_equal(planes["truth"], golden.read(first).labels)
@@ -431,7 +428,6 @@ def test_a_click_on_a_class_hides_it(world: Path, tmp_path: Path, browser: Brows
     (tmp_path / "p.html").write_text(text.replace("</body>", script + "</body>"))
 
     state = browser.state(tmp_path / "p.html", "labels=truth")
-
     assert state["drawn"] == count_by_class(planes["truth"], hidden=[road])
 
 
@@ -504,7 +500,6 @@ def test_a_recording_reads_back(world: Path, tmp_path: Path, dataset: SemanticKi
     pytest.importorskip("rerun.chunk")
     command = ("view", world / "data", "--weights", world / "w.safetensors")
     command += ("--sequences", "08", "--save", tmp_path / "r.rrd")
-
     assert run_cli(*command)[0] == 0
 
     recording = Recording(tmp_path / "r.rrd")
