@@ -30,13 +30,15 @@ def has_color(image: np.ndarray, color: tuple[float, ...]) -> bool:
 
 
 def class_color(class_id: int) -> tuple[float, ...]:
-    return tuple(part / 255 for part in NUSCENES.colors[class_id])
+    red, green, blue = NUSCENES.colors[class_id]
+    return red / 255, green / 255, blue / 255
 
 
 def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
     points, truth = blocks([4, 11, 16])
     prediction = truth.copy()
     prediction[:BLOCK] = 3
+
     path = draw_scan(
         tmp_path / "a" / "b.png",
         points,
@@ -50,6 +52,7 @@ def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
     image = imread(path)
     for class_id in (3, 4, 11, 16):
         assert has_color(image, class_color(class_id))
+
     assert not has_color(image, class_color(7))
     assert has_color(image, WRONG)
     assert has_color(image, UNCERTAIN)
@@ -63,7 +66,9 @@ def test_every_part_is_optional(tmp_path: Path, with_truth: bool, with_uncertain
     points[0] = np.nan
     truth = ids if with_truth else None
     uncertain = ids > 0 if with_uncertain else None
+
     path = tmp_path / "a.png"
+
     assert draw_scan(path, points, NUSCENES, {"p": ids}, truth, uncertain=uncertain).is_file()
 
 
@@ -78,4 +83,5 @@ def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
         draw_scan(tmp_path / "a.png", points, NUSCENES, {})
     with pytest.raises(InputError, match="'rv'"):
         draw_scan(tmp_path / "a.png", points, NUSCENES, {"rv": ids[1:]})
+
     assert not any(tmp_path.iterdir())

@@ -25,6 +25,7 @@ def draw(
         path = folder / f"{number:02d}.png"
         _draw_cluster(row, ranking, dataset, segmenter, by=by, path=path)
         paths.append(path)
+
     return paths
 
 
@@ -38,6 +39,7 @@ def _draw_cluster(
 ) -> None:
     record = ranking.records[row["scan"]]
     scan = check_scan(dataset.read(record))
+
     doubts = find_doubts(scan, segmenter, by)
     _, cluster_ids = find_clusters(doubts)
     in_cluster = cluster_ids == cluster_ids[row["point"]]
