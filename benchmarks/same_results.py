@@ -118,8 +118,7 @@ predict city64/sequences/00/velodyne --weights sim-hdl32e --format npy --out lon
 evaluate city64 --split all --weights sim-hdl64e --json figures/64.json \
     --methods rv,bev,arithmetic,maximum,ensemble,amvnet
 evaluate city32 --sequences simulated-0000 --weights sim-hdl32e --json figures/32.json \
-    --pictures figures/32 \
-    --methods rv,bev,arithmetic,maximum,ensemble,amvnet
+    --pictures figures/32 --methods rv,bev,arithmetic,maximum,ensemble,amvnet
 evaluate city64 --split all --predictions labels/64/amvnet --json figures/files.json
 analyze city64 --split all --weights sim-hdl64e --out figures/analysis
 
@@ -266,10 +265,7 @@ class Runner:
             self.environment["PYTHONPATH"] = os.pathsep.join(map(os.path.abspath, paths))
 
     def __call__(self, *words: str) -> str:
-        """Run a program, print its CPU time and return its output.
-
-        If it fails, its exit code and the end of its output are printed, too.
-        """
+        """Run a program, print its CPU time and, if it fails, why; return its output."""
         shown = shlex.join([Path(words[0]).name, *words[1:]]).removeprefix("-m ")
         started = cpu_seconds()
         done = subprocess.run(
@@ -324,9 +320,12 @@ def use_library() -> None:
 
 def save_segmentation(path: Path, result: Any) -> None:
     """Save the arrays of a Segmentation."""
-    names = ("labels", "uncertain", "scores", "rv", "bev")
-    arrays = {name: getattr(result, name) for name in names}
-    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    arrays: dict[str, np.ndarray] = {}
+    for name in ("labels", "uncertain", "scores", "rv", "bev"):
+        array = getattr(result, name)
+        if array is not None:  # a single network has no scores of the other
+            arrays[name] = array
+    np.savez(path, **arrays)
 
 
 # ---- reading what was written
@@ -385,9 +384,10 @@ def read_arrays(path: Path) -> dict[str, Part]:
 def read_weights(path: Path) -> dict[str, Part]:
     """Read the tensors of a weights file, and its description."""
     with safe_open(path, "numpy") as file:
-        parts = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  no dictionary
-        description = json.loads(file.metadata()["amvnet"])
-    return parts | flatten(description, "description.")
+        parts = flatten(json.loads(file.metadata()["amvnet"]), "description.")
+        for name in file.keys():  # noqa: SIM118  not a dictionary
+            parts[name] = file.get_tensor(name)
+    return parts
 
 
 def read_json(path: Path) -> dict[str, Part]:
@@ -414,8 +414,12 @@ def read_table(path: Path) -> dict[str, Part]:
     """Read the columns of a CSV file, without speeds."""
     with path.open(newline="") as file:
         head, *rows = csv.reader(file)
-    columns = {name: " ".join(values) for name, *values in zip(head, *rows, strict=True)}
-    return {name: text for name, text in columns.items() if not name.endswith("/s")}
+
+    parts: dict[str, Part] = {}
+    for name, *values in zip(head, *rows, strict=True):
+        if not name.endswith("/s"):
+            parts[name] = " ".join(values)
+    return parts
 
 
 def read_help(path: Path) -> dict[str, Part]:
@@ -485,16 +489,19 @@ def compare(before: Path, after: Path) -> int:
     """Print what differs between the results in two folders; return 1 if anything does, else 0."""
     old = json.loads((before / DIGESTS).read_text())
     new = json.loads((after / DIGESTS).read_text())
-    differing = [path for path in sorted(old.keys() | new.keys()) if old.get(path) != new.get(path)]
+    paths = sorted(old.keys() | new.keys())
+    differing = 0
 
-    for path in differing:
+    for path in paths:
         if path not in old or path not in new:
+            differing += 1
             print(f"{path}: only in {before if path in old else after}")
-            continue
-        for line in differences(old[path], new[path], before / path, after / path):
-            print(f"{path}: {line}")
+        elif old[path] != new[path]:
+            differing += 1
+            for line in differences(old[path], new[path], before / path, after / path):
+                print(f"{path}: {line}")
 
-    print(f"{len(differing)} of {len(old.keys() | new.keys())} files differ")
+    print(f"{differing} of {len(paths)} files differ")
     return 1 if differing else 0
 
 
@@ -514,15 +521,16 @@ def differences(
         elif name not in old:
             yield f"{name} is only in the second"
         elif old[name] != new[name]:
-            yield f"{name} differs{how(old_parts.get(name), new_parts.get(name))}"
+            # Without the files, their digests are shown. Exit codes are their own digests.
+            old_part = old_parts.get(name, old[name])
+            new_part = new_parts.get(name, new[name])
+            yield f"{name} differs{how(old_part, new_part)}"
 
 
-def how(old: Part | None, new: Part | None) -> str:
-    """Say by how much two parts differ, as far as that is known."""
-    if isinstance(old, str) and isinstance(new, str):
+def how(old: Part, new: Part) -> str:
+    """Say by how much two parts differ."""
+    if isinstance(old, str) or isinstance(new, str):
         return f": {old[:60]} -> {new[:60]}"
-    if not isinstance(old, np.ndarray) or not isinstance(new, np.ndarray):
-        return ""
     if (old.shape, old.dtype) != (new.shape, new.dtype):
         return f": {old.dtype} {old.shape} -> {new.dtype} {new.shape}"
 
