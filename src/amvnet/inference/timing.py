@@ -80,7 +80,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class LeastAgreeing:
-    """An assertion: a fixed share of the points, on which the networks agree least, is uncertain."""
+    """An assertion: the share of the points on which the networks agree least is uncertain."""
 
     share: float
 
