@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset
-from amvnet.evaluation.top_view import draw_scan
+from amvnet.evaluation.top_view import TopView, draw_scan
 from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.ranking.rank import Criterion, Ranking, find_clusters, find_doubts
 
@@ -51,8 +51,7 @@ def _draw_cluster(
         panels["label"] = doubts.label[near]
 
     x, y, z = row["xyz"]
-    draw_scan(
-        path,
+    view = TopView(
         points[near],
         dataset.taxonomy,
         panels,
@@ -61,3 +60,4 @@ def _draw_cluster(
         reach=REACH,
         marked="cluster",
     )
+    draw_scan(path, view)

@@ -286,7 +286,15 @@ class HeadRun(StageRun):
         head = self.model().point_head
         assert head is not None
         weights = self.class_weights() if config.class_weights else None
-        stage = HeadStage(head, train, val, config, scans.dataset.taxonomy, weights, processes)
+        stage = HeadStage(
+            head,
+            train,
+            val,
+            config=config,
+            taxonomy=scans.dataset.taxonomy,
+            weights=weights,
+            processes=processes,
+        )
         train_loader = make_head_loader(
             train, config.batch, shuffle=True, seed=training.seed, processes=processes
         )
