@@ -112,17 +112,18 @@ def main() -> None:
     for folder in parser.parse_args().folders:
         counts = count_folder(folder)
         thousand = counts.lines / 1000
-        print(
-            f"{folder}: {counts.lines} lines; "
-            f"functions over {MOST_PARAMETERS} parameters {counts.many_parameters} "
-            f"({1000 * counts.many_parameters / counts.functions:.0f} per 1000), "
-            f"calls over {MOST_POSITIONAL} positional {counts.many_positional / thousand:.1f} per 1000 lines, "
-            f"blank lines in bodies {counts.blank_body_lines / counts.body_lines:.1%}, "
-            f"lines over {LONGEST_LINE} {counts.long_lines / counts.lines:.1%}, "
-            f"tuple assignments {counts.tuple_assignments / thousand:.1f}, "
-            f"comprehensions {counts.comprehensions / thousand:.1f} per 1000 lines, "
-            f"mean line {counts.characters / counts.lines:.0f}"
-        )
+        figures = [
+            f"{counts.lines} lines",
+            f"functions over {MOST_PARAMETERS} parameters: {counts.many_parameters}"
+            f" ({1000 * counts.many_parameters / counts.functions:.0f} per 1000)",
+            f"calls over {MOST_POSITIONAL} positional: {counts.many_positional / thousand:.1f}",
+            f"blank lines in bodies: {counts.blank_body_lines / counts.body_lines:.1%}",
+            f"lines over {LONGEST_LINE}: {counts.long_lines / counts.lines:.1%}",
+            f"tuple assignments: {counts.tuple_assignments / thousand:.1f}",
+            f"comprehensions: {counts.comprehensions / thousand:.1f}",
+            f"mean line: {counts.characters / counts.lines:.0f}",
+        ]
+        print(f"{folder}: {'; '.join(figures)}")
 
 
 if __name__ == "__main__":
