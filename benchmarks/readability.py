@@ -115,9 +115,9 @@ def main() -> None:
         figures = [
             f"{counts.lines} lines",
             f"functions over {MOST_PARAMETERS} parameters: {counts.many_parameters}"
-            f" ({1000 * counts.many_parameters / counts.functions:.0f} per 1000)",
+            f" ({1000 * counts.many_parameters / max(counts.functions, 1):.0f} per 1000)",
             f"calls over {MOST_POSITIONAL} positional: {counts.many_positional / thousand:.1f}",
-            f"blank lines in bodies: {counts.blank_body_lines / counts.body_lines:.1%}",
+            f"blank lines in bodies: {counts.blank_body_lines / max(counts.body_lines, 1):.1%}",
             f"lines over {LONGEST_LINE}: {counts.long_lines / counts.lines:.1%}",
             f"tuple assignments: {counts.tuple_assignments / thousand:.1f}",
             f"comprehensions: {counts.comprehensions / thousand:.1f}",
