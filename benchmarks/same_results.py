@@ -12,7 +12,7 @@ with scan files of other formats.
 `compare` prints what differs between two such folders, by how much if they still hold the files,
 and exits with 1 if anything does. Both must come from one machine and the same libraries.
 
-`make` takes about ten minutes on one core, three of them for the real scans.
+`make` takes about eleven minutes on one core, two of them for the real scans.
 """
 
 from __future__ import annotations
