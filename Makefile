@@ -9,8 +9,8 @@ SPREAD := OMP_NUM_THREADS=1
 demo: .venv/installed  ## simulate streets, segment, score and draw them
 	$(BIN)/amvnet demo --out demo
 
-test: .venv/installed lint  ## style, types and the tests
-	$(SPREAD) $(BIN)/python -m pytest -n auto
+test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 measures which lines they run
+	$(SPREAD) $(BIN)/python -m pytest -n auto $(if $(COVERAGE),--cov=amvnet --cov-report=term:skip-covered)
 
 test-slow: .venv/installed  ## the tests that take minutes, too
 	$(SPREAD) $(BIN)/python -m pytest -n auto -m "slow or not slow"
@@ -20,12 +20,12 @@ bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN
 	$(BIN)/amvnet bench --recipe semantickitti $(SCAN)
 
 lint: .venv/installed
-	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/ruff check src tests benchmarks docs
 	$(BIN)/ruff format --check src tests benchmarks
 	$(BIN)/mypy
 
 format: .venv/installed
-	$(BIN)/ruff check --fix src tests benchmarks
+	$(BIN)/ruff check --fix src tests benchmarks docs
 	$(BIN)/ruff format src tests benchmarks
 
 # torch first and by itself: pinned, so that no other build is drawn in.

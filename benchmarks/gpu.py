@@ -75,6 +75,7 @@ def median_seconds(work: Callable[[], object], runs: int, device: str) -> float:
         if device != "cpu":
             torch.cuda.synchronize(device)
         times.append(time.perf_counter() - started)
+
     return median(times[WARM_UP:])
 
 
@@ -98,6 +99,7 @@ def untrained_weights(config: ModelConfig) -> Weights:
     """
     torch.manual_seed(0)
     model = build_amvnet(config, CLASSES)
+
     tensors: dict[str, torch.Tensor] = {}
     for name in ("range_net", "polar_net", "point_head"):
         tensors |= part_state(name, getattr(model, name))
@@ -110,6 +112,7 @@ def make_segmenter(weights: Weights, scan: Scan, precision: str, options: Option
     Untrained networks would disagree on another share than trained ones.
     """
     segmenter = Segmenter(weights, options.device, precision=precision)  # type: ignore[arg-type]
+
     segmentation = segmenter(scan)
     f = torch.from_numpy(segmentation.rv[scan.valid])
     g = torch.from_numpy(segmentation.bev[scan.valid])
@@ -124,12 +127,13 @@ def peak_memory(device: str) -> str:
     """Return the most memory that was in use since the last call."""
     if device == "cpu":
         return "not measured"
+
     peak = torch.cuda.max_memory_allocated(device)
     torch.cuda.reset_peak_memory_stats(device)
     return f"{peak / 2**30:.1f} GiB"
 
 
-def time_method(segmenter: Segmenter, scan: Scan, batch: int, runs: int) -> None:
+def time_segmentation(segmenter: Segmenter, scan: Scan, batch: int, runs: int) -> None:
     seconds = median_seconds(lambda: segmenter.many([scan] * batch), runs, segmenter.device)
     print(
         f"points to labels, {segmenter.precision}, {batch} at a time: "
@@ -159,6 +163,7 @@ def time_neighbour_search(segmenter: Segmenter, scan: Scan, runs: int) -> None:
     device = segmenter.device
     assert model.point_head is not None
     n = model.point_head.config.neighbours
+
     xyz = scan.points[scan.valid][:, :3].copy()
     uncertain = segmenter(scan).uncertain[scan.valid].nonzero()[0]
     device_xyz = torch.from_numpy(xyz).to(device)
@@ -195,6 +200,7 @@ def time_training(stage: NetworkStage, scan: Scan, limit: float, options: Option
     device = options.device
     batch = stage.config.batch
     part = min(options.part, batch)
+
     stage.to(device).train()
     optimizer = torch.optim.AdamW(stage.trained.parameters(), lr=1e-4)
     points = PointBatch.of([scan] * part).to(device)
@@ -216,7 +222,8 @@ def time_training(stage: NetworkStage, scan: Scan, limit: float, options: Option
     flops = count_flops(backward) * (batch // part)
     if options.compile:  # after counting: compiled networks cannot be counted
         stage.trained.compile()
-    peak_memory(device)
+
+    peak_memory(device)  # forget the peak so far
     seconds = median_seconds(step, options.runs, device)
     rate = flops / seconds
     print(
@@ -260,6 +267,7 @@ def load_scan(path: Path | None) -> Scan:
     """Read a scan, or simulate one if no path is given."""
     if path is not None:
         return read_scan(path)
+
     with TemporaryDirectory() as folder:
         simulate(Path(folder), scans=1)
         return read_scan(Path(folder) / "sequences/00/velodyne/000000.bin")
@@ -284,7 +292,7 @@ def main() -> None:
     for precision in options.precision.split(","):
         segmenter = make_segmenter(weights, scan, precision, options)
         for batch in map(int, options.batch.split(",")):
-            time_method(segmenter, scan, batch, runs)
+            time_segmentation(segmenter, scan, batch, runs)
             time_networks(segmenter, scan, batch, runs, limit)
 
     time_neighbour_search(segmenter, scan, runs)

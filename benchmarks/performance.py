@@ -13,7 +13,9 @@ import json
 import subprocess
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -24,6 +26,7 @@ from torch import nn
 from torch.nn import functional as F
 
 import amvnet.inference.segmenter
+import amvnet.models.amvnet
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
@@ -32,6 +35,7 @@ from amvnet.data.scan_files import read_scan, write_labels
 from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
+from amvnet.models.amvnet import step
 from amvnet.models.layers import upsample
 from amvnet.models.point_head import head_features, point_table
 from amvnet.simulation import simulate
@@ -85,7 +89,8 @@ def without_joining() -> None:
 def without_sharing() -> None:
     """Compute the head's first layer for every neighbour of every uncertain point."""
 
-    def settle(head, points, f, g, index, near):  # type: ignore[no-untyped-def]
+    def settle(self, points, f, g, index, near):  # type: ignore[no-untyped-def]
+        head = self.point_head
         table = point_table(points, f, g)
         logits = []
         for uncertain, neighbours in zip(index.split(2048), near.split(2048), strict=True):
@@ -93,7 +98,7 @@ def without_sharing() -> None:
             logits.append(head(point, rows))
         return torch.cat(logits).softmax(dim=1)
 
-    amvnet.inference.timing.settle = settle
+    amvnet.models.amvnet.AMVNet.settle = step("head")(settle)
 
 
 UNCHANGED = "as it is"
@@ -202,11 +207,11 @@ def compare(options: argparse.Namespace, scan: Path) -> None:
 
     Each measurement is a process of its own. The variants take turns, round by round.
     """
-    variants = [(UNCHANGED, engine) for engine in options.engines.split(",")]
+    variants = list(product([UNCHANGED], options.engines.split(",")))
     if not options.short:
-        variants += [(name, "torch") for name in (*REMOVALS, ALL)]
+        variants += product([*REMOVALS, ALL], ["torch"])
 
-    results: dict[tuple[str, str], list[dict[str, float]]] = {key: [] for key in variants}
+    results: defaultdict[tuple[str, str], list[dict[str, float]]] = defaultdict(list)
     for number in range(options.rounds):
         for variant, engine in variants:
             results[variant, engine].append(run_variant(variant, engine, scan, options))

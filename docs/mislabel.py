@@ -1,7 +1,7 @@
-"""Give 1 % of the things in a labelled data set another class; with a ranking, say how many of them it found.
+"""Give 1 % of the things in a dataset another class, and score a ranking that looks for them.
 
 python mislabel.py DATA WRONG SEED [alike]     writes WRONG, a copy with wrong labels
-python mislabel.py WRONG RANKING.csv           the share of the wrong things in the first rows
+python mislabel.py WRONG RANKING.csv           prints the share found in the first rows
 """
 
 import csv
@@ -15,66 +15,82 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.scan_files import write_labels
 from amvnet.ranking.clusters import cluster
 
-SHARE, LEAST = 0.01, 10  # of the things that have so many points
-ALIKE = [
-    (1, 2, 3, 4, 5),
-    (6, 7, 8),
-    (9, 10, 11, 12, 17),
-    (13, 14),
-    (15, 16, 18, 19),
-]  # car and truck, pole and trunk, ...
+SHARE = 0.01  # of the things
+MIN_POINTS = 10  # of a thing
+# Classes that are easily mistaken for each other: car and truck, pole and trunk, ...
+ALIKE = [(1, 2, 3, 4, 5), (6, 7, 8), (9, 10, 11, 12, 17), (13, 14), (15, 16, 18, 19)]
 
 
 def mislabel(data, wrong, seed, alike):
+    """Write a copy of a dataset with wrong labels, and which points they belong to."""
     shutil.copytree(data, wrong)
-    right, copy, rng = open_dataset(data), open_dataset(wrong), np.random.default_rng(seed)
-    records, things, marks = [one.records(one.sequences("all")) for one in (right, copy)], [], {}
-    for place, record in enumerate(records[0]):
-        scan = right.read(record)
-        thing, first = connected(scan), np.unique(connected(scan), return_index=True)[1]
-        things += [
-            (place, k)
-            for k in np.flatnonzero((np.bincount(thing) >= LEAST) & (scan.labels[first] > 0))
-        ]
+    dataset = open_dataset(data)
+    copy = open_dataset(wrong)
+    records = dataset.records(dataset.sequences("all"))
+    copied_records = copy.records(copy.sequences("all"))
+    rng = np.random.default_rng(seed)
+
+    things = list_things(dataset, records)
+    marks = {}
     for number in rng.permutation(len(things))[: round(SHARE * len(things))]:
-        place, k = things[number]
-        scan = right.read(records[0][place])
-        points = connected(scan) == k
-        own = scan.labels[points][0]
-        others = (
-            next(group for group in ALIKE if own in group)
-            if alike
-            else range(1, right.taxonomy.size + 1)
-        )
-        now = copy.read(records[1][place]).labels
-        now[points] = rng.choice([other for other in others if other != own])
-        write_labels(records[1][place].labels_path, right.taxonomy.to_raw(now))
-        marks.setdefault(records[1][place].name, np.zeros(len(points), dtype=int))[points] = (
-            number + 1
-        )
+        index, thing = things[number]
+        scan = dataset.read(records[index])
+        points = connected(scan) == thing
+        label = scan.labels[points][0]
+
+        labels = copy.read(copied_records[index]).labels
+        labels[points] = rng.choice(other_classes(label, alike, dataset.taxonomy.size))
+        raw = dataset.taxonomy.to_raw(labels)
+        write_labels(copied_records[index].labels_path, raw)
+        mark = marks.setdefault(copied_records[index].name, np.zeros(len(points), dtype=int))
+        mark[points] = number + 1
     np.savez(Path(wrong, "wrong.npz"), things=len(things), **marks)
 
 
+def list_things(dataset, records):
+    """Return (index of the scan, thing) for all labelled things with enough points."""
+    things = []
+    for index, record in enumerate(records):
+        scan = dataset.read(record)
+        of_thing, first = np.unique(connected(scan), return_index=True)
+        sizes = np.bincount(connected(scan))
+        for thing in of_thing[(sizes >= MIN_POINTS) & (scan.labels[first] > 0)]:
+            things.append((index, thing))
+    return things
+
+
 def connected(scan):
-    return cluster(scan.points[:, :3], scan.labels)  # points of one class
+    """Return (N,) the connected thing of one class that each point is part of."""
+    return cluster(scan.points[:, :3], scan.labels)
+
+
+def other_classes(label, alike, count):
+    """Return the classes that a label can be replaced by."""
+    classes = range(1, count + 1)
+    if alike:
+        classes = next(group for group in ALIKE if label in group)
+    return [other for other in classes if other != label]
 
 
 def score(wrong, ranking):
+    """Print how many of the wrong things are in the first rows of a ranking."""
     with np.load(Path(wrong, "wrong.npz")) as file:
-        things, marks = (
-            int(file["things"]),
-            {name: file[name] for name in file.files if name != "things"},
-        )
+        marks = dict(file)
+    things = int(marks.pop("things"))
     with open(ranking, newline="") as file:
-        rows = [(row["scan"], int(row["point"])) for row in csv.DictReader(file)]
-    found = [marks[scan][point] if scan in marks else 0 for scan, point in rows]
-    wrong = set(np.concatenate(list(marks.values())).tolist()) - {0}
-    print(f"{len(wrong)} of {things} things are wrong; {len(rows)} rows")
+        rows = list(csv.DictReader(file))
+
+    found = []
+    for row in rows:
+        mark = marks.get(row["scan"])
+        found.append(0 if mark is None else mark[int(row["point"])])
+    wrong_things = set(np.concatenate(list(marks.values())).tolist()) - {0}
+    print(f"{len(wrong_things)} of {things} things are wrong; {len(rows)} rows")
+
     for share in (0.01, 0.05, 0.1, 1):
-        hit = wrong & set(found[: round(share * len(rows))])
-        print(
-            f"in the first {share:.0%} of the rows: {len(hit)} of them, {len(hit) / len(wrong):.0%}"
-        )
+        hits = wrong_things & set(found[: round(share * len(rows))])
+        percent = f"{len(hits) / len(wrong_things):.0%}"
+        print(f"in the first {share:.0%} of the rows: {len(hits)} of them, {percent}")
 
 
 if len(sys.argv) > 3:

@@ -1,4 +1,7 @@
-"""A model of 20 lines: how often each class is at a height, a distance and an intensity. Learns from 00 to 03."""
+"""A tiny model: how often each class is at a height, a distance and an intensity.
+
+python tiny_model.py DATA OUT     learns from the sequences 00 to 03, and writes scores of all
+"""
 
 import sys
 from pathlib import Path
@@ -8,21 +11,29 @@ import numpy as np
 from amvnet.data.datasets.open import open_dataset
 
 
-def cell(points):
-    """(N, 4) -> (N,) which of 40 x 20 x 10 cells of height, distance and intensity each point is in."""
-    values = [(points[:, 2] + 3) / 8, np.hypot(points[:, 0], points[:, 1]) / 60, points[:, 3]]
-    return np.ravel_multi_index(
-        [(v * n).astype(int) for v, n in zip(values, SIZE, strict=True)], SIZE, mode="clip"
-    )
+SIZE = (40, 20, 10)  # cells of height, distance and intensity
 
 
-SIZE, (data, out) = (40, 20, 10), sys.argv[1:]
-city, counts = open_dataset(data), np.full((np.prod(SIZE), 20), 0.1)
+def cells(points):
+    """Return (N,) the index of the cell that each of (N, 4) points is in."""
+    height = (points[:, 2] + 3) / 8
+    distance = np.hypot(points[:, 0], points[:, 1]) / 60
+    shares = np.stack([height, distance, points[:, 3]])
+    indices = (shares * np.array(SIZE)[:, None]).astype(int)
+    return np.ravel_multi_index(indices, SIZE, mode="clip")
+
+
+data, out = sys.argv[1:]
+city = open_dataset(data)
+
+counts = np.full((np.prod(SIZE), 20), 0.1)
 for record in city.records(["00", "01", "02", "03"]):
     scan = city.read(record)
-    np.add.at(counts, (cell(scan.points), scan.labels), 1)
-table = counts[:, 1:] / counts[:, 1:].sum(axis=1, keepdims=True)  # column c is class c + 1
+    np.add.at(counts, (cells(scan.points), scan.labels), 1)
+scores = counts[:, 1:] / counts[:, 1:].sum(axis=1, keepdims=True)  # column c is class c + 1
+
 for record in city.records(city.sequences("all")):
     path = Path(out, record.prediction).with_suffix(".npy")
     path.parent.mkdir(parents=True, exist_ok=True)
-    np.save(path, table[cell(city.read(record).points)].astype(np.float16))
+    points = city.read(record).points
+    np.save(path, scores[cells(points)].astype(np.float16))

@@ -66,6 +66,8 @@ def load(
 
 
 def __getattr__(name: str) -> Any:
+    if name == "weights":
+        return import_module("amvnet.weights")
     if name not in _MODULES:
         raise AttributeError(f"module 'amvnet' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

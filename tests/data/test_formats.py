@@ -20,7 +20,7 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
 from amvnet.data.formats.cloud import MAX_POINTS
-from amvnet.data.formats.detect import find_scans, read_cloud, scan_stem, scans_in_file
+from amvnet.data.formats.detect import find_scans, list_scans, read_cloud, scan_stem
 from amvnet.data.formats.pcd import unpack_lzf
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.data.scan_files import read_scan
@@ -80,7 +80,7 @@ def test_a_folder_lists_all_of_them(folder: Path) -> None:
 
     names = set()
     for path in paths:
-        for scan in scans_in_file(path):
+        for scan in list_scans(path):
             names.add(scan.name)
     assert {"nuscenes", "plain/000000", "lone/000000"} <= names
 
@@ -342,7 +342,7 @@ def test_a_bag_is_its_scans_in_order(
     assert find_scans(path) == [path]
     assert find_scans(tmp_path) == [path]
 
-    scans = list(scans_in_file(path))
+    scans = list(list_scans(path))
     assert len(scans) == 5
     for i in (0, 1, 2, 3, 4, 2, 0, 4):  # first in order, then not
         assert scans[i].name == f"drive/{i:06d}"
@@ -354,15 +354,15 @@ def test_the_topic_is_found_or_asked_for(tmp_path: Path) -> None:
     front = [some_points(60, 1)]
     rear = [some_points(60, 2), some_points(60, 3)]
     path = write_bag1(tmp_path / "two.bag", {"/front": front, "/rear": rear})
-    fails(lambda: list(scans_in_file(path)), "/front", "/rear", "--topic")
-    fails(lambda: list(scans_in_file(path, "/top")), "/front", "/rear", "/top")
+    fails(lambda: list(list_scans(path)), "/front", "/rear", "--topic")
+    fails(lambda: list(list_scans(path, "/top")), "/front", "/rear", "/top")
 
-    scans = list(scans_in_file(path, "/rear"))
+    scans = list(list_scans(path, "/rear"))
     assert len(scans) == 2
     np.testing.assert_array_equal(scans[1].read().to_scan().points, rear[1])
 
     empty = write_bag1(tmp_path / "none.bag", {})
-    fails(lambda: list(scans_in_file(empty)), "none.bag")
+    fails(lambda: list(list_scans(empty)), "none.bag")
 
 
 def test_a_bag_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
@@ -372,10 +372,10 @@ def test_a_bag_that_claims_more_than_it_has_is_refused(tmp_path: Path) -> None:
     text = metadata.read_text()
 
     metadata.write_text(text.replace("message_count: 3", "message_count: 3000000000"))
-    fails(lambda: list(scans_in_file(path)), "3000000000")
+    fails(lambda: list(list_scans(path)), "3000000000")
 
     metadata.write_text(text.replace("message_count: 3", "message_count: 4"))
-    scans = list(scans_in_file(path))
+    scans = list(list_scans(path))
     assert len(scans) == 4
     fails(lambda: scans[3].read(), "drive", "3")
 
@@ -385,7 +385,7 @@ def test_a_bag_is_read_in_constant_memory(tmp_path: Path) -> None:
     path = write_bag1(tmp_path / "long.bag", {"/lidar": [points] * 30})
 
     tracemalloc.start()
-    for scan in scans_in_file(path):
+    for scan in list_scans(path):
         scan.read()
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin
 
-from amvnet.data.formats.detect import scans_in_file
+from amvnet.data.formats.detect import list_scans
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -133,7 +133,7 @@ def test_a_broken_file_gives_a_scan_or_an_error_of_one_line(
 def error_of(path: Path) -> str:
     """Return the InputError of reading all scans of a file; empty if there is none."""
     try:
-        for scan in scans_in_file(path):
+        for scan in list_scans(path):
             assert isinstance(scan.read().to_scan(), Scan)
     except InputError as error:
         return str(error)

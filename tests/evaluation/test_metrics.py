@@ -30,6 +30,7 @@ def golden_report(name: str, predictions: str) -> dict[str, Any]:
         assert scan.labels is not None
         prediction = dataset.read_prediction(record, GOLDEN / name / predictions)
         evaluation.add(scan.points, scan.labels, {"predictions": prediction})
+
     return evaluation.report(name)
 
 
@@ -63,6 +64,7 @@ def test_semantickitti_equals_the_official_tools() -> None:
 def test_nuscenes_equals_the_official_tool() -> None:
     figures = golden_report("nuscenes", "results")["methods"]["predictions"]
     expected = official_figures("nuscenes")
+
     assert figures["miou"] == pytest.approx(expected["miou"], abs=1e-9)
     assert figures["fwiou"] == pytest.approx(expected["freq_weighted_iou"], abs=1e-9)
 
@@ -104,6 +106,7 @@ def test_confusion_equals_a_plain_loop() -> None:
     expected = np.zeros((17, 17), dtype=np.int64)
     for true_id, predicted_id in zip(example.truth, example.prediction, strict=True):
         expected[true_id, predicted_id] += 1
+
     np.testing.assert_array_equal(confusion(example.truth, example.prediction, 16), expected)
 
 
@@ -120,23 +123,30 @@ def test_metrics_equal_plain_loops(taxonomy: Taxonomy) -> None:
     for true_id, predicted_id in zip(truth.tolist(), prediction.tolist(), strict=True):
         if true_id > 0:
             pairs.append((true_id, predicted_id))
+
     ious: dict[int, float | None] = {}
+    total = 0.0
     for class_id in range(1, taxonomy.size + 1):
         union = sum(class_id in pair for pair in pairs)
         hits = pairs.count((class_id, class_id))
         ious[class_id] = hits / union if union else None
+        total += ious[class_id] or 0.0
+
     assert ious[5] is None
 
     figures = metrics(confusion(truth, prediction, taxonomy.size), taxonomy)
     assert list(figures["iou"].values()) == pytest.approx(list(ious.values()))
-    total = sum(iou or 0.0 for iou in ious.values())
     divisor = taxonomy.size if taxonomy.counts_absent else taxonomy.size - 1
     assert figures["miou"] == pytest.approx(total / divisor)
     assert figures["miou_present"] == pytest.approx(total / (taxonomy.size - 2))
 
-    correct = [t == p for t, p in pairs if p > 0]
+    correct = []
+    iou_of_points = []
+    for true_id, predicted_id in pairs:
+        iou_of_points.append(ious[true_id] or 0.0)
+        if predicted_id > 0:
+            correct.append(true_id == predicted_id)
     assert figures["accuracy"] == pytest.approx(np.mean(correct))
-    iou_of_points = [ious[true_id] or 0.0 for true_id, _ in pairs]
     assert figures["fwiou"] == pytest.approx(np.mean(iou_of_points))
 
 
@@ -151,6 +161,7 @@ def test_nothing_to_count_is_none_not_a_number() -> None:
     figures = metrics(np.zeros((17, 17), dtype=np.int64), NUSCENES)
     for key in ("miou", "miou_present", "accuracy", "fwiou"):
         assert figures[key] is None
+
     assert set(figures["iou"].values()) == {None}
     json.dumps(figures, allow_nan=False)
 
@@ -163,6 +174,7 @@ def evaluate(*examples: Example) -> Evaluation:
     for example in examples:
         predictions = {"amvnet": example.prediction, "rv": example.truth}
         evaluation.add(example.points, example.truth, predictions, example.uncertain)
+
     return evaluation
 
 
@@ -170,8 +182,10 @@ def test_halves_add_up() -> None:
     whole = evaluate(random_example(2), random_example(3))
     first = evaluate(random_example(2))
     second = evaluate(random_example(3))
+
     assert (first + second).report("x") == whole.report("x")
     assert first.scans == 1  # the sum left its parts alone
+
     first.merge(second)
     assert first.report("x") == whole.report("x")
 
@@ -185,6 +199,7 @@ def test_order_of_the_points_changes_nothing() -> None:
 def test_report_has_the_keys_of_the_contract() -> None:
     example = random_example(5)
     report = evaluate(example).report("nuscenes:here")
+
     assert list(report) == ["dataset", "scans", "points", "uncertain_fraction", "methods"]
     assert report["dataset"] == "nuscenes:here"
     assert report["scans"] == 1

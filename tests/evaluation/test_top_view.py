@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
-from amvnet.evaluation.top_view import UNCERTAIN, WRONG, draw_scan
+from amvnet.evaluation.top_view import UNCERTAIN, WRONG, TopView, draw_scan
 
 BLOCK = 400  # points of one class in one block, dense enough to fill pixels
 
@@ -30,15 +30,16 @@ def has_color(image: np.ndarray, color: tuple[float, ...]) -> bool:
 
 
 def class_color(class_id: int) -> tuple[float, ...]:
-    return tuple(part / 255 for part in NUSCENES.colors[class_id])
+    red, green, blue = NUSCENES.colors[class_id]
+    return red / 255, green / 255, blue / 255
 
 
 def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
     points, truth = blocks([4, 11, 16])
     prediction = truth.copy()
     prediction[:BLOCK] = 3
-    path = draw_scan(
-        tmp_path / "a" / "b.png",
+
+    view = TopView(
         points,
         NUSCENES,
         {"RV": prediction, "AMVNet": truth},
@@ -46,10 +47,12 @@ def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
         uncertain=truth == 4,
         title="title",
     )
+    path = draw_scan(tmp_path / "a" / "b.png", view)
 
     image = imread(path)
     for class_id in (3, 4, 11, 16):
         assert has_color(image, class_color(class_id))
+
     assert not has_color(image, class_color(7))
     assert has_color(image, WRONG)
     assert has_color(image, UNCERTAIN)
@@ -63,19 +66,19 @@ def test_every_part_is_optional(tmp_path: Path, with_truth: bool, with_uncertain
     points[0] = np.nan
     truth = ids if with_truth else None
     uncertain = ids > 0 if with_uncertain else None
-    path = tmp_path / "a.png"
-    assert draw_scan(path, points, NUSCENES, {"p": ids}, truth, uncertain=uncertain).is_file()
+
+    view = TopView(points, NUSCENES, {"p": ids}, truth, uncertain)
+    assert draw_scan(tmp_path / "a.png", view).is_file()
 
 
 def test_truth_alone_is_enough(tmp_path: Path) -> None:
     points, ids = blocks([2])
-    assert draw_scan(tmp_path / "a.png", points, NUSCENES, {}, truth=ids).is_file()
+    assert draw_scan(tmp_path / "a.png", TopView(points, NUSCENES, {}, truth=ids)).is_file()
 
 
-def test_what_does_not_fit_is_named(tmp_path: Path) -> None:
+def test_what_does_not_fit_is_named() -> None:
     points, ids = blocks([2])
-    with pytest.raises(InputError, match=r"a\.png.*neither"):
-        draw_scan(tmp_path / "a.png", points, NUSCENES, {})
+    with pytest.raises(InputError, match="neither"):
+        TopView(points, NUSCENES, {})
     with pytest.raises(InputError, match="'rv'"):
-        draw_scan(tmp_path / "a.png", points, NUSCENES, {"rv": ids[1:]})
-    assert not any(tmp_path.iterdir())
+        TopView(points, NUSCENES, {"rv": ids[1:]})

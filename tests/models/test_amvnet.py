@@ -13,9 +13,10 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.schema import AssertionConfig, PointHeadConfig
-from amvnet.models.amvnet import arithmetic_mean, geometric_mean, maximum, merge
+from amvnet.models.amvnet import merge
 from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
 from amvnet.models.layers import fold_batch_norms
+from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
 from amvnet.models.point_head import (
     head_features,
     nearest_neighbours,
@@ -71,14 +72,13 @@ def test_folded_batch_norms_change_no_output_of_the_point_head() -> None:
     assert not any(isinstance(m, nn.BatchNorm1d) for m in head.modules())
 
 
-def neighbours_by_loop(points: Tensor, own: int) -> list[tuple[float, int]]:
-    """Return (distance, index) of every other point, nearest first."""
+def neighbours_by_loop(points: Tensor, own: int) -> tuple[list[int], list[float]]:
+    """Return the other points' indices, nearest first, and the distance of every point."""
     xyz = points[:, :3].tolist()
-    others = []
-    for index, position in enumerate(xyz):
-        if index != own:
-            others.append((math.dist(position, xyz[own]), index))
-    return sorted(others)
+    distances = [math.dist(position, xyz[own]) for position in xyz]
+    nearest = sorted(range(len(xyz)), key=distances.__getitem__)
+    nearest.remove(own)
+    return nearest, distances
 
 
 @pytest.fixture(params=["pykdtree", "scipy"])
@@ -93,8 +93,10 @@ def test_nearest_neighbours_equal_a_search_through_all_points() -> None:
     points = torch.randn(200, 4)
     index = torch.tensor([0, 7, 199, 42])
     nearest = nearest_neighbours(points, index, 15)
+
     for own, row in zip(index.tolist(), nearest.tolist(), strict=True):
-        assert row == [neighbour for _, neighbour in neighbours_by_loop(points, own)[:15]]
+        expected, _ = neighbours_by_loop(points, own)
+        assert row == expected[:15]
 
 
 @pytest.mark.parametrize("n", [1, 3, 12])
@@ -109,9 +111,9 @@ def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(
         assert own not in row
         assert len(set(row)) == n
 
-        others = neighbours_by_loop(points, own)
-        distance_of = {index: distance for distance, index in others}
-        assert [distance_of[index] for index in row] == [distance for distance, _ in others[:n]]
+        expected, distances = neighbours_by_loop(points, own)
+        for index, as_near in zip(row, expected[:n], strict=True):
+            assert distances[index] == distances[as_near]
 
 
 @pytest.mark.usefixtures("tree")
@@ -143,8 +145,9 @@ def head_features_by_loop(
     scale = TINY.point_head.position_scale
     point = [*f[own].tolist(), *g[own].tolist(), x * scale, y * scale, z * scale, intensity]
 
+    nearest, _ = neighbours_by_loop(points, own)
     rows = []
-    for _, k in neighbours_by_loop(points, own)[: TINY.point_head.neighbours]:
+    for k in nearest[: TINY.point_head.neighbours]:
         offset = (points[k] - points[own]).tolist()
         rows.append([*f[k].tolist(), *g[k].tolist(), *offset])
     return point, rows
@@ -171,13 +174,18 @@ def random_scores(count: int = 200) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def cosine(a: list[float], b: list[float]) -> float:
-    product = sum(x * y for x, y in zip(a, b, strict=True))
+    product = 0.0
+    for x, y in zip(a, b, strict=True):
+        product += x * y
     return product / (math.hypot(*a) * math.hypot(*b))
 
 
 def test_disagreement_equals_a_loop_of_its_formula() -> None:
     f, g, points, _ = random_scores()
-    expected = [cosine(f[i].tolist(), g[i].tolist()) <= 0.7 for i in range(len(f))]
+    expected = []
+    for i in range(len(f)):
+        expected.append(cosine(f[i].tolist(), g[i].tolist()) <= 0.7)
+
     assert Disagreement(0.7)(f, g, points).tolist() == expected
     assert set(expected) == {False, True}
 
@@ -185,6 +193,7 @@ def test_disagreement_equals_a_loop_of_its_formula() -> None:
 def test_at_the_threshold_a_point_is_uncertain() -> None:
     f = torch.eye(2)
     points = torch.zeros(2, 4)
+
     assert Disagreement(0.0)(f, f.flip(0), points).all()
     assert HighEntropy(0.0)(f, f, points).all()
     assert HighLoss(0.0)(f, f, points, torch.tensor([1, 2])).all()
@@ -307,6 +316,7 @@ def test_only_the_points_that_occur_are_selected() -> None:
     uncertain = torch.tensor([7, 3])
     near = torch.tensor([[3, 9, 9], [0, 7, 3]])
     selected, (uncertain_index, near_index) = select_used_points(12, uncertain, near)
+
     assert selected.tolist() == [0, 3, 7, 9]
     assert torch.equal(selected[uncertain_index], uncertain)
     assert torch.equal(selected[near_index], near)

@@ -17,18 +17,21 @@ from torch import Tensor, nn
 
 from amvnet import Scan, Segmenter, simulate
 from amvnet.data.scan_files import read_scan
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.inference.inputs import adapter_for
 from amvnet.inference.journal import Journal
-from amvnet.inference.pipeline import AHEAD, Task, stream
-from amvnet.inference.predict import ScanAdapter
+from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
+from amvnet.inference.predict import NetworkSegmentation
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import merge
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
 from amvnet.models.precision import InPrecision
-from amvnet.models.streams import Score, SideBySide
+from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.weights.file import save
 
+from fixtures.counted_scans import Counter, counted_scans
 from fixtures.networks import whole_model
 from fixtures.worlds import commands_of, fails, files, fresh_weights, make_streets, run_cli, street
 
@@ -147,6 +150,7 @@ def test_neighbours_by_blocks_equal_the_trees_on_a_scan_and_few_points_are_compa
     monkeypatch.setattr(block_search, "_nearest_of_all", counted)
     by_blocks = np.sort(nearest_others_by_blocks(xyz, own, N).numpy(), axis=1)
     by_tree = np.sort(nearest_others(xyz.numpy(), own.numpy(), N), axis=1)
+
     # pykdtree rounds distances to float32.
     assert (by_blocks == by_tree).all(axis=1).mean() > 0.999
 
@@ -210,32 +214,33 @@ class StandInCuda:
     def record_stream(self, stream: StandInStream) -> None:
         self.log.append(f"kept for {stream.name}")
 
-    def logged(self, name: str, score: Score) -> Score:
-        """Return the scorer such that it also logs its name and stream."""
-
-        def score_and_log(batch: PointBatch) -> Tensor:
-            self.log.append(f"{name} on {self.current.name}")
-            return score(batch)
-
-        return score_and_log
+    @contextlib.contextmanager
+    def log_step(self, name: str) -> Iterator[None]:
+        """Log a step of AMVNet with the stream that it runs on."""
+        self.log.append(f"{name} on {self.current.name}")
+        yield
 
 
-def test_side_by_side_waits_before_and_after(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_streams_wait_before_and_after_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     cuda = StandInCuda(monkeypatch)
     model = whole_model()
     batch = PointBatch.of([Scan(street(0)[0])])
     before = model(batch)
 
-    for name in ("score_range_view", "score_polar_view"):
-        monkeypatch.setattr(model, name, cuda.logged(name, getattr(model, name)))
-    model.run = SideBySide("cuda")
+    model.arrange = TwoStreams("cuda")
+    model.watch = cuda.log_step
     after = model(batch)
     assert cuda.log == [
+        "project on main",
         "side waits for main",
-        "score_range_view on side",
-        "score_polar_view on main",
+        "RV on side",
+        "BEV on main",
         "main waits for side",
         "kept for main",
+        "compare on main",
+        "neighbours on main",
+        "head on main",
+        "merge on main",
     ]
     assert torch.equal(after.merged, before.merged)
 
@@ -256,6 +261,7 @@ def test_the_merge_of_a_gpu_is_that_of_a_cpu(monkeypatch: pytest.MonkeyPatch) ->
 def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points(simulated_scan: Scan) -> None:
     exact = Segmenter("sim-hdl64e")(simulated_scan)
     lower = Segmenter("sim-hdl64e", precision="bfloat16")(simulated_scan)
+
     for name in ("scores", "rv", "bev"):
         assert getattr(lower, name).dtype == np.float32
         assert not np.array_equal(getattr(lower, name), getattr(exact, name))
@@ -306,8 +312,12 @@ def test_a_precision_that_a_cpu_lacks_is_refused(precision: str) -> None:
     fails(lambda: Segmenter(weights, "cpu", precision=precision), "expected", precision)
 
 
+def street_scans(*counts: int) -> list[Scan]:
+    return [Scan(street(seed, count)[0], name=str(seed)) for seed, count in enumerate(counts)]
+
+
 def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
-    scans = [Scan(street(seed, 100 + seed)[0]) for seed in range(3)]
+    scans = street_scans(100, 101, 102)
     scans[1].points[7] = np.nan
     batch = PointBatch.of(scans)
 
@@ -319,7 +329,7 @@ def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
 
 def test_several_scans_at_a_time_are_segmented_as_each_alone() -> None:
     segmenter = Segmenter(fresh_weights())
-    scans = [Scan(street(seed, 300 + 50 * seed)[0], name=str(seed)) for seed in range(3)]
+    scans = street_scans(300, 350, 400)
     scans[1].points[[0, 9]] = np.nan
 
     for scan, together in zip(scans, segmenter.many(scans), strict=True):
@@ -391,7 +401,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(ScanAdapter(weights).given),
+        "sensor": repr(adapter_for(weights).given),
         "scores": False,
         "uncertain": False,
         "format": "label",
@@ -413,32 +423,10 @@ def test_a_batch_of_no_scans_is_refused(world: Path, tmp_path: Path, batch: int)
     assert not files(tmp_path)
 
 
-class HeldScans:
-    """The scans of tasks that are read but not yet written."""
-
-    def __init__(self) -> None:
-        self.numbers: set[int] = set()
-        self.most = 0
-
-    def task(self, seed: int, segmenter: Segmenter) -> Task:
-        def read() -> Scan:
-            self.numbers.add(seed)
-            self.most = max(self.most, len(self.numbers))
-            return Scan(street(seed)[0])
-
-        def write(_: object) -> Path:
-            self.numbers.remove(seed)
-            return Path()
-
-        return Task(str(seed), read, segmenter, write, Path())
-
-
 def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory(
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    held = HeldScans()
     sizes = []
-    segmenter = Segmenter(fresh_weights())
     many = Segmenter.many
 
     def counted(self: Segmenter, scans: list[Scan]) -> object:
@@ -446,13 +434,19 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
         return many(self, scans)
 
     monkeypatch.setattr(Segmenter, "many", counted)
-    tasks = [held.task(seed, segmenter) for seed in range(23)]
-    results = list(stream(tasks, False, False, 4))
-    assert [task.name for task, _ in results] == [str(seed) for seed in range(23)]
+    pipeline = Pipeline(
+        NetworkSegmentation(Segmenter(fresh_weights())),
+        OutputOptions(tmp_path),
+        SEMANTICKITTI,
+        ExecutionOptions(batch=4),
+    )
+    counter = Counter()
+    results = list(pipeline.stream(counted_scans(23, counter)))
+    assert [scan.name for scan, _ in results] == [str(seed) for seed in range(23)]
     assert not any(fault for _, fault in results)
     assert sizes == [4, 4, 4, 4, 4, 3]
-    assert held.most <= 2 * 4 + AHEAD + 2
-    assert not held.numbers
+    assert counter.most <= 2 * 4 + AHEAD + 2
+    assert not counter.held
 
 
 @pytest.mark.parametrize("verb", ["predict", "evaluate", "bench"])
@@ -463,6 +457,7 @@ def test_every_verb_that_segments_takes_a_precision(world: Path, tmp_path: Path,
         "bench": ("--runs", 1, "--scan", world / "scans/000000.bin"),
     }
     options = ("--weights", world / "w.safetensors", "--precision", "bfloat16")
+
     assert run_cli(verb, *inputs[verb], *options) == (0, "")
 
 
@@ -477,9 +472,10 @@ def test_the_commands_of_the_page_run(
         "runs/kitti": "w.safetensors",
         "predictions": str(tmp_path),
     }
-    *commands, _, _, benchmark = commands_of("docs/gpu.md")
-    assert [words[:2] for words in commands] == [["amvnet", "predict"], ["amvnet", "evaluate"]]
-    for words in commands:
+    predict, evaluate, _, _, benchmark = commands_of("docs/gpu.md")
+    assert predict[:2] == ["amvnet", "predict"]
+    assert evaluate[:2] == ["amvnet", "evaluate"]
+    for words in (predict, evaluate):
         assert run_cli(*[stand_ins.get(word, word) for word in words[1:]]) == (0, "")
 
     script = Path(__file__).parents[2] / benchmark[1]
@@ -496,5 +492,6 @@ def test_a_gpu_gives_the_labels_of_a_cpu(simulated_scan: Scan, precision: str) -
     expected = Segmenter("sim-hdl64e")(simulated_scan)
     segmenter = Segmenter("sim-hdl64e", "cuda", precision=precision)  # type: ignore[arg-type]
     least = 0.999 if precision == "float32" else 0.98
+
     for segmentation in segmenter.many([simulated_scan, simulated_scan]):
         assert (segmentation.labels == expected.labels).mean() > least

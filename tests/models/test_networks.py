@@ -42,6 +42,7 @@ def test_a_network_keeps_the_shape_of_odd_sizes(case: Case) -> None:
 def test_a_network_loads_its_state_to_equal_outputs(case: Case) -> None:
     net = case.in_eval()
     other = case.in_eval(seed=1)
+
     assert not torch.equal(case.run(net, 3), case.run(other, 3))
     other.load_state_dict(net.state_dict())
     assert torch.equal(case.run(net, 3), case.run(other, 3))
@@ -90,6 +91,7 @@ def test_a_batch_of_two_equals_each_alone_in_eval(case: Case) -> None:
     net = case.in_eval()
     together = case.run(net, 3, 4)
     alone = torch.cat([case.run(net, 3), case.run(net, 4)])
+
     torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-5)
     assert not torch.allclose(together[0], together[1])
 
@@ -99,6 +101,7 @@ def test_range_net_without_gru_is_equivariant_to_a_shift_by_its_stride(steps: in
     net = CASES["range"].in_eval()
     image = torch.randn(1, 6, 7, 40)
     shifted = net(image).roll(steps, 3)
+
     torch.testing.assert_close(net(image.roll(steps, 3)), shifted, rtol=1e-4, atol=1e-5)
     assert not torch.allclose(net(image), shifted)
 
@@ -176,8 +179,8 @@ def test_wrap_width_continues_circularly_and_has_its_gradient(
     width: int, left: int, right: int
 ) -> None:
     x = torch.randn(2, 2, 3, width, dtype=torch.double, requires_grad=True)
-    columns = [x[..., (column - left) % width] for column in range(left + width + right)]
-    expected = torch.stack(columns, dim=-1)
+    expected = x[..., torch.arange(-left, width + right) % width]
+
     assert torch.equal(wrap_width(x, left, right), expected)
     assert torch.equal(wrap_width(x.detach(), left, right), expected)
     assert torch.autograd.gradcheck(lambda x: wrap_width(x, left, right), x)
@@ -274,6 +277,7 @@ def test_dropblock_is_identity_in_eval_and_at_probability_zero() -> None:
 def test_dropblock_drops_its_share_and_keeps_the_mean(probability: float, size: int) -> None:
     torch.manual_seed(0)
     dropped = DropBlock(probability, size).train()(torch.ones(16, 2, 80, 80))
+
     assert (dropped == 0).float().mean().item() == pytest.approx(probability, rel=0.15)
     assert dropped.mean().item() == pytest.approx(1, abs=1e-4)
     assert dropped.unique().numel() == 2

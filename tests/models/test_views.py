@@ -121,6 +121,7 @@ def project_to_grid(*scans: Scan) -> PolarGrid:
 def assert_equals_the_loop(scan: Scan, config: RangeViewConfig) -> None:
     view = project_to_image(scan, config)
     pixels, nearest, image = range_view_by_loop(scan, config)
+
     assert view.pixel.tolist() == pixels
     assert view.nearest.tolist() == nearest
     np.testing.assert_allclose(view.image[0].numpy(), image, rtol=1e-6, atol=1e-6)
@@ -268,6 +269,7 @@ def test_polar_view_equals_a_loop_on_degenerate_scans(case: str) -> None:
 def test_points_outside_the_polar_grid_go_to_the_nearest_cell() -> None:
     scan = scan_of((0.5, 0, 0), (100, 0, 0), (10, 0, -50), (10, 0, 50), (-10, 0.0, 0))
     grid = project_to_grid(scan)
+
     assert (grid.pillar // 17).tolist() == [0, 12, 2, 2, 2]
     assert grid.voxel.tolist() == [3, 3, 0, 4, 3]
     assert (grid.pillar % 17).tolist() == [8, 8, 8, 8, 16]
@@ -277,6 +279,7 @@ def test_pool_is_the_maximum_over_each_pillar(random_scan: RandomScan) -> None:
     grid = project_to_grid(random_scan(400, 1), random_scan(300, 2))
     features = torch.randn(700, 3) - 5  # nearly all negative, so that a wrong 0 shows
     pooled = grid.pool(features)
+
     for row, pillar in zip(pooled, grid.occupied, strict=True):
         assert torch.equal(row, features[grid.pillar == pillar].amax(dim=0))
 
@@ -320,6 +323,7 @@ def test_a_batch_of_polar_grids_equals_one_by_one(random_scan: RandomScan) -> No
     slices = PointBatch.of(scans).slices()
     together = project_to_grid(*scans)
     maps = together.to_map(together.pool(together.features))
+
     for b, (scan, rows) in enumerate(zip(scans, slices, strict=True)):
         alone = project_to_grid(scan)
         assert torch.equal(together.features[rows], alone.features)
@@ -344,6 +348,7 @@ def test_a_point_batch_leaves_lost_points_out(random_scan: RandomScan, lost: flo
 def test_slices_say_where_each_scan_stands(random_scan: RandomScan) -> None:
     scans = [random_scan(3), random_scan(0), random_scan(4), random_scan(0)]
     batch = PointBatch.of(scans)
+
     assert batch.slices() == [slice(0, 3), slice(3, 3), slice(3, 7), slice(7, 7)]
     assert batch.scan.tolist() == [0, 0, 0, 2, 2, 2, 2]
     assert batch.count == 4

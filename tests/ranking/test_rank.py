@@ -27,7 +27,11 @@ from fixtures.worlds import files, fresh_weights, make_streets, run_cli, without
 
 DOCS = Path(__file__).parents[2] / "docs"
 WEIGHTS = fresh_weights()
-CAR, PERSON, ROAD, WALL = 1, 6, 9, 13  # train ids
+# Train ids of SemanticKITTI.
+CAR = 1
+PERSON = 6
+ROAD = 9
+WALL = 13
 
 
 # ---- clusters
@@ -40,6 +44,7 @@ def clusters_by_flooding(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
     for start in range(len(cells)):
         if cluster_ids[start] >= 0:
             continue
+
         number = cluster_ids.max() + 1
         waiting = [start]
         while waiting:
@@ -55,6 +60,7 @@ def test_clusters_are_connected_points_of_one_kind() -> None:
     rng = np.random.default_rng(0)
     xyz = rng.uniform(-2, 2, (150, 3))
     kind = rng.integers(0, 3, 150)
+
     ours = cluster(xyz, kind)
     expected = clusters_by_flooding(xyz, kind)
 
@@ -62,7 +68,7 @@ def test_clusters_are_connected_points_of_one_kind() -> None:
     assert 5 < count < 150
     assert set(ours) == set(range(count))
 
-    # Each of ours is one of the expected, and the other way round.
+    # Each of our clusters is exactly one of the expected ones.
     pairs = np.unique(np.stack([ours, expected]), axis=1)
     assert pairs.shape[1] == count
     assert len(np.unique(expected)) == count
@@ -101,7 +107,10 @@ def confident(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
 def doubts_of(
     points: np.ndarray, rv: np.ndarray, bev: np.ndarray, labels: np.ndarray | None = None
 ) -> Doubts:
-    """Return what is doubted if the views predict these ids: labels if given, or disagreement."""
+    """Return the doubts about a scan for which the two views predict these ids.
+
+    The labels are doubted if they are given; without labels, it is the views' disagreement.
+    """
     segmenter = FixedScores(confident(rv), confident(bev))
     by: Criterion = "disagreement" if labels is None else "labels"
     return find_doubts(Scan(points, labels), segmenter, by)
@@ -126,6 +135,7 @@ def test_the_vehicle_that_carries_the_sensor_is_not_doubted() -> None:
     points[thing == 0, :3] *= (1, 0.1, 1)  # to half a metre from the sensor
     doubts = doubts_of(points, rv=np.full(301, CAR), bev=np.full(301, PERSON))
     _, cluster_ids = find_clusters(doubts)
+
     assert np.array_equal(cluster_ids >= 0, (thing == 1) | (thing == 2))
 
 
@@ -149,6 +159,7 @@ def test_a_label_is_doubted_only_if_both_views_contradict_it() -> None:
     labels[thing == 1] = ROAD  # one view does
     rv = np.full(301, CAR)
     bev = np.where(thing == 1, ROAD, CAR)
+
     doubts = doubts_of(points, rv, bev, labels)
     rows, cluster_ids = find_clusters(doubts)
 
@@ -200,13 +211,15 @@ def read_table(path: Path) -> list[dict[str, str]]:
 def test_the_tables_are_in_order(world: Path, by: str) -> None:
     clusters = read_table(world / f"{by}.csv")
     scans = read_table(world / f"{by}-scans.csv")
+
     assert len(clusters) > 20
     assert len(scans) == 6
     for table in (clusters, scans):
-        ranks = [int(row["rank"]) for row in table]
-        assert ranks == list(range(1, len(table) + 1))
-        scores = [float(row["score"]) for row in table]
-        assert scores == sorted(scores, reverse=True)
+        previous_score = float("inf")
+        for number, row in enumerate(table, start=1):
+            assert int(row["rank"]) == number
+            assert float(row["score"]) <= previous_score
+            previous_score = float(row["score"])
 
 
 @pytest.mark.parametrize("by", ["disagreement", "labels"])
@@ -233,7 +246,10 @@ def test_the_tables_say_what_the_scans_hold(world: Path, by: str) -> None:
 
 
 def test_the_first_twelve_clusters_are_drawn(world: Path) -> None:
-    assert files(world / "labels") == {f"{number:02d}.png" for number in range(1, 13)}
+    pictures = files(world / "labels")
+    assert len(pictures) == 12
+    assert min(pictures) == "01.png"
+    assert max(pictures) == "12.png"
 
 
 def test_scans_without_labels_are_ranked_alike(world: Path, tmp_path: Path) -> None:
@@ -242,6 +258,7 @@ def test_scans_without_labels_are_ranked_alike(world: Path, tmp_path: Path) -> N
         shutil.rmtree(folder / "labels")
     command = ("rank", tmp_path / "data", "--weights", world / "w.safetensors")
     command += ("--out", tmp_path / "next.csv")
+
     assert run_cli(*command) == (0, "")
 
     expected = read_table(world / "disagreement.csv")
@@ -264,6 +281,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(
 ) -> None:
     options = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path / "next.csv")
     code, error = run_cli("rank", world / "data", *options)
+
     assert code == 2
     assert error.count("\n") == 1
     assert word in error
@@ -284,6 +302,7 @@ def test_each_scan_is_read_only_in_its_turn(world: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(type(dataset), "read", recorded_read)
     rank(dataset, dataset.records(["00", "01"]), Segmenter(WEIGHTS), "labels", progress)
+
     assert events == ["progress", "read"] * 4 + ["progress"]
 
 
@@ -300,6 +319,7 @@ def test_every_command_of_the_page_runs_and_finds_most(
     commands: list[str] = []
     for block in re.findall(r"```bash\n(.*?)```", page, re.S):
         commands += block.splitlines()
+
     assert len(commands) == 5
 
     for command in commands:
@@ -309,5 +329,5 @@ def test_every_command_of_the_page_runs_and_finds_most(
         else:
             assert run_cli(*words[1:]) == (0, ""), command
 
-    shares = [int(text) for text in re.findall(r"(\d+)%\n", capfd.readouterr().out)]
-    assert shares[1] >= 40  # of seven or so; 5 of 100 by chance
+    shares = re.findall(r"(\d+)%\n", capfd.readouterr().out)
+    assert int(shares[1]) >= 40  # of seven or so; 5 of 100 by chance

@@ -139,7 +139,7 @@ class AssertionConfig(Checked):
     name: Literal["disagreement", "entropy", "loss"] = "disagreement"
     """The assertion: low cosine similarity of the networks' scores, high entropy, or high loss."""
     threshold: float = 0.85
-    """tau: uncertain at a cosine similarity of at most this; the others: at least this, in nats."""
+    """tau: uncertain if the cosine similarity is at most this (entropy, loss: at least, nats)."""
 
 
 @dataclass(frozen=True)
@@ -259,8 +259,7 @@ class HeadTraining(Checked):
     points: Count = 300_000
     """Limit of uncertain points, an equal share per scan; 1.3 kB of disk each (K = 19)."""
     folds: Count = 1
-    """Folds of cross-fitting: networks score only scans of sequences that they were not trained on;
-    1: the final networks score all scans, as in the paper."""
+    """Folds of cross-fitting: networks score sequences held out from their training; 1: none."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from amvnet.errors import InputError
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
-UNKNOWN = -1  # in lookup tables: there is no train id for this raw id
+UNKNOWN = -1  # in lookup tables: no train id belongs to this raw id
 
 # The tables of a YAML label map, and its names of the splits.
 _YAML_TABLES = (
@@ -93,7 +93,7 @@ class Taxonomy:
         """(65536,) int16: raw id -> train id, UNKNOWN if the taxonomy has no such raw id."""
         table = np.full(INSTANCE_MASK + 1, UNKNOWN, dtype=np.int16)
 
-        # Categories that are known by name have no numbers but those of prediction files.
+        # If categories have names, the only numeric raw ids are those of prediction files.
         if any(isinstance(raw, str) for raw in self.raw_to_train):
             table[list(self.train_to_raw)] = np.arange(self.size + 1)
 

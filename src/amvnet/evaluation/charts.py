@@ -64,9 +64,9 @@ def write_sweep(
     """Write Figure 8 of the paper: mIoU and the share of uncertain points over a parameter.
 
     Args:
-        swept: the figures reached with each value.
+        swept: the scores reached with each value of the parameter.
         name: the parameter's name.
-        used: the value in the weights.
+        used: the parameter's value in the weights.
         dataset: the dataset as the user named it, for the title.
         path: the files to write, without an ending.
 
@@ -78,10 +78,12 @@ def write_sweep(
     shares = []
     rows: list[Sequence[Cell]] = []
     for result in swept:
+        miou = 100 * result.miou
+        share = 100 * result.uncertain
         values.append(result.value)
-        mious.append(100 * result.miou)
-        shares.append(100 * result.uncertain)
-        rows.append((values[-1], shares[-1], mious[-1], 100 * result.accuracy))
+        mious.append(miou)
+        shares.append(share)
+        rows.append((result.value, share, miou, 100 * result.accuracy))
 
     figure, axes = _figure(f"{name} on {dataset}")
     marker = "" if len(swept) > MOST_MARKED else "o"
@@ -103,7 +105,8 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
     """Write Table 5 of the paper, the ablation of the range-view network.
 
     Args:
-        rows: with the GRU or not, with class weights or not, and the metrics reached.
+        rows: for each network, whether it has the GRU, whether it was trained with class weights,
+            and the metrics it reached.
         path: the files to write, without an ending.
 
     Returns:
@@ -114,11 +117,12 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
         miou = _percent(reached["miou"])
         accuracy = _percent(reached["accuracy"])
         table.append(("yes" if gru else "no", "yes" if weighted else "no", miou, accuracy))
+
     return _write(path, ("GRU", "class weights", "mIoU %", "accuracy %"), table)
 
 
 def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
-    """Write Figure 5 of the paper: a histogram of how well the two networks agree."""
+    """Write Figure 5 of the paper: a histogram of the similarity of the two networks' scores."""
     edges = np.arange(BINS + 1) / BINS
     total = max(analysis.points.sum(), 1)
     rows: list[Sequence[Cell]] = []
@@ -126,13 +130,14 @@ def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path
         rows.append((low, high, int(count), 100 * float(count / total)))
 
     figure, axes = _figure(f"agreement of the two networks on {dataset}")
-    # A logarithmic scale has no 0: empty bins end below one point.
+    # A logarithmic axis has no 0: empty bins are drawn as half a point.
     axes.stairs(np.maximum(analysis.points, 0.5), edges, fill=True, color="0.55")
     label = f"tau = {analysis.tau:g}"
     axes.axvline(analysis.tau, color="black", linewidth=0.8, linestyle=":", label=label)
     axes.set(xlabel="cosine similarity of the two scores", xlim=(0, 1))
     axes.set(ylabel="points", yscale="log")
     axes.legend(frameon=False, loc="upper left")
+
     return _write(path, ("above", "up to", "points", "points %"), rows, figure)
 
 
@@ -145,13 +150,16 @@ def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
         table.append([extent["from_m"], extent["to_m"]])
         middles.append((extent["from_m"] + extent["to_m"]) / 2)
 
+    columns = ["from m", "to m"]
     figure, axes = _figure(f"mIoU by distance on {dataset}")
     for method, style in STYLES.items():
+        columns.append(f"{style.title} %")
         heights = []
         for row, extent in zip(table, methods[method]["by_distance"], strict=True):
             miou = _percent(extent["miou_present"])
             row.append(miou)
             heights.append(np.nan if miou is None else miou)
+
         axes.plot(
             middles,
             heights,
@@ -164,23 +172,21 @@ def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
 
     axes.set(xlabel="distance from the sensor (m)", ylabel="mIoU, classes present (%)")
     axes.legend(frameon=False)
-    columns = [f"{style.title} %" for style in STYLES.values()]
-    return _write(path, ("from m", "to m", *columns), table, figure)
+    return _write(path, columns, table, figure)
 
 
 def _write_classes(analysis: Analysis, path: Path) -> list[Path]:
     """Write Table 3 of the paper: IoU by class."""
-    reached = []
-    for method in STYLES:
-        matrix = analysis.evaluation.matrices[method][0]
-        reached.append(metrics(matrix, analysis.taxonomy))
+    rows: list[list[Cell]] = [[name] for name in (*analysis.taxonomy.classes, "mIoU", "fwIoU")]
+    columns = ["IoU %"]
+    for method, style in STYLES.items():
+        columns.append(style.title)
+        reached = metrics(analysis.evaluation.matrices[method][0], analysis.taxonomy)
+        values = (*reached["iou"].values(), reached["miou"], reached["fwiou"])
+        for row, value in zip(rows, values, strict=True):
+            row.append(_percent(value))
 
-    rows: list[Sequence[Cell]] = []
-    for name in analysis.taxonomy.classes:
-        rows.append((name, *(_percent(values["iou"][name]) for values in reached)))
-    rows.append(("mIoU", *(_percent(values["miou"]) for values in reached)))
-    rows.append(("fwIoU", *(_percent(values["fwiou"]) for values in reached)))
-    return _write(path, ("IoU %", *(style.title for style in STYLES.values())), rows)
+    return _write(path, columns, rows)
 
 
 def _write_methods(analysis: Analysis, path: Path) -> list[Path]:
@@ -242,8 +248,7 @@ def _write(
 
 
 def _markdown_row(cells: Sequence[Cell]) -> str:
-    texts = [_cell_text(cell) for cell in cells]
-    return f"| {' | '.join(texts)} |\n"
+    return f"| {' | '.join(map(_cell_text, cells))} |\n"
 
 
 def _cell_text(cell: Cell) -> str:

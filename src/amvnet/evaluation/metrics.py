@@ -143,10 +143,11 @@ class Evaluation:
         counts = {}
         for method, ids in predictions.items():
             counts[method] = self._confusions(truth, ids, masks)
-
         self._add_counts(counts)
+
         self.scans += 1
         self.points += len(points)
+
         if uncertain is not None:
             self.uncertain += int(np.count_nonzero(uncertain))
             self.asked += len(uncertain)
@@ -177,6 +178,7 @@ class Evaluation:
         total = Evaluation(self.taxonomy, self.edges)
         total.merge(self)
         total.merge(other)
+
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
@@ -202,6 +204,7 @@ class Evaluation:
         for (near, far), matrix in zip(pairwise(self.edges), matrices[1:], strict=True):
             extent = {"from_m": float(near), "to_m": float(far), "points": int(matrix.sum())}
             bins.append({**extent, **metrics(matrix, self.taxonomy)})
+
         return {**metrics(matrices[0], self.taxonomy), "by_distance": bins}
 
     def _masks(self, points: np.ndarray) -> list[np.ndarray]:
@@ -217,6 +220,7 @@ class Evaluation:
         matrices = [confusion(truth, ids, size)]
         for mask in masks:
             matrices.append(confusion(truth[mask], ids[mask], size))
+
         return np.stack(matrices)
 
     def _add_counts(self, counts: Mapping[str, np.ndarray]) -> None:

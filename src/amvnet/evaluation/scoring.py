@@ -13,7 +13,7 @@ from amvnet.data.datasets.open import check_classes
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
-from amvnet.evaluation.top_view import draw_scan
+from amvnet.evaluation.top_view import TopView, draw_scan
 from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.models.methods import PAPER_METHODS
 from amvnet.progress import Progress, no_progress
@@ -65,8 +65,7 @@ def evaluate(
         labels = label(record, scan)
         evaluation.add(scan.points, scan.labels, labels.ids, labels.uncertain)
         if pictures is not None and record.name in pictured:
-            draw_scan(
-                pictures / f"{record.name.replace('/', '_')}.png",
+            view = TopView(
                 scan.points,
                 dataset.taxonomy,
                 labels.ids,
@@ -74,6 +73,7 @@ def evaluate(
                 uncertain=labels.uncertain,
                 title=record.name,
             )
+            draw_scan(pictures / f"{record.name.replace('/', '_')}.png", view)
 
     return sum(processes.gather(evaluation), Evaluation(dataset.taxonomy))
 

@@ -47,69 +47,14 @@ class _Panel:
     on_top: np.ndarray
 
 
-def draw_scan(
-    path: Path | str,
-    points: np.ndarray,
-    taxonomy: Taxonomy,
-    panels: Mapping[str, np.ndarray],
-    truth: np.ndarray | None = None,
-    uncertain: np.ndarray | None = None,
-    title: str = "",
-    reach: float = REACH,
-    marked: str = "uncertain",
-) -> Path:
-    """Draw one scan from above, x to the right and y up, 50 m (`reach`) to each side.
+@dataclass(frozen=True)
+class TopView:
+    """What a drawing of N points from above shows.
 
-    The first row shows the truth and each prediction. Below each prediction are its errors
-    (correct in grey, wrong in red; ignored points count as neither), below the truth the
-    uncertain points. The legend has the classes that appear. The file appears whole or not at
-    all.
-
-    Args:
-        path: the PNG to write; the other arguments are those of `scan_figure`.
-
-    Returns:
-        The path that was written.
-
-    Raises:
-        InputError: if there is nothing to draw, or an array does not have one value per point.
-    """
-    path = Path(path)
-    try:
-        figure = scan_figure(
-            points,
-            taxonomy,
-            panels,
-            truth=truth,
-            uncertain=uncertain,
-            title=title,
-            reach=reach,
-            marked=marked,
-        )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-    with atomic_write(path) as part:
-        figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor=GROUND)
-    return path
-
-
-def scan_figure(
-    points: np.ndarray,
-    taxonomy: Taxonomy,
-    panels: Mapping[str, np.ndarray],
-    truth: np.ndarray | None = None,
-    uncertain: np.ndarray | None = None,
-    title: str = "",
-    reach: float = REACH,
-    marked: str = "uncertain",
-) -> Any:
-    """Return the Matplotlib figure that `draw_scan` writes.
-
-    Args:
+    Attributes:
         points: (N, 3 or more) x, y, z in metres.
         taxonomy: names and colours of the classes.
-        panels: title -> (N,) train ids of a prediction; may be empty if there is a truth.
+        predictions: (N,) train ids by title; may be empty if there is a truth.
         truth: (N,) train ids, or None.
         uncertain: (N,) bool, or None.
         title: a line above all panels.
@@ -119,59 +64,81 @@ def scan_figure(
     Raises:
         InputError: if there is nothing to draw, or an array does not have one value per point.
     """
-    _check(len(points), panels, truth, uncertain)
 
-    grid = _grid(taxonomy, panels, truth, uncertain, marked)
-    entries = _class_entries(taxonomy, panels, truth)
-    if truth is not None and panels:
+    points: np.ndarray
+    taxonomy: Taxonomy
+    predictions: Mapping[str, np.ndarray]
+    truth: np.ndarray | None = None
+    uncertain: np.ndarray | None = None
+    title: str = ""
+    reach: float = REACH
+    marked: str = "uncertain"
+
+    def __post_init__(self) -> None:
+        if not self.predictions and self.truth is None:
+            raise InputError("expected a prediction or the truth to draw, found neither; give one")
+
+        count = len(self.points)
+        arrays = {**self.predictions, "truth": self.truth, "uncertain": self.uncertain}
+        for name, values in arrays.items():
+            if values is not None and np.shape(values) != (count,):
+                raise InputError(
+                    f"expected {count} values for {name!r}, one per point, "
+                    f"found {np.shape(values)}; give the values of this scan"
+                )
+
+
+def draw_scan(path: Path | str, view: TopView) -> Path:
+    """Draw one scan from above, x to the right and y up, `reach` metres to each side.
+
+    The first row shows the truth and each prediction. Below each prediction are its errors
+    (correct in grey, wrong in red; ignored points count as neither), below the truth the
+    uncertain points. The legend has the classes that appear. The PNG appears whole or not at
+    all.
+
+    Returns:
+        The path that was written.
+    """
+    path = Path(path)
+    figure = scan_figure(view)
+    with atomic_write(path) as part:
+        figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor=GROUND)
+    return path
+
+
+def scan_figure(view: TopView) -> Any:
+    """Return the Matplotlib figure that `draw_scan` writes."""
+    entries = _class_entries(view)
+    if view.truth is not None and view.predictions:
         entries.append(("wrong", WRONG))
-    if uncertain is not None and marked:
-        entries.append((marked, UNCERTAIN))
-    return _figure(points, grid, entries, title, reach)
+    if view.uncertain is not None and view.marked:
+        entries.append((view.marked, UNCERTAIN))
+    return _figure(view, _grid(view), entries)
 
 
-def _check(
-    count: int,
-    panels: Mapping[str, np.ndarray],
-    truth: np.ndarray | None,
-    uncertain: np.ndarray | None,
-) -> None:
-    if not panels and truth is None:
-        raise InputError("expected a prediction or the truth to draw, found neither; give one")
-
-    for name, values in {**panels, "truth": truth, "uncertain": uncertain}.items():
-        if values is not None and np.shape(values) != (count,):
-            raise InputError(
-                f"expected {count} values for {name!r}, one per point, found {np.shape(values)}; "
-                "give the values of this scan"
-            )
-
-
-def _grid(
-    taxonomy: Taxonomy,
-    panels: Mapping[str, np.ndarray],
-    truth: np.ndarray | None,
-    uncertain: np.ndarray | None,
-    marked: str,
-) -> list[list[_Panel | None]]:
+def _grid(view: TopView) -> list[list[_Panel | None]]:
     """Return the rows of panels; None leaves a cell of the grid empty.
 
     With truth, its column is the first, and each prediction has a column of its own. Without
     truth there is one row, and the uncertain points are its last panel.
     """
-    palette = np.asarray(taxonomy.colors) / 255.0
+    palette = np.asarray(view.taxonomy.colors) / 255.0
     palette[0] = IGNORED
+    truth = view.truth
 
-    predictions = [_Panel(title, palette[ids], ids > 0) for title, ids in panels.items()]
+    predictions = []
+    for title, ids in view.predictions.items():
+        predictions.append(_Panel(title, palette[ids], ids > 0))
     uncertainty = None
-    if uncertain is not None:
-        uncertainty = _highlight(marked, uncertain, len(uncertain), UNCERTAIN)
+    if view.uncertain is not None:
+        total = len(view.uncertain)
+        uncertainty = _highlight(view.marked, view.uncertain, total, UNCERTAIN)
     if truth is None:
         return [[*predictions]] if uncertainty is None else [[*predictions, uncertainty]]
 
     labelled = truth > 0
     errors = []
-    for title, ids in panels.items():
+    for title, ids in view.predictions.items():
         wrong = (ids != truth) & labelled
         errors.append(_highlight(f"errors of {title}", wrong, labelled.sum(), WRONG))
 
@@ -191,13 +158,12 @@ def _highlight(title: str, mask: np.ndarray, total: int, color: Color) -> _Panel
     return _Panel(f"{title} ({share:.1%})", colors, mask)
 
 
-def _class_entries(
-    taxonomy: Taxonomy, panels: Mapping[str, np.ndarray], truth: np.ndarray | None
-) -> list[tuple[str, Color]]:
+def _class_entries(view: TopView) -> list[tuple[str, Color]]:
     """Return (name, colour) of the classes that appear, for the legend; "ignored" comes last."""
-    arrays = list(panels.values())
-    if truth is not None:
-        arrays.append(truth)
+    taxonomy = view.taxonomy
+    arrays = list(view.predictions.values())
+    if view.truth is not None:
+        arrays.append(view.truth)
     class_ids = np.unique(np.concatenate(arrays)).tolist()
 
     entries: list[tuple[str, Color]] = []
@@ -212,11 +178,7 @@ def _class_entries(
 
 
 def _figure(
-    points: np.ndarray,
-    grid: list[list[_Panel | None]],
-    entries: list[tuple[str, Color]],
-    title: str,
-    reach: float,
+    view: TopView, grid: list[list[_Panel | None]], entries: list[tuple[str, Color]]
 ) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -232,10 +194,10 @@ def _figure(
         for column, panel in enumerate(row_panels):
             if panel is not None:
                 axes = figure.add_subplot(rows, columns, row * columns + column + 1)
-                _draw_panel(axes, points, panel, reach)
+                _draw_panel(axes, view.points, panel, view.reach)
 
-    if title:
-        figure.suptitle(title, color=INK, fontsize=13)
+    if view.title:
+        figure.suptitle(view.title, color=INK, fontsize=13)
     _draw_legend(figure, entries, columns)
     return figure
 

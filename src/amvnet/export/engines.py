@@ -45,12 +45,14 @@ def use_engine(segmenter: Segmenter, engine: str) -> str:
         raise InputError(
             f"expected an engine of {', '.join(ENGINES)}, found {engine!r}; use one of them"
         )
+
     if engine == "auto":
         engine = FASTEST
     if engine == "compile":
         _use_compile(segmenter)
     if engine == "onnx":
         _use_onnx(segmenter)
+
     segmenter.engine = engine
     return engine
 
@@ -63,6 +65,7 @@ def _use_compile(segmenter: Segmenter) -> None:
         view = sizes.range_view
         shape = (1, view.height, view.width, CHANNELS)
         _set_range_net(segmenter, _compiled(_range_net(segmenter), shape, segmenter.device))
+
     if "polar_net" in parts:
         grid = sizes.polar_view
         shape = (1, grid.radial, grid.angular, sizes.polar_net.pillar)
@@ -87,6 +90,7 @@ def _use_onnx(segmenter: Segmenter) -> None:
 def _compiled(function: Runner, shape: tuple[int, ...], device: str) -> Any:
     """Return a function or module compiled for inputs of a shape (1, H, W, C), and run it once."""
     compiled = torch.compile(function)
+
     try:
         with torch.inference_mode():
             compiled(torch.zeros(shape, device=device).permute(0, 3, 1, 2))
@@ -95,6 +99,7 @@ def _compiled(function: Runner, shape: tuple[int, ...], device: str) -> Any:
         raise InputError(
             f"expected torch.compile to work, found {reason}; use the engine torch"
         ) from error
+
     return compiled
 
 
@@ -116,6 +121,7 @@ def _polar_net(segmenter: Segmenter) -> PolarNet:
     net = segmenter.model.polar_net
     if isinstance(net, InPrecision):
         net = net.net
+
     assert isinstance(net, PolarNet)
     return net
 
@@ -124,6 +130,7 @@ def cache_folder() -> Path:
     """Return where exported networks are kept: $AMVNET_CACHE, or amvnet in the user's cache."""
     if os.environ.get(CACHE):
         return Path(os.environ[CACHE])
+
     caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(caches) / "amvnet"
 

@@ -61,9 +61,11 @@ class FileFusion:
             checked = check_scan(scan)
             f, g = self.pair.read(scan_input.scores_path, checked, self.classes)
             result = self.fusion(checked, f, g)
+
             self.uncertain += int(result.uncertain.sum())
             self.points += len(checked)
             results.append(result)
+
         return results
 
 

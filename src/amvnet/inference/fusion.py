@@ -45,6 +45,7 @@ class Fusion:
         """
         scan = check_scan(points)
         self._check_shapes(scan, f, g)
+
         f_valid = np.asarray(f, dtype=np.float32)[scan.valid]
         g_valid = np.asarray(g, dtype=np.float32)[scan.valid]
         check_probabilities(f_valid, "f", "apply softmax")
@@ -56,6 +57,7 @@ class Fusion:
                 torch.from_numpy(f_valid).clamp_min(SURE),
                 torch.from_numpy(g_valid).clamp_min(SURE),
             )
+
         return to_segmentation(scan.valid, Scores(scores.merged, scores.uncertain, None, None))
 
     def _check_shapes(self, scan: Scan, f: np.ndarray, g: np.ndarray) -> None:
@@ -64,8 +66,10 @@ class Fusion:
                 f"expected two arrays of scores of shape ({len(scan)}, K), "
                 f"found {f.shape} and {g.shape}; give both models' scores of this scan"
             )
+
         if self.model.point_head is None:
             return
+
         classes = self.model.point_head.fc[-1].out_features
         if classes != f.shape[1]:
             raise InputError(
@@ -99,6 +103,7 @@ def _build_fusion(head: Head, tau: float | None) -> LateFusion:
     """Return the head with the assertion that chooses its points."""
     if isinstance(head, str | Path):
         head = load(head)
+
     config = AssertionConfig()
     if isinstance(head, Weights):
         config = head.model.assertion
@@ -109,6 +114,7 @@ def _build_fusion(head: Head, tau: float | None) -> LateFusion:
             "expected an assertion that needs no labels, found loss; "
             "train the head with another one"
         )
+
     assertion = build_assertion(config) if tau is None else Disagreement(tau)
     point_head = None if head is None else copy.deepcopy(head).cpu().eval()
     return LateFusion(assertion, point_head)

@@ -54,7 +54,12 @@ class LoadedScan:
 
 @dataclass(frozen=True)
 class LabelFormat:
-    """How labels of scan files are written: one of `label_files.KINDS`, in raw ids of a taxonomy."""
+    """How labels of scan files are written.
+
+    Attributes:
+        kind: one of `label_files.KINDS`.
+        taxonomy: of the raw ids.
+    """
 
     kind: str
     taxonomy: Taxonomy

@@ -47,6 +47,7 @@ def predict(
             f"expected a method of two networks for --uncertain, found {segmenter.method}; "
             "use amvnet"
         )
+
     adapter = adapter or adapter_for(segmenter.weights)
     opened = Inputs(options, segmenter.taxonomy, adapter)
     opened.open(inputs)
@@ -67,10 +68,12 @@ class NetworkSegmentation:
 
     def __call__(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
         results: list[Segmentation] = []
+
         pairs = zip(inputs, scans, strict=True)
         for is_adapted, group in groupby(pairs, key=lambda pair: pair[0].is_adapted):
             segmenter = self.by_ring if is_adapted else self.segmenter
             results += segmenter.many([scan for _, scan in group])
+
         return results
 
 
@@ -85,6 +88,7 @@ def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter)
         "uncertain": output.uncertain,
         "format": output.kind,
     }
+
     if segmenter.precision != "float32":
         settings["precision"] = segmenter.precision
     return settings

@@ -89,14 +89,14 @@ class Segmenter:
         if keep_memory and device == "cpu":
             keep_freed_memory()
 
-        model = self.weights.build().to(device)
-        self.model: AMVNet = model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.model: AMVNet = self.weights.build().to(device)
+        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         fold_batch_norms(self.model)
         _set_up_networks(self.model, device, precision)
 
     @property
     def at_once(self) -> int:
-        """How many scans are best segmented at the same time, each with its share of the threads."""
+        """How many scans are best segmented at a time, each with its share of the threads."""
         if self.device != "cpu" or self.engine != "torch":
             return 1
         return min(torch.get_num_threads(), MOST_AT_ONCE)

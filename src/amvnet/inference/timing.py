@@ -80,7 +80,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class LeastAgreeing:
-    """An assertion: a fixed share of the points, on which the networks agree least, is uncertain."""
+    """An assertion: the share of the points on which the networks agree least is uncertain."""
 
     share: float
 
@@ -88,8 +88,10 @@ class LeastAgreeing:
         self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None
     ) -> Tensor:
         count = round(self.share * len(f))
+        least = cosine_similarity(f, g).topk(count, largest=False).indices
+
         uncertain = torch.zeros(len(f), dtype=torch.bool, device=f.device)
-        uncertain[cosine_similarity(f, g).topk(count, largest=False).indices] = True
+        uncertain[least] = True
         return uncertain
 
 
@@ -116,18 +118,21 @@ def time_jobs(
             limits[kind] = max(speed, limits.get(kind, 0))
         for job, timings_of_job in zip(jobs, timings, strict=True):
             timings_of_job.append(run_once(job))
+
         progress(run + 1, runs + WARM_UP)
 
-    return [
-        _report(job, timings_of_job[WARM_UP:], limits)
-        for job, timings_of_job in zip(jobs, timings, strict=True)
-    ]
+    reports = []
+    for job, timings_of_job in zip(jobs, timings, strict=True):
+        reports.append(_report(job, timings_of_job[WARM_UP:], limits))
+    return reports
 
 
 def _check_job(job: Job) -> None:
     method = job.segmenter.method
+
     if method != "amvnet":
         raise InputError(f"expected AMVNet to time, found the method {method}; use amvnet")
+
     if job.share is not None and not 0 <= job.share <= 1:
         raise InputError(
             f"expected a share of uncertain points from 0 to 1, found {job.share}; give another"
@@ -139,6 +144,7 @@ def run_once(job: Job) -> Timing:
     """Time a job once, with a clock around each step of `AMVNet.forward`."""
     device = job.segmenter.device
     clock = _Clock(device)
+
     model = copy.copy(job.segmenter.model)
     model.watch = clock
     model.arrange = one_after_the_other
@@ -149,7 +155,9 @@ def run_once(job: Job) -> Timing:
         scan = job.read()
     with clock("project"):
         batch = PointBatch.of([scan]).to(device)
+
     scores = model(batch)
+
     with clock("merge"):
         labels = label_ids(scores.merged).cpu().numpy()
     with clock("write"):
@@ -157,6 +165,7 @@ def run_once(job: Job) -> Timing:
 
     with clock(MEAN):
         label_ids(geometric_mean(scores.rv, scores.bev)).cpu()
+
     return Timing(dict(clock.seconds), len(labels), int(scores.uncertain.sum()))
 
 
@@ -171,8 +180,10 @@ class _Clock:
     def __call__(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
+
         if self._gpu:
             torch.cuda.synchronize()
+
         self.seconds[stage] += time.perf_counter() - start
 
 
@@ -193,6 +204,7 @@ def _report(job: Job, timings: Sequence[Timing], limits: dict[str, float]) -> di
 
     fusion_shares = [_sum(timing, FUSION) / timing.all for timing in timings]
     over_networks = [timing.all / _sum(timing, NETWORKS) for timing in timings]
+
     return {
         "engine": job.name,
         "device": job.segmenter.device,
@@ -232,6 +244,7 @@ def _flops(job: Job) -> dict[str, float]:
         with FlopCounterMode(display=False) as counter:
             score(batch)
         counts[name] = float(counter.get_total_flops())
+
     return counts
 
 
@@ -242,10 +255,12 @@ def product_limits(device: str) -> dict[str, float]:
     """
     types = [torch.float32, torch.bfloat16] if device.startswith("cuda") else [torch.float32]
     rows, inner, columns = PRODUCT
+
     limits = {}
     for kind in types:
         x = torch.randn(rows, inner, dtype=kind, device=device)
         weight = torch.randn(columns, inner, dtype=kind, device=device)
+
         seconds = min(_fastest(_matmul, x, weight), _fastest(linear, x, weight))
         limits[str(kind).removeprefix("torch.")] = 2 * rows * inner * columns / seconds / 1e9
     return limits
@@ -263,7 +278,9 @@ def _fastest(product: Callable[[Tensor, Tensor, None], Tensor], x: Tensor, weigh
         clock = _Clock(str(x.device))
         with clock("product"):
             product(x, weight, None)
+
         seconds.append(clock.seconds["product"])
+
     return min(seconds)
 
 
@@ -276,7 +293,9 @@ def untrained(recipe: Recipe) -> Weights:
     """Return random weights of a recipe's sizes, to time them."""
     taxonomy = TAXONOMIES[recipe.taxonomy]
     model = build_amvnet(recipe.model, taxonomy.size)
+
     tensors: dict[str, Tensor] = {}
     for part in PARTS:
         tensors |= part_state(part, getattr(model, part))
+
     return Weights(recipe.model, taxonomy, recipe.sensor, tensors)

@@ -116,10 +116,12 @@ class LateFusion(nn.Module):
     def settle(self, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
         """Return (U, K) for the points `index` (U,) of one scan, with neighbours `near` (U, n)."""
         assert self.point_head is not None
+
         used, (index, near) = select_used_points(len(points), index, near)
         table = point_table(
             points.index_select(0, used), f.index_select(0, used), g.index_select(0, used)
         )
+
         return self.point_head.score(table, index, near).softmax(dim=1)
 
     @step("merge")

@@ -35,6 +35,7 @@ def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
     """
     if not left and not right:
         return x
+
     return _WrapWidth.apply(x, left, right) if x.requires_grad else _pad_width(x, left, right)
 
 
@@ -77,11 +78,11 @@ class PointLinear(nn.Linear):
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """Apply `F.linear` to rows (N, C) with a weight (C', C) -> (N, C').
+    """Apply a linear layer to rows: (N, C), with a weight (C', C), -> (N, C').
 
-    On a CPU it is computed as a convolution with kernels of one cell. torch multiplies matrices
-    by MKL there, which leaves half or more of an AMD processor's float32 performance unused.
-    Convolutions, by oneDNN, do not.
+    On a CPU it is computed as a convolution with kernels of one cell. There torch multiplies
+    matrices by MKL, which leaves half or more of an AMD processor's float32 performance unused.
+    oneDNN, which computes convolutions, does not.
     """
     # A convolution does not take an empty image.
     if torch.compiler.is_compiling() or not x.is_cpu or not len(x):
@@ -112,6 +113,7 @@ class ResidualBlock(nn.Module):
         super().__init__()
         self.first = ConvBlock(channels, out, stride=stride)
         self.second = nn.Sequential(RingConv2d(out, out), nn.BatchNorm2d(out))
+
         self.skip: nn.Module = nn.Identity()
         if stride != (1, 1) or channels != out:
             self.skip = nn.Sequential(RingConv2d(channels, out, 1), nn.BatchNorm2d(out))
@@ -160,7 +162,7 @@ def upsample(x: Tensor, like: Tensor) -> Tensor:
 def fold_batch_norms(module: nn.Module) -> None:
     """Fold the batch norms of a module in evaluation mode into the layers before them.
 
-    The result is as exact, and faster.
+    The outputs stay the same up to rounding, and are faster to compute.
     """
     for layers in list(module.modules()):
         if not isinstance(layers, nn.Sequential):

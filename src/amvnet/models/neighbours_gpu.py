@@ -94,19 +94,19 @@ def _split(xyz: Tensor, index: Tensor, ways: int) -> Tensor:
 
 def _nearest(xyz: Tensor, own: Tensor, n: int) -> Tensor:
     """Return (U, n) indices of the nearest others in a scan with at least n other points."""
-    # The blocks hold at least half of `BLOCK` points each, and have to hold all candidates.
+    # Blocks are at least half full; those that are searched have to hold all candidates.
     if len(xyz) <= NEAREST * BLOCK or n + SPARE > NEAREST * BLOCK // 2:
         return _nearest_of_all(xyz, own, n)
 
     blocks = split_into_blocks(xyz)
-    parts = []
+    nearest_parts = []
     sure_parts = []
     for queries in _parts(own, _bytes_per_query(blocks)):
         nearest, sure = _nearest_in_blocks(xyz, blocks, queries, n)
-        parts.append(nearest)
+        nearest_parts.append(nearest)
         sure_parts.append(sure)
 
-    nearest = torch.cat(parts)
+    nearest = torch.cat(nearest_parts)
     unsure = (~torch.cat(sure_parts)).nonzero()[:, 0]
     if len(unsure):
         nearest[unsure] = _nearest_of_all(xyz, own[unsure], n)

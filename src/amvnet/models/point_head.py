@@ -29,6 +29,7 @@ class PointHead(nn.Module):
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
         super().__init__()
         self.config = config
+
         width = 2 * classes + POINT_VALUES
         self.mlp = _mlp((width, *config.hidden))
         self.fc = nn.Sequential(
@@ -38,7 +39,7 @@ class PointHead(nn.Module):
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
         encoded = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1])
-        pooled = encoded.amax(dim=1)  # (U, hidden)
+        pooled = encoded.amax(dim=1)  # (U, hidden[-1])
         return self.fc(torch.cat([pooled, point], dim=1))
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
@@ -66,7 +67,7 @@ class PointHead(nn.Module):
             rows = first_of_all.index_select(0, k.flatten()).unflatten(0, k.shape)
             rows = rows.sub_(shift[:, None])  # (part, n, hidden[0])
 
-            # A ReLU keeps the order: after the maximum it costs a fifteenth and changes nothing.
+            # ReLU is monotonic: after the maximum it gives the same for a fraction of the work.
             pooled = activation(middle(rows.flatten(0, 1)).unflatten(0, k.shape).amax(dim=1))
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
             logits.append(self.fc(torch.cat([pooled, point], dim=1)))
@@ -88,6 +89,7 @@ def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tenso
     """
     if not indices[0].is_cpu:
         return torch.arange(count, device=indices[0].device), list(indices)
+
     return occurring(count, *indices)
 
 

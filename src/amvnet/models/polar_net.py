@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -13,44 +14,48 @@ from amvnet.models.layers import ConvBlock, PointLinear, linear
 from amvnet.models.upsampled_conv import joined
 from amvnet.models.views.polar_view import FEATURES, PolarGrid
 
-PART, PART_ON_GPU = (
-    2048,
-    2**18,
-)  # points that are encoded at a time: what a cache holds; what keeps a GPU busy
+# Points that are encoded at a time.
+PART = 2048  # fits a processor's cache
+PART_ON_GPU = 2**18  # keeps a GPU busy
 
 
 class PolarNet(nn.Module):
-    """Points in the polar grid -> scores before softmax (M, Z * K) of the M occupied pillars, K for each voxel."""
+    """Points in the polar grid -> logits (M, Z * K) of the M occupied pillars, K per voxel."""
 
     def __init__(self, config: PolarNetConfig, vertical: int, classes: int) -> None:
         super().__init__()
-        c = config
-        self.point_mlp = _point_mlp(c.point_widths)
+        widths = config.widths
+        self.point_mlp = _point_mlp(config.point_widths)
         self.compress = nn.Sequential(
-            PointLinear(c.point_widths[-1], c.pillar), nn.ReLU(inplace=True)
+            PointLinear(config.point_widths[-1], config.pillar), nn.ReLU(inplace=True)
         )
-        self.first = _double(c.pillar, c.widths[0])
-        downs = zip(c.widths[:-1], c.widths[1:], strict=True)
-        self.down = nn.ModuleList(_double(fine, coarse) for fine, coarse in downs)
-        ups = [
-            (coarse + fine, fine) for fine, coarse in zip(c.widths[:-1], c.widths[1:], strict=True)
-        ]
-        self.up = nn.ModuleList(_double(channels, fine) for channels, fine in reversed(ups))
-        self.drop = DropBlock(c.dropblock, c.dropblock_size)
-        self.scores = nn.Conv2d(c.widths[0], vertical * classes, 1)
-        # What runs the U-Net: its own method, or an engine's compiled or exported equivalent.
+
+        # The U-Net, from fine to coarse and back.
+        self.first = _double(config.pillar, widths[0])
+        self.down = nn.ModuleList()
+        for fine, coarse in pairwise(widths):
+            self.down.append(_double(fine, coarse))
+        self.up = nn.ModuleList()
+        for coarse, fine in pairwise(reversed(widths)):
+            self.up.append(_double(coarse + fine, fine))
+        self.drop = DropBlock(config.dropblock, config.dropblock_size)
+        self.scores = nn.Conv2d(widths[0], vertical * classes, 1)
+
+        # An engine's compiled or exported equivalent of the U-Net; None uses the method.
         self.run_unet: Callable[[Tensor], Tensor] | None = None
 
     def forward(self, grid: PolarGrid) -> Tensor:
         pillars = self.compress(self.pool(grid))  # (M, pillar)
-        # An empty pillar has no point to score, and most are empty.
         run_unet = self.unet if self.run_unet is None else self.run_unet
-        return self.score(grid.at_pillars(run_unet(grid.to_map(pillars))))
+        decoded = run_unet(grid.to_map(pillars))  # (B, widths[0], R, A)
+        # Most pillars are empty, and have no point to score.
+        return self.score(grid.at_pillars(decoded))
 
     def pool(self, grid: PolarGrid) -> Tensor:  # (M, point_widths[-1])
         if torch.is_grad_enabled():
             return grid.pool(self.point_mlp(grid.features))
-        return grid.pool_by_parts(self.point_mlp, PART if grid.features.is_cpu else PART_ON_GPU)
+        part = PART if grid.features.is_cpu else PART_ON_GPU
+        return grid.pool_by_parts(self.point_mlp, part)
 
     def score(self, pillars: Tensor) -> Tensor:  # (M, widths[0]) -> (M, Z * K)
         return linear(pillars, self.scores.weight.flatten(1), self.scores.bias)
@@ -61,6 +66,7 @@ class PolarNet(nn.Module):
         for down in self.down:
             x = down(F.max_pool2d(x, 2, ceil_mode=True))
             skips.append(x)
+
         for up, skip in zip(self.up, reversed(skips[:-1]), strict=True):
             first, second = up.children()
             x = self.drop(second(joined(first, x, skip)))
@@ -72,21 +78,26 @@ class DropBlock(nn.Module):
 
     def __init__(self, probability: float, size: int) -> None:
         super().__init__()
-        self.probability, self.size = probability, size
+        self.probability = probability
+        self.size = size
 
     def forward(self, x: Tensor) -> Tensor:  # (B, C, H, W)
         if not self.training or not self.probability:
             return x
+
+        # An odd size, so that a square has a centre.
         size = min(self.size, *x.shape[-2:])
-        size -= 1 - size % 2  # odd, so that a square has a centre
-        # Every cell is dropped with the given probability if a centre falls within the square around it.
+        size -= 1 - size % 2
+
+        # A cell is dropped if a centre falls within the square around it, which has to happen with
+        # the given probability.
         rate = 1 - (1 - self.probability) ** (1 / size**2)
-        centres = (torch.rand(x.shape[0], 1, *x.shape[-2:], device=x.device) < rate).to(x.dtype)
-        kept = 1 - F.max_pool2d(centres, size, stride=1, padding=size // 2)
-        share = kept.mean(dtype=torch.float32).clamp_min(
-            1 / kept.numel()
-        )  # a sum would overflow half precision
-        return x * (kept / share).to(x.dtype)
+        centres = torch.rand(x.shape[0], 1, *x.shape[-2:], device=x.device) < rate
+        mask = 1 - F.max_pool2d(centres.to(x.dtype), size, stride=1, padding=size // 2)
+
+        # A mean, because a sum would overflow half precision.
+        kept_share = mask.mean(dtype=torch.float32).clamp_min(1 / mask.numel())
+        return x * (mask / kept_share).to(x.dtype)
 
 
 def _double(channels: int, out: int) -> nn.Sequential:
@@ -94,8 +105,8 @@ def _double(channels: int, out: int) -> nn.Sequential:
 
 
 def _point_mlp(widths: tuple[int, ...]) -> nn.Sequential:
-    """The shared MLP over points, with batch norm after the input and each layer but the last."""
+    """Return the shared MLP, with batch norm after the input and each layer but the last."""
     layers: list[nn.Module] = [nn.BatchNorm1d(FEATURES)]
-    for channels, out in zip((FEATURES, *widths[:-2]), widths[:-1], strict=True):
+    for channels, out in pairwise((FEATURES, *widths[:-1])):
         layers += [PointLinear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers, PointLinear(widths[-2], widths[-1]))

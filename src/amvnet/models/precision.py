@@ -1,4 +1,4 @@
-"""The precision that a network computes in; what goes in and comes out stays float32."""
+"""The precision that a network computes in; its inputs and outputs stay float32."""
 
 from __future__ import annotations
 
@@ -14,28 +14,27 @@ from amvnet.models.methods import PRECISIONS, Precision
 
 
 class InPrecision(nn.Module):
-    """A network whose convolutions and matrix products are of a precision; its scores are float32.
+    """A network whose convolutions and matrix products have a precision; its scores are float32.
 
-    On a GPU float32 means float32: TF32, which PyTorch takes for convolutions by default, is used where
-    `torch.set_float32_matmul_precision("high")` was said.
+    On a GPU, float32 means float32: TF32, which PyTorch uses for convolutions by default, is used
+    only after `torch.set_float32_matmul_precision("high")`.
     """
 
     def __init__(self, net: nn.Module, device: str, precision: Precision) -> None:
         super().__init__()
-        self.net, self.precision = net, precision
+        self.net = net
+        self.precision = precision
         self.kind = torch.device(device).type
 
     def forward(self, view: Any) -> Tensor:
-        lower = self.precision != "float32"
-        with (
-            _tf32_as_asked(),
-            torch.autocast(self.kind, getattr(torch, self.precision) if lower else None, lower),
-        ):
+        is_lower = self.precision != "float32"
+        dtype = getattr(torch, self.precision) if is_lower else None
+        with _tf32_as_set(), torch.autocast(self.kind, dtype, enabled=is_lower):
             return self.net(view).float()
 
 
 def check_precision(precision: str, device: str) -> None:
-    """Raises InputError where there is no such precision, or the device has none."""
+    """Raise InputError if there is no such precision, or the device does not have it."""
     if precision not in PRECISIONS:
         raise InputError(
             f"expected a precision of {', '.join(PRECISIONS)}, found {precision!r}; use one of them"
@@ -45,8 +44,8 @@ def check_precision(precision: str, device: str) -> None:
 
 
 @contextmanager
-def _tf32_as_asked() -> Iterator[None]:
-    """Let convolutions and recurrent layers use TF32 where matrix products may, and leave the setting as it was."""
+def _tf32_as_set() -> Iterator[None]:
+    """Let convolutions and recurrent layers use TF32 only if matrix products may."""
     before = torch.backends.cudnn.allow_tf32
     torch.backends.cudnn.allow_tf32 = torch.get_float32_matmul_precision() != "highest"
     try:

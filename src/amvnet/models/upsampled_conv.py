@@ -57,10 +57,12 @@ def _convolve_upsampled(x: Tensor, weight: Tensor, scale: tuple[int, int]) -> Te
     output = F.conv2d(wrap_width(x, 1, 1), kernels, padding=(1, 0))
     output = output.permute(0, 2, 3, 1)  # (B, h + 1, w + 1, s * s * C')
     b, h, w, _ = output.shape
-    cells = output.view(b, h, w, rows, columns, -1).transpose(2, 3)
+
+    # From the outputs of each coarse cell to a map of fine cells
+    cells = output.unflatten(3, (rows, columns, -1)).transpose(2, 3)
     cells = cells.reshape(b, h * rows, w * columns, -1)
 
-    # Without the cells before the first, and after the last
+    # Without the cells before the first and after the last
     top = int(rows > 1)
     left = int(columns > 1)
     height = x.shape[2] * rows

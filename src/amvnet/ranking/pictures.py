@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset
-from amvnet.evaluation.top_view import draw_scan
+from amvnet.evaluation.top_view import TopView, draw_scan
 from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.ranking.rank import Criterion, Ranking, find_clusters, find_doubts
 
@@ -25,6 +25,7 @@ def draw(
         path = folder / f"{number:02d}.png"
         _draw_cluster(row, ranking, dataset, segmenter, by=by, path=path)
         paths.append(path)
+
     return paths
 
 
@@ -38,6 +39,7 @@ def _draw_cluster(
 ) -> None:
     record = ranking.records[row["scan"]]
     scan = check_scan(dataset.read(record))
+
     doubts = find_doubts(scan, segmenter, by)
     _, cluster_ids = find_clusters(doubts)
     in_cluster = cluster_ids == cluster_ids[row["point"]]
@@ -49,8 +51,7 @@ def _draw_cluster(
         panels["label"] = doubts.label[near]
 
     x, y, z = row["xyz"]
-    draw_scan(
-        path,
+    view = TopView(
         points[near],
         dataset.taxonomy,
         panels,
@@ -59,3 +60,4 @@ def _draw_cluster(
         reach=REACH,
         marked="cluster",
     )
+    draw_scan(path, view)

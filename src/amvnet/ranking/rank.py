@@ -29,7 +29,7 @@ Criterion = Literal["disagreement", "labels"]
 
 # Metres: points nearer to the sensor than this belong to the vehicle that carries it.
 NEAR = 1.5
-# Points without doubt that are added to each cluster's mean, so that stray points do not lead.
+# Points without doubt that enter the mean doubt of each cluster, so that stray points do not lead.
 FEW = 20.0
 # Scores are divided by the number of clusters with the same contradiction to this power:
 # a contradiction that is met often is a mistake of the views.
@@ -38,20 +38,18 @@ COMMON = 0.5
 COLUMNS = ("rank", "scan", "score", "x", "y", "z", "points", "point", "rv", "bev", "label")
 SCAN_COLUMNS = ("rank", "scan", "score", "points", "clusters")
 
-# One cluster: number of its scan, score, its middle point's place in metres, number of its
-# points, index of the middle point in the scan, train ids (the most common one by each view,
-# and the middle point's label), and kind of doubt.
+# One cluster. Its middle point is the one nearest to the mean of its points.
 ROW = np.dtype(
     [
-        ("scan", np.int32),
+        ("scan", np.int32),  # number of the scan
         ("score", np.float32),
-        ("xyz", np.float32, 3),
-        ("points", np.int32),
-        ("point", np.int32),
-        ("rv", np.uint8),
-        ("bev", np.uint8),
-        ("label", np.uint8),
-        ("kind", np.int32),
+        ("xyz", np.float32, 3),  # metres, of the middle point
+        ("points", np.int32),  # how many
+        ("point", np.int32),  # index of the middle point in the scan
+        ("rv", np.uint8),  # most common train id by the range view
+        ("bev", np.uint8),  # most common train id by the bird's-eye view
+        ("label", np.uint8),  # train id of the middle point's label
+        ("kind", np.int32),  # as in `Doubts`
     ]
 )
 
@@ -66,9 +64,10 @@ class Doubts:
         rv: (N,) train ids by the range view.
         bev: (N,) train ids by the bird's-eye view.
         label: (N,) train ids of the labels; 0 if there are none.
-        kind: (N,) kind of doubt; a cluster has points of one kind.
-        whole: (N,) number of points of the labelled thing that each point is part of, if labels
-            are doubted, or None.
+        kind: (N,) the two classes that contradict each other, as one number; a cluster has points
+            of one kind.
+        whole: (N,) number of points in the labelled thing that each point is part of; None if
+            labels are not doubted.
     """
 
     xyz: np.ndarray
@@ -130,10 +129,12 @@ def rank(
     sizes = np.zeros(len(records), dtype=np.int64)
     for number, record in enumerate(records):
         progress(number, len(records))
+
         doubts = find_doubts(check_scan(dataset.read(record)), segmenter, by)
         rows, _ = find_clusters(doubts)
         rows["scan"] = number
         rows_by_scan.append(rows)
+
         mean_doubts[number] = doubts.doubt.mean()
         sizes[number] = len(doubts.doubt)
     progress(len(records), len(records))
@@ -167,6 +168,7 @@ def find_doubts(scan: Scan, segmenter: Segmenter, by: Criterion) -> Doubts:
 
     scores, uncertain = segmenter.scores_by_method(scan, ("rv", "bev"))
     assert uncertain is not None
+
     f = scores["rv"]  # (P, K) class probabilities of the P valid points
     g = scores["bev"]  # (P, K)
     valid = scan.valid
@@ -215,6 +217,7 @@ def _contradiction(
     """
     agreed = (f * g).argmax(dim=1)
     column = (label.long() - 1).clamp_min(0)
+
     for_label = torch.maximum(f, g).gather(1, column[:, None])[:, 0]
     for_agreed = torch.minimum(f, g).gather(1, agreed[:, None])[:, 0]
     contradiction = (for_agreed - for_label).clamp_min(0) * (label > 0)
@@ -265,6 +268,7 @@ def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.
     squared_distance = ((xyz - mean[group]) ** 2).sum(axis=1)
     order = np.lexsort((squared_distance, group))
     group_starts = np.cumsum(sizes) - sizes
+
     return order[group_starts]
 
 
@@ -298,6 +302,7 @@ def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
         The file of the scans, NAME-scans.csv.
     """
     _write(path, COLUMNS, _cluster_rows(ranking, taxonomy))
+
     scans_path = path.with_name(f"{path.stem}-scans{path.suffix}")
     _write(scans_path, SCAN_COLUMNS, _scan_rows(ranking))
     return scans_path

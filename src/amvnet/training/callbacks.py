@@ -16,7 +16,7 @@ from lightning.pytorch.callbacks import Callback, RichProgressBar
 from torch import Tensor, nn
 
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.evaluation.top_view import scan_figure
+from amvnet.evaluation.top_view import TopView, scan_figure
 from amvnet.files import atomic_write
 from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
@@ -248,7 +248,8 @@ class Pictures(Callback):
         ids[scan.valid] = self.label(batch).cpu().numpy()
 
         predictions = {"prediction": ids}
-        figure = scan_figure(scan.points, self.taxonomy, predictions, scan.labels, title=scan.name)
+        view = TopView(scan.points, self.taxonomy, predictions, scan.labels, title=scan.name)
+        figure = scan_figure(view)
         figure.set_dpi(PICTURE_DPI)
 
         assert trainer.logger is not None

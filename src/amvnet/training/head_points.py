@@ -319,21 +319,6 @@ class PointGatherer:
         return point_dtype(self.dataset.taxonomy.size, self.model.point_head.neighbours)
 
 
-def gather_points(
-    sources: Sequence[ScoreSource],
-    dataset: Dataset,
-    model: ModelConfig,
-    training: TrainingConfig,
-    views: int,
-    folder: Path,
-    say: Callable[[str], None] = lambda line: None,
-    processes: Processes = ALONE,
-) -> HeadPoints:
-    """Gather the points of the head; see `PointGatherer`."""
-    gatherer = PointGatherer(dataset, model, training, processes)
-    return gatherer.gather(sources, folder, views, say)
-
-
 def _everywhere(f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
     """The assertion that finds every point uncertain."""
     return torch.ones(len(f), dtype=torch.bool, device=f.device)

@@ -31,9 +31,9 @@ class HeadStage(Stage):
     config: HeadTraining
 
     def __init__(
-        self, head: PointHead, train: HeadPoints, val: HeadPoints | None, *args: Any
+        self, head: PointHead, train: HeadPoints, val: HeadPoints | None, **shared: Any
     ) -> None:
-        super().__init__(*args)
+        super().__init__(**shared)
         self.trained = head
         self.train_points = train
         self.val_points = val

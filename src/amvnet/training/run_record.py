@@ -1,4 +1,4 @@
-"""What the folder of a run records: its recipe, what each call made of what, and how to repeat it."""
+"""What the folder of a run records: its recipe, and how each call can be repeated."""
 
 from __future__ import annotations
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import shutil
 import time
 from collections.abc import Callable
@@ -24,7 +23,7 @@ from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
 from amvnet.training.fit import FitOptions, Loaders, fit
-from amvnet.training.head_points import gather_points, make_head_loader
+from amvnet.training.head_points import PointGatherer, make_head_loader
 from amvnet.training.head_scores import NetworkScores, ScoreSource, score_source, scorer_with_head
 from amvnet.training.head_stage import HeadStage
 from amvnet.training.loaders import ScanSet, count_classes, make_loader
@@ -278,25 +277,24 @@ class HeadRun(StageRun):
 
         # The uncertain points of all scans, with their scores and neighbours.
         validated = score_source(self.weights, self.plan.scores, scans.val)
-        gather = functools.partial(
-            gather_points,
-            dataset=scans.dataset,
-            model=self.weights.model,
-            training=training,
-            processes=processes,
+        gatherer = PointGatherer(scans.dataset, self.weights.model, training, processes)
+        train = gatherer.gather(
+            self._score_sources(), self.folder / "train", config.views, options.say
         )
-        train = gather(
-            self._score_sources(),
-            views=config.views,
-            folder=self.folder / "train",
-            say=options.say,
-        )
-        val = gather([validated], views=0, folder=self.folder / "val") if scans.val else None
+        val = gatherer.gather([validated], self.folder / "val") if scans.val else None
 
         head = self.model().point_head
         assert head is not None
         weights = self.class_weights() if config.class_weights else None
-        stage = HeadStage(head, train, val, config, scans.dataset.taxonomy, weights, processes)
+        stage = HeadStage(
+            head,
+            train,
+            val,
+            config=config,
+            taxonomy=scans.dataset.taxonomy,
+            weights=weights,
+            processes=processes,
+        )
         train_loader = make_head_loader(
             train, config.batch, shuffle=True, seed=training.seed, processes=processes
         )

@@ -61,7 +61,13 @@ class Stage(L.LightningModule):
         raise NotImplementedError
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
-        """Convert floating-point values of a batch to the precision of the weights."""
+        """Convert floating-point values of a batch to the precision of the weights.
+
+        Raises:
+            InputError: if the batch is one, because a scan cannot be read.
+        """
+        if isinstance(batch, InputError):
+            raise batch
         return tuple(self._in_precision(values) for values in batch)
 
     def check_finite(self, loss: Tensor, where: str) -> None:

@@ -38,8 +38,8 @@ class Frame:
         labels: (N,) train ids by method; "labels" are those from files.
         uncertain: (N,) bool, the points on which the two networks disagree; None without two
             networks.
-        disagreement: (N,) float32 in [0, 1], 1 - the cosine similarity of the networks' scores; None
-            without two networks.
+        disagreement: (N,) float32 in [0, 1], 1 - the cosine similarity of the networks' scores;
+            None without two networks.
     """
 
     name: str

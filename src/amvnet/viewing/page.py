@@ -22,28 +22,39 @@ from amvnet.files import atomic_write
 from amvnet.models.methods import METHODS, title_of
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
-# Of one scan. Of a larger scan, every second or third point is drawn, so that phones can keep up.
+# In one scan; larger ones are thinned to every second or third point, so that phones keep up.
 MOST_POINTS = 400_000
-# Metres along each axis; farther points are left out, so that positions are exact to 1.6 cm.
+# Metres along each axis; farther points are left out, so that positions are off by 1.6 cm at most.
 REACH = 500.0
 LEVELS = 32_767  # int16
 STOPS = 17  # colours between which the page interpolates a ramp
 # Matplotlib's colour map, and the part of it that is used.
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
 DOUBT = (RIGHT, (128, 104, 92), (190, 110, 50), UNCERTAIN, (255, 190, 60))
-SCRIPTS = ("scans", "camera", "shaders", "draw", "look", "panel", "point", "hands", "page")
+# In this order: later ones use what earlier ones define.
+SCRIPTS = (
+    "scans.js",
+    "camera.js",
+    "shaders.js",
+    "draw.js",
+    "look.js",
+    "panel.js",
+    "point.js",
+    "hands.js",
+    "page.js",
+)
 
 
 @dataclass(frozen=True)
 class Packed:
-    """One scan as the page carries it.
+    """One scan, packed for the page.
 
     Attributes:
-        about: what the page's JSON says about the scan.
-        planes: its points' values, deflated and in base64.
+        about: name, number of points and the like, for the page's JSON.
+        planes: the values of its points, deflated and in base64.
         present: ids of the classes in its truth and labels.
-        height: metres; almost all points are between these two.
-        intensity: almost all intensities are below this one.
+        height: metres, (low, high); almost all points are between the two.
+        intensity: in [0, 1]; almost all points are below it.
         ground: metres, height of the ground.
     """
 
@@ -93,9 +104,14 @@ def pack(frame: Frame) -> Packed:
     xyz = frame.points[indices, :3].astype(np.float64)
     center, step = _quantisation(xyz)
     steps = np.round((xyz - center) / step).astype(np.int16)
-    values = {name: plane[indices] for name, plane in _byte_planes(frame).items()}
-    planes = [_differences(axis) for axis in steps.T]
-    planes += [plane.tobytes() for plane in values.values()]
+
+    data = bytearray()
+    for axis in steps.T:
+        data += _differences(axis)
+    planes = {}
+    for name, values in _byte_planes(frame).items():
+        planes[name] = values[indices]
+        data += planes[name].tobytes()
 
     about = {
         "name": frame.name,
@@ -103,24 +119,24 @@ def pack(frame: Frame) -> Packed:
         "note": _note(left_out, stride),
         "center": center.tolist(),
         "step": step.tolist(),
-        "planes": list(values),
+        "planes": list(planes),
     }
-    deflated = zlib.compress(b"".join(planes), 9)
     height, ground = _heights(xyz[:, 2])
+
     return Packed(
         about=about,
-        planes=base64.b64encode(deflated).decode("ascii"),
-        present=_class_ids(values, (*frame.labels, "truth")),
+        planes=base64.b64encode(zlib.compress(data, 9)).decode("ascii"),
+        present=_class_ids(planes, (*frame.labels, "truth")),
         height=height,
-        intensity=_bright(values["intensity"]),
+        intensity=_highest_intensity(planes["intensity"]),
         ground=ground,
     )
 
 
 def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
-    """Return the text of the page; the names of the user's files go in as JSON, or escaped."""
+    """Return the text of the page; names of the user's files are escaped, in HTML or in JSON."""
     style = _source("page.css")
-    script = "\n".join(_source(f"{name}.js") for name in SCRIPTS)
+    script = "\n".join(map(_source, SCRIPTS))
     policy = (
         f"default-src 'none'; style-src '{_hash(style)}'; script-src '{_hash(script)}'; "
         "img-src data:; base-uri 'none'; form-action 'none'"
@@ -157,6 +173,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     lowest = min(scan.height[0] for scan in packed)
     highest = max(scan.height[1] for scan in packed)
     brightest = max(scan.intensity for scan in packed)
+
     return {
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
@@ -182,6 +199,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
 def _byte_planes(frame: Frame) -> dict[str, np.ndarray]:
     """Return the values of the points other than positions, (N,) uint8 each."""
     planes = {"intensity": _to_bytes(np.nan_to_num(frame.points[:, 3]))}
+
     if frame.truth is not None:
         planes["truth"] = frame.truth.astype(np.uint8)
     for method, ids in frame.labels.items():
@@ -189,6 +207,7 @@ def _byte_planes(frame: Frame) -> dict[str, np.ndarray]:
     if frame.uncertain is not None and frame.disagreement is not None:
         planes["uncertain"] = frame.uncertain.astype(np.uint8)
         planes["disagreement"] = _to_bytes(frame.disagreement)
+
     return planes
 
 
@@ -201,6 +220,7 @@ def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the (3,) middle of the points, and the (3,) metres of one step of an int16."""
     if not len(xyz):
         return np.zeros(3), np.ones(3)
+
     low = xyz.min(axis=0)
     high = xyz.max(axis=0)
     return (low + high) / 2, np.maximum((high - low) / 2, 1e-3) / LEVELS
@@ -219,17 +239,18 @@ def _heights(z: np.ndarray) -> tuple[tuple[float, float], float]:
     """Return the range that most heights are in, and the height of the ground, in metres."""
     if not len(z):
         return (0.0, 1.0), 0.0
+
     low, high = np.percentile(z, (1, 99))
     return (float(low), float(high)), float(np.percentile(z, 10))
 
 
-def _bright(intensity: np.ndarray) -> float:
-    """Return the intensity in [0, 1] that only a few points exceed, from bytes."""
+def _highest_intensity(intensity: np.ndarray) -> float:
+    """Return the intensity in [0, 1] that only a few points exceed, given (N,) bytes."""
     return float(np.percentile(intensity, 98)) / 255 if len(intensity) else 1.0
 
 
 def _class_ids(planes: Mapping[str, np.ndarray], names: Sequence[str]) -> frozenset[int]:
-    """Return the class ids in the planes that have one of these names."""
+    """Return the class ids that appear in the planes with these names."""
     ids: set[int] = set()
     for name in names:
         if name in planes:
@@ -248,6 +269,7 @@ def _note(left_out: int, stride: int) -> str:
         notes.append(f"{left_out:,} without a place or beyond {REACH:g} m")
     if stride > 1:
         notes.append(f"one in {stride} of the scan")
+
     return "; ".join(notes)
 
 
@@ -266,7 +288,7 @@ def _source(name: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """Return what a content security policy says to allow this text and no other."""
+    """Return the name by which a content security policy allows this text and no other."""
     digest = hashlib.sha256(text.encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
 
@@ -279,6 +301,6 @@ def _json(tree: Any) -> str:
 def _fill(template: str, parts: Mapping[str, str]) -> str:
     """Replace each @@NAME@@ of a template by the part of that name.
 
-    Parts are not searched: one that contains @@NAME@@ itself stays as it is.
+    A part is never searched itself: any @@NAME@@ within it stays as it is.
     """
     return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], template)

@@ -132,20 +132,21 @@ def blueprint(frame: Frame) -> Any:
     """
     import rerun.blueprint as parts
 
-    has_errors = bool(frame.labels) and frame.truth is not None
+    has_errors = len(frame.labels) > 0 and frame.truth is not None
     has_uncertain = frame.uncertain is not None
-    titles = {method: title_of(method) for method in frame.labels}
+    labels = []
+    errors = []
+    for method in frame.labels:
+        title = title_of(method)
+        labels.append(_view(title, f"/labels/{method}"))
+        errors.append(_view(f"errors of {title}", "/points", f"/errors/{method}"))
 
     views = []
     if frame.truth is not None:
         views.append(_view("truth", "/truth"))
-    if titles:
-        labels = [_view(title, f"/labels/{method}") for method, title in titles.items()]
+    if labels:
         views.append(_tabs(labels))
     if has_errors:
-        errors = []
-        for method, title in titles.items():
-            errors.append(_view(f"errors of {title}", "/points", f"/errors/{method}"))
         views.append(_tabs(errors))
     if has_uncertain:
         views.append(_view("uncertain", "/points", "/uncertain"))

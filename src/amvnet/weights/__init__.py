@@ -1,6 +1,6 @@
 """Weights files, the hub and model cards.
 
-`load` and `Weights` are imported when they are first used: they need torch, the hub does not.
+`load` and `Weights` are imported on first use, so that importing this package is fast.
 """
 
 from __future__ import annotations

@@ -157,7 +157,10 @@ class Weights:
 
     def _load_part(self, part: str, module: torch.nn.Module) -> None:
         """Load the parameters of one part into its module, as float32."""
-        state = {key: tensor.float() for key, tensor in self.part(part).items()}
+        state = {}
+        for key, tensor in self.part(part).items():
+            state[key] = tensor.float()
+
         try:
             module.load_state_dict(state)
         except RuntimeError:
@@ -261,7 +264,10 @@ def _check_description(description: Any, path: Path) -> None:
 def built_in() -> dict[str, Path]:
     """Return the weights that come with the package, by name."""
     folder = Path(str(resources.files("amvnet"))) / "pretrained"
-    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+    paths = {}
+    for path in sorted(folder.glob("*.safetensors")):
+        paths[path.stem] = path
+    return paths
 
 
 def _find(name_or_path: str) -> Path:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, one_line_errors
 
 PREFIX = "hf-hub:"
 FILE = "model.safetensors"
@@ -65,23 +64,19 @@ def client() -> Any:
     return huggingface_hub
 
 
-@contextmanager
-def hub_errors(name: str, cure: str) -> Iterator[None]:
+def hub_errors(name: str, advice: str) -> AbstractContextManager[None]:
     """Turn any error of the hub's client into one line that says what to do.
 
     Args:
         name: the beginning of the message.
-        cure: what to do.
-
-    Raises:
-        InputError: if the block raises anything.
+        advice: what to do.
     """
-    try:
-        yield
-    # The types of the errors depend on the versions of the client and of its HTTP library.
-    except Exception as error:
-        message = str(error).strip()
-        reason = message.splitlines()[0].strip() if message else "no more"
-        raise InputError(
-            f"{name}: expected an answer of the hub, found {type(error).__name__}: {reason}; {cure}"
-        ) from None
+
+    # The classes of the errors depend on the version of the client, and of its HTTP library.
+    def message(error: BaseException) -> str:
+        lines = [line.strip() for line in str(error).splitlines()]
+        reason = next(filter(None, lines), "no more")
+        kind = type(error).__name__
+        return f"{name}: expected an answer of the hub, found {kind}: {reason}; {advice}"
+
+    return one_line_errors(message)

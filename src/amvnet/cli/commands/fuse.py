@@ -29,14 +29,14 @@ def fuse(
 
     Args:
         inputs: datasets, scan files, or folders of scans.
-        scores_a: folder of one model's class probabilities, an .npz or .npy of shape (N, K) for each
-            scan, where predict --scores writes its own.
+        scores_a: folder of one model's class probabilities, an .npz or .npy of shape (N, K) for
+            each scan, where predict --scores writes its own.
         scores_b: folder of the other model's.
         out: folder for the labels.
         head: weights with a point head, trained with these scores or with networks; without, the
             ensemble is used.
-        tau: points whose scores have a cosine similarity of at most this are uncertain; default: the
-            head's.
+        tau: points whose scores have a cosine similarity of at most this are uncertain; default:
+            the head's.
         key_a: which array of each .npz in --scores-a; not needed if there is one.
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.

@@ -48,17 +48,19 @@ def predict(
         sequences: of datasets, these sequences or scenes instead, with commas.
         scores: also write the probabilities of both networks.
         resume: continue an interrupted run into the folder.
-        format: of scan files' labels: raw ids alone (label, npy), or coloured points (ply, pcd, las).
+        format: of scan files' labels: raw ids alone (label, npy), or coloured points (ply, pcd,
+            las).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         device: cpu, cuda, cuda:1, ...
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or auto,
-            the fastest here.
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
+            auto, the fastest here.
         precision: of the networks; float16 on a GPU only.
         batch: scans that go through the networks at a time; more than one suits a GPU.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
-        sensor: of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured.
+        sensor: of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default:
+            measured.
         height: of scan files, the sensor's metres over the ground; default: measured.
         intensity_scale: of scan files, the largest possible intensity; default: 1, 255 or 65535 by
             the values.

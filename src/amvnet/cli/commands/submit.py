@@ -23,10 +23,10 @@ def submit(
     use_map: bool = False,
     use_external: bool = False,
 ) -> None:
-    """Pack predictions for the benchmark's server after checking them, or check an archive of any tool.
+    """Check and pack predictions for the benchmark's server, or check an archive of any tool.
 
     Args:
-        data: the data set, whose scans are the reference.
+        data: the dataset, whose scans are the reference.
         predictions: a folder of predictions in the benchmark's layout.
         out: the archive to write, NAME.zip.
         check: an archive to check instead.
@@ -38,27 +38,30 @@ def submit(
         use_map: nuScenes: the method was given the semantic map.
         use_external: nuScenes: the method was given data that are not of nuScenes.
     """
-    from amvnet.submission import pack as submission
+    from amvnet.submission import pack
     from amvnet.submission.rules import Sources, rules_for
 
     sources = Sources(use_camera, use_lidar, use_radar, use_map, use_external)
-    rules = rules_for(open_data(data, None), split, parse_names(sequences))
+    rules = rules_for(open_data(data), split, parse_names(sequences))
     if sources != Sources() and (check is not None or rules.meta is None):
         raise InputError(
             "expected no --use-... but to write an archive for nuScenes, found one; leave it out"
         )
+
     if check is not None and predictions is None and out is None:
         with progress("checking") as step:
-            found = submission.check(rules, check, step)
+            submission = pack.check(rules, check, step)
     elif predictions is not None and out is not None and check is None:
         with progress("packing") as step:
-            found = submission.write(rules, predictions, out, sources, step)
+            submission = pack.write(rules, predictions, out, sources, step)
     else:
         raise InputError(
-            "expected either --predictions and --out, or --check, found others; give one or the other"
+            "expected either --predictions and --out, or --check, found others; "
+            "give one or the other"
         )
     say(
-        f"{check or out}: {found.predictions} predictions of {rules.what} keep to the rules of {rules.taxonomy.name}"
+        f"{check or out}: {submission.predictions} predictions of {rules.what} "
+        f"keep to the rules of {rules.taxonomy.name}"
     )
-    for note in found.notes:
+    for note in submission.notes:
         say(f"note: {note}")

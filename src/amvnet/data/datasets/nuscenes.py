@@ -48,7 +48,9 @@ VAL = _scenes(
 
 
 class NuScenes:
-    """The LIDAR_TOP key frames of one version; a `Dataset`, which describes arguments and errors.
+    """The LIDAR_TOP key frames of one version of nuScenes.
+
+    `Dataset` documents the arguments and errors of the methods.
 
     Attributes:
         root: the folder that holds `samples/` and `v1.0-*/`.
@@ -164,7 +166,11 @@ class NuScenes:
 
     def _find_version(self, version: str | None) -> str:
         """Return the version to read: the one asked for, or the only one in the folder."""
-        present = sorted(path.name for path in self.root.glob("v1.0-*") if path.is_dir())
+        present = []
+        for path in sorted(self.root.glob("v1.0-*")):
+            if path.is_dir():
+                present.append(path.name)
+
         if version is None and len(present) == 1:
             return present[0]
         if version is not None and version in present:

@@ -42,7 +42,7 @@ def read_prediction(path: Path, dtype: DTypeLike, count: int, taxonomy: Taxonomy
 
 
 def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> None:
-    """Check the size of a file of labels; the message recognises another number type.
+    """Check the size of a file of labels; an error names the likely mistake.
 
     Args:
         name: the beginning of the message.
@@ -72,7 +72,7 @@ def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> Non
 
 
 def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarray:
-    """Turn raw ids into train ids; the message recognises another number type.
+    """Turn raw ids into train ids; an error names the likely mistake.
 
     Args:
         name: the beginning of the message.

@@ -18,7 +18,7 @@ from amvnet.scan import Scan
 
 @dataclass(frozen=True)
 class SemanticKitti:
-    """The scans in one folder; a `Dataset`, whose methods describe arguments and errors.
+    """A SemanticKITTI dataset. `Dataset` documents the arguments and errors of its methods.
 
     Attributes:
         root: the folder that holds `sequences/`, or `sequences` itself.
@@ -100,7 +100,10 @@ class SemanticKitti:
 
     def _present(self) -> tuple[str, ...]:
         """Return the names of the sequences on disk."""
-        return tuple(sorted(path.parent.name for path in self._folder.glob("*/velodyne")))
+        names = []
+        for path in self._folder.glob("*/velodyne"):
+            names.append(path.parent.name)
+        return tuple(sorted(names))
 
     def _count_points(self, record: ScanRecord) -> int:
         return files.count_rows(record.points_path, np.float32, files.KITTI_COLUMNS)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import FARTHEST, Scan
 
 # Points of one scan: 40 times as many as the largest sensors give. A header that claims more is
@@ -177,21 +177,13 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
     Raises:
         InputError: if the block raises anything but an interrupt or an exit.
     """
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            yield
-    except InputError:
-        raise
-    except BaseException as error:
-        # The panic of a Rust library is not an Exception. Neither is the user's interrupt, which
-        # must pass.
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-            raise
 
+    def message(error: BaseException) -> str:
         reason = " ".join(str(error).split())[:160] or type(error).__name__
-        raise InputError(
-            f"{path}: expected {expected}, found a broken one ({reason}); {advice}"
-        ) from None
+        return f"{path}: expected {expected}, found a broken one ({reason}); {advice}"
+
+    with warnings.catch_warnings(action="ignore"), one_line_errors(message):
+        yield
 
 
 def find_columns(names: Sequence[str]) -> dict[str, int]:

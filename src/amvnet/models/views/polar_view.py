@@ -95,13 +95,13 @@ class PolarView:
         x, y, z = batch.points[:, :3].double().unbind(1)
         radius = torch.sqrt(x * x + y * y)
         angle = torch.atan2(y, x)
-
         radial_cell, radius_offset = _cells(radius, c.radius_min, c.radius_max, c.radial)
         angular_cell, angle_offset = _cells(angle, -math.pi, math.pi, c.angular)
         voxel, height_offset = _cells(z, c.z_min, c.z_max, c.vertical)
 
         polar = torch.stack([radius_offset, angle_offset, height_offset, radius, angle, z], dim=1)
         features = torch.cat([polar.to(batch.points.dtype), batch.points[:, [0, 1, 3]]], dim=1)
+
         pillar = (batch.scan * c.radial + radial_cell) * c.angular + angular_cell
         occupied, (slot,) = occurring(batch.count * c.radial * c.angular, pillar)
         return PolarGrid(

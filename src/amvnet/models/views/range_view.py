@@ -13,7 +13,7 @@ from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 
 CHANNELS = 6  # x, y, z, intensity, range, mask
-_INDEX_BITS = 32  # `_nearest` sorts by keys with the range above a point's index of so many bits
+_INDEX_BITS = 32  # lower bits of a key of `_nearest`, for a point's index; the rest is its range
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,11 @@ class RangeView:
         pixel = (batch.scan * c.height + self.rows(batch)) * c.width + self.columns(batch)
         nearest = _nearest(distance, pixel, batch.count * c.height * c.width)
 
+        # A row of zeros at the end stands for pixels without a point.
         mask = torch.ones_like(distance)
         values = torch.cat([batch.points, distance[:, None], mask[:, None]], dim=1)
         padded = torch.cat([values, values.new_zeros(1, CHANNELS)])
-        image = padded.index_select(0, nearest % len(padded))  # -1, no point, is the last row
+        image = padded.index_select(0, nearest % len(padded))  # -1 selects the last row
         image = image.view(batch.count, c.height, c.width, CHANNELS).permute(0, 3, 1, 2)
         return RangeImage(image, pixel, nearest)
 
@@ -109,6 +110,7 @@ def _nearest(distance: Tensor, pixel: Tensor, pixels: int) -> Tensor:
     # distance and its point.
     index = torch.arange(len(distance), device=distance.device)
     key = (distance.float().view(torch.int32).long() << _INDEX_BITS) | index
+
     empty = torch.iinfo(torch.int64).max
     least = torch.full((pixels,), empty, device=key.device).scatter_reduce_(0, pixel, key, "amin")
     return torch.where(least == empty, -1, least & ((1 << _INDEX_BITS) - 1))

@@ -1,0 +1,546 @@
+"""Check that two states of this project compute the same results, to the bit.
+
+    python benchmarks/same_results.py make OUT [--real FOLDER]
+    python benchmarks/same_results.py compare BEFORE AFTER
+
+`make` runs the installed amvnet (or that of PYTHONPATH) through its command line and its public
+functions, keeps what they write in OUT, and writes OUT/digests.json: a digest of each array,
+tensor, figure and graph. Dates, durations, versions and progress text are left out. `--real` adds
+real scans; FOLDER has semantickitti/ and nuscenes/ in the layout of their benchmarks, and formats/
+with scan files of other formats.
+
+`compare` prints what differs between two such folders, by how much if they still hold the files,
+and exits with 1 if anything does. Both must come from one machine and the same libraries.
+
+`make` takes about eleven minutes on one core, two of them for the real scans.
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import csv
+import hashlib
+import json
+import os
+import re
+import resource
+import shlex
+import subprocess
+import sys
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from safetensors import safe_open
+
+DIGESTS = "digests.json"
+LOG = "log.txt"  # what the commands say
+REAL = "real"  # a link to the real scans, so that no output names their place
+CACHE = "cache"  # of exported networks
+
+# Files with nothing to compare. Checkpoints and TensorBoard's curves hold times; the weights and
+# the metrics.csv of each stage have what matters of them.
+LEFT_OUT = {REAL, CACHE, LOG, DIGESTS}
+LEFT_OUT_ANYWHERE = ("*.ckpt", "*.tfevents.*")
+
+# Entries of JSON and YAML files that differ between equal runs or between installations.
+VOLATILE = {"seconds", "made_by", "versions", "python"}
+
+# One thread: sums over several would depend on how they share the work.
+SETTINGS = {
+    "OMP_NUM_THREADS": "1",
+    "OMP_WAIT_POLICY": "passive",
+    "COLUMNS": "10000",  # no option's help is broken into lines
+    "PYTHONSAFEPATH": "1",  # no folder of OUT is taken for a package
+}
+
+METHODS = ("rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet")
+
+# Networks of a few thousand parameters, every kind of augmentation, a head that learns from views.
+TINY = """
+base: {base}
+model:
+  range_view: {{width: 256}}
+  polar_view: {{radial: 32, angular: 32, vertical: 8}}
+  range_net: {{stem: 8, widths: {widths}, decoder: 16, head: 16, dropout: 0.1}}
+  polar_net: {{point_widths: [8, 16], pillar: 8, widths: [16, 16]}}
+  assertion: {{threshold: 0.95}}
+  point_head: {{neighbours: 4, hidden: [8, 8], fc: 8}}
+training:
+  rv: {{epochs: 2, batch: 2, lr: 0.02}}
+  bev: {{epochs: 2, batch: 2, lr: 0.02, accumulate: 2}}
+  head: {{epochs: 2, batch: 64, lr: 0.05, points: 4000, views: 1}}
+  augment: {{height: 0.1, intensity: 0.2, no_intensity: 0.3, drop: 0.1, mix: 0.5}}
+  precision: {precision}
+  accelerator: cpu
+"""
+RECIPES = {
+    "kitti.yaml": TINY.format(
+        base="semantickitti-compact", widths=[8, 8, 16, 16, 16, 16, 16], precision="32-true"
+    ),
+    "nuscenes.yaml": TINY.format(
+        base="nuscenes-compact", widths=[8, 8, 16, 16, 16, 16], precision="bf16-mixed"
+    ),
+}
+
+# Each line is a command of amvnet, run in OUT.
+COMMANDS = """
+simulate city64 --sequences 3 --scans 1 --seed 5 --processes 1
+simulate city32 --sequences 3 --scans 2 --seed 6 --processes 1 --sensor hdl32e
+
+# Labels of the built-in weights, by every method
+predict city64 --weights sim-hdl64e --scores --method rv --out labels/64/rv
+predict city64 --weights sim-hdl64e --scores --method bev --out labels/64/bev
+predict city64 --sequences 00 --weights sim-hdl64e --method arithmetic --out labels/64/arithmetic
+predict city64 --sequences 00 --weights sim-hdl64e --method maximum --out labels/64/maximum
+predict city64 --sequences 00 --weights sim-hdl64e --method ensemble --out labels/64/ensemble
+predict city64 --weights sim-hdl64e --scores --uncertain --out labels/64/amvnet
+predict city32 --weights sim-hdl32e --scores --uncertain --out labels/32/amvnet
+predict city32 --weights sim-hdl32e --method ensemble --batch 2 --out labels/32/batch
+predict city32 --sequences simulated-0000 --weights sim-hdl32e --precision bfloat16 --scores \
+    --out labels/32/bfloat16
+
+# Lone scans: each format of labels; a sensor that is measured, named and described
+predict city64/sequences/00/velodyne --weights sim-hdl64e --uncertain --out lone/label
+predict city64/sequences/00/velodyne --weights sim-hdl64e --format ply --out lone/ply
+predict city64/sequences/00/velodyne --weights sim-hdl64e --format pcd --uncertain \
+    --sensor os1-64 --height 1.2 --out lone/pcd
+predict city64/sequences/00/velodyne --weights sim-hdl64e --format las --axes y-forward \
+    --rotate 0,5,0 --offset 0.5,0,0.1 --intensity-scale 2 --out lone/las
+predict city64/sequences/00/velodyne --weights sim-hdl32e --format npy --out lone/npy
+
+# Figures and pictures
+evaluate city64 --split all --weights sim-hdl64e --json figures/64.json \
+    --methods rv,bev,arithmetic,maximum,ensemble,amvnet
+evaluate city32 --sequences simulated-0000 --weights sim-hdl32e --json figures/32.json \
+    --pictures figures/32 --methods rv,bev,arithmetic,maximum,ensemble,amvnet
+evaluate city64 --split all --predictions labels/64/amvnet --json figures/files.json
+analyze city64 --split all --weights sim-hdl64e --out figures/analysis
+
+# Two models' scores
+fuse city64 --scores-a labels/64/rv --scores-b labels/64/bev --out fused/ensemble
+fuse city64 --scores-a labels/64/amvnet --scores-b labels/64/amvnet --key-a rv --key-b bev \
+    --head sim-hdl64e --tau 0.7 --out fused/head
+rank city64 --weights sim-hdl64e --out rank/next.csv
+rank city32 --weights sim-hdl32e --by labels --out rank/suspects.csv --pictures rank/suspects
+
+# What others read
+view city64 --weights sim-hdl64e --scans 2 --html pages/weights.html
+view city32 --labels labels/32/amvnet --scans 2 --html pages/labels.html
+submit city64 --sequences 00 --predictions labels/64/amvnet --out archives/64.zip
+submit city32 --sequences simulated-0000 --predictions labels/32/amvnet --use-external \
+    --out archives/32.zip
+
+# Training
+train kitti.yaml --data city64 --out runs/kitti --train-sequences 00,01 --val-sequences 02
+train nuscenes.yaml --data city32 --out runs/folds --training.head.folds 2 --training.workers 1
+train kitti.yaml --data city64 --out runs/entropy --stage head --init runs/kitti \
+    --train-sequences 00,01 --val-sequences 02 --training.head.class_weights true \
+    --model.assertion.name entropy --model.assertion.threshold 1.5
+train kitti.yaml --data city64 --out runs/scores --stage head --with-val \
+    --scores-a labels/64/amvnet --scores-b labels/64/amvnet --key-a rv --key-b bev
+ablate nuscenes.yaml --data city32 --out runs/ablation --training.rv.epochs 1
+analyze city64 --sequences 02 --weights runs/kitti --out runs/analysis --neighbours 2 \
+    --recipe kitti.yaml --train-sequences 00,01
+predict city64 --sequences 02 --weights runs/kitti --scores --uncertain --out labels/trained
+predict city64 --sequences 02 --weights runs/kitti --engine onnx --out labels/onnx
+
+# Graphs
+export --weights sim-hdl64e --out graphs/64
+export --weights sim-hdl64e --out graphs/64-int8 --int8 city64
+export --weights sim-hdl32e --out graphs/32
+"""
+REAL_COMMANDS = f"""
+predict {REAL}/semantickitti --weights sim-hdl64e --out real-labels/kitti
+predict {REAL}/nuscenes --weights sim-hdl32e --scores --uncertain --out real-labels/nuscenes
+predict {REAL}/formats --weights sim-hdl64e --scores --uncertain --out real-labels/formats64
+predict {REAL}/formats --weights sim-hdl32e --scores --uncertain --out real-labels/formats32
+evaluate {REAL}/semantickitti --split all --predictions real-labels/kitti --json figures/kitti.json
+"""
+
+# Options and their defaults are read from the help of each verb, and of `train` with each recipe.
+VERBS = (
+    *("demo", "simulate", "train", "predict", "evaluate", "submit", "fuse", "rank"),
+    *("analyze", "ablate", "export", "view", "bench", "info"),
+)
+BUILT_IN_RECIPES = (
+    *("semantickitti", "semantickitti-no-rnn", "semantickitti-polarnet"),
+    *("semantickitti-compact", "semantickitti-no-rnn-compact", "semantickitti-polarnet-compact"),
+    *("nuscenes", "nuscenes-no-rnn", "nuscenes-polarnet"),
+    *("nuscenes-compact", "nuscenes-no-rnn-compact", "nuscenes-polarnet-compact"),
+    *("simulated", "simulated-compact", "simulated-hdl32e-compact"),
+)
+
+Part = np.ndarray | str
+
+
+def main() -> int:
+    """Run a verb; return the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    making = verbs.add_parser("make", help="run everything and digest the results")
+    making.add_argument("out", type=Path, metavar="OUT", help="a new folder")
+    making.add_argument("--real", type=Path, metavar="FOLDER", help="real scans")
+    comparing = verbs.add_parser("compare", help="print what differs")
+    comparing.add_argument("before", type=Path, metavar="BEFORE")
+    comparing.add_argument("after", type=Path, metavar="AFTER")
+    verbs.add_parser("library", help="what `make` runs within OUT to use the public functions")
+    arguments = parser.parse_args()
+
+    if arguments.verb == "make":
+        make(arguments.out, arguments.real)
+        return 0
+    if arguments.verb == "compare":
+        return compare(arguments.before, arguments.after)
+    use_library()
+    return 0
+
+
+# ---- running
+
+
+def make(out: Path, real: Path | None) -> None:
+    """Run all commands in a new folder, and digest what they write."""
+    if out.exists():
+        sys.exit(f"{out}: expected no such folder, found one; give another")
+
+    out.mkdir(parents=True)
+    if real is not None:
+        (out / REAL).symlink_to(real.resolve())
+    for name, text in RECIPES.items():
+        (out / name).write_text(text)
+
+    run = Runner(out)
+    print(f"measuring {run.installed()}")
+    save_help(run, out / "help")
+    for words in commands(COMMANDS + (REAL_COMMANDS if real else "")):
+        run("-m", "amvnet", *words)
+    run(str(Path(__file__).resolve()), "library")
+
+    digests = {"exit codes": run.codes}
+    for path in files_to_digest(out):
+        parts = read_parts(out / path)
+        digests[path] = {name: digest(part) for name, part in parts.items()}
+    (out / DIGESTS).write_text(json.dumps(digests, indent=1))
+    print(f"{len(digests)} files in {out / DIGESTS}")
+
+
+def save_help(run: Runner, folder: Path) -> None:
+    """Write what `--help` prints, a file for each verb and for each recipe."""
+    folder.mkdir()
+    for verb in VERBS:
+        (folder / f"{verb}.help").write_text(run("-m", "amvnet", verb, "--help"))
+    for recipe in BUILT_IN_RECIPES:
+        text = run("-m", "amvnet", "train", recipe, "--help")
+        (folder / f"train-{recipe}.help").write_text(text)
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """Yield the words of each command, without comments."""
+    for line in text.replace("\\\n", " ").splitlines():
+        if words := shlex.split(line, comments=True):
+            yield words
+
+
+class Runner:
+    """Runs Python programs in a folder, one after the other.
+
+    Attributes:
+        codes: exit code of each program, by its words.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.codes: dict[str, str] = {}
+        self.environment = os.environ | SETTINGS | {"AMVNET_CACHE": str(folder.resolve() / CACHE)}
+        if "PYTHONPATH" in os.environ:  # its folders may be relative to this one
+            paths = os.environ["PYTHONPATH"].split(os.pathsep)
+            self.environment["PYTHONPATH"] = os.pathsep.join(map(os.path.abspath, paths))
+
+    def __call__(self, *words: str) -> str:
+        """Run a program, print its CPU time and, if it fails, why; return its output."""
+        shown = shlex.join([Path(words[0]).name, *words[1:]]).removeprefix("-m ")
+        started = cpu_seconds()
+        done = subprocess.run(
+            (sys.executable, *words),
+            check=False,
+            cwd=self.folder,
+            env=self.environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        print(f"{cpu_seconds() - started:6.1f} s  {shown}", flush=True)
+
+        self.codes[shown] = str(done.returncode)
+        with (self.folder / LOG).open("a") as log:
+            log.write(f"$ {shown}\n{done.stdout}\n")
+        if done.returncode:
+            tail = "\n".join(done.stdout.splitlines()[-5:])
+            print(f"exit code {done.returncode}:\n{tail}", flush=True)
+        return done.stdout
+
+    def installed(self) -> str:
+        """Return the path of the package that is measured."""
+        command = (sys.executable, "-c", "import amvnet; print(amvnet.__file__)")
+        return subprocess.check_output(command, env=self.environment, text=True).strip()
+
+
+def cpu_seconds() -> float:
+    """Return the CPU time of the programs so far; unlike time, it leaves out what others run."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def use_library() -> None:
+    """Save what the public functions return, in the folder `library`."""
+    import amvnet  # here alone: `make` and `compare` need none
+
+    folder = Path("library")
+    folder.mkdir()
+    amvnet.simulate(folder / "city", sensor="hdl32e", sequences=2, scans=1, seed=7, processes=2)
+
+    points = np.fromfile("city64/sequences/00/velodyne/000000.bin", np.float32).reshape(-1, 4)
+    points[::1000] = np.nan  # lost returns
+    for method in METHODS:
+        result = amvnet.load("sim-hdl64e", method=method)(points)
+        save_segmentation(folder / f"{method}.npz", result)
+
+    result = amvnet.load("sim-hdl64e")(points)
+    labels = amvnet.fuse(points, result.rv, result.bev, head="sim-hdl64e", tau=0.7)
+    np.savez(folder / "fused.npz", labels=labels)
+
+
+def save_segmentation(path: Path, result: Any) -> None:
+    """Save the arrays of a Segmentation."""
+    arrays: dict[str, np.ndarray] = {}
+    for name in ("labels", "uncertain", "scores", "rv", "bev"):
+        array = getattr(result, name)
+        if array is not None:  # a single network has no scores of the other
+            arrays[name] = array
+    np.savez(path, **arrays)
+
+
+# ---- reading what was written
+
+
+def files_to_digest(out: Path) -> list[str]:
+    """List the files below a folder that are compared, relative to it."""
+    files: list[str] = []
+    for path in sorted(out.rglob("*")):
+        name = path.relative_to(out)
+        left_out = name.parts[0] in LEFT_OUT or any(map(name.match, LEFT_OUT_ANYWHERE))
+        if path.is_file() and not left_out:
+            files.append(str(name))
+    return files
+
+
+def digest(part: Part) -> str:
+    """Return the SHA-256 of a part of a file; of an array also by its type and shape."""
+    if isinstance(part, str):
+        return hashlib.sha256(part.encode()).hexdigest()
+    head = f"{part.dtype.str} {part.shape} ".encode()
+    return hashlib.sha256(head + part.tobytes()).hexdigest()
+
+
+def read_parts(path: Path) -> dict[str, Part]:
+    """Read what is compared of a file: its arrays, its figures, or all of its bytes."""
+    read = READERS.get(path.suffix, read_bytes)
+    return read(path)
+
+
+def read_bytes(path: Path) -> dict[str, Part]:
+    return {"bytes": hashlib.sha256(path.read_bytes()).hexdigest()}
+
+
+def read_labels(path: Path) -> dict[str, Part]:
+    """Read the raw ids of SemanticKITTI."""
+    return {"labels": np.fromfile(path, np.uint32)}
+
+
+def read_points_or_labels(path: Path) -> dict[str, Part]:
+    """Read points, or the labels of nuScenes, which have the same ending."""
+    if path.stem.endswith("_lidarseg"):
+        return {"labels": np.fromfile(path, np.uint8)}
+    return {"points": np.fromfile(path, np.float32)}
+
+
+def read_array(path: Path) -> dict[str, Part]:
+    return {"array": np.load(path)}
+
+
+def read_arrays(path: Path) -> dict[str, Part]:
+    with np.load(path) as arrays:
+        return dict(arrays)
+
+
+def read_weights(path: Path) -> dict[str, Part]:
+    """Read the tensors of a weights file, and its description."""
+    with safe_open(path, "numpy") as file:
+        parts = flatten(json.loads(file.metadata()["amvnet"]), "description.")
+        for name in file.keys():  # noqa: SIM118  not a dictionary
+            parts[name] = file.get_tensor(name)
+    return parts
+
+
+def read_json(path: Path) -> dict[str, Part]:
+    return flatten(json.loads(path.read_text()))
+
+
+def read_yaml(path: Path) -> dict[str, Part]:
+    return flatten(yaml.safe_load(path.read_text()))
+
+
+def flatten(tree: Any, prefix: str = "") -> dict[str, Part]:
+    """Return the leaves of nested dictionaries by their path, as JSON; lists count as leaves."""
+    if not isinstance(tree, dict):
+        return {prefix.removesuffix("."): json.dumps(tree)}
+
+    leaves: dict[str, Part] = {}
+    for key, value in tree.items():
+        if key not in VOLATILE:
+            leaves |= flatten(value, f"{prefix}{key}.")
+    return leaves
+
+
+def read_table(path: Path) -> dict[str, Part]:
+    """Read the columns of a CSV file, without speeds."""
+    with path.open(newline="") as file:
+        head, *rows = csv.reader(file)
+
+    parts: dict[str, Part] = {}
+    for name, *values in zip(head, *rows, strict=True):
+        if not name.endswith("/s"):
+            parts[name] = " ".join(values)
+    return parts
+
+
+def read_help(path: Path) -> dict[str, Part]:
+    """Read the options of a verb, with their types and defaults; without what is said of them."""
+    text = re.sub(r"\bamvnet[\w.]*\.", "", path.read_text())  # a class may move to another module
+    parts: dict[str, Part] = {}
+    for option in re.split(r"\n  (?=-)", text)[1:]:
+        name, *_ = option.split()
+        type_and_default = re.search(r"\((?:required|type:|default:).*\)", option)
+        parts[name] = type_and_default[0] if type_and_default else ""
+    return parts
+
+
+def read_page(path: Path) -> dict[str, Part]:
+    """Read the scans and their description within a page of `view`."""
+    parts: dict[str, Part] = {}
+    elements = re.findall(
+        r'<script type="(\S+)" id="(\S+)">(.*?)</script>', path.read_text(), re.DOTALL
+    )
+    for kind, name, text in elements:
+        if kind == "application/json":
+            parts |= flatten(json.loads(text), f"{name}.")
+        else:
+            parts[name] = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8)
+    return parts
+
+
+def read_archive(path: Path) -> dict[str, Part]:
+    parts = read_bytes(path)
+    with zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            parts[name] = hashlib.sha256(archive.read(name)).hexdigest()
+    return parts
+
+
+def read_graph(path: Path) -> dict[str, Part]:
+    """Read an ONNX file: its bytes, and to tell why they differ its operators and its tensors."""
+    import onnx
+
+    graph = onnx.load(path).graph
+    parts = read_bytes(path) | {"operators": " ".join(node.op_type for node in graph.node)}
+    for tensor in graph.initializer:
+        parts[tensor.name] = onnx.numpy_helper.to_array(tensor)
+    return parts
+
+
+READERS: dict[str, Callable[[Path], dict[str, Part]]] = {
+    ".label": read_labels,
+    ".bin": read_points_or_labels,
+    ".npy": read_array,
+    ".npz": read_arrays,
+    ".safetensors": read_weights,
+    ".json": read_json,
+    ".yaml": read_yaml,
+    ".csv": read_table,
+    ".help": read_help,
+    ".html": read_page,
+    ".zip": read_archive,
+    ".onnx": read_graph,
+}
+
+
+# ---- comparing
+
+
+def compare(before: Path, after: Path) -> int:
+    """Print what differs between the results in two folders; return 1 if anything does, else 0."""
+    old = json.loads((before / DIGESTS).read_text())
+    new = json.loads((after / DIGESTS).read_text())
+    paths = sorted(old.keys() | new.keys())
+    differing = 0
+
+    for path in paths:
+        if path not in old or path not in new:
+            differing += 1
+            print(f"{path}: only in {before if path in old else after}")
+        elif old[path] != new[path]:
+            differing += 1
+            for line in differences(old[path], new[path], before / path, after / path):
+                print(f"{path}: {line}")
+
+    print(f"{differing} of {len(paths)} files differ")
+    return 1 if differing else 0
+
+
+def differences(
+    old: dict[str, str], new: dict[str, str], before: Path, after: Path
+) -> Iterator[str]:
+    """Yield a line for each part of a file whose digests differ."""
+    old_parts: dict[str, Part] = {}
+    new_parts: dict[str, Part] = {}
+    if before.is_file() and after.is_file():
+        old_parts = read_parts(before)
+        new_parts = read_parts(after)
+
+    for name in sorted(old.keys() | new.keys()):
+        if name not in new:
+            yield f"{name} is only in the first"
+        elif name not in old:
+            yield f"{name} is only in the second"
+        elif old[name] != new[name]:
+            # Without the files, their digests are shown. Exit codes are their own digests.
+            old_part = old_parts.get(name, old[name])
+            new_part = new_parts.get(name, new[name])
+            yield f"{name} differs{how(old_part, new_part)}"
+
+
+def how(old: Part, new: Part) -> str:
+    """Say by how much two parts differ."""
+    if isinstance(old, str) or isinstance(new, str):
+        return f": {old[:60]} -> {new[:60]}"
+    if (old.shape, old.dtype) != (new.shape, new.dtype):
+        return f": {old.dtype} {old.shape} -> {new.dtype} {new.shape}"
+
+    unequal = old != new
+    text = f" in {np.count_nonzero(unequal):,} of {old.size:,} values"
+    if old.dtype.kind == "f":
+        largest = np.nanmax(np.abs(old.astype(np.float64) - new), initial=0)
+        text += f", by {largest:.3g} at most"
+    return text
+
+
+if __name__ == "__main__":
+    sys.exit(main())
