@@ -153,7 +153,9 @@ def test_a_tau_above_those_that_are_swept_is_analyzed(
 
 def test_every_method_is_scored_as_by_the_segmenter(dataset: Dataset, weights: Weights) -> None:
     matrices = analyze_08(dataset, weights).evaluation.matrices
-    expected = {method: np.zeros((K + 1, K + 1), np.int64) for method in matrices}
+    expected: dict[str, np.ndarray] = {}
+    for method in matrices:
+        expected[method] = np.zeros((K + 1, K + 1), np.int64)
     for record in dataset.records(["08"]):
         scan = dataset.read(record)
         result = Segmenter(weights)(scan)
@@ -226,10 +228,13 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
     assert not torch.equal(two.tensors[name], five.tensors[name])
 
     # The heads are not trained a second time.
-    last_files = [out / f"neighbours/{count}/head/last.safetensors" for count in (2, 5)]
-    times = [path.stat().st_mtime_ns for path in last_files]
+    two_last = out / "neighbours/2/head/last.safetensors"
+    five_last = out / "neighbours/5/head/last.safetensors"
+    two_time = two_last.stat().st_mtime_ns
+    five_time = five_last.stat().st_mtime_ns
     succeed(command)
-    assert [path.stat().st_mtime_ns for path in last_files] == times
+    assert two_last.stat().st_mtime_ns == two_time
+    assert five_last.stat().st_mtime_ns == five_time
 
     save(fresh_weights(seed=1), world / "other.safetensors")
     assert "networks" in refusal(command.replace("weights.safetensors", "other.safetensors"))
@@ -274,8 +279,9 @@ def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -
     assert load(out / "rv-gru-weights/weights.safetensors").model.range_net.gru
 
     # One network and the table are unfinished: the table becomes the same again.
-    last_files = [out / "rv/rv/last.safetensors", out / "rv-gru/rv/last.safetensors"]
-    ends = [path.read_bytes()[-1000:] for path in last_files]
+    ends = {}
+    for path in (out / "rv/rv/last.safetensors", out / "rv-gru/rv/last.safetensors"):
+        ends[path] = path.read_bytes()[-1000:]
     text = (out / "ablation.md").read_text()
     (out / "rv-gru/rv/done").unlink()
     (out / "ablation.md").unlink()
@@ -284,4 +290,5 @@ def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -
 
     make_streets(world / "data2", ("02", "03", "08"))
     assert "scans" in refusal(command.replace(f"{world}/data", f"{world}/data2"))
-    assert [path.read_bytes()[-1000:] for path in last_files] == ends
+    for path, end in ends.items():
+        assert path.read_bytes()[-1000:] == end

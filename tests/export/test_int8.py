@@ -86,12 +86,17 @@ def read_points(path: Path) -> np.ndarray:
     return np.fromfile(path, np.float32).reshape(-1, 4)
 
 
+def nodes_by_output(model: Any) -> dict[str, Any]:
+    """Return the nodes of a graph by the name of their first output."""
+    return {node.output[0]: node for node in model.graph.node}
+
+
 def kernels(model: Any) -> dict[str, Kernel]:
     """Return each convolution's kernel by its name."""
     from onnx import numpy_helper
 
     stored = {value.name: numpy_helper.to_array(value) for value in model.graph.initializer}
-    node_of = {node.output[0]: node for node in model.graph.node}  # by its first output
+    nodes = nodes_by_output(model)
 
     by_name = {}
     for node in model.graph.node:
@@ -101,7 +106,7 @@ def kernels(model: Any) -> dict[str, Kernel]:
         if name in stored:
             by_name[name] = Kernel(stored[name])
         else:
-            integers, scale = node_of[name].input[:2]
+            integers, scale = nodes[name].input[:2]
             by_name[integers.removesuffix("_quantized")] = Kernel(stored[integers], stored[scale])
     return by_name
 
@@ -129,12 +134,12 @@ def test_convolutions_hold_integers_nearest_to_their_weights(exported: Folders, 
 
 def test_the_gru_stays_in_float32(exported: Folders) -> None:
     model = load_model(exported.int8, "range_net")
-    type_of = {node.output[0]: node.op_type for node in model.graph.node}  # by its first output
+    nodes = nodes_by_output(model)
     layers = [node for node in model.graph.node if node.op_type == "GRU"]
     assert layers
     for layer in layers:
         for weights in layer.input[1:3]:
-            assert type_of.get(weights) != "DequantizeLinear"
+            assert weights not in nodes or nodes[weights].op_type != "DequantizeLinear"
 
 
 def test_the_description_says_which_graphs_are_in_int8(exported: Folders, scans: Path) -> None:

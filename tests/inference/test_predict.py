@@ -120,7 +120,7 @@ def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> N
         for scan_input in inputs:
             if scan_input.name == "3":
                 raise InputError("3: broken")
-        return [no_segmentation(scan) for scan in scans]
+        return list(map(no_segmentation, scans))
 
     execution = ExecutionOptions(batch=4)
     pipeline = Pipeline(segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
@@ -268,7 +268,7 @@ def test_few_scans_are_in_memory_however_many_there_are(
         ExecutionOptions(at_once=at_once),
     )
     done = [scan.name for scan, fault in pipeline.stream(scans) if fault is None]
-    assert done == [str(index) for index in range(30)]
+    assert done == list(map(str, range(30)))
     assert counter.most <= 2 * AHEAD + 2 * at_once
     assert not counter.in_memory
 
@@ -289,9 +289,10 @@ def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
 
     def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
         barrier.wait()
-        return [no_segmentation(scan) for scan in scans]
+        return list(map(no_segmentation, scans))
 
     execution = ExecutionOptions(at_once=2)
     pipeline = Pipeline(segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
-    scans = counted_scans(2, Counter())
-    assert [fault for _, fault in pipeline.stream(scans)] == [None, None]
+    first, second = pipeline.stream(counted_scans(2, Counter()))
+    assert first[1] is None
+    assert second[1] is None
