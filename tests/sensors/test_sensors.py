@@ -20,7 +20,7 @@ from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import MEASURED, ScanAdapter
-from amvnet.sensors.lidars import AXES, HEIGHTS, SENSORS, Sensor, make_sensor, rotation
+from amvnet.sensors.lidars import AXES, HEIGHTS, SENSORS, Sensor, make_sensor, rotation_from_degrees
 from amvnet.sensors.measure import ground_height, measure
 from amvnet.simulation.sensors import HDL32E, HDL64E
 from amvnet.weights.file import save
@@ -140,7 +140,7 @@ def test_any_frame_that_is_described_gives_the_same_scan(
     points, _ = place(LASERS["os1-64"], 1.2)
     points[5] = 0
     expected = _fitting()[0](_cloud(points), "a")
-    matrix, offset = rotation(*turn) @ np.array(AXES[axes], float), np.array([0.1, -0.2, 0.4])
+    matrix, offset = rotation_from_degrees(*turn) @ np.array(AXES[axes], float), np.array([0.1, -0.2, 0.4])
     there = (points[:, :3] - offset) @ matrix  # the inverse of matrix @ there + offset
     there[5] = 0
     sensor = Sensor(axes=axes, rotate=turn, offset=(0.1, -0.2, 0.4))
@@ -151,13 +151,13 @@ def test_any_frame_that_is_described_gives_the_same_scan(
 
 def test_rotations_are_yaw_pitch_and_roll() -> None:
     np.testing.assert_allclose(
-        rotation(90, 0, 0) @ [1, 0, 0], [0, 1, 0], atol=1e-12
+        rotation_from_degrees(90, 0, 0) @ [1, 0, 0], [0, 1, 0], atol=1e-12
     )  # ahead comes to the left
     np.testing.assert_allclose(
-        rotation(0, 90, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-12
+        rotation_from_degrees(0, 90, 0) @ [1, 0, 0], [0, 0, -1], atol=1e-12
     )  # ahead comes down
     np.testing.assert_allclose(
-        rotation(0, 0, 90) @ [0, 1, 0], [0, 0, 1], atol=1e-12
+        rotation_from_degrees(0, 0, 90) @ [0, 1, 0], [0, 0, 1], atol=1e-12
     )  # left comes up
     for axes in AXES.values():
         assert np.linalg.det(np.array(axes)) == pytest.approx(1)  # no mirror
