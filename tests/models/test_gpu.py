@@ -17,9 +17,9 @@ from torch import Tensor, nn
 
 from amvnet import Scan, Segmenter, simulate
 from amvnet.data.scan_files import read_scan
+from amvnet.inference.inputs import adapter_for
 from amvnet.inference.journal import Journal
 from amvnet.inference.pipeline import AHEAD, Task, stream
-from amvnet.inference.predict import ScanAdapter
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import merge
 from amvnet.models.neighbours import nearest_others
@@ -391,7 +391,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(ScanAdapter(weights).given),
+        "sensor": repr(adapter_for(weights).sensor),
         "scores": False,
         "uncertain": False,
         "format": "label",
