@@ -23,8 +23,8 @@ from amvnet.sensors.measure import SensorGeometry, elevations, measure
 MEASURED = 5  # scans of a recording that are measured; later ones get the median of these
 STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
 SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
-LOWEST = 0.3  # metres: a lower origin of the coordinates is a place on the ground, not the sensor
-OUTSIDE = 0.16  # share of points outside the weights' field of view that makes it too narrow
+LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
+OUTSIDE = 0.16  # share of points outside a field of view from which on it is too narrow
 SAME_ANGLE = 6.0  # degrees: fields of view are alike if both ends differ by less
 SAME_BEAMS = 1.4  # factor: numbers of lasers are alike if they differ by less
 KEYS = ("beams", "fov_up", "fov_down", "height")  # attributes of a SensorGeometry
@@ -37,8 +37,8 @@ class _Recording:
     Attributes:
         measurements: of the first scans, at most `MEASURED`.
         is_steady: whether the measured heights agree.
-        is_learnt: whether there are no more scans to measure for `measurements`.
-        is_reported: whether the user was told what is assumed.
+        is_learnt: whether `measurements` is complete; later scans add nothing to it.
+        is_reported: whether the user was told what was assumed.
     """
 
     measurements: list[SensorGeometry] = field(default_factory=list)
@@ -110,6 +110,7 @@ class ScanAdapter:
         scale = self._intensity_scale(cloud)
         scan = _level(cloud, self.sensor).to_scan(scale)
         valid = scan.valid
+
         recording = self._recording(source, scale)
         geometry = _override(recording.measure(scan, valid), self.sensor)
         moved = _raise_points(scan, self._rise(geometry))
@@ -126,7 +127,7 @@ class ScanAdapter:
         return dataclasses.replace(moved, ring=self._rows(seen, valid, view))
 
     def learn(self, source: str, first: Sequence[Callable[[], Cloud]]) -> None:
-        """Measure the first scans of a source; its other scans then change no measurement.
+        """Measure the first scans of a source; later scans add no measurements.
 
         Args:
             first: functions that read these scans; broken scans are left out.
@@ -152,6 +153,7 @@ class ScanAdapter:
         """Return how far to move a scan up, metres."""
         if geometry.height is None or self._trained_height is None:
             return 0.0
+
         rise = geometry.height - self._trained_height
         return 0.0 if abs(rise) < SAME_HEIGHT else rise
 
@@ -169,6 +171,7 @@ class ScanAdapter:
             ends = None if lasers is None else _field_of_view(lasers)
             if ends is None:
                 return None
+            # The highest and the lowest laser get the first and the last row.
             view = _by_elevation(view, ends, view.height - 1)
 
         elevation = elevations(points[:, :3].astype(np.float64))
@@ -208,11 +211,13 @@ class ScanAdapter:
         ]
         if cloud.note:
             assumed.insert(0, cloud.note)
+
         line = f"{cloud.name}: assumed {', '.join(assumed)}"
 
         trained = self._trained_sensor
         if trained is None or self._is_like(trained, geometry):
             return line
+
         return (
             f"{line}; the weights were trained for {trained.name} ({_describe_lasers(trained)}) "
             "and have seen no such sensor"
@@ -221,6 +226,7 @@ class ScanAdapter:
     def _describe_height(self, geometry: SensorGeometry) -> str:
         if geometry.height is None:
             return "no ground to measure the height by (give --height)"
+
         text = f"sensor {geometry.height:.2f} m over the ground"
         rise = self._rise(geometry)
         if rise:
@@ -236,6 +242,7 @@ class ScanAdapter:
             ratio = geometry.beams / trained.beams
             if not 1 / SAME_BEAMS < ratio < SAME_BEAMS:
                 return False
+
         return _is_near(geometry.fov_up, trained.fov_up) and _is_near(
             geometry.fov_down, trained.fov_down
         )
@@ -245,6 +252,7 @@ def _level(cloud: Cloud, sensor: Sensor) -> Cloud:
     """Return the cloud in the package's axes; lost points, at the file's origin, stay lost."""
     if sensor.level:
         return cloud
+
     xyz = sensor.to_level(cloud.xyz)
     xyz[(cloud.xyz == 0).all(axis=1)] = np.nan
     return dataclasses.replace(cloud, xyz=xyz)
@@ -254,12 +262,13 @@ def _raise_points(scan: Scan, rise: float) -> Scan:
     """Return the scan moved up by some metres."""
     if not rise:
         return scan
+
     offset = np.array([0, 0, rise, 0], np.float32)
     return dataclasses.replace(scan, points=scan.points + offset)
 
 
 def _field_of_view(sensor: Sensor | SensorGeometry) -> tuple[float, float] | None:
-    """Return the upper and the lower end in degrees; None if they are unknown or coincide."""
+    """Return the upper and the lower end, degrees; None if one is unknown or they are swapped."""
     if sensor.fov_up is None or sensor.fov_down is None or sensor.fov_up <= sensor.fov_down:
         return None
     return sensor.fov_up, sensor.fov_down
@@ -305,6 +314,7 @@ def _override(measured: SensorGeometry, sensor: Sensor) -> SensorGeometry:
         value = getattr(sensor, key)
         if value is not None:
             known[key] = value
+
     return dataclasses.replace(measured, **known)
 
 
@@ -323,6 +333,7 @@ def _is_near(angle: float | None, trained_angle: float | None) -> bool:
 def _describe_intensity(cloud: Cloud, scale: float | None) -> str:
     if cloud.intensity is None or scale is None:
         return "no intensity"
+
     return f"intensity 0 to {scale:g}"
 
 
@@ -330,4 +341,5 @@ def _describe_lasers(sensor: Sensor | SensorGeometry) -> str:
     lasers = "lasers" if sensor.beams is None else f"{sensor.beams} lasers"
     if sensor.fov_up is None or sensor.fov_down is None:
         return lasers if sensor.beams else "field of view not found"
+
     return f"{lasers} from {sensor.fov_up:+.0f} to {sensor.fov_down:+.0f} degrees"
