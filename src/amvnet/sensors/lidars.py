@@ -91,6 +91,7 @@ class Sensor:
         """
         if self.level:
             return xyz
+
         axes = np.array(AXES[self.axes], dtype=np.float64)
         turn = rotation_from_degrees(*self.rotate) @ axes
         return xyz.astype(np.float64) @ turn.T + np.array(self.offset)
@@ -157,6 +158,7 @@ def make_sensor(sensor: str | None = None, **options: Any) -> Sensor:
         InputError: if there is no such sensor or file, or a value is impossible.
     """
     base = Sensor() if sensor is None else _read_sensor(sensor)
+
     changes = {key: value for key, value in options.items() if value is not None}
     return dataclasses.replace(base, **_convert(changes, are_options=True))
 
@@ -179,6 +181,7 @@ def _read_sensor(text: str) -> Sensor:
         raise InputError(
             f"{path}: expected a YAML file that describes a sensor, found none; check it"
         ) from None
+
     if not isinstance(tree, Mapping):
         raise InputError(
             f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md"
@@ -213,6 +216,7 @@ def _convert(values: Mapping[Any, Any], are_options: bool = False) -> dict[str, 
             raise InputError(
                 f"{title}: expected {_example(key)}, found {value!r}; correct the value"
             ) from None
+
     return attributes
 
 
@@ -224,6 +228,7 @@ def _converter(key: str) -> Callable[[Any], Any]:
         return _to_whole
     if key in ("rotate", "offset"):
         return _to_triple
+
     return float
 
 
@@ -232,6 +237,7 @@ def _example(key: str) -> str:
         return "yaw,pitch,roll such as 90,0,0"
     if key == "offset":
         return "x,y,z such as 0,0,1.2"
+
     return "a number"
 
 
