@@ -81,6 +81,7 @@ class ScoreFolder:
         """
         path = self.find(prediction)
         scores = self._load(path)
+
         if scores.shape != (len(scan), classes):
             has_other_column = scores.shape[-1:] == (classes + 1,)
             advice = (
@@ -90,6 +91,7 @@ class ScoreFolder:
                 f"{path}: expected scores of shape ({len(scan)}, {classes}), one row per point and "
                 f"one column per class, found {scores.shape}; {advice}"
             )
+
         if scores.dtype.kind != "f":
             raise InputError(
                 f"{path}: expected float scores, found {scores.dtype}; save class probabilities"
@@ -111,6 +113,7 @@ class ScoreFolder:
             content = np.load(path, allow_pickle=False)
             if isinstance(content, np.ndarray):
                 return content
+
             with content:
                 return np.asarray(content[self._choose_key(path, content.files)])
 
@@ -166,11 +169,13 @@ class ScorePair:
         settings = {}
         for scores in (self.a, self.b):
             settings[scores.side] = {**asdict(scores), "folder": str(scores.folder)}
+
         return settings
 
     def options(self) -> list[str]:
         """Return the command-line options that give this pair."""
         folders = (self.a, self.b)
+
         options = []
         for scores in folders:
             options += [f"--scores-{scores.side}", str(scores.folder)]
@@ -199,6 +204,7 @@ def check_probabilities(values: np.ndarray, name: str, advice: str) -> None:
         InputError: if a value is negative or not finite, or a row does not add up to 1.
     """
     check_finite(values, name)
+
     sums = values.sum(axis=1)
     is_wrong = (np.abs(sums - 1) > ROUNDING) | (values < 0).any(axis=1)
     if not is_wrong.any():
@@ -232,6 +238,7 @@ def _softmax(logits: np.ndarray) -> np.ndarray:
 def _digest(scores: ScoreFolder, records: Sequence[ScanRecord]) -> str:
     """Return a digest of the scores of some scans, by the size and the end of each file."""
     digest = hashlib.sha256(repr((scores.key, scores.logits)).encode())
+
     for record in records:
         path = scores.find(Path(record.prediction))
         size = path.stat().st_size
@@ -239,4 +246,5 @@ def _digest(scores: ScoreFolder, records: Sequence[ScanRecord]) -> str:
             file.seek(max(size - TAIL, 0))
             end = file.read()
         digest.update(f"{record.name} {size} ".encode() + end)
+
     return digest.hexdigest()[:16]
