@@ -60,6 +60,7 @@ class Processes:
         """Return the values of all processes, by rank. Every process must call this."""
         if self.size == 1:
             return [value]
+
         values: list[Any] = [None] * self.size
         dist.all_gather_object(values, value, group=self.group)
         return values
@@ -72,6 +73,7 @@ class Processes:
         """Return the device of this process: its own GPU if several processes share `cuda`."""
         if name == "cuda" and self.size > 1:
             return f"cuda:{self.local_rank}"
+
         return name
 
 
@@ -88,9 +90,11 @@ def environment() -> ClusterEnvironment:
 
     if TorchElasticEnvironment.detect():
         return TorchElasticEnvironment()
+
     if _slurm_tasks() > 1 and SLURMEnvironment.detect():
         # A job that is queued again continues only if the user says --resume.
         return SLURMEnvironment(auto_requeue=False)
+
     return LightningEnvironment()
 
 
@@ -98,6 +102,7 @@ def started() -> int:
     """Return how many processes were started for this job, by the environment variables."""
     if dist.is_torchelastic_launched():
         return int(os.environ.get("WORLD_SIZE", "1"))
+
     return _slurm_tasks()
 
 
@@ -105,6 +110,7 @@ def _slurm_tasks() -> int:
     """Return the number of tasks that srun has started; 1 in the script of a job itself."""
     if "SLURM_STEP_ID" not in os.environ:
         return 1
+
     return int(os.environ.get("SLURM_NTASKS", "1"))
 
 
@@ -129,6 +135,7 @@ def join(cuda: bool = False) -> Processes:
         torch.cuda.set_device(local_rank)
     dist.init_process_group("nccl" if cuda else "gloo", rank=rank, world_size=size)
     atexit.register(dist.destroy_process_group)
+
     group = dist.new_group(backend="gloo", timeout=PATIENCE)
     return Processes(rank, size, local_rank, _node_count(size), group)
 
@@ -138,6 +145,7 @@ def _node_count(size: int) -> int:
     local_size = os.environ.get("LOCAL_WORLD_SIZE")
     if local_size:
         return size // int(local_size)
+
     return int(os.environ.get("SLURM_NNODES", "1"))
 
 
