@@ -38,6 +38,7 @@ class Scan:
                 f"{self.name or 'scan'}: expected points of shape (N, 4) with columns x, y, z, "
                 f"intensity, found {self.points.shape}; reorder or pad the columns"
             )
+
         self._check_count("labels", self.labels)
         self._check_count("ring indices", self.ring)
 
@@ -45,6 +46,7 @@ class Scan:
         """Raise an InputError unless there is one value per point, or no values at all."""
         if values is None or values.shape == (len(self.points),):
             return
+
         count = values.shape[0] if values.ndim else "one number"
         raise InputError(
             f"{self.name or 'scan'}: expected {len(self.points)} {kind}, one per point, "
