@@ -45,9 +45,10 @@ class Journal:
             self._remove_old_files()
         processes.wait()
 
-        with atomic_write(self.path) as part:
-            lines = [dict(settings), *sorted(self.done)]
-            part.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+        with atomic_write(self.path) as part, part.open("w") as file:
+            file.write(_to_line(dict(settings)))
+            for name in sorted(self.done):
+                file.write(_to_line(name))
 
     def _read_all(self, settings: dict[str, Any]) -> set[str]:
         """Return the names that the interrupted run's journals hold, if it had these settings."""
@@ -58,8 +59,9 @@ class Journal:
                 changed = ", ".join(_changed_keys(earlier_settings, settings))
                 raise InputError(
                     f"{self.folder}: expected the settings of the interrupted run, found another "
-                    f"{changed}; resume it with its own, or leave --resume out to start over"
+                    f"{changed}; resume it with the same, or leave --resume out to start over"
                 )
+
             done.update(names)
         return done
 
@@ -73,7 +75,7 @@ class Journal:
     def add(self, name: str) -> None:
         """Write down that a scan is done."""
         with self.path.open("a") as file:
-            file.write(f"{json.dumps(name)}\n")
+            file.write(_to_line(name))
 
     def close(self) -> None:
         """Remove the journal at the end of the run."""
@@ -81,22 +83,31 @@ class Journal:
         self.path.unlink(missing_ok=True)
 
 
+def _to_line(value: Any) -> str:
+    return f"{json.dumps(value)}\n"
+
+
 def _read(path: Path) -> tuple[Any, list[str]]:
-    """Return the settings and the names in a journal.
+    """Return the settings and the names in a journal; None for settings that cannot be read."""
+    lines = path.read_text(errors="replace").splitlines(keepends=True)
+    settings = _from_line(lines[0]) if lines else None
 
-    The last line may be unfinished if the process was killed. Lines that are unfinished or
-    unreadable are skipped; settings that cannot be read are None.
-    """
-    values: list[Any] = []
-    for line in path.read_text(errors="replace").splitlines(keepends=True):
-        try:
-            values.append(json.loads(line) if line.endswith("\n") else None)
-        except ValueError:
-            values.append(None)
+    names = []
+    for line in lines[1:]:
+        name = _from_line(line)
+        if isinstance(name, str):
+            names.append(name)
+    return settings, names
 
-    if not values:
-        return None, []
-    return values[0], [value for value in values[1:] if isinstance(value, str)]
+
+def _from_line(line: str) -> Any:
+    """Return the value in a line; None if a killed process left it unfinished, or it is corrupt."""
+    if not line.endswith("\n"):
+        return None
+    try:
+        return json.loads(line)
+    except ValueError:
+        return None
 
 
 def _changed_keys(earlier: Any, settings: dict[str, Any]) -> list[str]:
