@@ -48,6 +48,7 @@ REAL = os.environ.get("AMVNET_REAL_DATA")
 def test_lasers_field_of_view_and_height_are_measured(name: str, height: float) -> None:
     points, laser = place(LASERS[name], height)
     by_laser = np.argsort(laser, kind="stable")
+
     for table, ring in ((points, None), (points[by_laser], None), (points, laser)):
         geometry = measure(table, ring)
         assert geometry.beams == len(LASERS[name])
@@ -96,6 +97,7 @@ def test_real_sensors_have_the_height_that_is_known(name: str, beams: int) -> No
         geometry = measure(scan.points[scan.valid], scan.ring)
         assert geometry.beams == beams
         assert geometry.height is not None
+
         heights.append(geometry.height)
 
     expected = HEIGHTS[f"hdl{beams}e"]
@@ -132,9 +134,9 @@ def test_the_sensor_is_moved_to_the_height_of_the_training(height: float) -> Non
     points, _ = place(LASERS["os1-64"], height)
     adapter, _ = make_adapter()
     scan = adapter(make_cloud(points), "a")
-
     np.testing.assert_array_equal(scan.points[:, [0, 1, 3]], points[:, [0, 1, 3]])
     assert ground_height(scan.points[:, :3].astype(np.float64)) == pytest.approx(1.73, abs=0.05)
+
     rise = scan.points[:, 2] - points[:, 2]
     assert rise.max() - rise.min() < 1e-5
     assert np.all(rise == 0) == (height == 1.73)
@@ -161,6 +163,7 @@ def test_any_frame_that_is_described_gives_the_same_scan(
     matrix = rotation_from_degrees(*turn) @ np.array(AXES[axes], float)
     file_xyz = (points[:, :3] - offset) @ matrix  # the inverse of matrix @ file_xyz + offset
     file_xyz[5] = 0
+
     adapter, _ = make_adapter(Sensor(axes=axes, rotate=turn, offset=offset))
     scan = adapter(Cloud(file_xyz, points[:, 3], None, "a.pcd"), "a")
 
@@ -210,6 +213,7 @@ def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None
         rows_of_laser = np.unique(ring[laser == index])
         assert len(rows_of_laser) == 1
         rows.append(rows_of_laser[0])
+
     assert (np.diff(rows) >= 0).all()
     assert set(np.bincount(rows).tolist()) <= {3, 4, 5}  # 64 lasers on the 16 rows of these weights
 
@@ -220,6 +224,7 @@ def test_weights_with_rings_as_rows_get_the_rings_of_the_training(kind: str) -> 
     rings = {"none": None, "right": laser, "reversed": 31 - laser}
     adapter, _ = make_adapter(trained_for="hdl32e", is_nuscenes=True)
     ring = adapter(make_cloud(points, rings[kind]), "a").ring
+
     assert ring is not None
     np.testing.assert_array_equal(ring, laser)
 
@@ -231,6 +236,7 @@ def test_weights_of_an_unknown_sensor_get_rings_if_the_lasers_can_be_told_apart(
 
     np.testing.assert_array_equal(adapter(make_cloud(points), "a").ring, laser)
     assert adapter(make_cloud(fewer_lasers), "b").ring is None
+
     scan = adapter(make_cloud(points, 31 - laser), "c")
     np.testing.assert_array_equal(scan.ring, 31 - laser)
 
@@ -271,6 +277,7 @@ def test_scans_of_one_source_keep_one_height() -> None:
     for seed, height in enumerate((1.0, 1.0, 1.1, 1.0, 1.0, 1.1, 1.1, 1.1, 1.1, 1.1)):
         points, _ = place(LASERS["os1-64"], height, seed=seed)
         rises.append(rise_of(adapter, points, "drive"))
+
     assert np.ptp(rises[MEASURED:]) < 1e-5
     assert rises[-1] == pytest.approx(1.0 - 1.73, abs=0.03)
 
@@ -287,10 +294,11 @@ def test_scans_of_two_robots_in_one_source_get_their_own_heights() -> None:
 def test_a_scan_whose_origin_is_on_the_ground_or_below_is_moved(up: float) -> None:
     points, _ = place(HDL64E.elevations, 1.73)
     raised = points + np.array([0, 0, up, 0], np.float32)
+
     adapter, _ = make_adapter()
-    assert_alike(
-        adapter(make_cloud(raised), "raised"), adapter(make_cloud(points), "level"), atol=0.05
-    )
+    scan = adapter(make_cloud(raised), "raised")
+    expected = adapter(make_cloud(points), "level")
+    assert_alike(scan, expected, atol=0.05)
 
 
 COORDINATE = (
@@ -321,10 +329,12 @@ def test_any_numbers_end_in_a_scan_or_one_line(
     points = np.array(rows * repeated, np.float32).reshape(-1, 4)
     cloud = make_cloud(points, np.arange(len(points)) % 40 if has_ring else None)
     adapter, _ = make_adapter(sensor, trained_for, is_nuscenes)
+
     with contextlib.suppress(InputError):
         for _ in range(2):
             scan = adapter(cloud, "a")
             assert len(scan) == len(points)
+
             assert not scan.valid[(points[:, :3] == 0).all(axis=1)].any()
             intensity = scan.points[scan.valid, 3]
             assert ((intensity >= 0) & (intensity <= 1)).all()
@@ -339,9 +349,9 @@ def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
         "beams: 16\nfov_up: 15\nfov_down: -15\nheight: 0.4\naxes: z-forward\nrotate: [0, -5, 0]\n"
     )
     lasers = Sensor("robot", 16, 15, -15)
-    assert make_sensor(str(path)) == replace(
-        lasers, height=0.4, axes="z-forward", rotate=(0, -5, 0)
-    )
+    expected = replace(lasers, height=0.4, axes="z-forward", rotate=(0, -5, 0))
+    assert make_sensor(str(path)) == expected
+
     assert make_sensor(str(path), height=0.5, offset="0,0,1e-1").height == 0.5
     assert make_sensor(None, rotate="90, 0,0").rotate == (90, 0, 0)
     assert make_sensor("vlp16") == SENSORS["vlp16"]
@@ -421,6 +431,7 @@ def test_labels_stand_at_the_lines_of_their_points(
 
     options = ("--weights", world / f"{weights}.safetensors", "--out", tmp_path)
     assert run_cli("predict", path, *options)[0] == 0
+
     labels = np.fromfile(tmp_path / "a.label", np.uint32)
     assert len(labels) == len(points)
     assert np.array_equal(labels == 0, is_lost)
@@ -493,6 +504,7 @@ def test_scans_of_datasets_are_not_adapted(tmp_path: Path) -> None:
 
     options = ("--weights", weights, "--height", 0.5, "--axes", "z-forward")
     assert run_cli("predict", data, *options, "--out", tmp_path / "out")[0] == 0
+
     labels = np.fromfile(tmp_path / "out/sequences/00/predictions/000000.label", np.uint32)
     expected = Segmenter(str(weights))(points).labels
     np.testing.assert_array_equal(labels, SEMANTICKITTI.to_raw(expected))
