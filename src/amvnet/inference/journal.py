@@ -15,7 +15,7 @@ PATTERN = ".unfinished-*.jsonl"  # one file per process; a run that ends removes
 
 
 class Journal:
-    """The names of the scans that are done, each written down after its output.
+    """A file with the names of the scans that are done, each added after its output.
 
     Args:
         folder: of the output.

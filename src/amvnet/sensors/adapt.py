@@ -158,21 +158,14 @@ class ScanAdapter:
         return 0.0 if abs(rise) < SAME_HEIGHT else rise
 
     def _row_view(self, points: np.ndarray, geometry: SensorGeometry) -> RangeViewConfig | None:
-        """Return a range view that gives (P, 4) points their rows by elevation.
+        """Return the range view that gives (P, 4) points their rows by elevation.
 
-        It has the field of view of the weights, or that of the scan if too many points are outside.
-        None if rows are lasers and their elevations are unknown.
+        It is that of the weights, but with the sensor's field of view if too many points are
+        outside. None if the rows are lasers and their elevations are unknown.
         """
-        view = self._view
-        if view.rows == "ring":
-            lasers: Sensor | SensorGeometry | None = self._trained_sensor
-            if lasers is None and geometry.beams == view.height:
-                lasers = geometry
-            ends = None if lasers is None else _field_of_view(lasers)
-            if ends is None:
-                return None
-            # The highest and the lowest laser get the first and the last row.
-            view = _by_elevation(view, ends, view.height - 1)
+        view = self._trained_view(geometry)
+        if view is None:
+            return None
 
         elevation = elevations(points[:, :3].astype(np.float64))
         is_outside = (elevation > view.fov_up) | (elevation < view.fov_down)
@@ -180,6 +173,22 @@ class ScanAdapter:
         if is_outside.mean() < OUTSIDE or ends is None:
             return view
         return _by_elevation(view, ends, view.height)
+
+    def _trained_view(self, geometry: SensorGeometry) -> RangeViewConfig | None:
+        """Return the range view of the weights with rows by elevation.
+
+        If the rows are lasers, the highest one gets the first row and the lowest one the last.
+        None if their elevations are unknown.
+        """
+        view = self._view
+        if view.rows != "ring":
+            return view
+
+        lasers: Sensor | SensorGeometry | None = self._trained_sensor
+        if lasers is None and geometry.beams == view.height:
+            lasers = geometry
+        ends = None if lasers is None else _field_of_view(lasers)
+        return None if ends is None else _by_elevation(view, ends, view.height - 1)
 
     def _rows(
         self, scan: Scan, valid: np.ndarray, view: RangeViewConfig | None
@@ -203,7 +212,7 @@ class ScanAdapter:
         return all_rows
 
     def _report(self, cloud: Cloud, scale: float | None, geometry: SensorGeometry) -> str:
-        """Return the line that says what was assumed, and whether the weights know the sensor."""
+        """Return a line on what was assumed, and whether the weights have seen such a sensor."""
         assumed = [
             _describe_intensity(cloud, scale),
             self._describe_height(geometry),
