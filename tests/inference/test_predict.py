@@ -214,7 +214,7 @@ def test_a_part_of_a_folder_is_labelled_as_in_the_whole(
 def settings_of(world: Path) -> dict[str, object]:
     weights = Segmenter(str(world / WEIGHTS)).weights
     parts = {part: weights.digest(part) for part in weights.parts}
-    sensor = repr(adapter_for(weights).given)
+    sensor = repr(adapter_for(weights).sensor)
     kept = {"scores": False, "uncertain": False, "format": "label"}
     return {"weights": parts, "method": "amvnet", "sensor": sensor, **kept}
 

@@ -401,7 +401,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(adapter_for(weights).given),
+        "sensor": repr(adapter_for(weights).sensor),
         "scores": False,
         "uncertain": False,
         "format": "label",

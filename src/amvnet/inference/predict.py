@@ -83,7 +83,7 @@ def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter)
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": segmenter.method,
-        "sensor": repr(adapter.given),
+        "sensor": repr(adapter.sensor),
         "scores": output.scores,
         "uncertain": output.uncertain,
         "format": output.kind,
