@@ -1,4 +1,7 @@
-"""Exported graphs say what torch says, and the runner needs no torch. Skipped without ONNX Runtime."""
+"""Exported graphs say what torch says, and the runner needs no torch.
+
+Skipped without ONNX Runtime.
+"""
 
 from __future__ import annotations
 
@@ -9,49 +12,76 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.export import onnx as onnx_export
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.methods import Method
+from amvnet.models.methods import MethodName
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights, save
 
-from fixtures.worlds import commands_of, fails, files, fresh_weights, run_cli, street, without
+from fixtures.worlds import (
+    commands_of,
+    fails,
+    files,
+    fresh_weights,
+    refusal,
+    run_cli,
+    street,
+    succeed,
+    without,
+)
 
-DOCS = Path(__file__).parents[2] / "docs"
+PROJECT = Path(__file__).parents[2]
 POINTS = 6000
-TAXONOMIES = {"elevation": SEMANTICKITTI, "ring": NUSCENES}  # by what fresh_weights' rows are
+TAXONOMIES = {"elevation": SEMANTICKITTI, "ring": NUSCENES}  # by the rows of `fresh_weights`
+
+
+@dataclass(frozen=True)
+class Export:
+    """Weights, and the folder of their exported graphs, which no test may change."""
+
+    weights: Weights
+    folder: Path
+
+
+Exports = dict[str, Export]  # by what the rows of the range image are
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Weights, Path]]:
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Exports:
     for library in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(library)
-    from amvnet.export.onnx import export
 
-    found = {}
+    exports = {}
     for rows, taxonomy in TAXONOMIES.items():
-        found[rows] = fresh_weights(taxonomy), tmp_path_factory.mktemp(rows)
-        assert 0 <= max(export(*found[rows]).differences.values()) <= 1e-4
-    return found
+        weights = fresh_weights(taxonomy)
+        folder = tmp_path_factory.mktemp(rows)
+        differences = onnx_export.export(weights, folder).differences
+        assert 0 <= max(differences.values()) <= 1e-4
+        exports[rows] = Export(weights, folder)
+    return exports
 
 
 @pytest.fixture
-def folder(exported: dict[str, tuple[Weights, Path]], tmp_path: Path) -> Path:
+def folder(exported: Exports, tmp_path: Path) -> Path:
     """A copy that a test may break."""
-    return Path(shutil.copytree(exported["elevation"][1], tmp_path / "copy"))
+    return shutil.copytree(exported["elevation"].folder, tmp_path / "copy")
 
 
-def scan_of(seed: int, count: int = POINTS) -> Scan:
-    """A street with lost returns, points beyond the grid, two in one place, and rings."""
-    points = street(seed, count)[0]
+def make_scan(seed: int, count: int = POINTS) -> Scan:
+    """Return a street with rings, lost returns, points beyond the grid, and points in one place."""
+    points, _ = street(seed, count)
     rng = np.random.default_rng(seed)
     points[rng.integers(0, count, count // 50), 0] = np.nan
     points[rng.integers(0, count, count // 50), :3] *= 5
@@ -61,199 +91,237 @@ def scan_of(seed: int, count: int = POINTS) -> Scan:
 
 @pytest.mark.parametrize("rows", TAXONOMIES)
 @pytest.mark.parametrize("count", [6, 700, POINTS])
-def test_the_runner_says_what_torch_says(
-    exported: dict[str, tuple[Weights, Path]], rows: str, count: int
-) -> None:
-    weights, folder = exported[rows]
-    scan = scan_of(count, count)
-    expected, found = Segmenter(weights)(scan), OnnxSegmenter(folder)(scan.points, scan.ring)
+def test_the_runner_says_what_torch_says(exported: Exports, rows: str, count: int) -> None:
+    scan = make_scan(count, count)
+    expected = Segmenter(exported[rows].weights)(scan)
     assert expected.uncertain.any()
-    assert count < POINTS or not expected.uncertain[scan.valid].all()
-    same = expected.uncertain == found.uncertain
+    if count == POINTS:
+        assert not expected.uncertain[scan.valid].all()
+
+    actual = OnnxSegmenter(exported[rows].folder)(scan.points, scan.ring)
+    same = expected.uncertain == actual.uncertain
     assert same.mean() >= 0.9999
-    assert (expected.labels == found.labels).mean() >= 0.9999
-    assert np.abs(expected.scores - found.scores)[same].max() <= 1e-4
-    assert found.labels.dtype == np.uint8
-    assert found.scores.dtype == np.float32
-    assert not found.labels[~scan.valid].any()
-    assert not found.scores[~scan.valid].any()
+    assert (expected.labels == actual.labels).mean() >= 0.9999
+    assert np.abs(expected.scores - actual.scores)[same].max() <= 1e-4
+    assert actual.labels.dtype == np.uint8
+    assert actual.scores.dtype == np.float32
+    assert not actual.labels[~scan.valid].any()
+    assert not actual.scores[~scan.valid].any()
 
 
 @pytest.mark.parametrize("rows", TAXONOMIES)
-def test_the_networks_alone_say_what_torch_says(
-    exported: dict[str, tuple[Weights, Path]], rows: str
-) -> None:
-    weights, folder = exported[rows]
-    scan, runner = scan_of(7), OnnxSegmenter(folder)
-    expected, valid = Segmenter(weights)(scan), scan.valid
+def test_the_networks_alone_say_what_torch_says(exported: Exports, rows: str) -> None:
+    scan = make_scan(7)
+    valid = scan.valid
+    expected = Segmenter(exported[rows].weights)(scan)
     assert scan.ring is not None
     assert expected.rv is not None
     assert expected.bev is not None
+
+    runner = OnnxSegmenter(exported[rows].folder)
     f = runner.score_range_view(scan.points[valid], scan.ring[valid])
+    g = runner.score_polar_view(scan.points[valid])
     assert np.abs(f - expected.rv[valid]).max() <= 1e-4
-    assert np.abs(runner.score_polar_view(scan.points[valid]) - expected.bev[valid]).max() <= 1e-4
+    assert np.abs(g - expected.bev[valid]).max() <= 1e-4
 
 
 @pytest.mark.parametrize("method", ["ensemble", "rv", "bev"])
 def test_other_methods_say_what_torch_says(
-    exported: dict[str, tuple[Weights, Path]], folder: Path, method: Method
+    exported: Exports, folder: Path, method: MethodName
 ) -> None:
-    _change(folder, "method", to=method)
-    scan = scan_of(3)
-    expected = Segmenter(exported["elevation"][0], method=method)(scan)
-    found = OnnxSegmenter(folder)(scan.points)
-    assert (expected.labels == found.labels).mean() >= 0.9999
-    assert (expected.uncertain == found.uncertain).mean() >= 0.9999
+    change(folder, "method", to=method)
+    scan = make_scan(3)
+    expected = Segmenter(exported["elevation"].weights, method=method)(scan)
+    actual = OnnxSegmenter(folder)(scan.points)
+    assert (expected.labels == actual.labels).mean() >= 0.9999
+    assert (expected.uncertain == actual.uncertain).mean() >= 0.9999
 
 
-def test_the_description_says_what_a_program_needs(
-    exported: dict[str, tuple[Weights, Path]],
-) -> None:
+# ---- the files
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / "amvnet.json").read_text())
+
+
+def change(folder: Path, *keys: str, to: object) -> None:
+    """Change the value under some keys of a description, from the outermost key to the inmost."""
+    description = read_description(folder)
+    parent = description
+    for key in keys[:-1]:
+        parent = parent[key]
+    parent[keys[-1]] = to
+    (folder / "amvnet.json").write_text(json.dumps(description))
+
+
+def test_the_description_says_what_a_program_needs(exported: Exports) -> None:
+    description = read_description(exported["ring"].folder)
+    names = []
+    for train_id, described in enumerate(description["classes"]):
+        names.append(described["name"])
+        assert described["raw_id"] == NUSCENES.train_to_raw[train_id]
+        assert tuple(described["color"]) == NUSCENES.colors[train_id]
+    assert names[1:] == list(NUSCENES.classes)
+
+    model = exported["ring"].weights.model
+    assert description["sensor"] == "tiny"
+    assert description["range_view"]["rows"] == "ring"
+    assert len(description["range_channels"]) == 6
+    assert len(description["polar_features"]) == 9
+    assert description["assertion"]["threshold"] == model.assertion.threshold
+    assert description["point_head"] == {
+        "neighbours": 4,
+        "position_scale": model.point_head.position_scale,
+    }
+
+    graphs = description["graphs"]
+    uncertain, rows = graphs["point_head"]["inputs"]
+    assert uncertain["shape"] == ["uncertain", 36]
+    assert rows["shape"] == ["uncertain", 4, 36]
+    assert graphs["polar_map"]["outputs"][0]["shape"][2:] == [12, 16]
+    assert graphs["polar_scores"]["outputs"][0]["shape"] == ["pillars", 4 * 16]
+
+
+def test_the_description_is_that_of_the_graphs(exported: Exports) -> None:
     import onnx
 
-    weights, folder = exported["ring"]
-    said = json.loads((folder / "amvnet.json").read_text())
-    assert [one["name"] for one in said["classes"][1:]] == list(NUSCENES.classes)
-    assert [one["raw_id"] for one in said["classes"]] == list(NUSCENES.train_to_raw)
-    assert [tuple(one["color"]) for one in said["classes"]] == list(NUSCENES.colors)
-    assert said["range_view"]["rows"] == "ring"
-    assert said["sensor"] == "tiny"
-    assert said["assertion"]["threshold"] == weights.model.assertion.threshold
-    assert said["point_head"] == {
-        "neighbours": 4,
-        "position_scale": weights.model.point_head.position_scale,
-    }
-    assert len(said["polar_features"]) == 9
-    assert len(said["range_channels"]) == 6
-    for name, graph in said["graphs"].items():
+    folder = exported["ring"].folder
+    description = read_description(folder)
+    for name, graph in description["graphs"].items():
         model = onnx.load(folder / graph["file"])
-        assert {one.domain: one.version for one in model.opset_import}[""] == said["opset"], name
-        for ours, theirs in (
-            (graph["inputs"], model.graph.input),
-            (graph["outputs"], model.graph.output),
-        ):
-            shapes = [
-                [d.dim_param or d.dim_value for d in one.type.tensor_type.shape.dim]
-                for one in theirs
-            ]
-            assert [one["shape"] for one in ours] == shapes, name
-            assert [one["name"] for one in ours] == [one.name for one in theirs], name
-    shapes = {
-        name: [one["shape"] for one in graph["inputs"]] for name, graph in said["graphs"].items()
-    }
-    assert shapes["point_head"] == [["uncertain", 36], ["uncertain", 4, 36]]
-    assert said["graphs"]["polar_map"]["outputs"][0]["shape"][2:] == [12, 16]
-    assert said["graphs"]["polar_scores"]["outputs"][0]["shape"] == ["pillars", 4 * 16]
+        opsets = {opset.domain: opset.version for opset in model.opset_import}
+        assert opsets[""] == description["opset"], name
+        check_values(graph["inputs"], model.graph.input)
+        check_values(graph["outputs"], model.graph.output)
 
 
-def test_the_graphs_say_nothing_of_the_machine(exported: dict[str, tuple[Weights, Path]]) -> None:
-    for path in exported["elevation"][1].iterdir():
+def check_values(described: list[dict[str, Any]], values: Any) -> None:
+    """Check the description of the inputs or outputs of a graph."""
+    assert len(described) == len(values)
+    for description, value in zip(described, values, strict=True):
+        dims = value.type.tensor_type.shape.dim
+        assert description["name"] == value.name
+        assert description["shape"] == [dim.dim_param or dim.dim_value for dim in dims], value.name
+
+
+def test_the_graphs_say_nothing_of_the_machine(exported: Exports) -> None:
+    for path in exported["elevation"].folder.iterdir():
         data = path.read_bytes()
-        for word in (str(Path(__file__).parents[2]), sys.prefix, "site-packages"):
+        for word in (str(PROJECT), sys.prefix, "site-packages"):
             assert word.encode() not in data, path.name
 
 
-def test_the_runner_needs_no_torch(
-    exported: dict[str, tuple[Weights, Path]], tmp_path: Path
-) -> None:
-    weights, folder = exported["elevation"]
-    scan = scan_of(5)
-    np.save(tmp_path / "points.npy", scan.points)
+# ---- the runner
+
+
+def test_the_runner_needs_no_torch(exported: Exports, tmp_path: Path) -> None:
+    points = tmp_path / "points.npy"
+    labels = tmp_path / "labels.npy"
+    scan = make_scan(5)
+    np.save(points, scan.points)
     code = f"""
 import sys
 sys.modules["torch"] = None  # an import fails
 import numpy as np
 from amvnet.onnx_runner import OnnxSegmenter
-result = OnnxSegmenter({str(folder)!r})(np.load({str(tmp_path / "points.npy")!r}))
-np.save({str(tmp_path / "labels.npy")!r}, result.labels)
+result = OnnxSegmenter({str(exported["elevation"].folder)!r})(np.load({str(points)!r}))
+np.save({str(labels)!r}, result.labels)
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-    assert (np.load(tmp_path / "labels.npy") == Segmenter(weights)(scan).labels).mean() >= 0.9999
+    expected = Segmenter(exported["elevation"].weights)(scan).labels
+    assert (np.load(labels) == expected).mean() >= 0.9999
 
 
 def test_pooling_is_the_maximum_of_each_pillar() -> None:
     rng = np.random.default_rng(0)
-    pillar, features = rng.integers(0, 9, 50), rng.normal(size=(50, 3)).astype(np.float32)
+    pillar = rng.integers(0, 9, 50)
+    features = rng.normal(size=(50, 3)).astype(np.float32)
     occupied, pooled = pool(pillar, features)
     assert occupied.tolist() == sorted(set(pillar.tolist()))
-    for place, values in zip(occupied, pooled, strict=True):
-        assert values.tolist() == [
-            max(features[i, c] for i in range(50) if pillar[i] == place) for c in range(3)
-        ]
+    for index, values in zip(occupied, pooled, strict=True):
+        assert values.tolist() == features[pillar == index].max(axis=0).tolist()
 
 
 def test_neighbours_are_the_nearest_of_all_others() -> None:
     xyz = np.random.default_rng(0).normal(size=(40, 3)).astype(np.float32)
-    for own, near in enumerate(nearest_others(xyz, np.arange(40), 5)):
-        far = [float(np.linalg.norm(xyz[i] - xyz[own])) if i != own else np.inf for i in range(40)]
-        assert near.tolist() == sorted(range(40), key=far.__getitem__)[:5]
+    for own, nearest in enumerate(nearest_others(xyz, np.arange(40), 5)):
+        distances = np.linalg.norm(xyz - xyz[own], axis=1)
+        distances[own] = np.inf
+        assert nearest.tolist() == np.argsort(distances, kind="stable")[:5].tolist()
 
 
-def _cut(folder: Path) -> None:
-    data = (folder / "range_net.onnx").read_bytes()
-    (folder / "range_net.onnx").write_bytes(data[: len(data) // 2])
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
 
 
-def _change(folder: Path, *keys: str, to: object) -> None:
-    said = json.loads((folder / "amvnet.json").read_text())
-    place = said
-    for key in keys[:-1]:
-        place = place[key]
-    place[keys[-1]] = to
-    (folder / "amvnet.json").write_text(json.dumps(said))
+def write(name: str, text: str) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_text(text)
+
+
+def truncate_range_net(folder: Path) -> None:
+    path = folder / "range_net.onnx"
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def replace_range_net(folder: Path) -> None:
+    shutil.copy(folder / "polar_map.onnx", folder / "range_net.onnx")
 
 
 @pytest.mark.parametrize(
-    ("breaks", "word"),
+    ("break_folder", "word"),
     [
-        (lambda folder: (folder / "amvnet.json").unlink(), "amvnet.json"),
-        (lambda folder: (folder / "amvnet.json").write_text("{"), "amvnet.json"),
-        (lambda folder: (folder / "amvnet.json").write_text("[]"), "format 2"),
-        (lambda folder: _change(folder, "method", to=["rv"]), "method"),
-        (lambda folder: _change(folder, "graphs", to=3), "range_net"),
-        (lambda folder: _change(folder, "graphs", "polar_map", to={}), "polar_map"),
-        (
-            lambda folder: _change(
-                folder, "graphs", "polar_map", "inputs", to=[{"name": 1, "shape": 2}]
-            ),
-            "polar_map",
-        ),
-        (lambda folder: _change(folder, "range_view", "height", to=-4), "height"),
-        (lambda folder: _change(folder, "range_view", "width", to=32), "range_net"),
-        (lambda folder: _change(folder, "point_head", "neighbours", to=3), "point_head"),
-        (lambda folder: (folder / "point_head.onnx").unlink(), "point_head.onnx"),
-        (_cut, "range_net.onnx"),
-        (
-            lambda folder: shutil.copy(folder / "polar_map.onnx", folder / "range_net.onnx"),
-            "range_net.onnx",
-        ),
+        (remove("amvnet.json"), "amvnet.json"),
+        (write("amvnet.json", "{"), "amvnet.json"),
+        (write("amvnet.json", "[]"), "format 2"),
+        (remove("point_head.onnx"), "point_head.onnx"),
+        (truncate_range_net, "range_net.onnx"),
+        (replace_range_net, "range_net.onnx"),
     ],
 )
 def test_a_broken_folder_is_one_line(
-    folder: Path, breaks: Callable[[Path], object], word: str
+    folder: Path, break_folder: Callable[[Path], object], word: str
 ) -> None:
-    breaks(folder)
-    fails(lambda: OnnxSegmenter(folder), word, "export again" if word != "height" else "height")
+    break_folder(folder)
+    fails(lambda: OnnxSegmenter(folder), word, "export again")
 
 
-def test_wrong_scans_are_one_line(exported: dict[str, tuple[Weights, Path]]) -> None:
-    by_ring, by_elevation = (
-        OnnxSegmenter(exported["ring"][1]),
-        OnnxSegmenter(exported["elevation"][1]),
-    )
-    points = scan_of(0, 10).points[:4]
+@pytest.mark.parametrize(
+    ("keys", "value", "words"),
+    [
+        ("method", ["rv"], ("method", "export again")),
+        ("graphs", 3, ("range_net", "export again")),
+        ("graphs polar_map", {}, ("polar_map", "export again")),
+        ("graphs polar_map inputs", [{"name": 1, "shape": 2}], ("polar_map", "export again")),
+        ("range_view height", -4, ("height",)),
+        ("range_view width", 32, ("range_net", "export again")),
+        ("point_head neighbours", 3, ("point_head", "export again")),
+    ],
+)
+def test_a_wrong_description_is_one_line(
+    folder: Path, keys: str, value: object, words: tuple[str, ...]
+) -> None:
+    change(folder, *keys.split(), to=value)
+    fails(lambda: OnnxSegmenter(folder), *words)
+
+
+def test_wrong_scans_are_one_line(exported: Exports) -> None:
+    by_ring = OnnxSegmenter(exported["ring"].folder)
+    by_elevation = OnnxSegmenter(exported["elevation"].folder)
+    points = make_scan(0, 10).points[:4]
     fails(lambda: by_ring(points), "ring index")
     fails(lambda: by_ring(points, np.full(4, 99)), "0 to 31")
     fails(lambda: by_elevation(points[:, :3]), "(N, 4)")
     fails(lambda: by_elevation(np.full((3, 4), np.nan)), "finite")
 
 
-def test_the_verb_exports_and_its_mistakes_are_one_line(
-    exported: dict[str, tuple[Weights, Path]], tmp_path: Path
-) -> None:
-    weights = exported["elevation"][0]
-    path = save(without(weights, "range_net", "point_head"), tmp_path / "w.safetensors")
-    assert run_cli("export", "--weights", path, "--out", tmp_path / "out")[0] == 0
+# ---- the verb
+
+
+def test_the_verb_exports_one_network(exported: Exports, tmp_path: Path) -> None:
+    weights = without(exported["elevation"].weights, "range_net", "point_head")
+    path = save(weights, tmp_path / "w.safetensors")
+    succeed(f"export --weights {path} --out {tmp_path}/out")
     assert files(tmp_path / "out") == {
         "amvnet.json",
         "polar_points.onnx",
@@ -261,39 +329,35 @@ def test_the_verb_exports_and_its_mistakes_are_one_line(
         "polar_map.onnx",
         "polar_scores.onnx",
     }
-    assert OnnxSegmenter(tmp_path / "out")(scan_of(1).points).labels.any()
-    code, line = run_cli("export", "--weights", tmp_path / "none", "--out", tmp_path / "none_out")
-    assert code == 2
-    assert line.count("\n") == 1
-    (tmp_path / "file").write_text("")
-    code, line = run_cli("export", "--weights", path, "--out", tmp_path / "file")
-    assert code == 2
-    assert line.count("\n") == 1
+    assert OnnxSegmenter(tmp_path / "out")(make_scan(1).points).labels.any()
+
+
+def test_mistakes_of_the_verb_are_one_line(exported: Exports, tmp_path: Path) -> None:
+    weights = exported["elevation"].weights
+    polar_only = save(without(weights, "range_net", "point_head"), tmp_path / "polar.safetensors")
     head_only = save(without(weights, "range_net", "polar_net"), tmp_path / "head.safetensors")
-    code, line = run_cli("export", "--weights", head_only, "--out", tmp_path / "head_out")
-    assert code == 2
-    assert line.count("\n") == 1
+    (tmp_path / "file").write_text("")
+
+    refusal(f"export --weights {tmp_path}/none --out {tmp_path}/none_out")
+    refusal(f"export --weights {polar_only} --out {tmp_path}/file")
+    refusal(f"export --weights {head_only} --out {tmp_path}/head_out")
     assert not (tmp_path / "head_out").exists()
 
 
 def test_a_graph_that_differs_leaves_no_files(
-    exported: dict[str, tuple[Weights, Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported: Exports, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from amvnet.export import onnx as module
+    run = onnx_export._run
 
-    run = module._run
+    def run_wrongly(path: Path, graph: onnx_export.Graph) -> tuple[Any, Any, Tensor]:
+        inputs, outputs, result = run(path, graph)
+        channels = torch.linspace(0, 1, result.shape[1])
+        shape = [1, -1] + [1] * (result.ndim - 2)
+        return inputs, outputs, result + channels.view(shape)
 
-    def wrong(path: Path, graph: module.Graph) -> tuple[object, object, torch.Tensor]:
-        inputs, outputs, found = run(path, graph)
-        return (
-            inputs,
-            outputs,
-            found + torch.linspace(0, 1, found.shape[1]).view(1, -1, *[1] * (found.ndim - 2)),
-        )
-
-    monkeypatch.setattr(module, "_run", wrong)
-    weights = without(exported["elevation"][0], "range_net", "point_head")
-    fails(lambda: module.export(weights, tmp_path), "polar_points", "difference")
+    monkeypatch.setattr(onnx_export, "_run", run_wrongly)
+    weights = without(exported["elevation"].weights, "range_net", "point_head")
+    fails(lambda: onnx_export.export(weights, tmp_path), "polar_points", "difference")
     assert not list(tmp_path.iterdir())
 
 
@@ -303,9 +367,7 @@ def test_without_the_extra_the_command_is_said(
 ) -> None:
     pytest.importorskip("onnx")
     monkeypatch.setitem(sys.modules, library, None)
-    code, line = run_cli("export", "--weights", "sim-hdl64e", "--out", tmp_path / "out")
-    assert code == 2
-    assert line.count("\n") == 1
+    line = refusal(f"export --weights sim-hdl64e --out {tmp_path}/out")
     assert "pip install 'amvnet[export]'" in line
     assert not (tmp_path / "out").exists()
 
@@ -317,24 +379,24 @@ def test_the_runner_without_its_runtime_says_the_command(
     fails(lambda: OnnxSegmenter(folder), "pip install onnxruntime")
 
 
-def test_the_page_runs(
-    exported: dict[str, tuple[Weights, Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_page_runs(exported: Exports, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    quick = without(exported["elevation"][0], "range_net", "point_head")
-    save(quick, tmp_path / "weights.safetensors")
+    polar_only = without(exported["elevation"].weights, "range_net", "point_head")
+    save(polar_only, tmp_path / "weights.safetensors")
     (tmp_path / "scans").mkdir()
     for path in ("scan.bin", "scans/0.bin"):
-        scan_of(1).points.tofile(tmp_path / path)
+        make_scan(1).points.tofile(tmp_path / path)
+
     for words in commands_of("docs/export.md"):
+        command = shlex.join(words)
         if words[0] == "amvnet":
-            small = ["weights.safetensors" if word == "sim-hdl64e" else word for word in words]
-            assert run_cli(*small[1:])[0] == 0, shlex.join(words)
+            smaller = [word.replace("sim-hdl64e", "weights.safetensors") for word in words[1:]]
+            assert run_cli(*smaller)[0] == 0, command
         else:
-            assert words[:2] == ["pip", "install"], shlex.join(words)
-    scope: dict[str, object] = {}
-    for block in re.findall(
-        r"(?s)```python\n(.*?)```", (DOCS / "export.md").read_text(encoding="utf-8")
-    ):
+            assert words[:2] == ["pip", "install"], command
+
+    scope: dict[str, Any] = {}
+    page = (PROJECT / "docs/export.md").read_text(encoding="utf-8")
+    for block in re.findall(r"(?s)```python\n(.*?)```", page):
         exec(block, scope)
-    assert len(scope["result"].labels) == POINTS  # type: ignore[attr-defined]
+    assert len(scope["result"].labels) == POINTS

@@ -1,8 +1,9 @@
-"""Many scans: some broken, interrupted and gone on with, in little memory."""
+"""Many scans: some broken, some runs interrupted and resumed, all in little memory."""
 
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -26,9 +27,10 @@ from amvnet.scan import Scan
 from amvnet.weights.file import save
 
 from fixtures.counted_scans import Counter, counted_scans
-from fixtures.worlds import files, fresh_weights, make_streets, run_cli, street
+from fixtures.worlds import files, fresh_weights, refusal, run_cli, street, succeed
 
 WEIGHTS = "w.safetensors"
+SCANS = 12
 
 
 @pytest.fixture(scope="module")
@@ -36,194 +38,236 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights, and a folder of twelve lone scans from sensors at different heights."""
     root = tmp_path_factory.mktemp("world")
     save(fresh_weights(), root / WEIGHTS)
+
     (root / "scans").mkdir()
-    for place in range(12):
-        points, _ = street(place)
-        points[:, 2] += 0.1 * place
-        points.tofile(root / f"scans/{place:06d}.bin")
-    make_streets(root / "data")
+    for index in range(SCANS):
+        points, _ = street(index)
+        points[:, 2] += 0.1 * index
+        points.tofile(root / f"scans/{index:06d}.bin")
     return root
+
+
+def predict(world: Path, out: Path, options: str = "") -> str:
+    """Return the command that segments the lone scans."""
+    return f"predict {world}/scans --weights {world}/{WEIGHTS} --out {out} {options}"
 
 
 @pytest.fixture(scope="module")
 def whole(world: Path) -> Path:
-    """What an undisturbed run writes."""
-    assert run_cli(
-        "predict", world / "scans", "--weights", world / WEIGHTS, "--out", world / "whole"
-    ) == (0, "")
+    """The folder that an undisturbed run writes."""
+    succeed(predict(world, world / "whole"))
     return world / "whole"
 
 
-def same(a: Path, b: Path) -> None:
+def check_same(a: Path, b: Path) -> None:
+    """Check that two folders hold the same files."""
     assert files(a) == files(b)
     for name in files(a):
         assert (a / name).read_bytes() == (b / name).read_bytes(), name
+
+
+def settings_of(world: Path) -> dict[str, object]:
+    """Return what the journal of a run on the lone scans holds of its options."""
+    weights = Segmenter(str(world / WEIGHTS)).weights
+    return {
+        "weights": {part: weights.digest(part) for part in weights.parts},
+        "method": "amvnet",
+        "sensor": repr(adapter_for(weights).given),
+        "scores": False,
+        "uncertain": False,
+        "format": "label",
+    }
+
+
+# ---- broken scans
 
 
 def test_broken_scans_are_listed_and_the_others_are_segmented(
     world: Path, whole: Path, tmp_path: Path
 ) -> None:
     scans = tmp_path / "scans"
-    scans.mkdir()
-    for path in (world / "scans").iterdir():
-        (scans / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(world / "scans", scans)
     (scans / "000003.bin").write_bytes(b"123")
     (scans / "000007.bin").write_bytes(b"")
-    code, error = run_cli("predict", scans, "--weights", world / WEIGHTS, "--out", tmp_path / "out")
+
+    options = ("--weights", world / WEIGHTS, "--out", tmp_path / "out")
+    code, error = run_cli("predict", scans, *options)
     assert code == 3
-    *faults, last = error.splitlines()
-    assert [
-        name in line for name, line in zip(("000003.bin", "000007.bin"), faults, strict=True)
-    ] == [True, True]
-    assert "10 of 12" in last
+    first, second, summary = error.splitlines()
+    assert "000003.bin" in first
+    assert "000007.bin" in second
+    assert "10 of 12" in summary
     assert files(tmp_path / "out") == files(whole) - {"000003.label", "000007.label"}
 
 
 def test_only_broken_scans_are_one_line(world: Path, tmp_path: Path) -> None:
-    for name in ("a.bin", "b.bin"):
-        (tmp_path / name).write_bytes(b"123")
-    inputs = (tmp_path / "a.bin", tmp_path / "b.bin")
-    code, error = run_cli(
-        "predict", *inputs, "--weights", world / WEIGHTS, "--out", tmp_path / "out"
-    )
-    assert (code, error.count("\n")) == (2, 1)
-    assert "a.bin" in error
+    (tmp_path / "a.bin").write_bytes(b"123")
+    (tmp_path / "b.bin").write_bytes(b"123")
+    inputs = f"{tmp_path}/a.bin {tmp_path}/b.bin"
+    line = refusal(f"predict {inputs} --weights {world}/{WEIGHTS} --out {tmp_path}/out")
+    assert "a.bin" in line
     assert not files(tmp_path / "out")
+
+
+def no_segmentation(scan: Scan) -> Segmentation:
+    """Return labels and scores of 0."""
+    zeros = np.zeros(len(scan))
+    return Segmentation(labels=zeros, uncertain=zeros, scores=zeros)
+
+
+def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> None:
+    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+        for scan_input in inputs:
+            if scan_input.name == "3":
+                raise InputError("3: broken")
+        return [no_segmentation(scan) for scan in scans]
+
+    execution = ExecutionOptions(batch=4)
+    pipeline = Pipeline(segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
+    faults = {scan.name: fault for scan, fault in pipeline.stream(counted_scans(8, Counter()))}
+    assert faults.pop("3") == "3: broken"
+    assert list(faults.values()) == [None] * 7
+
+
+# ---- interrupted runs
+
+
+SLOW_CLI = """
+import sys, time
+from amvnet.cli.main import main
+from amvnet.inference.pipeline import Pipeline
+
+write = Pipeline._write
+
+def write_slowly(*arguments):
+    time.sleep(0.1)
+    return write(*arguments)
+
+Pipeline._write = write_slowly
+sys.exit(main())
+"""
 
 
 @pytest.mark.parametrize("kills", [1, 2])
 def test_a_killed_run_goes_on_where_it_stopped(
     world: Path, whole: Path, tmp_path: Path, kills: int
 ) -> None:
-    """SIGKILL in the midst of it, once or twice; what is done is not done again, and the end is the same."""
+    """After SIGKILL, once or twice, no scan is segmented again, and the labels are the same."""
     out = tmp_path / "out"
-    slow = """
-import sys, time
-from amvnet.cli.main import main
-from amvnet.inference.pipeline import Pipeline
-
-write = Pipeline._write
-Pipeline._write = lambda *arguments: (time.sleep(0.1), write(*arguments))
-sys.exit(main())
-"""
-    arguments = [
-        "predict",
-        str(world / "scans"),
-        "--weights",
-        str(world / WEIGHTS),
-        "--out",
-        str(out),
-        "--resume",
-    ]
+    command = predict(world, out, "--resume")
     times: dict[str, int] = {}
     for kill in range(1, kills + 1):
         process = subprocess.Popen(
-            [sys.executable, "-c", slow, *arguments], stdout=subprocess.DEVNULL
+            [sys.executable, "-c", SLOW_CLI, *command.split()], stdout=subprocess.DEVNULL
         )
         while len(list(out.glob("*.label"))) < 3 * kill and process.poll() is None:
             time.sleep(0.005)
         process.kill()
         process.wait()
         assert list(out.glob(".unfinished-*")), "the run was over before it was killed"
-        written = {path.name: path.stat().st_mtime_ns for path in out.glob("*.label")}
-        kept = {name for name in times if written.get(name) == times[name]}
-        assert (
-            len(kept) >= len(times) - 1
-        )  # the last one may have been written, and not yet written down
-        times = written
-    assert run_cli(*arguments) == (0, "")
-    same(out, whole)
-    assert (
-        sum((out / name).stat().st_mtime_ns == at for name, at in times.items()) >= len(times) - 1
-    )
+        check_kept(out, times)
+        times = {path.name: path.stat().st_mtime_ns for path in out.glob("*.label")}
+
+    assert run_cli(*command.split()) == (0, "")
+    check_same(out, whole)
+    check_kept(out, times)
+
+
+def check_kept(folder: Path, times: dict[str, int]) -> None:
+    """Check that files were not written again; the last one may be missing in the journal."""
+    kept = 0
+    for name, time_written in times.items():
+        path = folder / name
+        kept += path.is_file() and path.stat().st_mtime_ns == time_written
+    assert kept >= len(times) - 1
 
 
 def test_an_interrupted_run_is_not_gone_on_with_by_others(world: Path, tmp_path: Path) -> None:
-    arguments = (
-        "predict",
-        world / "scans",
-        "--weights",
-        world / WEIGHTS,
-        "--out",
-        tmp_path,
-        "--resume",
-    )
     Journal(tmp_path, {**settings_of(world), "method": "rv"})
-    code, error = run_cli(*arguments)
-    assert (code, error.count("\n")) == (2, 1)
-    assert "method" in error
-    assert run_cli(*arguments[:-1]) == (0, "")  # without --resume it begins anew
-    assert len(files(tmp_path)) == 12
+    assert "method" in refusal(predict(world, tmp_path, "--resume"))
+
+    # Without --resume it starts again.
+    succeed(predict(world, tmp_path))
+    assert len(files(tmp_path)) == SCANS
 
 
 def test_a_finished_run_is_not_taken_for_an_interrupted_one(
     world: Path, whole: Path, tmp_path: Path
 ) -> None:
-    arguments = (
-        "predict",
-        world / "scans",
-        "--weights",
-        world / WEIGHTS,
-        "--out",
-        tmp_path,
-        "--resume",
-    )
-    assert run_cli(*arguments) == (0, "")
+    succeed(predict(world, tmp_path, "--resume"))
     (tmp_path / "000005.label").write_bytes(b"other")
-    assert run_cli(*arguments) == (0, "")
-    same(tmp_path, whole)
+    succeed(predict(world, tmp_path, "--resume"))
+    check_same(tmp_path, whole)
 
 
-@pytest.mark.parametrize("end", ['"a"\n"b"\n', '"a"\n"b"', '"a"\n"b', '"a"\n\x00\n"b"\n{}\n'])
-def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, end: str) -> None:
-    """A name that was not finished is not done."""
+@pytest.mark.parametrize(
+    ("text", "done"),
+    [
+        ('"a"\n"b"\n', {"a", "b"}),
+        ('"a"\n"b"', {"a"}),
+        ('"a"\n"b', {"a"}),
+        ('"a"\n\x00\n"b"\n{}\n', {"a", "b"}),
+    ],
+)
+def test_a_journal_reads_what_was_written_to_the_end(
+    tmp_path: Path, text: str, done: set[str]
+) -> None:
+    """A scan whose name was not written to the end is not done."""
     journal = Journal(tmp_path, {"x": 1})
     with journal.path.open("a") as file:
-        file.write(end)
-    assert Journal(tmp_path, {"x": 1}, resume=True).done == (
-        {"a", "b"} if end.count('"b"\n') else {"a"}
-    )
-    kept = [
-        json.loads(line) for line in (tmp_path / ".unfinished-0.jsonl").read_text().splitlines()
-    ]
-    assert kept[0] == {"x": 1}
+        file.write(text)
+
+    assert Journal(tmp_path, {"x": 1}, resume=True).done == done
+    lines = (tmp_path / ".unfinished-0.jsonl").read_text().splitlines()
+    for line in lines:
+        json.loads(line)
+    assert json.loads(lines[0]) == {"x": 1}
 
 
 def test_a_part_of_a_folder_is_labelled_as_in_the_whole(
     world: Path, whole: Path, tmp_path: Path
 ) -> None:
-    """What is measured of a sensor comes of a folder's first scans, whichever are left to segment."""
+    """A folder's first scans say what its sensor is, whichever scans are left to segment."""
     journal = Journal(tmp_path, settings_of(world))
-    for place in range(9):
-        journal.add(f"{place:06d}.npz")
-    arguments = (
-        "predict",
-        world / "scans",
-        "--weights",
-        world / WEIGHTS,
-        "--out",
-        tmp_path,
-        "--resume",
-    )
-    assert run_cli(*arguments) == (0, "")
-    assert files(tmp_path) == {f"{place:06d}.label" for place in (9, 10, 11)}
+    for index in range(9):
+        journal.add(f"{index:06d}.npz")
+
+    succeed(predict(world, tmp_path, "--resume"))
+    assert files(tmp_path) == {"000009.label", "000010.label", "000011.label"}
     for name in files(tmp_path):
         assert (tmp_path / name).read_bytes() == (whole / name).read_bytes()
 
 
+<<<<<<< HEAD
 def settings_of(world: Path) -> dict[str, object]:
     weights = Segmenter(str(world / WEIGHTS)).weights
     parts = {part: weights.digest(part) for part in weights.parts}
     sensor = repr(adapter_for(weights).sensor)
     kept = {"scores": False, "uncertain": False, "format": "label"}
     return {"weights": parts, "method": "amvnet", "sensor": sensor, **kept}
+=======
+def test_what_a_killed_run_left_half_written_is_taken_away(
+    world: Path, whole: Path, tmp_path: Path
+) -> None:
+    (tmp_path / ".notes.part").write_text("a user's own file")
+    with atomic_write(tmp_path / "000000.label") as part:
+        part.write_bytes(b"whole")
+    part.write_bytes(b"half")  # under the name that a file has until it is whole
+    Journal(tmp_path, settings_of(world)).add("000000.npz")
+
+    succeed(predict(world, tmp_path))
+    assert files(tmp_path) == files(whole) | {".notes.part"}
+
+
+# ---- several scans at once
+>>>>>>> h-tests2
 
 
 @pytest.mark.parametrize("at_once", [1, 3])
 def test_few_scans_are_in_memory_however_many_there_are(
     world: Path, tmp_path: Path, at_once: int
 ) -> None:
-    """Counted: those that are read and not yet written."""
+    """Count the scans that are read and not written yet."""
     counter = Counter()
     scans = counted_scans(30, counter, seconds_to_write=0.02)  # slower than the reading
     pipeline = Pipeline(
@@ -235,65 +279,28 @@ def test_few_scans_are_in_memory_however_many_there_are(
     done = [scan.name for scan, fault in pipeline.stream(scans) if fault is None]
     assert done == [str(index) for index in range(30)]
     assert counter.most <= 2 * AHEAD + 2 * at_once
-    assert not counter.held
-
-
-def test_what_a_killed_run_left_half_written_is_taken_away(
-    world: Path, whole: Path, tmp_path: Path
-) -> None:
-    (tmp_path / ".notes.part").write_text("of somebody else")
-    with atomic_write(tmp_path / "000000.label") as part:
-        part.write_bytes(b"whole")
-    part.write_bytes(b"half")  # under the name that it has until it is whole
-    arguments = ("predict", world / "scans", "--weights", world / WEIGHTS, "--out", tmp_path)
-    Journal(tmp_path, settings_of(world)).add("000000.npz")
-    assert run_cli(*arguments) == (0, "")
-    assert files(tmp_path) == files(whole) | {".notes.part"}
+    assert not counter.in_memory
 
 
 @pytest.mark.parametrize("at_once", [2, 5])
 def test_scans_side_by_side_get_the_labels_they_get_one_by_one(
     world: Path, whole: Path, tmp_path: Path, at_once: int
 ) -> None:
-    arguments = (
-        "predict",
-        world / "scans",
-        "--weights",
-        world / WEIGHTS,
-        "--out",
-        tmp_path,
-        "--at-once",
-        at_once,
-    )
     threads = torch.get_num_threads()
-    assert run_cli(*arguments) == (0, "")
-    same(tmp_path, whole)
+    succeed(predict(world, tmp_path, f"--at-once {at_once}"))
+    check_same(tmp_path, whole)
     assert torch.get_num_threads() == threads
 
 
 def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
-    """Each waits for the other."""
-    both = threading.Barrier(2, timeout=30)
+    """Each of two scans waits for the other."""
+    barrier = threading.Barrier(2, timeout=30)
 
     def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
-        both.wait()
-        return [Segmentation(*np.zeros((3, len(scan)))) for scan in scans]
+        barrier.wait()
+        return [no_segmentation(scan) for scan in scans]
 
-    pipeline = Pipeline(
-        segment, OutputOptions(tmp_path), SEMANTICKITTI, ExecutionOptions(at_once=2)
-    )
+    execution = ExecutionOptions(at_once=2)
+    pipeline = Pipeline(segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
     scans = counted_scans(2, Counter())
     assert [fault for _, fault in pipeline.stream(scans)] == [None, None]
-
-
-def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> None:
-    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
-        if any(scan_input.name == "3" for scan_input in inputs):
-            raise InputError("3: broken")
-        return [Segmentation(*np.zeros((3, len(scan)))) for scan in scans]
-
-    output = OutputOptions(tmp_path)
-    pipeline = Pipeline(segment, output, SEMANTICKITTI, ExecutionOptions(batch=4))
-    faults = {scan.name: fault for scan, fault in pipeline.stream(counted_scans(8, Counter()))}
-    assert {name for name, fault in faults.items() if fault} == {"3"}
-    assert faults["3"] == "3: broken"
