@@ -72,7 +72,7 @@ def settings_of(world: Path) -> dict[str, object]:
     return {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(adapter_for(weights).given),
+        "sensor": repr(adapter_for(weights).sensor),
         "scores": False,
         "uncertain": False,
         "format": "label",
@@ -238,14 +238,6 @@ def test_a_part_of_a_folder_is_labelled_as_in_the_whole(
         assert (tmp_path / name).read_bytes() == (whole / name).read_bytes()
 
 
-<<<<<<< HEAD
-def settings_of(world: Path) -> dict[str, object]:
-    weights = Segmenter(str(world / WEIGHTS)).weights
-    parts = {part: weights.digest(part) for part in weights.parts}
-    sensor = repr(adapter_for(weights).sensor)
-    kept = {"scores": False, "uncertain": False, "format": "label"}
-    return {"weights": parts, "method": "amvnet", "sensor": sensor, **kept}
-=======
 def test_what_a_killed_run_left_half_written_is_taken_away(
     world: Path, whole: Path, tmp_path: Path
 ) -> None:
@@ -260,7 +252,6 @@ def test_what_a_killed_run_left_half_written_is_taken_away(
 
 
 # ---- several scans at once
->>>>>>> h-tests2
 
 
 @pytest.mark.parametrize("at_once", [1, 3])

@@ -446,7 +446,7 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
     assert not any(fault for _, fault in results)
     assert sizes == [4, 4, 4, 4, 4, 3]
     assert counter.most <= 2 * 4 + AHEAD + 2
-    assert not counter.held
+    assert not counter.in_memory
 
 
 @pytest.mark.parametrize("verb", ["predict", "evaluate", "bench"])
