@@ -38,11 +38,11 @@ STYLES = {
 }
 
 
-def write_all(found: Analysis, dataset: str, out: Path) -> list[Path]:
+def write_all(analysis: Analysis, dataset: str, out: Path) -> list[Path]:
     """Write Figures 5, 6 and 8a and Tables 3 and 4 of the paper for one analysis.
 
     Args:
-        found: the analysis.
+        analysis: what to draw and write.
         dataset: the dataset as the user named it, for the titles.
         out: folder for the files.
 
@@ -50,11 +50,11 @@ def write_all(found: Analysis, dataset: str, out: Path) -> list[Path]:
         The files that were written.
     """
     return [
-        *_write_similarity(found, dataset, out / "similarity"),
-        *_write_distance(found, dataset, out / "distance"),
-        *write_sweep(found.sweep(), "tau", found.tau, dataset, out / "tau"),
-        *_write_classes(found, out / "classes"),
-        *_write_methods(found, out / "methods"),
+        *_write_similarity(analysis, dataset, out / "similarity"),
+        *_write_distance(analysis, dataset, out / "distance"),
+        *write_sweep(analysis.sweep(), "tau", analysis.tau, dataset, out / "tau"),
+        *_write_classes(analysis, out / "classes"),
+        *_write_methods(analysis, out / "methods"),
     ]
 
 

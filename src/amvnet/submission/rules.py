@@ -62,7 +62,7 @@ class Rules:
 
     Attributes:
         taxonomy: the classes.
-        what: the scans in words.
+        description: of the scans, in words.
         points: by name, each prediction that the archive may contain, with the number of points
             of its scan; None if the scan is not on disk.
         required: names of the predictions that it must contain.
@@ -76,7 +76,7 @@ class Rules:
     """
 
     taxonomy: Taxonomy
-    what: str
+    description: str
     points: Mapping[str, int | None]
     required: Collection[str]
     dtype: type[np.unsignedinteger]
@@ -92,13 +92,13 @@ class Rules:
         """The names of the files that are not predictions."""
         return self.texts if self.meta is None else (*self.texts, self.meta)
 
-    def check_size(self, name: str, size: int, shown: str) -> None:
+    def check_size(self, name: str, size: int, label: str) -> None:
         """Check the size of a file before it is read.
 
         Args:
             name: name of the file in the archive.
             size: bytes that the file has, or that its entry declares.
-            shown: the beginning of error messages.
+            label: the beginning of error messages.
 
         Raises:
             InputError: if a prediction does not have one id per point, or another file is too
@@ -107,44 +107,44 @@ class Rules:
         if name in self.others:
             if size > MOST_TEXT:
                 raise InputError(
-                    f"{shown}: expected at most {MOST_TEXT} bytes of text, found {size}; shorten it"
+                    f"{label}: expected at most {MOST_TEXT} bytes of text, found {size}; shorten it"
                 )
             return
 
         count = self.points[name]
         if count is not None:
-            check_size(shown, size, count, self.dtype)
+            check_size(label, size, count, self.dtype)
             return
 
         width = np.dtype(self.dtype).itemsize
         if not 0 < size <= MOST_POINTS * width or size % width:
             raise InputError(
-                f"{shown}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; "
+                f"{label}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; "
                 "write one id per point"
             )
 
-    def check_content(self, name: str, data: bytes, shown: str) -> None:
+    def check_content(self, name: str, data: bytes, label: str) -> None:
         """Check the content of a file whose size has been checked.
 
         Args:
             name: name of the file in the archive.
             data: all of its bytes.
-            shown: the beginning of error messages.
+            label: the beginning of error messages.
 
         Raises:
             InputError: if an id is not one of the benchmark, if a point needs a class and has
                 none, or if submission.json is not valid (see `check_sources`).
         """
         if name == self.meta:
-            check_sources(data, shown)
+            check_sources(data, label)
             return
         if name not in self.points:
             return
 
-        ids = train_ids(shown, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
+        ids = train_ids(label, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
         if not self.unlabelled and not ids.all():
             raise InputError(
-                f"{shown}: expected a class 1..{self.taxonomy.size} for every point, "
+                f"{label}: expected a class 1..{self.taxonomy.size} for every point, "
                 f"found 0 for {np.count_nonzero(ids == 0)} of {len(ids)}; "
                 "give these points a class"
             )
@@ -210,7 +210,7 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
     is_whole_test = split == "test" and sequences is None
     return Rules(
         taxonomy=dataset.taxonomy,
-        what=_describe(split, sequences),
+        description=_describe(split, sequences),
         points=points,
         required=required,
         dtype=np.uint32,
@@ -258,7 +258,7 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     (only_split,) = splits
     return Rules(
         taxonomy=dataset.taxonomy,
-        what=_describe(split, sequences),
+        description=_describe(split, sequences),
         points=points,
         required=points.keys(),
         dtype=np.uint8,
@@ -272,12 +272,12 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
 RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuScenes: _nuscenes}
 
 
-def check_sources(data: bytes, shown: str) -> None:
+def check_sources(data: bytes, label: str) -> None:
     """Check the content of a submission.json.
 
     Args:
         data: all of its bytes.
-        shown: the beginning of error messages.
+        label: the beginning of error messages.
 
     Raises:
         InputError: if it is not JSON, or its "meta" does not have exactly the five flags.
@@ -286,7 +286,7 @@ def check_sources(data: bytes, shown: str) -> None:
         content = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{shown}: expected JSON, found {reason}; write it again") from None
+        raise InputError(f"{label}: expected JSON, found {reason}; write it again") from None
 
     flags = content.get("meta") if isinstance(content, dict) else None
     keys = list(asdict(Sources()))
@@ -295,14 +295,14 @@ def check_sources(data: bytes, shown: str) -> None:
         if isinstance(flags, dict):
             flags_text = ", ".join(map(repr, flags)) or "nothing"
         raise InputError(
-            f'{shown}: expected {", ".join(keys)} in the object "meta", '
+            f'{label}: expected {", ".join(keys)} in the object "meta", '
             f"found {flags_text[:200]}; write these five"
         )
 
     for key in keys:
         if not isinstance(flags[key], bool):
             raise InputError(
-                f"{shown}: expected true or false for {key}, "
+                f"{label}: expected true or false for {key}, "
                 f"found a value of type {type(flags[key]).__name__}; write true or false"
             )
 
