@@ -160,7 +160,7 @@ def draw(specs: tuple[str, str], path: str) -> None:
     figure.savefig(path, dpi=110)
 
 
-def table(title: str, columns: tuple[str, ...], rows: list[tuple[str, ...]]) -> Table:
+def table(title: str, columns: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> Table:
     """Return a table whose first column is aligned to the left."""
     result = Table(title=title, show_edge=False)
     for name in columns:

@@ -114,6 +114,8 @@ def make_segmenter(weights: Weights, scan: Scan, precision: str, options: Option
     segmenter = Segmenter(weights, options.device, precision=precision)  # type: ignore[arg-type]
 
     segmentation = segmenter(scan)
+    assert segmentation.rv is not None
+    assert segmentation.bev is not None
     f = torch.from_numpy(segmentation.rv[scan.valid])
     g = torch.from_numpy(segmentation.bev[scan.valid])
 

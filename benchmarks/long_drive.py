@@ -7,6 +7,7 @@ The drive is simulated in FOLDER. One run is left alone, another is killed twice
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 import time
@@ -67,7 +68,16 @@ def have_same_files(folder: Path, other: Path) -> bool:
     return all((folder / name).read_bytes() == (other / name).read_bytes() for name in names)
 
 
-def main(folder: Path, scans: int = 1000, method: str = "amvnet") -> None:
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("scans", type=int, nargs="?", default=1000)
+    parser.add_argument("method", nargs="?", default="amvnet")
+    arguments = parser.parse_args()
+    measure(arguments.folder, arguments.scans, arguments.method)
+
+
+def measure(folder: Path, scans: int, method: str) -> None:
     simulate_drive(folder, scans)
     whole = folder / "whole"
     if not whole.exists():
@@ -87,4 +97,4 @@ def main(folder: Path, scans: int = 1000, method: str = "amvnet") -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), *map(int, sys.argv[2:3]), *sys.argv[3:4])
+    main()

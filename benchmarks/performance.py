@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 from salsanext import CHANNELS, SalsaNext
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 import amvnet.inference.segmenter
@@ -35,9 +35,11 @@ from amvnet.data.scan_files import read_scan, write_labels
 from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
-from amvnet.models.amvnet import step
+from amvnet.models.amvnet import AMVNet, step
 from amvnet.models.layers import upsample
 from amvnet.models.point_head import head_features, point_table
+from amvnet.models.polar_net import PolarNet
+from amvnet.models.views.polar_view import PolarGrid
 from amvnet.simulation import simulate
 
 HEIGHT = 64  # of the range image that SalsaNext is timed on
@@ -50,12 +52,13 @@ def without_memory() -> None:
 
 
 def without_folding() -> None:
-    amvnet.inference.segmenter.fold_batch_norms = lambda model: None
+    amvnet.inference.segmenter.fold_batch_norms = lambda module: None
 
 
 def without_convolved_rows() -> None:
-    amvnet.models.layers.linear = F.linear
-    amvnet.models.polar_net.linear = F.linear
+    # Nobody names the first parameter, `x`, which torch calls `input`.
+    amvnet.models.layers.linear = F.linear  # type: ignore[assignment]
+    amvnet.models.polar_net.linear = F.linear  # type: ignore[assignment]
 
 
 def without_pykdtree() -> None:
@@ -65,11 +68,11 @@ def without_pykdtree() -> None:
 def without_occupied_pillars() -> None:
     """Score every voxel of every pillar, and select those of the occupied pillars."""
 
-    def forward(self, grid):  # type: ignore[no-untyped-def]
+    def forward(self: PolarNet, grid: PolarGrid) -> Tensor:
         pillars = self.compress(self.pool(grid))
         return grid.at_pillars(self.scores(self.unet(grid.to_map(pillars))))
 
-    amvnet.models.polar_net.PolarNet.forward = forward
+    PolarNet.forward = forward  # type: ignore[method-assign]
 
 
 def without_parts() -> None:
@@ -79,7 +82,7 @@ def without_parts() -> None:
 def without_joining() -> None:
     """Upsample the coarse maps and convolve them at full size."""
 
-    def joined(block, coarse, fine):  # type: ignore[no-untyped-def]
+    def joined(block: nn.Module, coarse: Tensor, fine: Tensor) -> Tensor:
         return block(torch.cat([upsample(coarse, fine), fine], dim=1))
 
     amvnet.models.polar_net.joined = joined
@@ -89,8 +92,11 @@ def without_joining() -> None:
 def without_sharing() -> None:
     """Compute the head's first layer for every neighbour of every uncertain point."""
 
-    def settle(self, points, f, g, index, near):  # type: ignore[no-untyped-def]
+    def settle(
+        self: AMVNet, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor
+    ) -> Tensor:
         head = self.point_head
+        assert head is not None
         table = point_table(points, f, g)
         logits = []
         for uncertain, neighbours in zip(index.split(2048), near.split(2048), strict=True):
@@ -98,7 +104,7 @@ def without_sharing() -> None:
             logits.append(head(point, rows))
         return torch.cat(logits).softmax(dim=1)
 
-    amvnet.models.amvnet.AMVNet.settle = step("head")(settle)
+    AMVNet.settle = step("head")(settle)  # type: ignore[method-assign]
 
 
 UNCHANGED = "as it is"

@@ -32,11 +32,14 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 from safetensors import safe_open
+
+if TYPE_CHECKING:
+    from amvnet.models.methods import MethodName
 
 DIGESTS = "digests.json"
 LOG = "log.txt"  # what the commands say
@@ -59,7 +62,7 @@ SETTINGS = {
     "PYTHONSAFEPATH": "1",  # no folder of OUT is taken for a package
 }
 
-METHODS = ("rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet")
+METHODS: tuple[MethodName, ...] = ("rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet")
 
 # Networks of a few thousand parameters, every kind of augmentation, a head that learns from views.
 TINY = """
@@ -314,13 +317,15 @@ def use_library() -> None:
         save_segmentation(folder / f"{method}.npz", result)
 
     result = amvnet.load("sim-hdl64e")(points)
+    assert result.rv is not None
+    assert result.bev is not None
     labels = amvnet.fuse(points, result.rv, result.bev, head="sim-hdl64e", tau=0.7)
     np.savez(folder / "fused.npz", labels=labels)
 
 
 def save_segmentation(path: Path, result: Any) -> None:
     """Save the arrays of a Segmentation."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     for name in ("labels", "uncertain", "scores", "rv", "bev"):
         array = getattr(result, name)
         if array is not None:  # a single network has no scores of the other

@@ -176,7 +176,7 @@ def test_the_processes_parts_of_the_batches_make_up_those_of_one_process(
     ]
     assert len({len(part) for part in parts}) == 1
 
-    together = []
+    together: list[tuple[int, int]] = []
     for turn in zip(*parts, strict=True):
         together += turn
     assert together[:size] == alone
@@ -186,7 +186,7 @@ def test_the_processes_parts_of_the_batches_make_up_those_of_one_process(
 
 @pytest.mark.parametrize(("size", "count"), [(10, 2), (11, 2), (7, 3), (2, 4)])
 def test_processes_validate_every_scan_once(size: int, count: int) -> None:
-    keys = []
+    keys: list[tuple[int, int]] = []
     for rank in range(count):
         keys += EpochSampler(size, 3, shuffle=False, processes=Processes(rank, count))
     assert sorted(keys) == [(0, index) for index in range(size)]
@@ -205,6 +205,7 @@ def test_a_synced_batch_norm_is_that_of_the_whole_batch(tmp_path: Path) -> None:
     (norm(whole) ** 3).sum().backward()
 
     parts = [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in range(2)]
+    assert whole.grad is not None
     gradient = torch.cat([part.pop("x") for part in parts])
     assert torch.allclose(gradient, whole.grad, rtol=1e-9, atol=1e-9)
     for part in parts:
@@ -239,6 +240,7 @@ def test_a_synced_batch_norm_evaluates_like_the_one_it_replaces() -> None:
     expected = net.eval()(x)
 
     synced = synchronise_batch_norms(net, cuda=False)
+    assert isinstance(synced, nn.Sequential)
     assert isinstance(synced[1], SyncedBatchNorm)
     assert torch.equal(synced.eval()(x), expected)
     assert {"1.weight", "1.running_mean"} <= set(synced.state_dict())

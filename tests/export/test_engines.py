@@ -162,6 +162,7 @@ def test_a_segmenters_norms_are_folded_and_its_kernels_keep_their_channels_last(
     blocks = [module for module in model.modules() if isinstance(module, ConvBlock)]
     assert len(blocks) > 10
     for convolution, norm, _ in blocks:
+        assert isinstance(convolution, torch.nn.Conv2d)
         assert isinstance(norm, torch.nn.Identity)
         assert convolution.weight.is_contiguous(memory_format=torch.channels_last)
 

@@ -329,6 +329,7 @@ def test_certain_points_get_the_ensemble_and_uncertain_ones_the_head(
     batch = PointBatch.of([random_scan(30)])
     intensity = batch.points[:, 3].sort(descending=True).values
     model = whole_model(dull=intensity[brightest].item())
+    assert model.point_head is not None
     scores = model(batch)
     assert scores.uncertain.sum() == brightest
 

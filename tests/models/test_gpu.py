@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pi
 from amvnet.inference.predict import NetworkSegmentation
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import merge
+from amvnet.models.methods import Precision
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
 from amvnet.models.precision import InPrecision
@@ -91,8 +93,8 @@ def check_nearest(xyz: Tensor, own: Tensor, n: int = N) -> None:
 
     # The tree's first result has the distance 0: it is the point itself, or one in its place.
     distance = np.linalg.norm(points[nearest] - points[index][:, None], axis=2)
-    expected = cKDTree(points).query(points[index], k=others + 1)[0][:, 1:]
-    np.testing.assert_allclose(distance[:, :others], expected, rtol=1e-12, atol=0)
+    expected = np.asarray(cKDTree(points).query(points[index], k=others + 1)[0])
+    np.testing.assert_allclose(distance[:, :others], expected[:, 1:], rtol=1e-12, atol=0)
 
     assert not (nearest[:, :others] == index[:, None]).any()
     assert (np.diff(np.sort(nearest[:, :others], axis=1), axis=1) > 0).all()
@@ -282,7 +284,7 @@ class PrecisionProbe(nn.Module):
     ("precision", "dtype"), [("float32", torch.float32), ("bfloat16", torch.bfloat16)]
 )
 def test_a_network_multiplies_in_its_precision_and_scores_in_float32(
-    precision: str, dtype: torch.dtype
+    precision: Precision, dtype: torch.dtype
 ) -> None:
     net = PrecisionProbe()
     assert InPrecision(net, "cpu", precision)(torch.ones(2, 2)).dtype == torch.float32
@@ -307,7 +309,7 @@ def test_tf32_is_used_only_if_it_was_asked_for(setting: str, allowed: bool) -> N
 
 
 @pytest.mark.parametrize("precision", ["float16", "float64", ""])
-def test_a_precision_that_a_cpu_lacks_is_refused(precision: str) -> None:
+def test_a_precision_that_a_cpu_lacks_is_refused(precision: Any) -> None:
     weights = fresh_weights()
     fails(lambda: Segmenter(weights, "cpu", precision=precision), "expected", precision)
 
@@ -335,8 +337,10 @@ def test_several_scans_at_a_time_are_segmented_as_each_alone() -> None:
     for scan, together in zip(scans, segmenter.many(scans), strict=True):
         alone = segmenter(scan)
         assert (together.labels == alone.labels).mean() > 0.995
-        np.testing.assert_allclose(together.rv, alone.rv, rtol=1e-4, atol=1e-5)
-        np.testing.assert_allclose(together.bev, alone.bev, rtol=1e-4, atol=1e-5)
+        for name in ("rv", "bev"):
+            np.testing.assert_allclose(
+                getattr(together, name), getattr(alone, name), rtol=1e-4, atol=1e-5
+            )
 
         labelled = together.labels > 0
         assert np.array_equal(labelled, alone.labels > 0)
@@ -480,7 +484,7 @@ def test_the_commands_of_the_page_run(
 
     script = Path(__file__).parents[2] / benchmark[1]
     options = ["--batch", "1,2", "--part", "1", "--scan", "scans/000000.bin"]
-    command = [sys.executable, script, *benchmark[2:], *options]
+    command = [sys.executable, str(script), *benchmark[2:], *options]
     process = subprocess.run(command, capture_output=True, text=True)
     assert process.returncode == 0, process.stderr
     assert process.stdout.count("\ntraining ") == 2

@@ -20,7 +20,7 @@ from amvnet.models.layers import (
     upsample,
     wrap_width,
 )
-from amvnet.models.polar_net import DropBlock
+from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.upsampled_conv import convolve_joined
 from amvnet.scan import Scan
@@ -108,6 +108,7 @@ def test_range_net_without_gru_is_equivariant_to_a_shift_by_its_stride(steps: in
 
 def test_the_unet_of_polar_net_is_equivariant_to_a_shift_by_its_stride() -> None:
     net = CASES["polar"].in_eval()
+    assert isinstance(net, PolarNet)
     pillars = torch.randn(1, 5, 9, 20)
     shifted = net.unet(pillars).roll(4, 3)
     torch.testing.assert_close(net.unet(pillars.roll(4, 3)), shifted, rtol=1e-4, atol=1e-5)
@@ -149,6 +150,7 @@ def test_a_joined_convolution_costs_less() -> None:
 
 def test_the_unet_of_polar_net_halves_odd_sizes_upwards() -> None:
     net = CASES["polar"].in_eval()
+    assert isinstance(net, PolarNet)
     sizes = []
     for down in net.down:
         down.register_forward_hook(lambda _, __, output: sizes.append(tuple(output.shape[2:])))

@@ -71,6 +71,7 @@ def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[
         degrees = math.degrees(math.atan2(z, math.sqrt(x * x + y * y)))
         row = cell_of((c.fov_up - degrees) / (c.fov_up - c.fov_down), c.height)
         if c.rows == "ring":
+            assert scan.ring is not None
             row = c.height - 1 - int(scan.ring[i])
         column = cell_of((math.pi - math.atan2(y, x)) / (2 * math.pi), c.width)
         pixel = row * c.width + column
@@ -78,7 +79,7 @@ def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[
 
         distance = math.sqrt(x * x + y * y + z * z)
         if np.float32(distance) < least[pixel]:
-            least[pixel] = np.float32(distance)
+            least[pixel] = float(np.float32(distance))
             nearest[pixel] = i
             image[:, row, column] = x, y, z, intensity, distance, 1
     return pixels, nearest, image
@@ -86,7 +87,7 @@ def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[
 
 def polar_view_by_loop(
     scan: Scan, c: PolarViewConfig
-) -> tuple[list[tuple[int, int, int]], list[list[float]]]:
+) -> tuple[list[tuple[int, ...]], list[list[float]]]:
     """Return (P,) cells (radius, angle, height) and (P, 9) features."""
     axes = (
         (c.radius_min, c.radius_max, c.radial),
@@ -342,6 +343,7 @@ def test_a_point_batch_leaves_lost_points_out(random_scan: RandomScan, lost: flo
     batch = PointBatch.of([scan])
     assert batch.points.tolist() == scan.points[valid].tolist()
     assert batch.ring is not None
+    assert scan.ring is not None
     assert batch.ring.tolist() == scan.ring[valid].tolist()
 
 

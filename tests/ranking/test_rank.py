@@ -256,8 +256,8 @@ def test_scans_without_labels_are_ranked_alike(world: Path, tmp_path: Path) -> N
     shutil.copytree(world / "data", tmp_path / "data")
     for folder in (tmp_path / "data/sequences").iterdir():
         shutil.rmtree(folder / "labels")
-    command = ("rank", tmp_path / "data", "--weights", world / "w.safetensors")
-    command += ("--out", tmp_path / "next.csv")
+    options = ("--weights", world / "w.safetensors", "--out", tmp_path / "next.csv")
+    command = ("rank", tmp_path / "data", *options)
 
     assert run_cli(*command) == (0, "")
 

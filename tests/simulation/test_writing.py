@@ -99,7 +99,7 @@ def test_a_complete_simulation_is_not_written_again(
 
 @pytest.mark.parametrize("other", [{"seed": 3}, {"scans": 4}, {"sensor": "hdl64e"}])
 def test_a_folder_with_other_settings_is_refused(nuscenes: Path, other: dict[str, Any]) -> None:
-    settings = {"sensor": "hdl32e", "scans": 3, "seed": 2} | other
+    settings: dict[str, Any] = {"sensor": "hdl32e", "scans": 3, "seed": 2} | other
     fails(lambda: simulate(nuscenes, **settings), nuscenes, "another folder")
 
 

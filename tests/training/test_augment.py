@@ -154,6 +154,8 @@ def test_points_are_dropped_together_with_their_labels_and_rings(random_scan: Ra
         changed = augmented(scan, replace(OFF, drop=0.4), seed)
         indices = [index_of[tuple(row)] for row in changed.points.tolist()]
         assert indices == sorted(indices)
+        assert changed.labels is not None
+        assert changed.ring is not None
         assert np.array_equal(changed.labels, scan.labels[indices])
         assert np.array_equal(changed.ring, scan.ring[indices])
         shares.append(1 - len(changed) / len(scan))

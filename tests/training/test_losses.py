@@ -160,6 +160,7 @@ def test_ignored_points_carry_no_gradient_and_the_others_do(loss: Loss) -> None:
     logits.requires_grad_()
     loss(logits, labels, torch.rand(K), 1.0).backward()
     assert (labels == 0).any()
+    assert logits.grad is not None
     assert (logits.grad[labels == 0] == 0).all()
     assert logits.grad[labels > 0].any(dim=1).all()
 
@@ -179,6 +180,7 @@ def test_if_every_point_is_ignored_loss_and_gradient_are_zero(loss: Loss, points
     value = loss(logits, labels, torch.ones(K), 1.0)
     value.backward()
     assert value.item() == 0
+    assert logits.grad is not None
     assert torch.equal(logits.grad, torch.zeros(points, K))
 
 
@@ -192,6 +194,7 @@ def test_for_extreme_logits_the_loss_is_in_float32_and_its_gradient_finite(
     value = loss(logits, labels.to(torch.uint8), None, 1.0)
     value.backward()
     assert value.dtype == torch.float32
+    assert logits.grad is not None
     assert logits.grad.isfinite().all()
 
 
@@ -201,6 +204,7 @@ def test_a_step_down_the_gradient_lowers_the_loss(loss: Loss) -> None:
     logits.requires_grad_()
     before = loss(logits, labels, None, 1.0)
     before.backward()
+    assert logits.grad is not None
     assert loss(logits - 0.5 * logits.grad, labels, None, 1.0) < before
 
 

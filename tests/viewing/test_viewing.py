@@ -498,9 +498,9 @@ class Recording:
 
 def test_a_recording_reads_back(world: Path, tmp_path: Path, dataset: SemanticKitti) -> None:
     pytest.importorskip("rerun.chunk")
-    command = ("view", world / "data", "--weights", world / "w.safetensors")
-    command += ("--sequences", "08", "--save", tmp_path / "r.rrd")
-    assert run_cli(*command)[0] == 0
+    options = ("--sequences", "08", "--save", tmp_path / "r.rrd")
+    weights = world / "w.safetensors"
+    assert run_cli("view", world / "data", "--weights", weights, *options)[0] == 0
 
     recording = Recording(tmp_path / "r.rrd")
     segmenter = Segmenter(world / "w.safetensors")

@@ -6,6 +6,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -50,7 +51,7 @@ class Hub:
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:
     hub = Hub(tmp_path / "hub")
-    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)  # type: ignore[arg-type]
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
     return hub
 
 
@@ -126,7 +127,7 @@ def test_the_code_of_the_card_runs(dropped: tuple[str, ...], tmp_path: Path) -> 
     code = card.split("```python\n")[1].split("```")[0]
 
     scores = np.full((len(POINTS), 19), 1 / 19, np.float32)
-    names = {"points": POINTS, "f": scores, "g": scores}
+    names: dict[str, Any] = {"points": POINTS, "f": scores, "g": scores}
     exec(code, names)
     labels = names["labels"] if "labels" in names else names["result"].labels
     assert labels.shape == (len(POINTS),)

@@ -58,7 +58,9 @@ def analyze(
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
     study = None
+    counts: list[int] = []
     if recipe is not None:
+        counts = parse_numbers(str(neighbours))
         quiet_lightning()
         names = parse_names(train_sequences) or dataset.sequences("train")
         scans = TrainingScans(dataset, dataset.records(names), records)
@@ -71,7 +73,7 @@ def analyze(
     written = charts.write_all(analysis, data, out)
 
     if study is not None:
-        sweep = list(study.sweep(parse_numbers(str(neighbours)), say, device))
+        sweep = list(study.sweep(counts, say, device))
         used = loaded.model.point_head.neighbours
         written += charts.write_sweep(sweep, "neighbours", used, data, out / "neighbours")
     say(f"{len(written)} files in {out}")
