@@ -438,14 +438,16 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
         return many(self, scans)
 
     monkeypatch.setattr(Segmenter, "many", counted)
+    counter = Counter()
+    scans = counted_scans(23, counter)
     pipeline = Pipeline(
+        scans,
         NetworkSegmentation(Segmenter(fresh_weights())),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
         ExecutionOptions(batch=4),
     )
-    counter = Counter()
-    results = list(pipeline.stream(counted_scans(23, counter)))
+    results = list(pipeline.stream(scans))
     assert [scan.name for scan, _ in results] == [str(seed) for seed in range(23)]
     assert not any(fault for _, fault in results)
     assert sizes == [4, 4, 4, 4, 4, 3]

@@ -10,7 +10,7 @@ from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.inference.fusion import Fusion
 from amvnet.inference.inputs import InputScan, ScanOptions, open_inputs
-from amvnet.inference.pipeline import OutputOptions, Pipeline, segment_inputs
+from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.score_files import ScorePair
 from amvnet.inference.segmenter import Segmentation, check_scan
 from amvnet.progress import Progress, no_progress
@@ -106,7 +106,6 @@ def fuse_files(
         pair.b.find(scan.scores_path)
 
     segment = FileFusion(Fusion(head, fusion.tau), pair, opened.taxonomy.size)
-    pipeline = Pipeline(segment, OutputOptions(out), opened.taxonomy)
-    settings = {"fused": pair.to_dict()}
-    written = segment_inputs(opened.scans, pipeline, settings, progress=progress)
+    pipeline = Pipeline(opened.scans, segment, OutputOptions(out), opened.taxonomy)
+    written = pipeline.run({"fused": pair.to_dict()}, progress)
     return written, segment.uncertain_share

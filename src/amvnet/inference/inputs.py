@@ -321,10 +321,11 @@ def open_inputs(
                 scans.append(DatasetScan(dataset, record))
             taxonomies.append(dataset.taxonomy)
         else:
-            for scan in list_scans(text, options.topic):
+            files = list(list_scans(text, options.topic))
+            for scan in files:
                 reader.add(scan)
                 scans.append(FileScan(scan, reader))
-            taxonomies.append(taxonomy or _usual_taxonomy(scans[-1]))
+            taxonomies.append(taxonomy or _usual_taxonomy(files[0]))
 
     if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
         raise InputError(
@@ -334,6 +335,6 @@ def open_inputs(
     return Inputs(scans, taxonomies)
 
 
-def _usual_taxonomy(scan: InputScan) -> Taxonomy:
+def _usual_taxonomy(scan: NamedScan) -> Taxonomy:
     """Return the classes of a scan file's labels if the user names none."""
     return NUSCENES if ending_of(scan.path) == NUSCENES_ENDING else SEMANTICKITTI

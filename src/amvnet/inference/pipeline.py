@@ -115,52 +115,6 @@ class Broken:
     fault: str
 
 
-def segment_inputs(
-    scans: Sequence[InputScan],
-    pipeline: Pipeline,
-    settings: Mapping[str, Any],
-    progress: Progress = no_progress,
-) -> int:
-    """Segment scans, and write the results.
-
-    Args:
-        scans: the scans, for all processes together.
-        pipeline: segments and writes them.
-        settings: what the labels depend on, as JSON types; an interrupted run is resumed only with
-            the same settings.
-
-    Returns:
-        The number of label files of these scans, with those of the run that is resumed.
-
-    Raises:
-        InputError: if two scans would have the same files, an output folder is that of a scan, or
-            all scans are broken.
-        SomeBroken: at the end, if some of several scans are broken.
-    """
-    output = pipeline.output
-    processes = pipeline.execution.processes
-    _check_names(scans)
-    for scan in scans:
-        _check_folder(scan, output)
-
-    journal = Journal(output.folder, settings, pipeline.execution.resume, processes)
-    share = processes.share(scans)
-    remaining = [scan for scan in share if str(scan.scores_path) not in journal.done]
-    faults: list[str] = []
-    for done, (scan, fault) in enumerate(pipeline.stream(remaining)):
-        progress(done, len(remaining))
-        if fault is None:
-            journal.add(str(scan.scores_path))
-        else:
-            faults.append(fault)
-    progress(len(remaining), len(remaining))
-    journal.close()
-
-    all_faults = list(chain.from_iterable(processes.gather(faults)))
-    _raise_faults(all_faults, len(scans))
-    return len(scans)
-
-
 def _raise_faults(faults: list[str], total: int) -> None:
     """Raise SomeBroken if some of `total` scans are broken, InputError if all are."""
     if faults and len(faults) == total:
@@ -204,16 +158,56 @@ class Pipeline:
     """Reads, segments and writes scans at the same time.
 
     Attributes:
+        scans: the scans, for all processes together.
         segment: segments scans that have been read.
         output: what is written, and where.
         taxonomy: the classes of the labels.
         execution: how many scans at a time; an `at_once` of None means 1 here.
     """
 
+    scans: Sequence[InputScan]
     segment: SegmentScans
     output: OutputOptions
     taxonomy: Taxonomy
     execution: ExecutionOptions = ExecutionOptions()
+
+    def run(self, settings: Mapping[str, Any], progress: Progress = no_progress) -> int:
+        """Segment the scans, and write the results.
+
+        Args:
+            settings: what the labels depend on, as JSON types; an interrupted run is resumed only
+                with the same settings.
+
+        Returns:
+            The number of label files of these scans, with those of the run that is resumed.
+
+        Raises:
+            InputError: if two scans would have the same files, an output folder is that of a scan,
+                or all scans are broken.
+            SomeBroken: at the end, if some of several scans are broken.
+        """
+        processes = self.execution.processes
+        _check_names(self.scans)
+        for scan in self.scans:
+            _check_folder(scan, self.output)
+
+        journal = Journal(self.output.folder, settings, self.execution.resume, processes)
+        share = processes.share(self.scans)
+        remaining = [scan for scan in share if str(scan.scores_path) not in journal.done]
+
+        faults: list[str] = []
+        for done, (scan, fault) in enumerate(self.stream(remaining)):
+            progress(done, len(remaining))
+            if fault is None:
+                journal.add(str(scan.scores_path))
+            else:
+                faults.append(fault)
+        progress(len(remaining), len(remaining))
+        journal.close()
+
+        all_faults = list(chain.from_iterable(processes.gather(faults)))
+        _raise_faults(all_faults, len(self.scans))
+        return len(self.scans)
 
     def stream(self, scans: Sequence[InputScan]) -> Iterator[tuple[InputScan, str | None]]:
         """Read, segment and write scans, of which only a few are in memory at a time.

@@ -9,7 +9,7 @@ from typing import Any
 
 from amvnet.errors import InputError
 from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
-from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline, segment_inputs
+from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
@@ -56,9 +56,8 @@ def predict(
 
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
     segment = NetworkSegmentation(segmenter)
-    pipeline = Pipeline(segment, output, segmenter.taxonomy, execution)
-    settings = _settings(segmenter, output, adapter)
-    return segment_inputs(opened.scans, pipeline, settings, progress)
+    pipeline = Pipeline(opened.scans, segment, output, segmenter.taxonomy, execution)
+    return pipeline.run(_settings(segmenter, output, adapter), progress)
 
 
 class NetworkSegmentation:
