@@ -10,7 +10,6 @@ import numpy as np
 
 from amvnet.data.datasets.open import open_dataset
 
-
 SIZE = (40, 20, 10)  # cells of height, distance and intensity
 
 

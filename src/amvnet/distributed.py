@@ -1,4 +1,4 @@
-"""The processes that share a job, started by torchrun or SLURM: which one this is, and what they tell each other."""
+"""Processes that share a job, started by torchrun or SLURM."""
 
 from __future__ import annotations
 
@@ -19,65 +19,69 @@ if TYPE_CHECKING:
     from lightning.fabric.plugins.environments import ClusterEnvironment
 
 T = TypeVar("T")
-PATIENCE = timedelta(
-    days=7
-)  # one process may read for hours while the others wait; a dead one ends them all
+
+# How long a process waits for the others. One may read for hours; if one dies, all are ended.
+PATIENCE = timedelta(days=7)
 
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those of a job; by default it is alone.
+    """This process among the processes of a job; by default it is the only one.
 
     Attributes:
-        rank: its number, from 0, among all.
-        size: how many there are.
-        local_rank: its number among those of its machine.
-        nodes: machines.
-        words: the group in which they exchange Python objects, or None where it is alone.
+        rank: its number among all processes, from 0.
+        size: number of processes.
+        local_rank: its number among the processes on the same machine, from 0.
+        nodes: number of machines.
+        group: torch's process group for the exchange of Python objects; None if it is alone.
     """
 
     rank: int = 0
     size: int = 1
     local_rank: int = 0
     nodes: int = 1
-    words: Any = None
+    group: Any = None
 
     @property
     def first(self) -> bool:
-        """Whether this is the process that prints, and writes what is written once."""
+        """Whether this is the process that prints, and writes what only one should write."""
         return self.rank == 0
 
     @property
     def here(self) -> int:
-        """How many there are on each machine."""
+        """Number of processes on each machine."""
         return self.size // self.nodes
 
     def share(self, items: Sequence[T]) -> Sequence[T]:
-        """This process's part: every `size`-th, so that all parts together are the items."""
+        """Return this process's share of the items: every `size`-th, from `rank` on."""
         return items[self.rank :: self.size]
 
-    def gather(self, mine: T) -> list[T]:
-        """What each process has, by rank. All must call it."""
+    def gather(self, value: T) -> list[T]:
+        """Return the values of all processes, by rank. Every process must call this."""
         if self.size == 1:
-            return [mine]
-        found: list[Any] = [None] * self.size
-        dist.all_gather_object(found, mine, group=self.words)
-        return found
+            return [value]
+
+        values: list[Any] = [None] * self.size
+        dist.all_gather_object(values, value, group=self.group)
+        return values
 
     def wait(self) -> None:
-        """Until all are here."""
+        """Wait until every process has called this."""
         self.gather(None)
 
     def device(self, name: str) -> str:
-        """The device of this process, where the user said `cuda`: one for each process of a machine."""
-        return f"cuda:{self.local_rank}" if name == "cuda" and self.size > 1 else name
+        """Return the device of this process: its own GPU if several processes share `cuda`."""
+        if name == "cuda" and self.size > 1:
+            return f"cuda:{self.local_rank}"
+
+        return name
 
 
 ALONE = Processes()
 
 
 def environment() -> ClusterEnvironment:
-    """Who started the processes: torchrun, SLURM's srun, or nobody."""
+    """Return Lightning's environment for what started the processes: torchrun, srun or nothing."""
     from lightning.fabric.plugins.environments import (
         LightningEnvironment,
         SLURMEnvironment,
@@ -86,60 +90,80 @@ def environment() -> ClusterEnvironment:
 
     if TorchElasticEnvironment.detect():
         return TorchElasticEnvironment()
+
     if _slurm_tasks() > 1 and SLURMEnvironment.detect():
-        # A job that is put back into the queue goes on by --resume, which is the user's to say.
+        # A job that is queued again continues only if the user says --resume.
         return SLURMEnvironment(auto_requeue=False)
+
     return LightningEnvironment()
 
 
 def started() -> int:
-    """How many processes were started for this job, by what the environment says."""
-    return (
-        int(os.environ.get("WORLD_SIZE", "1"))
-        if dist.is_torchelastic_launched()
-        else _slurm_tasks()
-    )
+    """Return how many processes were started for this job, by the environment variables."""
+    if dist.is_torchelastic_launched():
+        return int(os.environ.get("WORLD_SIZE", "1"))
+
+    return _slurm_tasks()
 
 
 def _slurm_tasks() -> int:
-    # Of a job's script itself, which srun has not started, there is one.
-    return int(os.environ.get("SLURM_NTASKS", "1")) if "SLURM_STEP_ID" in os.environ else 1
+    """Return the number of tasks that srun has started; 1 in the script of a job itself."""
+    if "SLURM_STEP_ID" not in os.environ:
+        return 1
+
+    return int(os.environ.get("SLURM_NTASKS", "1"))
 
 
 @functools.cache
 def join(cuda: bool = False) -> Processes:
-    """Meet the other processes of this job, if it has any.
+    """Connect to the other processes of this job, if there are any.
 
     Args:
-        cuda: whether they compute on CUDA devices, and so exchange gradients by NCCL and not by gloo.
+        cuda: whether they compute on CUDA devices, and exchange gradients by NCCL instead of gloo.
     """
     if started() == 1:
         return ALONE
-    found = environment()
-    os.environ["MASTER_ADDR"], os.environ["MASTER_PORT"] = found.main_address, str(found.main_port)
-    rank, size, local = found.global_rank(), found.world_size(), found.local_rank()
-    here = os.environ.get("LOCAL_WORLD_SIZE")
-    nodes = size // int(here) if here else int(os.environ.get("SLURM_NNODES", "1"))
+
+    cluster = environment()
+    os.environ["MASTER_ADDR"] = cluster.main_address
+    os.environ["MASTER_PORT"] = str(cluster.main_port)
+    rank = cluster.global_rank()
+    size = cluster.world_size()
+    local_rank = cluster.local_rank()
+
     if cuda:
-        torch.cuda.set_device(local)
+        torch.cuda.set_device(local_rank)
     dist.init_process_group("nccl" if cuda else "gloo", rank=rank, world_size=size)
     atexit.register(dist.destroy_process_group)
-    return Processes(rank, size, local, nodes, dist.new_group(backend="gloo", timeout=PATIENCE))
+
+    group = dist.new_group(backend="gloo", timeout=PATIENCE)
+    return Processes(rank, size, local_rank, _node_count(size), group)
+
+
+def _node_count(size: int) -> int:
+    """Return the number of machines, given the number of processes."""
+    local_size = os.environ.get("LOCAL_WORLD_SIZE")
+    if local_size:
+        return size // int(local_size)
+
+    return int(os.environ.get("SLURM_NNODES", "1"))
 
 
 def device_of(accelerator: str) -> str:
-    """The kind of device that Lightning's name of an accelerator means on this machine: cuda, mps or cpu.
+    """Return the kind of device (cuda, mps or cpu) that an accelerator of Lightning is here.
 
     Raises:
-        InputError: where the machine has none of it.
+        InputError: if this machine has no such device.
     """
-    cuda, mps = torch.cuda.is_available(), torch.backends.mps.is_available()
-    known = {"cpu": "cpu", "auto": "cuda" if cuda else "mps" if mps else "cpu"}
-    known |= (
-        {"gpu": "cuda", "cuda": "cuda"} if cuda else {"gpu": "mps", "mps": "mps"} if mps else {}
-    )
-    if accelerator not in known:
+    devices = {"cpu": "cpu", "auto": "cpu"}
+    if torch.cuda.is_available():
+        devices |= {"auto": "cuda", "gpu": "cuda", "cuda": "cuda"}
+    elif torch.backends.mps.is_available():
+        devices |= {"auto": "mps", "gpu": "mps", "mps": "mps"}
+
+    if accelerator not in devices:
         raise InputError(
-            f"expected an accelerator of this machine ({', '.join(known)}), found {accelerator!r}; use one of them"
+            f"expected an accelerator of this machine ({', '.join(devices)}), "
+            f"found {accelerator!r}; use one of them"
         )
-    return known[accelerator]
+    return devices[accelerator]

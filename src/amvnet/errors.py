@@ -1,4 +1,4 @@
-"""Exceptions for input that cannot be used, all of it or some of it."""
+"""Exceptions for input that cannot be used."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class InputError(ValueError):
 
 
 class SomeBroken(Exception):
-    """Some of several inputs could not be used, and the others are done.
+    """Some of several inputs could not be used; the others have been processed.
 
     Attributes:
         faults: one line for each broken input.
@@ -34,19 +34,24 @@ def one_line_errors(
 ) -> Iterator[None]:
     """Turn whatever a library raises on bad input into an `InputError` of one line.
 
-    An `InputError` passes as it is. A panic of a library written in Rust, which is no `Exception`,
-    is turned into one too; an interrupt by the user is not.
+    An `InputError` passes unchanged, as does an interrupt by the user.
 
     Args:
-        message: makes the line from the exception.
-        only: the exceptions that are turned; others pass.
-        leave: exceptions among these that pass all the same.
+        message: returns the line for an exception.
+        only: the exceptions to convert; others pass unchanged.
+        leave: exceptions to exclude from `only`; they pass unchanged, too.
+
+    Raises:
+        InputError: if the block raises one of the exceptions to convert, or a library written in
+            Rust panics.
     """
     try:
         yield
     except BaseException as error:
+        # A panic of a library written in Rust is no `Exception`, and no module exports its class.
         is_panic = type(error).__name__ == "PanicException"
         is_bad_input = isinstance(error, only) or is_panic
-        if isinstance(error, (InputError, *leave)) or not is_bad_input:
+        passes = isinstance(error, (InputError, *leave))
+        if passes or not is_bad_input:
             raise
         raise InputError(message(error)) from error

@@ -1,4 +1,4 @@
-"""Memory of this process: keep it from one scan to the next, and ask for its peak."""
+"""Keep the memory of this process from one scan to the next, and measure its peak."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ import resource
 import sys
 
 # Options of glibc's mallopt, from malloc.h.
-M_TRIM_THRESHOLD = -1
-M_MMAP_MAX = -4
-M_ARENA_MAX = -8
+M_TRIM_THRESHOLD = -1  # free bytes from which on they are returned to the system
+M_MMAP_MAX = -4  # blocks that may each have a mapping of their own
+M_ARENA_MAX = -8  # heaps that the process may have
 
 
 def keep_freed_memory() -> bool:
     """Let this process keep the memory that it frees, instead of returning it to the system.
 
-    By default glibc asks the system for each block over 32 MiB and returns it when it is freed, and
-    the system fills every new block with zeros. Kept is at most what the largest scan needed. All
-    threads share one heap, because the heaps of single threads hold no block over 64 MiB.
+    By default glibc requests each block over 32 MiB from the system and returns it once it is
+    freed. The system fills every new block with zeros, which takes time. The process keeps at most
+    what its largest scan needed. All threads share one heap, because a thread's own heap cannot
+    hold a block over 64 MiB.
 
     This changes the allocator of the whole process.
 
@@ -28,9 +29,10 @@ def keep_freed_memory() -> bool:
         return False
     try:
         mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError):  # musl has none
+    except (OSError, AttributeError):  # musl has no mallopt
         return False
 
+    # No block has a mapping of its own, no memory is returned (-1), and there is one heap.
     options = ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1), (M_ARENA_MAX, 1))
     return all(mallopt(option, value) for option, value in options)
 
@@ -38,4 +40,4 @@ def keep_freed_memory() -> bool:
 def peak_memory() -> int:
     """Return the peak memory of this process in bytes."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
+    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB

@@ -232,7 +232,7 @@ def test_distance_bins_are_open_at_both_ends() -> None:
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(InputError, match="one predicted id"):
+    with pytest.raises(InputError, match="of one shape"):
         confusion(np.zeros(3, int), np.zeros(4, int), 16)
     with pytest.raises(InputError, match=r"0\.\.16"):
         confusion(np.zeros(1, int), np.full(1, 17), 16)

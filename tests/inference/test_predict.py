@@ -72,7 +72,7 @@ def settings_of(world: Path) -> dict[str, object]:
     return {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(adapter_for(weights).given),
+        "sensor": repr(adapter_for(weights).sensor),
         "scores": False,
         "uncertain": False,
         "format": "label",
@@ -122,9 +122,10 @@ def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> N
                 raise InputError("3: broken")
         return list(map(no_segmentation, scans))
 
+    scans = counted_scans(8, Counter())
     execution = ExecutionOptions(batch=4)
-    pipeline = Pipeline(segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
-    faults = {scan.name: fault for scan, fault in pipeline.stream(counted_scans(8, Counter()))}
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
+    faults = {scan.name: fault for scan, fault in pipeline.stream(scans)}
     assert faults.pop("3") == "3: broken"
     assert list(faults.values()) == [None] * 7
 
@@ -262,6 +263,7 @@ def test_few_scans_are_in_memory_however_many_there_are(
     counter = Counter()
     scans = counted_scans(30, counter, seconds_to_write=0.02)  # slower than the reading
     pipeline = Pipeline(
+        scans,
         NetworkSegmentation(Segmenter(str(world / WEIGHTS))),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
@@ -291,8 +293,9 @@ def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
         barrier.wait()
         return list(map(no_segmentation, scans))
 
+    scans = counted_scans(2, Counter())
     execution = ExecutionOptions(at_once=2)
-    pipeline = Pipeline(segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
-    first, second = pipeline.stream(counted_scans(2, Counter()))
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
+    first, second = pipeline.stream(scans)
     assert first[1] is None
     assert second[1] is None

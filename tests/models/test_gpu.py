@@ -405,7 +405,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(adapter_for(weights).given),
+        "sensor": repr(adapter_for(weights).sensor),
         "scores": False,
         "uncertain": False,
         "format": "label",
@@ -438,14 +438,16 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
         return many(self, scans)
 
     monkeypatch.setattr(Segmenter, "many", counted)
+    counter = Counter()
+    scans = counted_scans(23, counter)
     pipeline = Pipeline(
+        scans,
         NetworkSegmentation(Segmenter(fresh_weights())),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
         ExecutionOptions(batch=4),
     )
-    counter = Counter()
-    results = list(pipeline.stream(counted_scans(23, counter)))
+    results = list(pipeline.stream(scans))
     assert [scan.name for scan, _ in results] == [str(seed) for seed in range(23)]
     assert not any(fault for _, fault in results)
     assert sizes == [4, 4, 4, 4, 4, 3]

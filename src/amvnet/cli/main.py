@@ -35,7 +35,7 @@ FAILED = 1
 WRONG_INPUT = 2
 SOME_BROKEN = 3
 
-SHARED = ("train", "predict", "evaluate", "ablate")  # verbs that several processes can share
+SHARED = ("train", "predict", "evaluate", "ablate")  # verbs whose work several processes can share
 
 _DATA = {"data": {"metavar": "DATA"}}
 _INPUTS = {"inputs": {"metavar": "INPUT", "nargs": "+"}}
@@ -79,10 +79,14 @@ USAGE = f"""usage: amvnet VERB ...
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb.
+    """Run the command line, and print an error as one line to stderr.
+
+    Args:
+        argv: the verb and its arguments; None means those of this process.
 
     Returns:
-        The exit code: 0 done, 2 the input is wrong, 3 some of several inputs are, 1 anything else.
+        The exit code: 0 if done, 2 if the input is wrong, 3 if only some of the inputs are broken,
+        1 for a full disk or an interruption.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -103,7 +107,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _complain(str(error))
         return SOME_BROKEN
     except OSError as error:  # a full disk, for example; earlier files are still whole
-        _complain(f"{error.filename or 'the disk'}: {error.strerror}; mend this and go on")
+        _complain(f"{error.filename or 'the disk'}: {error.strerror}; fix this and run it again")
         return FAILED
     except KeyboardInterrupt:
         _complain("interrupted")
@@ -119,7 +123,8 @@ def run(verb: str, arguments: Sequence[str]) -> None:
     """Run one verb.
 
     Raises:
-        InputError: if the verb, its arguments or what they name cannot be used.
+        InputError: if the verb, its arguments, or the files that they name cannot be used.
+        SomeBroken: if some of several scans are broken.
     """
     if verb not in VERBS:
         raise InputError(
@@ -127,7 +132,8 @@ def run(verb: str, arguments: Sequence[str]) -> None:
         )
     if verb not in SHARED and _has_several_processes():
         raise InputError(
-            f"expected {', '.join(SHARED)} for several processes, found {verb}; run it in one"
+            f"expected one of {', '.join(SHARED)} for several processes, found {verb}; "
+            "run it in one process"
         )
 
     _suppress_library_warnings()
@@ -139,12 +145,14 @@ def run(verb: str, arguments: Sequence[str]) -> None:
 
 
 def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
-    """Parse twice: once to find the recipe, and once more with its values as defaults."""
+    """Parse the arguments twice: to find the recipe, and with its values as the defaults."""
     from amvnet.config.recipes import load_recipe
     from amvnet.config.schema import Recipe
 
     command = VERBS[verb]
-    if not {"-h", "--help"} & set(arguments):
+    # A parser that is asked for help prints it and exits, so the recipe must be known before.
+    asks_for_help = "-h" in arguments or "--help" in arguments
+    if not asks_for_help:
         parsed = make_parser(verb, command, Recipe()).parse_args(list(arguments))
         recipe = load_recipe(parsed.recipe)
     elif arguments[0].startswith("-"):
@@ -170,7 +178,7 @@ def _has_several_processes() -> bool:
 
 
 def _suppress_library_warnings() -> None:
-    """Suppress warnings that libraries have for developers."""
+    """Suppress warnings of libraries that are meant for developers."""
     warnings.filterwarnings("ignore", module="lightning")
     warnings.filterwarnings("ignore", module="torch")
 

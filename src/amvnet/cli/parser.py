@@ -1,4 +1,4 @@
-"""Make the parser of a command from its function."""
+"""Make the parser of a verb from the signature and the docstring of its function."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Command:
     """One verb of the command line.
 
     Attributes:
-        run: does it; its signature and docstring define the options.
-        positional: the parameters that are given without an option's name, with argparse's
-            arguments for them.
+        run: does the work; its signature and docstring define the options.
+        positional: the parameters that are positional on the command line, and for each the
+            keyword arguments of argparse's `add_argument`.
     """
 
     run: Callable[..., None]
@@ -32,11 +32,12 @@ class Command:
 
     @property
     def takes_recipe(self) -> bool:
+        """Whether a recipe is an argument, and each of its values an option."""
         return "recipe" in self.positional
 
 
 class Parser(ArgumentParser):
-    """A parser that raises InputError with one line."""
+    """A parser that raises an InputError of one line instead of printing its usage."""
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         line = " ".join(message.split()) or str(ex)
@@ -44,7 +45,7 @@ class Parser(ArgumentParser):
 
 
 def make_parser(verb: str, command: Command, recipe: Recipe | None = None) -> Parser:
-    """Return the parser of a verb; with a recipe, each of its values is an option too."""
+    """Return the parser of a verb; the values of a recipe, if any, become options too."""
     docs = docstring_parser.parse(command.run.__doc__ or "")
     help_texts = {param.arg_name: param.description for param in docs.params}
     metavars = [str(options["metavar"]) for options in command.positional.values()]

@@ -40,7 +40,7 @@ OVERALL = {
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     """Return the table of an `Evaluation.report`: a row per class, a column per method.
 
-    The overall figures and those by distance are below the classes.
+    The overall figures and the mIoU by distance are below the classes.
     """
     methods = report["methods"]
     figures = list(methods.values())
@@ -56,9 +56,10 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     for key, row_title in OVERALL.items():
         table.add_row(row_title, *[_percent(method[key]) for method in figures])
     table.add_section()
-    for bins in zip(*[method["by_distance"] for method in figures], strict=True):
-        row_title = f"mIoU, {bins[0]['from_m']:.0f} to {bins[0]['to_m']:.0f} m"
-        table.add_row(row_title, *[_percent(figure["miou"]) for figure in bins])
+    # One row per range of distances, with the figures of each method in it.
+    for row in zip(*[method["by_distance"] for method in figures], strict=True):
+        row_title = f"mIoU, {row[0]['from_m']:.0f} to {row[0]['to_m']:.0f} m"
+        table.add_row(row_title, *[_percent(figure["miou"]) for figure in row])
 
     if report["uncertain_fraction"] is not None:
         table.caption = f"uncertain points: {report['uncertain_fraction']:.1%}"
@@ -66,7 +67,7 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 
 
 def timing_table(report: Mapping[str, Any]) -> Table:
-    """Return the table of a report of `time_jobs`: time per stage, and the networks' speed."""
+    """Return the table of a report of `time_jobs`: the time of each stage, the networks' speed."""
     points = report["points"]
     table = Table(
         title=f"{report['engine']} on {report['device']}, {report['threads']} threads: "
@@ -90,9 +91,9 @@ def timing_table(report: Mapping[str, Any]) -> Table:
     table.add_row("fusion", "", quartiles, f"{fusion['median']:.1%}")
     table.add_row("ensemble instead of it", *_times(stages[MEAN]))
 
-    limits = [
-        f"{speed:,.0f} GFLOP/s in {kind}" for kind, speed in report["limit_gflop_per_s"].items()
-    ]
+    limits = []
+    for kind, speed in report["limit_gflop_per_s"].items():
+        limits.append(f"{speed:,.0f} GFLOP/s in {kind}")
     table.caption = (
         f"limit, a large matrix product: {', '.join(limits)}; "
         f"peak memory {report['peak_memory_mib']:,.0f} MiB"
@@ -101,10 +102,12 @@ def timing_table(report: Mapping[str, Any]) -> Table:
 
 
 def _times(spread: Mapping[str, float]) -> tuple[str, str]:
+    """Return the median and the range between the quartiles, in milliseconds."""
     return f"{spread['median']:.1f}", f"{spread['low']:.1f} to {spread['high']:.1f}"
 
 
 def _speed(network: Mapping[str, float] | None) -> tuple[str, ...]:
+    """Return the GFLOP of a network and its share of the limit; no cells for other stages."""
     if network is None:
         return ()
     return f"{network['gflop']:.1f}", f"{network['share_of_limit']:.0%}"
@@ -135,4 +138,5 @@ def _version(name: str) -> str:
 
 
 def _percent(value: float | None) -> str:
+    """Return a share as a percentage, and a dash for None."""
     return "–" if value is None else f"{100 * value:.1f}"

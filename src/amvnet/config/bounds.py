@@ -1,4 +1,4 @@
-"""Ranges of numbers, and dataclasses that refuse numbers outside of them."""
+"""Ranges of numbers, and a base class of dataclasses that refuse numbers outside their range."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from amvnet.errors import InputError
 
 @dataclass(frozen=True)
 class Range:
-    """The numbers that a value may have, for `Annotated`.
+    """The numbers that a field may hold: `Annotated[float, Range(0, 1)]`.
 
     Attributes:
         low: lower end.
@@ -29,10 +29,11 @@ class Range:
         return self.low <= value <= self.high
 
     def __repr__(self) -> str:
-        lower = f"{'above' if self.open else 'at least'} {self.low:g}"
+        above = "above" if self.open else "at least"
+        below = "below" if self.open else "at most"
         if math.isinf(self.high):
-            return lower
-        return f"{lower} and {'below' if self.open else 'at most'} {self.high:g}"
+            return f"{above} {self.low:g}"
+        return f"{above} {self.low:g} and {below} {self.high:g}"
 
 
 Count = Annotated[int, Range(1)]
@@ -42,13 +43,13 @@ Share = Annotated[float, Range(0, 1)]
 
 
 class Checked:
-    """A base of dataclasses whose numbers must lie in the `Range` of their annotation."""
+    """A base class of dataclasses whose numbers must lie in the `Range` of their annotation."""
 
     def __post_init__(self) -> None:
         """Check every number.
 
         Raises:
-            InputError: at the first number out of its range.
+            InputError: if a number is out of its range; the message names the first.
         """
         for name, kind in get_type_hints(type(self), include_extras=True).items():
             value = getattr(self, name)
@@ -60,17 +61,22 @@ class Checked:
                 _check_range(name, value, kind)
 
     def check(self, holds: bool, expected: str, found: str) -> None:
-        """Check a condition on several numbers.
+        """Check a condition that involves several numbers.
+
+        Args:
+            holds: the condition.
+            expected: what the message says was expected.
+            found: what the message says was found.
 
         Raises:
-            InputError: if it does not hold.
+            InputError: if the condition does not hold.
         """
         if not holds:
             raise InputError(f"expected {expected}, found {found}; correct the values")
 
 
 def _check_range(name: str, value: Any, kind: Any) -> None:
-    for allowed in getattr(kind, "__metadata__", ()):
+    for allowed in getattr(kind, "__metadata__", ()):  # the ranges of an `Annotated` type
         if value not in allowed:
             raise InputError(
                 f"{name}: expected a number {allowed}, found {value}; correct the value"

@@ -1,4 +1,4 @@
-"""The configuration as nested dictionaries, as YAML and JSON hold them, and back."""
+"""Convert the configuration to nested dictionaries, as YAML and JSON hold them, and back."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ T = TypeVar("T")
 
 
 def merge_trees(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a copy of `base` in which the leaves of `over` replace those of the same keys."""
+    """Return a copy of `base`, updated with `over`.
+
+    Dictionaries under the same key are merged in the same way; any other value of `over` replaces
+    that of `base`.
+    """
     merged = dict(base)
     for key, value in over.items():
         base_value = merged.get(key)
@@ -30,11 +34,11 @@ def from_dict(cls: type[T], tree: Any, where: str = "configuration") -> T:
     Args:
         cls: a dataclass whose fields all have defaults.
         tree: values by field name; fields that it does not name keep their defaults.
-        where: the beginning of the message.
+        where: the beginning of error messages, such as the name of the file.
 
     Raises:
-        InputError: if a key is not a field, a value is not of the default's type, or a number is
-            out of its range.
+        InputError: if `tree` is not a dictionary, a key is not a field, a value is not of the
+            default's type, or a number is out of its range.
     """
     if not isinstance(tree, Mapping):
         raise InputError(f"{where}: expected keys and values, found {tree!r}; correct the value")
@@ -42,7 +46,7 @@ def from_dict(cls: type[T], tree: Any, where: str = "configuration") -> T:
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """Return a dataclass as nested dictionaries, with lists for its tuples."""
+    """Return a dataclass as nested dictionaries, with lists in place of tuples."""
     tree: dict[str, Any] = {}
     for key, value in vars(config).items():
         if isinstance(value, tuple):
@@ -56,17 +60,17 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
-    """Return a dataclass with some fields replaced by the values of a tree."""
-    kinds = get_type_hints(type(default))
+    """Return a copy of a dataclass with the values of a tree in the fields that it names."""
+    field_types = get_type_hints(type(default))
 
     changes = {}
     for key, value in tree.items():
-        if key not in kinds:
+        if key not in field_types:
             raise InputError(
-                f"{where}: expected one of {', '.join(kinds)}, found {key!r}; correct the key"
+                f"{where}: expected one of {', '.join(field_types)}, found {key!r}; correct the key"
             )
 
-        changes[key] = _convert(getattr(default, key), value, kinds[key], f"{where}: {key}")
+        changes[key] = _convert(getattr(default, key), value, field_types[key], f"{where}: {key}")
 
     try:
         return dataclasses.replace(cast(Any, default), **changes)
@@ -75,13 +79,16 @@ def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
 
 
 def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
-    """Return a value as the type of a field.
+    """Convert a value to the type of a field.
 
     Args:
         default: the field's default value.
         value: the value in YAML's or JSON's types.
         kind: the field's type.
-        where: the beginning of the message.
+        where: the beginning of error messages.
+
+    Raises:
+        InputError: if the value does not fit the type.
     """
     if dataclasses.is_dataclass(default):
         if not isinstance(value, Mapping):
@@ -94,7 +101,7 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
         item_kind = get_args(kind)[0]
         return tuple(_convert(default[0], item, item_kind, where) for item in value)
 
-    choices = get_args(kind)  # of a Literal
+    choices = get_args(kind)  # the values of a Literal; empty for any other type
     if choices:
         if value not in choices:
             raise InputError(
@@ -112,12 +119,14 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
 
 
 def _convert_float(default: float, value: Any, where: str) -> float:
+    """Convert a number to a float; accept text, because YAML reads 2e-3 (no dot) as text."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number and not isinstance(value, str):
         raise _wrong_type(default, value, where)
+
     try:
         return float(value)
-    except ValueError:  # a text, but not one such as 2e-3, which YAML does not read as a number
+    except ValueError:
         raise _wrong_type(default, value, where) from None
 
 

@@ -1,4 +1,4 @@
-"""What to train, and how: the built-in recipes in the folder `recipes`, and users' own."""
+"""Read recipes, which say what to train and how: the built-in ones and users' own."""
 
 from __future__ import annotations
 
@@ -12,20 +12,24 @@ from amvnet.config.nested import from_dict, merge_trees
 from amvnet.config.schema import Recipe
 from amvnet.errors import InputError
 
+# The folder of the built-in recipes.
 _FOLDER = resources.files("amvnet.config") / "recipes"
 
 
 def recipe_names() -> tuple[str, ...]:
     """Return the names of the built-in recipes, sorted."""
-    files = _FOLDER.iterdir()
-    return tuple(sorted(f.name.removesuffix(".yaml") for f in files if f.name.endswith(".yaml")))
+    names = []
+    for file in _FOLDER.iterdir():
+        if file.name.endswith(".yaml"):
+            names.append(file.name.removesuffix(".yaml"))
+    return tuple(sorted(names))
 
 
 def load_recipe(name_or_path: str) -> Recipe:
-    """Read a built-in recipe by name, or a user's YAML file that states only what differs.
+    """Read a built-in recipe by name, or a user's YAML file.
 
-    The key `base` names the recipe that a file builds on; without it, the defaults of `Recipe`
-    (the paper's sizes) apply.
+    A file states only what differs from its base: the recipe under its key `base`, or the defaults
+    of `Recipe` (the paper's sizes) if it has no such key.
 
     Raises:
         InputError: if there is no such recipe, or a key or value in it is not valid.
@@ -34,27 +38,30 @@ def load_recipe(name_or_path: str) -> Recipe:
 
 
 def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]:
-    """Read a recipe, merged with those that it builds on.
+    """Read a recipe, merged with its bases.
 
     Args:
         name_or_path: the recipe.
-        dependents: the recipes that build on this one, to find circles.
+        dependents: the recipes that build on this one, to detect a circle of bases.
     """
     if name_or_path in dependents:
         raise InputError(
-            f"{name_or_path}: expected a base that ends, found this recipe in its own bases; "
-            "name another"
+            f"{name_or_path}: expected bases without a circle, "
+            "found this recipe among its own bases; name another base"
         )
 
     try:
         tree = yaml.safe_load(_read_text(name_or_path)) or {}
     except yaml.YAMLError as error:
         reason = str(error).splitlines()[0]
-        raise InputError(f"{name_or_path}: expected YAML, found {reason}; mend the file") from None
+        raise InputError(
+            f"{name_or_path}: expected YAML, found {reason}; correct the file"
+        ) from None
 
     if not isinstance(tree, dict):
+        kind = type(tree).__name__
         raise InputError(
-            f"{name_or_path}: expected keys and values, found {type(tree).__name__}; mend the file"
+            f"{name_or_path}: expected keys and values, found {kind}; correct the file"
         )
 
     base = tree.pop("base", None)
@@ -66,7 +73,8 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
             "correct the value"
         )
 
-    return merge_trees(_read_tree(base, (*dependents, name_or_path)), tree)
+    base_tree = _read_tree(base, (*dependents, name_or_path))
+    return merge_trees(base_tree, tree)
 
 
 def _read_text(name_or_path: str) -> str:

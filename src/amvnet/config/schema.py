@@ -16,10 +16,10 @@ StageName = Literal["rv", "bev", "head"]
 
 @dataclass(frozen=True)
 class RangeViewConfig(Checked):
-    """The range image (section 3.1 of the paper)."""
+    """The range image (section 3.1 of the paper; its sizes: 4.2)."""
 
     rows: Literal["elevation", "ring"] = "elevation"
-    """A point's row is its elevation within the field of view, or the index of its laser."""
+    """What sets a point's row: its elevation in the field of view, or the index of its laser."""
     height: Count = 64
     """Rows of the range image: the lasers of the sensor."""
     width: Count = 4096
@@ -41,7 +41,7 @@ class RangeViewConfig(Checked):
 
 @dataclass(frozen=True)
 class PolarViewConfig(Checked):
-    """The polar grid (section 3.1 of the paper; PolarNet, section 3)."""
+    """The polar grid (section 3.1 of the paper, sizes: 4.2; section 3 of PolarNet's paper)."""
 
     radial: Count = 480
     """Cells along the radius."""
@@ -75,7 +75,7 @@ class PolarViewConfig(Checked):
 
 @dataclass(frozen=True)
 class RangeNetConfig(Checked):
-    """The range-view network (section 3.1 of the paper; its widths are open)."""
+    """The range-view network (sections 3.1 and 4.2 of the paper; its widths are open)."""
 
     stem: Count = 32
     """Channels at full resolution."""
@@ -134,17 +134,17 @@ class PolarNetConfig(Checked):
 
 @dataclass(frozen=True)
 class AssertionConfig(Checked):
-    """Which points are uncertain (section 3.2 of the paper)."""
+    """The assertion that decides which points are uncertain (section 3.2 of the paper)."""
 
     name: Literal["disagreement", "entropy", "loss"] = "disagreement"
     """The assertion: low cosine similarity of the networks' scores, high entropy, or high loss."""
     threshold: float = 0.85
-    """tau: uncertain if the cosine similarity is at most this (entropy, loss: at least, nats)."""
+    """tau: uncertain points have at most this cosine similarity (entropy, loss: at least, nats)."""
 
 
 @dataclass(frozen=True)
 class PointHeadConfig(Checked):
-    """The point head (section 3.2 of the paper)."""
+    """The point head (section 3.3 of the paper)."""
 
     neighbours: Count = 15
     """n: nearest neighbours of an uncertain point, among all raw points."""
@@ -153,7 +153,7 @@ class PointHeadConfig(Checked):
     fc: Count = 128
     """Channels of the fully connected layer before the scores."""
     position_scale: float = 0.05
-    """Factor of x, y, z (metres) as features, so that they are of the order of the scores."""
+    """Factor on x, y, z (metres) as features: brings them to the magnitude of the scores."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -181,7 +181,7 @@ class ModelConfig(Checked):
 
 @dataclass(frozen=True)
 class AugmentConfig(Checked):
-    """Augmentation of the points in training (section 4.1 of the paper lists the kinds)."""
+    """Augmentation of the points in training (section 3.1 of the paper lists the kinds)."""
 
     scale: Annotated[float, Range(0, 0.99)] = 0.05
     """Scaling by 1 +- this, one factor per scan."""
@@ -205,7 +205,7 @@ class AugmentConfig(Checked):
 
 @dataclass(frozen=True)
 class NetworkTraining(Checked):
-    """Training of one of the two networks: AdamW, one-cycle (section 4.1 of the paper)."""
+    """Training of one of the two networks: AdamW, one-cycle (section 4.2 of the paper)."""
 
     epochs: Count
     """Passes over the training scans."""
@@ -238,7 +238,7 @@ class NetworkTraining(Checked):
 
 @dataclass(frozen=True)
 class HeadTraining(Checked):
-    """Training of the point head: SGD, one-cycle, frozen networks (section 4.1 of the paper)."""
+    """Training of the point head: SGD, one-cycle, frozen networks (section 4.2 of the paper)."""
 
     epochs: Count = 20
     """Passes over the uncertain points of the training scans."""
@@ -253,11 +253,11 @@ class HeadTraining(Checked):
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the learning rate's peak (open)."""
     class_weights: bool = False
-    """Weight the classes as the networks' losses do (the paper has plain cross-entropy)."""
+    """Weight the classes as in the networks' losses (section 3.3: plain cross-entropy)."""
     views: Annotated[int, Range(0)] = 0
     """Augmented copies of each training scan to score for the head; 0: the scan itself."""
     points: Count = 300_000
-    """Limit of uncertain points, an equal share per scan; 1.3 kB of disk each (K = 19)."""
+    """Limit on the uncertain points of all scans, shared equally; 1.3 kB each on disk (K = 19)."""
     folds: Count = 1
     """Folds of cross-fitting: networks score sequences held out from their training; 1: none."""
 
@@ -297,7 +297,7 @@ class Recipe:
     sensor: str = "hdl64e"
     """Name of the scans' sensor, for the weights file."""
     stages: tuple[StageName, ...] = ("rv", "bev", "head")
-    """The stages that are trained by default; a baseline is a part of the method."""
+    """The stages that are trained by default. A baseline trains only one of the networks."""
     model: ModelConfig = ModelConfig()
     """The networks and their sizes."""
     training: TrainingConfig = field(default_factory=TrainingConfig)

@@ -1,4 +1,4 @@
-"""The labels of a single scan: alone, or as coloured points that other programs open."""
+"""Write the labels of a single scan: alone, or with its points, in colour, for other programs."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from amvnet.files import atomic_write
 Kind = Literal["label", "npy", "ply", "pcd", "las"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
-EXACT = 0.0005  # metres: if float32 is off by more, coordinates are written as float64
+MAX_ERROR = 0.0005  # metres: if float32 is off by more, coordinates are written as float64
 LAS_STEP = 0.0001  # metres: the unit of LAS coordinates
-LAS_REACH = 200_000.0  # metres: the range of 32 bits of that unit, either way
+LAS_REACH = 200_000.0  # metres from the offset, either way: a little less than 32 bits can hold
 LAS_POINT_FORMAT = 7  # of LAS 1.4, with colours
 
 PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
@@ -59,10 +59,10 @@ class LabelledPoints:
 
 
 def check_kind(kind: str) -> None:
-    """Check that a format can be written. Call it before any work is done.
+    """Check that a format can be written; call this before the work starts.
 
     Raises:
-        InputError: if the format is unknown, or needs laspy and that is missing.
+        InputError: if the format is unknown, or needs laspy, which is not installed.
     """
     if kind not in KINDS:
         raise InputError(
@@ -87,17 +87,19 @@ def write_scan_labels(
     taxonomy: Taxonomy,
     uncertain: np.ndarray | None = None,
 ) -> Path:
-    """Write the labels of a scan, one row per point in the scan's order, completely or not at all.
+    """Write the labels of a scan, one row per point, in the scan's order.
+
+    The file appears whole or not at all. Its formats:
 
     - `label`: uint32 raw ids only, as in SemanticKITTI.
-    - `npy`: the same as an array (N,).
+    - `npy`: the same ids as an (N,) array.
     - `ply` (binary): x, y, z, red, green, blue, class (raw id), uncertain (0 or 1).
     - `pcd` (binary): x, y, z, rgb (packed as in PCL), label (raw id), uncertain. NaN stays NaN, as
       in `ply`.
     - `las`: coordinates to 0.1 mm, colours, and the extra dimensions class (raw id) and uncertain.
-      LAS cannot hold NaN, nor points 200 km from the others. They keep their row, with class 0 and
-      the coordinates of the file's offset: 0, 0, 0 unless the scan is far from the origin, as in
-      map coordinates.
+      LAS cannot hold NaN, nor points 200 km from the others. Such points keep their row, with
+      class 0 and the file's offset as coordinates. The offset is 0, 0, 0 unless the scan is far
+      from the origin, as in map coordinates.
 
     Coordinates of `ply` and `pcd` are float32, or float64 if float32 would be off by more than half
     a millimetre.
@@ -133,7 +135,7 @@ def write_scan_labels(
 
 
 def write_uncertain(path: Path, uncertain: np.ndarray) -> Path:
-    """Write which points are uncertain, (N,) bool, as `.npy`, completely or not at all."""
+    """Write which points are uncertain, (N,) bool, as `.npy`; the file appears whole or not."""
     with atomic_write(path) as part:
         np.save(part, np.asarray(uncertain, dtype=bool))
     return path
@@ -147,7 +149,8 @@ def _write_ply(path: Path, points: LabelledPoints) -> None:
 
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
     for name in table.dtype.names or ():
-        header.append(f"property {PLY_TYPES[table.dtype[name].str[1:]]} {name}")
+        type_code = table.dtype[name].str[1:]  # without the byte order
+        header.append(f"property {PLY_TYPES[type_code]} {name}")
     header.append("end_header\n")
 
     path.write_bytes("\n".join(header).encode("ascii") + table.tobytes())
@@ -182,15 +185,14 @@ def _write_pcd(path: Path, points: LabelledPoints) -> None:
 def _write_las(path: Path, points: LabelledPoints) -> None:
     """Write LAS 1.4.
 
-    The raw ids are an extra dimension: LAS's own classification is one byte, and its numbers have
-    fixed meanings.
+    The raw ids are an extra dimension, because the classification that LAS defines is one byte and
+    its numbers have fixed meanings.
     """
     import laspy
 
     steps, offset, fits = _las_coordinates(points.xyz)
-    extra = {"class": np.where(fits, points.raw, 0).astype(np.uint16)} | _uncertain_column(
-        points.uncertain
-    )
+    raw_ids = np.where(fits, points.raw, 0).astype(np.uint16)
+    extra = {"class": raw_ids} | _uncertain_column(points.uncertain)
 
     header = laspy.LasHeader(point_format=LAS_POINT_FORMAT, version="1.4")
     header.scales = np.full(3, LAS_STEP)
@@ -204,7 +206,7 @@ def _write_las(path: Path, points: LabelledPoints) -> None:
     las = laspy.LasData(header, record)
     las.X, las.Y, las.Z = steps.T
 
-    # The specification scales 8 bits of colour to 16 by 256.
+    # LAS has 16 bits per colour; its specification says to multiply 8-bit colours by 256.
     las.red, las.green, las.blue = points.colors.T.astype(np.uint16) * 256
 
     for name, values in extra.items():
@@ -221,23 +223,24 @@ POINT_WRITERS: dict[str, Callable[[Path, LabelledPoints], None]] = {
 
 @np.errstate(invalid="ignore", over="ignore")
 def _las_coordinates(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how LAS holds (N, 3) coordinates.
+    """Convert (N, 3) coordinates, metres, to the integers of LAS.
 
     Returns:
-        (N, 3) int32 steps from the offset, 0 for points that do not fit; the (3,) offset, 0 unless
-        the scan is far from the origin; and the (N,) points that fit, bool.
+        (N, 3) int32 multiples of `LAS_STEP` from the offset, 0 for points that do not fit; the
+        (3,) offset, metres, 0 unless the scan is far from the origin; and (N,) bool, whether each
+        point fits.
     """
-    wide = xyz.astype(np.float64)
+    xyz64 = xyz.astype(np.float64)
     is_finite = np.isfinite(xyz).all(axis=1)
 
-    # A few broken points, however far away, do not move the median.
+    # The median, because a few broken points, however far away, do not move it.
     offset = np.zeros(3)
     if is_finite.any():
-        middle = np.round(np.median(wide[is_finite], axis=0))
-        if (np.abs(middle) > LAS_REACH / 2).any():
-            offset = middle
+        median = np.round(np.median(xyz64[is_finite], axis=0))
+        if (np.abs(median) > LAS_REACH / 2).any():
+            offset = median
 
-    distances = wide - offset
+    distances = xyz64 - offset
     fits = is_finite & (np.abs(distances) < LAS_REACH).all(axis=1)
     steps = np.round(np.where(fits[:, None], distances, 0) / LAS_STEP).astype(np.int32)
     return steps, offset, fits
@@ -245,16 +248,16 @@ def _las_coordinates(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 @np.errstate(invalid="ignore", over="ignore")
 def _coordinates(xyz: np.ndarray) -> Columns:
-    """Return the columns x, y, z as float32, or as float64 if that is not exact enough."""
+    """Return the columns x, y, z as float32, or as float64 if float32 is not exact enough."""
     values = xyz.astype(np.float32)
-    if (np.abs(values - xyz) > EXACT).any():
+    if (np.abs(values - xyz) > MAX_ERROR).any():
         values = xyz.astype(np.float64)
     x, y, z = values.T
     return {"x": x, "y": y, "z": z}
 
 
 def _uncertain_column(uncertain: np.ndarray | None) -> Columns:
-    """Return the column of uncertain points; none if unknown."""
+    """Return the column `uncertain`, or no column if the uncertain points are unknown."""
     if uncertain is None:
         return {}
     return {"uncertain": np.asarray(uncertain).astype(np.uint8)}
@@ -263,7 +266,7 @@ def _uncertain_column(uncertain: np.ndarray | None) -> Columns:
 def _to_records(columns: Columns) -> np.ndarray:
     """Return (N,) records of the columns, packed and little endian."""
     fields = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    (count,) = set(map(len, columns.values()))  # one length for all columns
+    (count,) = set(map(len, columns.values()))  # raises if the columns differ in length
 
     table = np.empty(count, fields)
     for name, values in columns.items():

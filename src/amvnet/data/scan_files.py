@@ -25,19 +25,21 @@ from amvnet.scan import Scan
 def read_scan(path: Path | str) -> Scan:
     """Read a single scan.
 
-    The content of the file decides on its format, or its name if the content is ambiguous:
+    The format is recognised by the file's content, or by its name if the content is ambiguous:
 
-    - rows of float32: x, y, z, intensity as in KITTI, or x, y, z, intensity 0..255, ring as in
+    - rows of float32: x, y, z, intensity as in KITTI, or x, y, z, intensity (0..255), ring as in
       nuScenes;
     - `.npy` and `.npz`: arrays (N, 3 or more), or range images (H, W, C), read row by row;
     - `.pcd`, `.ply`, `.las`, `.laz`;
     - bags of one scan.
 
-    Intensities are divided by 255 if one is above 1, and by 65535 if one is above 255. A point at
-    0, 0, 0 is a lost return: it keeps its index, and its coordinates become NaN.
+    Intensities are divided by 255 if any is above 1, and by 65535 if any is above 255
+    (`Cloud.intensity_scale` has the whole rule). A point at 0, 0, 0 is a lost return: it keeps its
+    index, and its coordinates become NaN.
 
     Returns:
-        Scan with points (N, 4) in metres, intensity in [0, 1], and `ring` if the file has it.
+        A scan with points (N, 4): x, y, z in metres and intensity in [0, 1]; and with `ring` if
+        the file has it.
 
     Raises:
         InputError: if the file is missing, of another format, truncated, empty or all NaN.
@@ -46,7 +48,7 @@ def read_scan(path: Path | str) -> Scan:
 
 
 def check_points(points: np.ndarray, path: Path) -> np.ndarray:
-    """Return (N, 4) points as float32, if there is anything to work on.
+    """Check that a scan has usable points, and return them as contiguous (N, 4) float32.
 
     Raises:
         InputError: if there is no point, or none with finite coordinates.
@@ -64,7 +66,7 @@ def check_points(points: np.ndarray, path: Path) -> np.ndarray:
 
 
 def read_kitti(path: Path) -> np.ndarray:
-    """Read (N, 4) float32 x, y, z, intensity, unchanged.
+    """Read (N, 4) float32: x, y, z, intensity, as in the file.
 
     Raises:
         InputError: as `read_table` and `check_points`.
@@ -73,7 +75,7 @@ def read_kitti(path: Path) -> np.ndarray:
 
 
 def read_nuscenes(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read (N, 4) float32 points, intensity scaled from 0..255 to [0, 1], and the (N,) int64 ring.
+    """Read (N, 4) float32 points and the (N,) int64 ring; scale intensities from 0..255 to [0, 1].
 
     Raises:
         InputError: as `read_table`, `check_points` and `ring_column`.
@@ -109,9 +111,9 @@ def read_labels(
 
 
 def write_labels(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint32) -> Path:
-    """Write (N,) raw ids as `dtype`, completely or not at all, and return the path.
+    """Write (N,) raw ids as `dtype` and return the path; the file appears whole or not at all.
 
-    The official `.label` files have uint32.
+    The official `.label` files hold uint32.
     """
     with atomic_write(path) as part:
         np.asarray(raw_ids).astype(dtype).tofile(part)
@@ -119,10 +121,14 @@ def write_labels(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.ui
 
 
 def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
-    """Return the ids to be written for the scan in `path`, if there is one per point.
+    """Check that there is one id per point, and return the ids as an array.
+
+    Args:
+        path: the file to name in the message.
+        count: the number of points.
 
     Raises:
-        InputError: if their shape is not (count,).
+        InputError: if the shape of the ids is not (count,).
     """
     ids = np.asarray(ids)
     if ids.shape != (count,):

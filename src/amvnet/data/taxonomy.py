@@ -17,7 +17,7 @@ from amvnet.errors import InputError
 INSTANCE_MASK = 0xFFFF
 UNKNOWN = -1  # in lookup tables: no train id belongs to this raw id
 
-# The tables of a YAML label map, and its names of the splits.
+# The tables of a YAML label map, and its name for each split.
 _YAML_TABLES = (
     "labels",
     "color_map",
@@ -40,7 +40,8 @@ class Taxonomy:
         raw_to_train: raw id (int) -> train id, or category name (str) -> train id if the dataset
             numbers its categories in a table of its own (nuScenes).
         train_to_raw: K + 1 raw ids, indexed by train id: what prediction files hold.
-        splits: official sequences of "train", "val" and "test"; empty if the reader knows them.
+        splits: official sequences of "train", "val" and "test"; empty if the dataset's reader
+            defines them.
         counts_absent: whether a class in neither ground truth nor prediction counts as 0 in the
             mIoU (SemanticKITTI) or is left out of it (nuScenes).
     """
@@ -85,21 +86,21 @@ class Taxonomy:
 
     @property
     def raw_ids(self) -> list[int]:
-        """The numeric raw ids of `raw_to_train`, then those of `train_to_raw`."""
+        """The numeric raw ids of `raw_to_train`, followed by those of `train_to_raw`."""
         return [raw for raw in (*self.raw_to_train, *self.train_to_raw) if isinstance(raw, int)]
 
     @cached_property
     def _raw_id_lookup(self) -> np.ndarray:
-        """(65536,) int16: raw id -> train id, UNKNOWN if the taxonomy has no such raw id."""
+        """(65536,) int16 train ids by raw id; UNKNOWN if the taxonomy has no such raw id."""
         table = np.full(INSTANCE_MASK + 1, UNKNOWN, dtype=np.int16)
 
         # If categories have names, the only numeric raw ids are those of prediction files.
         if any(isinstance(raw, str) for raw in self.raw_to_train):
             table[list(self.train_to_raw)] = np.arange(self.size + 1)
 
-        for raw, train in self.raw_to_train.items():
-            if isinstance(raw, int):
-                table[raw] = train
+        for raw_id, train_id in self.raw_to_train.items():
+            if isinstance(raw_id, int):
+                table[raw_id] = train_id
         return table
 
     def to_train(self, raw: np.ndarray) -> np.ndarray:
@@ -114,18 +115,18 @@ class Taxonomy:
         Raises:
             InputError: if a raw id is not in the table.
         """
-        ids = np.asarray(raw).astype(np.uint32) & np.uint32(INSTANCE_MASK)
-        train = self._raw_id_lookup[ids]
+        raw_ids = np.asarray(raw).astype(np.uint32) & np.uint32(INSTANCE_MASK)
+        train_ids = self._raw_id_lookup[raw_ids]
 
-        if (train == UNKNOWN).any():
-            unknown = np.unique(ids[train == UNKNOWN])
+        if (train_ids == UNKNOWN).any():
+            unknown = np.unique(raw_ids[train_ids == UNKNOWN])
             raise InputError(
                 f"taxonomy {self.name}: expected only raw ids of its table, "
                 f"found {unknown[:5].tolist()}; check that the file holds labels, "
                 "or give the label map (YAML) that it was written with"
             )
 
-        return train.astype(np.uint8)
+        return train_ids.astype(np.uint8)
 
     def to_raw(self, ids: np.ndarray) -> np.ndarray:
         """Turn train ids into the raw ids that prediction files hold.
@@ -149,7 +150,10 @@ class Taxonomy:
         return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields in types that JSON has, for `from_dict`."""
+        """Return the fields in JSON's types, for `from_dict`.
+
+        `raw_to_train` becomes a list of pairs, because keys in JSON are always text.
+        """
         return {
             "name": self.name,
             "classes": list(self.classes),
@@ -162,7 +166,7 @@ class Taxonomy:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Taxonomy:
-        """Return the taxonomy that `to_dict` described, equal in every field.
+        """Return the taxonomy whose fields `to_dict` returned.
 
         Raises:
             InputError: if a field is missing or has the wrong type.
@@ -192,7 +196,8 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
             learning_map, learning_map_inv, learning_ignore and split (train, valid, test).
 
     Raises:
-        InputError: if the file does not exist, is not YAML or lacks a key.
+        InputError: if the file does not exist, is not YAML or lacks a key, or its tables do not
+            fit each other.
     """
     path = Path(path)
     if not path.is_file():
@@ -243,30 +248,30 @@ def _missing_tables(config: Any) -> list[str]:
 def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
     """Build the taxonomy of a YAML label map.
 
-    Its learning ids are numbered without gaps; ignored ones become train id 0.
+    The file's learning ids become the train ids 1..K, without gaps; ignored ones become 0.
     """
     learning_to_raw = config["learning_map_inv"]
-    ignored = config["learning_ignore"]
+    is_ignored = config["learning_ignore"]
     learning_ids = []
-    for learning in learning_to_raw:
-        if learning != 0 and not ignored[learning]:
-            learning_ids.append(learning)
+    for learning_id in learning_to_raw:
+        if learning_id != 0 and not is_ignored[learning_id]:
+            learning_ids.append(learning_id)
 
-    raw_ids = [learning_to_raw[0]]
-    train_ids = {}
-    for train, learning in enumerate(sorted(learning_ids), start=1):
-        raw_ids.append(learning_to_raw[learning])
-        train_ids[learning] = train
+    train_to_raw = [learning_to_raw[0]]
+    learning_to_train = {}
+    for train_id, learning_id in enumerate(sorted(learning_ids), start=1):
+        train_to_raw.append(learning_to_raw[learning_id])
+        learning_to_train[learning_id] = train_id
 
     classes = []
     colors = []
-    for raw in raw_ids:
-        classes.append(str(config["labels"][raw]))
-        colors.append(_rgb(reversed(config["color_map"][raw])))
+    for raw_id in train_to_raw:
+        classes.append(str(config["labels"][raw_id]))
+        colors.append(_rgb(reversed(config["color_map"][raw_id])))
 
     raw_to_train: dict[int | str, int] = {}
-    for raw, learning in config["learning_map"].items():
-        raw_to_train[int(raw)] = train_ids.get(learning, 0)
+    for raw_id, learning_id in config["learning_map"].items():
+        raw_to_train[int(raw_id)] = learning_to_train.get(learning_id, 0)
 
     splits = {}
     for split, yaml_split in _YAML_SPLITS.items():
@@ -277,7 +282,7 @@ def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
         classes=tuple(classes[1:]),
         colors=tuple(colors),
         raw_to_train=raw_to_train,
-        train_to_raw=tuple(map(int, raw_ids)),
+        train_to_raw=tuple(map(int, train_to_raw)),
         splits=splits,
         counts_absent=True,
     )
@@ -312,7 +317,7 @@ _SEMANTICKITTI = (
     (19, "traffic-sign", (255, 0, 0), 81, ()),
 )
 
-# Categories of category.json that the lidarseg challenge ignores, and those of pedestrians.
+# Categories of category.json that the lidarseg challenge ignores.
 _IGNORED = (
     "noise",
     "animal",
@@ -327,6 +332,8 @@ _IGNORED = (
     "vehicle.emergency.ambulance",
     "vehicle.emergency.police",
 )
+
+# Categories of category.json that are pedestrians in the lidarseg challenge.
 _PEDESTRIANS = (
     "human.pedestrian.adult",
     "human.pedestrian.child",
@@ -360,9 +367,9 @@ def _semantickitti() -> Taxonomy:
     _, names, colors, raw_ids, _ = zip(*_SEMANTICKITTI, strict=True)
 
     raw_to_train: dict[int | str, int] = {}
-    for train, _, _, raw, further_raw_ids in _SEMANTICKITTI:
-        raw_to_train[raw] = train
-        raw_to_train.update(dict.fromkeys(further_raw_ids, train))
+    for train_id, _, _, raw_id, further_raw_ids in _SEMANTICKITTI:
+        raw_to_train[raw_id] = train_id
+        raw_to_train.update(dict.fromkeys(further_raw_ids, train_id))
 
     return Taxonomy(
         name="semantickitti",
@@ -383,15 +390,15 @@ def _nuscenes() -> Taxonomy:
     train_ids, names, colors, _ = zip(*_NUSCENES, strict=True)
 
     raw_to_train: dict[int | str, int] = {}
-    for train, _, _, categories in _NUSCENES:
-        raw_to_train.update(dict.fromkeys(categories, train))
+    for train_id, _, _, categories in _NUSCENES:
+        raw_to_train.update(dict.fromkeys(categories, train_id))
 
     return Taxonomy(
         name="nuscenes",
         classes=names[1:],
         colors=colors,
         raw_to_train=raw_to_train,
-        train_to_raw=train_ids,
+        train_to_raw=train_ids,  # prediction files of the challenge hold train ids
         splits={},
         counts_absent=False,
     )

@@ -1,4 +1,4 @@
-"""What the paper shows of the method (section 4): agreement, mIoU by distance, sweep of tau."""
+"""The paper's further analysis (section 4.4): agreement, mIoU by distance, sweep of tau."""
 
 from __future__ import annotations
 

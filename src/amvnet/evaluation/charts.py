@@ -1,4 +1,4 @@
-"""The paper's figures and tables of an analysis, each as PNG, CSV and Markdown."""
+"""The figures (PNG) and tables of the paper's section 4.4, with all numbers as CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from amvnet.files import atomic_write
 
 SIZE = (6.0, 3.6)  # inches
 DOTS_PER_INCH = 160
-MOST_MARKED = 20  # values of a sweep that get a marker each; more of them would overlap
-Cell = str | float | int | None
+MOST_MARKED = 20  # longer sweeps are drawn without markers, which would overlap
+Cell = str | float | int | None  # None: no such number, written as a dash
 
 
 @dataclass(frozen=True)
 class Style:
-    """The title of a method, and how Matplotlib draws it."""
+    """The title of a method, and the marker and line style of its curve in Matplotlib."""
 
     title: str
     marker: str
@@ -38,11 +38,11 @@ STYLES = {
 }
 
 
-def write_all(found: Analysis, dataset: str, out: Path) -> list[Path]:
-    """Write the histogram, mIoU by distance, the sweep of tau, and Tables 3 and 4.
+def write_all(analysis: Analysis, dataset: str, out: Path) -> list[Path]:
+    """Write Figures 5, 6 and 8a and Tables 3 and 4 of the paper for one analysis.
 
     Args:
-        found: the analysis.
+        analysis: what to draw and write.
         dataset: the dataset as the user named it, for the titles.
         out: folder for the files.
 
@@ -50,21 +50,21 @@ def write_all(found: Analysis, dataset: str, out: Path) -> list[Path]:
         The files that were written.
     """
     return [
-        *_write_similarity(found, dataset, out / "similarity"),
-        *_write_distance(found, dataset, out / "distance"),
-        *write_sweep(found.sweep(), "tau", found.tau, dataset, out / "tau"),
-        *_write_classes(found, out / "classes"),
-        *_write_methods(found, out / "methods"),
+        *_write_similarity(analysis, dataset, out / "similarity"),
+        *_write_distance(analysis, dataset, out / "distance"),
+        *write_sweep(analysis.sweep(), "tau", analysis.tau, dataset, out / "tau"),
+        *_write_classes(analysis, out / "classes"),
+        *_write_methods(analysis, out / "methods"),
     ]
 
 
 def write_sweep(
     swept: Sequence[Swept], name: str, used: float, dataset: str, path: Path
 ) -> list[Path]:
-    """Write Figure 8 of the paper: mIoU and the share of uncertain points over a parameter.
+    """Write Figure 8 of the paper: mIoU and share of uncertain points for values of a parameter.
 
     Args:
-        swept: the scores reached with each value of the parameter.
+        swept: the results for each value of the parameter.
         name: the parameter's name.
         used: the parameter's value in the weights.
         dataset: the dataset as the user named it, for the title.
@@ -106,17 +106,17 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
 
     Args:
         rows: for each network, whether it has the GRU, whether it was trained with class weights,
-            and the metrics it reached.
+            and its metrics.
         path: the files to write, without an ending.
 
     Returns:
         The files that were written.
     """
     table: list[Sequence[Cell]] = []
-    for gru, weighted, reached in rows:
-        miou = _percent(reached["miou"])
-        accuracy = _percent(reached["accuracy"])
-        table.append(("yes" if gru else "no", "yes" if weighted else "no", miou, accuracy))
+    for gru, weighted, network_metrics in rows:
+        miou = _percent(network_metrics["miou"])
+        accuracy = _percent(network_metrics["accuracy"])
+        table.append((_yes_or_no(gru), _yes_or_no(weighted), miou, accuracy))
 
     return _write(path, ("GRU", "class weights", "mIoU %", "accuracy %"), table)
 
@@ -154,15 +154,15 @@ def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
     figure, axes = _figure(f"mIoU by distance on {dataset}")
     for method, style in STYLES.items():
         columns.append(f"{style.title} %")
-        heights = []
+        mious = []
         for row, extent in zip(table, methods[method]["by_distance"], strict=True):
             miou = _percent(extent["miou_present"])
             row.append(miou)
-            heights.append(np.nan if miou is None else miou)
+            mious.append(np.nan if miou is None else miou)
 
         axes.plot(
             middles,
-            heights,
+            mious,
             label=style.title,
             marker=style.marker,
             linestyle=style.line,
@@ -181,8 +181,8 @@ def _write_classes(analysis: Analysis, path: Path) -> list[Path]:
     columns = ["IoU %"]
     for method, style in STYLES.items():
         columns.append(style.title)
-        reached = metrics(analysis.evaluation.matrices[method][0], analysis.taxonomy)
-        values = (*reached["iou"].values(), reached["miou"], reached["fwiou"])
+        figures = metrics(analysis.evaluation.matrices[method][0], analysis.taxonomy)
+        values = (*figures["iou"].values(), figures["miou"], figures["fwiou"])
         for row, value in zip(rows, values, strict=True):
             row.append(_percent(value))
 
@@ -197,14 +197,18 @@ def _write_methods(analysis: Analysis, path: Path) -> list[Path]:
 
     rows: list[Sequence[Cell]] = []
     for method, matrices in analysis.evaluation.matrices.items():
-        reached = metrics(matrices[0], analysis.taxonomy)
+        figures = metrics(matrices[0], analysis.taxonomy)
         row: list[Cell] = [titles.get(method, method)]
         for key in ("miou", "miou_present", "accuracy", "fwiou"):
-            row.append(_percent(reached[key]))
+            row.append(_percent(figures[key]))
         rows.append(row)
 
     columns = ("method", "mIoU %", "mIoU % of the classes present", "accuracy %", "fwIoU %")
     return _write(path, columns, rows)
+
+
+def _yes_or_no(flag: bool) -> str:
+    return "yes" if flag else "no"
 
 
 def _percent(value: float | None) -> float | None:

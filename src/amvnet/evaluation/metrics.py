@@ -34,8 +34,8 @@ def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarra
     prediction = np.asarray(prediction)
     if truth.shape != prediction.shape or truth.ndim != 1:
         raise InputError(
-            f"expected one predicted id for each of the {truth.shape} true ids, "
-            f"found {prediction.shape}; give the prediction of this scan"
+            "expected true and predicted ids of one shape (N,), "
+            f"found {truth.shape} and {prediction.shape}; give the prediction of this scan"
         )
     _check_ids(truth, "true", size)
     _check_ids(prediction, "predicted", size)
@@ -56,8 +56,8 @@ def _check_ids(ids: np.ndarray, kind: str, size: int) -> None:
 def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
     """Apply the benchmark's formulas to a confusion matrix.
 
-    Points whose true label is ignored (row 0) never count. A labelled point that was predicted
-    as ignored (column 0) counts as missed for its class, but does not enter the accuracy, as in
+    Points without a true class (row 0) never count. A labelled point whose predicted id
+    is 0 (column 0) counts as missed for its class, but does not enter the accuracy, as in
     SemanticKITTI's tool; nuScenes' tool does not allow such predictions.
 
     Args:
@@ -66,18 +66,18 @@ def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
             truth nor predicted enters the mIoU, with an IoU of 0.
 
     Returns:
-        Fractions, or None if there were no points to count: "miou" (official), "miou_present"
-        (over the classes in the truth), "accuracy", "fwiou" (IoU weighted by the frequency in
-        the truth) and "iou" {class: value}.
+        Fractions, or None if no point counts: "miou" (official), "miou_present" (over the
+        classes in the truth), "accuracy", "fwiou" (IoU weighted by the frequency in the truth)
+        and "iou", a dictionary of each class's IoU by name.
     """
     labelled = matrix[1:].astype(np.float64)  # (K, K + 1)
     correct = np.diagonal(labelled[:, 1:])
-    true = labelled.sum(axis=1)
-    predicted = labelled[:, 1:].sum(axis=0)
-    union = true + predicted - correct
+    true_counts = labelled.sum(axis=1)
+    predicted_counts = labelled[:, 1:].sum(axis=0)
+    union = true_counts + predicted_counts - correct
     iou = np.divide(correct, union, out=np.zeros_like(correct), where=union > 0)
 
-    present = true > 0
+    present = true_counts > 0
     averaged = np.full(len(iou), True) if taxonomy.counts_absent else union > 0
 
     iou_by_class: dict[str, float | None] = {}
@@ -87,8 +87,8 @@ def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
     return {
         "miou": _ratio(iou[averaged].sum(), averaged.sum()),
         "miou_present": _ratio(iou[present].sum(), present.sum()),
-        "accuracy": _ratio(correct.sum(), predicted.sum()),
-        "fwiou": _ratio((true * iou).sum(), true.sum()),
+        "accuracy": _ratio(correct.sum(), predicted_counts.sum()),
+        "fwiou": _ratio((true_counts * iou).sum(), true_counts.sum()),
         "iou": iou_by_class,
     }
 
@@ -99,18 +99,18 @@ def _ratio(part: float, whole: float) -> float | None:
 
 @dataclass
 class Evaluation:
-    """The counts of any number of scans for any number of methods.
+    """The confusion counts of any number of scans, for any number of methods.
 
     Attributes:
         taxonomy: the classes.
-        edges: distances from the sensor in metres. Two neighbouring edges bound a bin, which
-            contains neither of them, as in SemanticKITTI's tool.
+        edges: distances from the sensor in metres. Each two neighbouring edges bound a bin;
+            points exactly on an edge are in no bin, as in SemanticKITTI's tool.
         matrices: method -> (bins + 1, K + 1, K + 1) counts; the first matrix is over all
             distances.
         scans: number of scans that were added.
         points: number of points in these scans, labelled or not.
-        uncertain: number of uncertain points among those of `asked`.
-        asked: number of points in the scans that were added with their uncertain points.
+        uncertain: number of uncertain points.
+        asked: number of points of which it is known whether they are uncertain.
     """
 
     taxonomy: Taxonomy
@@ -137,7 +137,8 @@ class Evaluation:
             uncertain: (N,) bool, or None if it is not known which points are uncertain.
 
         Raises:
-            InputError: if the shapes differ or an id is outside 0..K; nothing is counted then.
+            InputError: if truth and prediction differ in shape or an id is outside 0..K. The scan
+                is then not counted at all.
         """
         masks = self._masks(points)
         counts = {}
@@ -174,7 +175,7 @@ class Evaluation:
         self.asked += other.asked
 
     def __add__(self, other: Evaluation) -> Evaluation:
-        """Return a new evaluation with the counts of both; raises what `merge` raises."""
+        """Return a new evaluation with the counts of both; raises the same errors as `merge`."""
         total = Evaluation(self.taxonomy, self.edges)
         total.merge(self)
         total.merge(other)
@@ -182,7 +183,7 @@ class Evaluation:
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
-        """Return all figures as JSON types.
+        """Return all metrics, of all points and by distance, as JSON types.
 
         Args:
             dataset: the dataset, as the user named it.
@@ -208,7 +209,7 @@ class Evaluation:
         return {**metrics(matrices[0], self.taxonomy), "by_distance": bins}
 
     def _masks(self, points: np.ndarray) -> list[np.ndarray]:
-        """Return for each bin which points are in it, (N,) bool."""
+        """Return one (N,) bool mask per bin: the points that are in it."""
         distances = np.linalg.norm(points[:, :3], axis=1)
         return [(near < distances) & (distances < far) for near, far in pairwise(self.edges)]
 

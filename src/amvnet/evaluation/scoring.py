@@ -28,7 +28,8 @@ class MethodLabels:
 
     Attributes:
         ids: (N,) train ids by method.
-        uncertain: (N,) bool, the uncertain points; None without two networks.
+        uncertain: (N,) bool, true for uncertain points; None if the labels are not those of two
+            networks.
     """
 
     ids: dict[str, np.ndarray]
@@ -49,9 +50,12 @@ def evaluate(
     """Score the labels of some scans.
 
     Args:
-        label: labels a scan.
-        pictures: a folder for drawings of some of the scans from above.
-        processes: those that share the scans; each gets the evaluation of all.
+        dataset: the dataset that has the scans.
+        records: the scans.
+        label: the function that labels a scan.
+        pictures: folder for pictures of a few of the scans from above; None draws none.
+        progress: called with the number of this process's scans that are done, and their total.
+        processes: the processes that share the scans; each returns the evaluation of all scans.
 
     Raises:
         InputError: if a scan has no ground truth.
@@ -81,7 +85,7 @@ def evaluate(
 def read_labelled(
     dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
 ) -> Iterator[tuple[ScanRecord, Scan]]:
-    """Read scans that must have ground truth.
+    """Yield the records and their scans, each of which must have ground truth.
 
     Raises:
         InputError: at the first scan that has none.
@@ -100,10 +104,15 @@ def read_labelled(
 def label_by_weights(
     dataset: Dataset, segmenter: Segmenter, methods: Sequence[str] = PAPER_METHODS
 ) -> LabelScan:
-    """Return what labels scans by each of some methods that the weights have the parts for.
+    """Return a function that labels a scan by several methods.
+
+    Args:
+        dataset: the dataset that has the scans.
+        segmenter: the networks, with the parts that the methods need.
+        methods: names of the methods.
 
     Raises:
-        InputError: if the weights have other classes than the dataset.
+        InputError: if the weights do not have the dataset's classes.
     """
     check_classes(dataset, segmenter.taxonomy)
 
@@ -114,7 +123,7 @@ def label_by_weights(
 
 
 def label_from_files(dataset: Dataset, folder: Path) -> LabelScan:
-    """Return what reads the labels of scans from a folder of predictions.
+    """Return a function that reads the labels of a scan from a folder of predictions.
 
     Raises:
         InputError: if there is no such folder.

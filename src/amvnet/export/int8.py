@@ -12,19 +12,18 @@ import numpy as np
 
 from amvnet.errors import InputError
 from amvnet.export.onnx_files import digest, quiet, strip, writer_errors
-from amvnet.inference.inputs import Inputs, ScanOptions, adapter_for
+from amvnet.inference.inputs import ScanOptions, adapter_for, open_inputs
 from amvnet.inference.segmenter import Segmenter
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
 
-SIMULATED = "simulated"  # instead of a dataset: streets of the weights' sensor
+SIMULATED = "simulated"  # instead of scans: simulated streets, seen by the weights' sensor
 SEED = 20_261_121  # of these streets, far from the seeds of any training
-SCANS = 20  # that are used, evenly spaced
-HELD = 5  # the first of every five scans checks, the others calibrate
+SCANS = 20  # used at most, evenly spaced
+CHECK_EVERY = 5  # the first of every five scans checks, the others calibrate
 LEAST_AGREEMENT = 0.9  # of labels before and after; far less than a good calibration gives
-# The graphs that are convolutions, which take nearly all of the time, and whether their first layer
-# stays in float32: the range view's input has metres next to a mask of 0 and 1, for which 256 steps
-# are too few.
+# The graphs of convolutions, which take nearly all of the time; True if the first layer stays in
+# float32. The range view's input has metres next to a mask of 0 and 1: 256 steps are too few.
 FIRST_KEPT = {"range_net": True, "polar_map": False}
 
 
@@ -52,26 +51,26 @@ def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
 def quantise(
     folder: Path, names: Sequence[str], scans: Sequence[Scan]
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Replace exported graphs by quantised ones.
+    """Replace exported graphs by quantised ones, one after the other.
 
     Args:
-        folder: what `amvnet export` wrote.
-        names: the graphs, of `FIRST_KEPT`.
+        folder: the output folder of `amvnet export`.
+        names: the graphs to quantise, all of them in `FIRST_KEPT`.
         scans: the first of every five checks, the others calibrate. A single one does both.
 
     Yields:
-        Each name with the changes of its description: `precision`, `sha256`, and `agreement`, the
-        share of the points whose label by this network stays.
+        The name of each graph, with the new values in its description: `precision`, `sha256`, and
+        `agreement`, the share of the points whose label by this network stays.
 
     Raises:
         InputError: if a graph cannot be quantised, or the agreement is below `LEAST_AGREEMENT`.
     """
-    checking = list(scans[::HELD])
-    calibrating = [scan for index, scan in enumerate(scans) if index % HELD] or checking
+    checking = list(scans[::CHECK_EVERY])
+    calibrating = [scan for index, scan in enumerate(scans) if index % CHECK_EVERY] or checking
     recorder = _Recorder(folder)
     for name in names:
         expected = _labels(recorder, name, checking)
-        recorder.recorded[name].clear()
+        recorder.recorded[name].clear()  # the inputs of the scans that only check
         _labels(recorder, name, calibrating)
         path = folder / f"{name}.onnx"
         _write(path, recorder.recorded.pop(name))
@@ -86,7 +85,7 @@ def quantise(
 
 
 class _Recorder(OnnxSegmenter):
-    """Records the inputs of each graph: a list of (input name, array)."""
+    """Records the inputs of the graphs to quantise: for each run, an array by input name."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__(folder)
@@ -100,13 +99,16 @@ class _Recorder(OnnxSegmenter):
 
 
 def _read(text: str, segmenter: Segmenter) -> list[Scan]:
-    """Read up to `SCANS` scans, evenly spaced, adapted to the weights as `predict` does."""
+    """Read up to `SCANS` scans, evenly spaced, adapted to the weights as `predict` does.
+
+    Raises:
+        InputError: if an input is missing or broken, or no scan has a finite point.
+    """
     adapter = adapter_for(segmenter.weights)
-    inputs = Inputs(ScanOptions(), segmenter.taxonomy, adapter)
-    inputs.open([text])
-    count = len(inputs.scans)
+    opened = open_inputs([text], ScanOptions(), segmenter.taxonomy, adapter)
+    count = len(opened.scans)
     indices = np.linspace(0, count - 1, min(SCANS, count)).astype(int)
-    loaded = [inputs.scans[index].load().scan for index in indices]
+    loaded = [opened.scans[index].load().scan for index in indices]
 
     scans = [scan for scan in loaded if scan.valid.any()]
     if not scans:
@@ -117,7 +119,10 @@ def _read(text: str, segmenter: Segmenter) -> list[Scan]:
 
 
 def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarray:
-    """Return the labels of all scans' finite points, by the network that a graph is a part of."""
+    """Return the column of the largest score, 0..K - 1, for the finite points of all scans.
+
+    The scores are those of the network that the graph `name` is a part of.
+    """
     labels = []
     for scan in scans:
         points = scan.points[scan.valid]
@@ -131,7 +136,7 @@ def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarr
 
 
 def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
-    """Replace a graph by its quantised version, calibrated with some inputs.
+    """Replace a graph by its quantised version, calibrated with inputs recorded from scans.
 
     ONNX Runtime's kernels for x86 support unsigned activations with signed weights best. Weights
     have seven bits, because processors without VNNI would overflow with eight. The range of a value
@@ -148,7 +153,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
         quantize_static(
             ready,
             quantised,
-            _Inputs(inputs),
+            _CalibrationInputs(inputs),
             quant_format=QuantFormat.QDQ,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
@@ -164,7 +169,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
 
 
 def _first_layer(path: Path) -> list[str]:
-    """Return the names of the nodes up to the first activation."""
+    """Return the names of the nodes up to the first activation; none if there is no activation."""
     import onnx
 
     names = []
@@ -175,11 +180,11 @@ def _first_layer(path: Path) -> list[str]:
     return []
 
 
-class _Inputs:
-    """Hands the inputs to onnxruntime's calibration: one by one, then None."""
+class _CalibrationInputs:
+    """Gives the inputs to ONNX Runtime's calibration: one by one, then None."""
 
     def __init__(self, inputs: list[dict[str, np.ndarray]]) -> None:
-        self._left = iter(inputs)
+        self._iterator = iter(inputs)
 
     def get_next(self) -> dict[str, np.ndarray] | None:
-        return next(self._left, None)
+        return next(self._iterator, None)

@@ -1,4 +1,4 @@
-"""Write trained networks as ONNX, checked, with a description of everything a program needs."""
+"""Write trained networks as ONNX, check them, and describe all that a program needs to use them."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from amvnet.weights.file import Weights, load
 
 EXTRA = ("onnx", "onnxscript", "onnxruntime")
 OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it
-LARGEST_DIFFERENCE = 1e-4  # of probabilities, and of features as shares of the largest
+LARGEST_DIFFERENCE = 1e-4  # from torch: of probabilities, and of features by `_shares`
 POINTS = 5000  # of the artificial scan that the graphs are traced and checked with
-# The graphs whose first axis has any length, and its name.
+# The graphs whose first axis may have any length, and the name of this axis.
 DYNAMIC = {
     "polar_points": "points",
     "polar_pillars": "pillars",
@@ -51,11 +51,11 @@ class Graph:
     """One part of the method, to be exported.
 
     Attributes:
-        module: what is traced.
+        module: computes it in torch.
         inputs: an example of each input, by name.
         output: the output's name.
-        compared: turns outputs into what is compared with torch: probabilities, or shares of the
-            largest value.
+        compared: turns outputs into values to compare with torch: probabilities, or features by
+            `_shares`.
     """
 
     module: nn.Module
@@ -65,7 +65,7 @@ class Graph:
 
 
 class _Part(nn.Module):
-    """A part of a network as a module of its own."""
+    """A part of a network as a module of its own, with the network's parameters."""
 
     def __init__(self, net: nn.Module, part: Callable[[Tensor], Tensor]) -> None:
         super().__init__()
@@ -78,11 +78,11 @@ class _Part(nn.Module):
 
 @dataclass(frozen=True)
 class Exported:
-    """What was measured of exported graphs.
+    """How well exported graphs agree with torch.
 
     Attributes:
-        differences: the largest difference between each graph and torch, before int8.
-        agreement: of the graphs in int8, the share of the labels that stay.
+        differences: the largest difference from torch, by graph, before int8.
+        agreement: the share of the labels that stay in int8, by graph; empty without int8.
     """
 
     differences: dict[str, float]
@@ -98,6 +98,8 @@ def export(
     """Write the graphs and `amvnet.json` into a folder.
 
     Args:
+        weights: trained weights, or the name or path of a weights file.
+        out: the folder.
         int8: convert the convolutions to int8, calibrated with these scans: as `predict` takes
             them, or `simulated`.
 
@@ -114,16 +116,16 @@ def export(
     # Write everything into a temporary folder first.
     out = Path(out)
     make_folder(out)
-    part = out / f".{uuid.uuid4().hex}.part"
-    part.mkdir()
+    temporary = out / f".{uuid.uuid4().hex}.part"
+    temporary.mkdir()
     try:
-        description, measured = _write_all(segmenter, scans, part, progress)
-        # Without it, it never describes another export's graphs.
+        description, measured = _write_all(segmenter, scans, temporary, progress)
+        # An interruption must not leave the old description with new graphs.
         (out / DESCRIPTION).unlink(missing_ok=True)
         for name in description["graphs"]:
-            os.replace(part / f"{name}.onnx", out / f"{name}.onnx")
+            os.replace(temporary / f"{name}.onnx", out / f"{name}.onnx")
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
     with atomic_write(out / DESCRIPTION) as file:
         _save(description, file)
@@ -133,7 +135,11 @@ def export(
 def _write_all(
     segmenter: Segmenter, scans: Sequence[Scan], folder: Path, progress: Progress
 ) -> tuple[dict[str, Any], Exported]:
-    """Write the graphs, in int8 if there are scans; return the description and the measurements."""
+    """Write the graphs, and convert the convolutions to int8 if there are scans to calibrate with.
+
+    Returns:
+        The content of `amvnet.json`, and how well the graphs agree with torch.
+    """
     written: dict[str, dict[str, Any]] = {}
     with torch.no_grad():
         graphs = _graphs(segmenter)
@@ -142,9 +148,10 @@ def _write_all(
         for name, graph in graphs.items():
             progress(len(written), total)
             written[name] = _write(graph, name, folder / f"{name}.onnx")
+
     differences = {name: graph["difference"] for name, graph in written.items()}
     description = describe_export(segmenter, written)
-    _save(description, folder / DESCRIPTION)  # needed to run the graphs
+    _save(description, folder / DESCRIPTION)  # the calibration runs the graphs by it
     progress(len(graphs), total)
 
     agreement: dict[str, float] = {}
@@ -162,7 +169,7 @@ def _save(description: dict[str, Any], path: Path) -> None:
 
 
 def check_libraries() -> None:
-    """Raise InputError if a library of the extra is not installed."""
+    """Raise InputError if a library of the extra `export` is not installed."""
     for name in EXTRA:
         try:
             importlib.import_module(name)
@@ -191,8 +198,15 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
         "range_channels": ["x", "y", "z", "intensity", "range", "mask"],
         "polar_view": to_dict(model.polar_view),
         "polar_features": [
-            *("radius - centre", "angle - centre", "z - centre"),
-            *("radius", "angle", "z", "x", "y", "intensity"),
+            "radius - centre",
+            "angle - centre",
+            "z - centre",
+            "radius",
+            "angle",
+            "z",
+            "x",
+            "y",
+            "intensity",
         ],
         "assertion": to_dict(model.assertion),
     }
@@ -237,7 +251,7 @@ def _polar_graphs(model: AMVNet, batch: PointBatch, classes: int) -> dict[str, G
     pillars = grid.to_map(net.compress(pooled)).contiguous()
     decoded = grid.at_pillars(net.unet(pillars))
 
-    def by_voxel(scores: Tensor) -> Tensor:
+    def by_voxel(scores: Tensor) -> Tensor:  # (M, Z * K) -> (M, Z, K)
         return scores.unflatten(1, (-1, classes)).softmax(dim=2)
 
     return {
@@ -258,6 +272,7 @@ def _head_graph(model: AMVNet, batch: PointBatch, classes: int) -> Graph:
     f = torch.randn(count, classes, generator=generator).mul(3).softmax(dim=1)
     g = torch.randn(count, classes, generator=generator).mul(3).softmax(dim=1)
     uncertain = torch.arange(0, count, 5)
+    # Any points serve as neighbours in an example.
     shape = (len(uncertain), head.config.neighbours)
     near = torch.randint(count, shape, generator=generator)
 
@@ -267,7 +282,7 @@ def _head_graph(model: AMVNet, batch: PointBatch, classes: int) -> Graph:
 
 
 def _artificial_scan(segmenter: Segmenter) -> PointBatch:
-    """Return points all around the sensor, inside and outside the views, with rings."""
+    """Return random points all around the sensor, inside and outside the views, with rings."""
     rng = np.random.default_rng(0)
     model = segmenter.weights.model
     view = model.polar_view
@@ -285,6 +300,7 @@ def _probabilities(scores: Tensor) -> Tensor:
 
 
 def _shares(features: Tensor) -> Tensor:
+    """Return features as shares of the largest, or as they are if all are below 1."""
     return features / features.abs().max().clamp_min(1)
 
 
@@ -313,9 +329,9 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
 
     inputs, outputs, actual = _run(path, graph)
     difference = _difference(graph, expected, actual)
-    if not difference <= LARGEST_DIFFERENCE:
+    if not difference <= LARGEST_DIFFERENCE:  # also if it is NaN
         raise InputError(
-            f"{name}: expected at most {LARGEST_DIFFERENCE:g} of difference between ONNX Runtime "
+            f"{name}: expected a difference of at most {LARGEST_DIFFERENCE:g} between ONNX Runtime "
             f"and torch, found {difference:.2g}; use other versions of {', '.join(EXTRA)}"
         )
     return {
@@ -329,7 +345,11 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:
-    """Run a file on the example; return its inputs, its outputs, and the result."""
+    """Run a file on the example inputs.
+
+    Returns:
+        Descriptions of the file's inputs and of its outputs, and the result.
+    """
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])

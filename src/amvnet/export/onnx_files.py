@@ -1,4 +1,4 @@
-"""Tidy what the writers of ONNX print, raise and leave in their files."""
+"""Tame the libraries that write ONNX: their warnings, exceptions, and notes in the files."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from amvnet.errors import one_line_errors
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
+    """Return the SHA-256 of a file, in hexadecimal."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def strip(path: Path) -> None:
-    """Remove a writer's notes from a graph; they name places on this machine."""
+    """Remove the notes of the writing library from a graph; they contain paths of this machine."""
     import onnx
 
     model = onnx.load(path)
@@ -31,7 +31,7 @@ def strip(path: Path) -> None:
 
 @contextmanager
 def quiet(name: str) -> Iterator[None]:
-    """Suppress a writer's warnings and notes for developers; `name` is its logger's."""
+    """Suppress warnings, and what the logger `name` of a library says below errors."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -44,7 +44,15 @@ def quiet(name: str) -> Iterator[None]:
 
 
 def writer_errors(name: str, writer: str, libraries: str) -> AbstractContextManager[None]:
-    """Turn a writer's exceptions, which share no class and span pages, into one line."""
+    """Turn any exception of a library, which may span pages, into an InputError of one line.
+
+    An OSError, such as a full disk, passes as it is.
+
+    Args:
+        name: of the graph.
+        writer: the library that writes it.
+        libraries: what the user should upgrade.
+    """
 
     def message(error: BaseException) -> str:
         kind = type(error).__name__

@@ -9,8 +9,8 @@ from pathlib import Path
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.inference.fusion import Fusion
-from amvnet.inference.inputs import Inputs, InputScan, ScanOptions
-from amvnet.inference.pipeline import OutputOptions, Pipeline, segment_inputs
+from amvnet.inference.inputs import InputScan, ScanOptions, open_inputs
+from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.score_files import ScorePair
 from amvnet.inference.segmenter import Segmentation, check_scan
 from amvnet.progress import Progress, no_progress
@@ -77,38 +77,35 @@ def fuse_files(
     options: ScanOptions = ScanOptions(),
     progress: Progress = no_progress,
 ) -> tuple[int, float]:
-    """Fuse two models' scores of the scans that `predict` would segment, into its label files.
+    """Fuse two models' scores of scans, and write the labels as `predict` does.
 
     Args:
-        inputs: as of `predict.predict`.
+        inputs: as for `predict`.
         pair: the two models' scores.
         out: the folder of predictions.
         fusion: the head, its threshold, and the classes.
         options: which scans of the inputs to fuse.
 
     Returns:
-        The number of label files that there are now, and the share of the points that are
-        uncertain.
+        The number of label files, and the share of the points that are uncertain.
 
     Raises:
-        InputError: before anything is written, if scores of a scan are missing; later, if all are
-            broken.
+        InputError: before anything is written, if scores of a scan are missing; at the end, if all
+            are broken.
         SomeBroken: at the end, if the scores of some scans are broken.
     """
     head = fusion.head
     taxonomy = fusion.taxonomy if head is None else head.taxonomy
-    # The head sees scan files as the networks that it was trained with would.
+    # Scan files are adapted as for the networks that the head was trained with.
     view = ModelConfig().range_view if head is None else head.model.range_view
     adapter = ScanAdapter(view, "" if head is None else head.sensor)
 
-    opened = Inputs(options, taxonomy, adapter)
-    opened.open(inputs)
+    opened = open_inputs(inputs, options, taxonomy, adapter)
     for scan in opened.scans:
         pair.a.find(scan.scores_path)
         pair.b.find(scan.scores_path)
 
     segment = FileFusion(Fusion(head, fusion.tau), pair, opened.taxonomy.size)
-    pipeline = Pipeline(segment, OutputOptions(out), opened.taxonomy)
-    settings = {"fused": pair.to_dict()}
-    written = segment_inputs(opened.scans, pipeline, settings, progress=progress)
+    pipeline = Pipeline(opened.scans, segment, OutputOptions(out), opened.taxonomy)
+    written = pipeline.run({"fused": pair.to_dict()}, progress)
     return written, segment.uncertain_share

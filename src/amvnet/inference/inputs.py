@@ -1,11 +1,11 @@
-"""From what a user names to scans: datasets, scan files, bags, and folders of these."""
+"""The scans of a user's inputs: datasets, scan files, bags, and folders of these."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -44,8 +44,9 @@ class LoadedScan:
     """A scan in memory.
 
     Attributes:
-        scan: for the segmenter.
-        file_xyz: (N, 3) the coordinates in the scan's file; None for a scan of a dataset.
+        scan: as the segmenter takes it.
+        file_xyz: (N, 3) the coordinates as they are in the scan's file; None for a scan of a
+            dataset.
     """
 
     scan: Scan
@@ -58,7 +59,7 @@ class LabelFormat:
 
     Attributes:
         kind: one of `label_files.KINDS`.
-        taxonomy: of the raw ids.
+        taxonomy: turns train ids into the raw ids that are written.
     """
 
     kind: str
@@ -70,7 +71,7 @@ class InputScan(Protocol):
 
     @property
     def name(self) -> str:
-        """The name in messages, unique among the scans of one input."""
+        """The name for messages, unique among the scans of one input."""
 
     @property
     def title(self) -> str:
@@ -78,7 +79,7 @@ class InputScan(Protocol):
 
     @property
     def scores_path(self) -> Path:
-        """Where the `.npz` of its scores lies, relative to a folder of predictions."""
+        """The path of the `.npz` of its scores, relative to a folder of predictions."""
 
     @property
     def path(self) -> Path:
@@ -86,17 +87,25 @@ class InputScan(Protocol):
 
     @property
     def is_adapted(self) -> bool:
-        """Whether `ring` is the row of the range image of each point, see `Segmenter.by_ring`."""
+        """Whether `ring` is the row of each point in the range image, for `Segmenter.by_ring`."""
 
     def load(self, labels: bool = False) -> LoadedScan:
-        """Read the scan, with ground truth if there is any and it is asked for.
+        """Read the scan.
+
+        Args:
+            labels: whether to read the ground truth too, if there is any.
 
         Raises:
             InputError: if it cannot be read.
         """
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-        """Read (N,) train ids of its `count` points from a folder of predictions, or a file.
+        """Read the (N,) train ids of the scan's points.
+
+        Args:
+            path: a folder of predictions; for scan files, also a label file.
+            count: N.
+            taxonomy: turns the raw ids of scan files into train ids; datasets have their own.
 
         Raises:
             InputError: if they cannot be read.
@@ -105,12 +114,27 @@ class InputScan(Protocol):
     def write_labels(
         self, out: Path, form: LabelFormat, loaded: LoadedScan, labels: Labels
     ) -> Path:
-        """Write the labels into a folder of predictions; return the path of the file."""
+        """Write the labels into a folder of predictions.
+
+        Args:
+            out: the folder.
+            form: the format for scan files; datasets have their own.
+            loaded: the scan.
+            labels: of the scan's points.
+
+        Returns:
+            The path of the file.
+        """
 
 
 @dataclass(frozen=True)
 class Labels:
-    """(N,) train ids of a scan, and (N,) bool, the uncertain points; None if that is not known."""
+    """The labels of a scan with N points.
+
+    Attributes:
+        ids: (N,) train ids.
+        uncertain: (N,) bool, the uncertain points; None if unknown.
+    """
 
     ids: np.ndarray
     uncertain: np.ndarray | None = None
@@ -122,7 +146,7 @@ class DatasetScan:
 
     dataset: Dataset
     record: ScanRecord
-    is_adapted = False
+    is_adapted: ClassVar[bool] = False
 
     @property
     def name(self) -> str:
@@ -132,7 +156,7 @@ class DatasetScan:
     def title(self) -> str:
         if "/" in self.record.name:
             return self.record.name
-        # nuScenes: a token says nothing to people; the last part of the file's name is the time.
+        # The name is a token of nuScenes. The file's name is easier to read: it ends in the time.
         time = scan_stem(self.record.points_path).split("__")[-1]
         return f"{self.record.sequence}/{time}"
 
@@ -159,15 +183,20 @@ class DatasetScan:
 def adapter_for(
     weights: Weights, given: Sensor | None = None, say: Say = say_nothing
 ) -> ScanAdapter:
-    """Return what adapts scan files to some weights; see `ScanAdapter`."""
+    """Return a `ScanAdapter` of scan files for some weights.
+
+    Args:
+        given: what is known of the sensor; the rest is measured.
+        say: is told what was assumed of the sensor.
+    """
     return ScanAdapter(weights.model.range_view, weights.sensor, given, say)
 
 
 class FileReader:
     """Reads scan files, adapted to what some weights expect.
 
-    Whichever scan of a source is read first, after an interruption or in another process, the
-    first scans of the source are measured: all of its scans are adapted in the same way.
+    All scans of a source are adapted alike, by measurements of its first scans. These are measured
+    even if another scan is read first, as after an interruption or in one of several processes.
 
     Args:
         adapter: adapts the scans; None reads them as they are.
@@ -178,12 +207,17 @@ class FileReader:
         self._first: dict[str, list[NamedScan]] = {}
 
     def add(self, scan: NamedScan) -> None:
-        """Take note of a scan, in the order of its source."""
+        """Make a scan known; call this for the scans of a source in their order."""
         first = self._first.setdefault(scan.source, [])
         if len(first) < MEASURED:
             first.append(scan)
 
     def read(self, scan: NamedScan) -> LoadedScan:
+        """Read a scan.
+
+        Raises:
+            InputError: if it cannot be read, or no point is usable.
+        """
         if self.adapter is None:
             cloud = scan.read()
             return LoadedScan(cloud.to_scan(), cloud.xyz)
@@ -225,8 +259,8 @@ class FileScan:
         return self.reader.read(self.scan)
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-        file = path / f"{self.scan.name}.label" if path.is_dir() else path
-        return read_labels(file, np.uint32, count, taxonomy.to_train)
+        label_path = path / f"{self.scan.name}.label" if path.is_dir() else path
+        return read_labels(label_path, np.uint32, count, taxonomy.to_train)
 
     def write_labels(
         self, out: Path, form: LabelFormat, loaded: LoadedScan, labels: Labels
@@ -242,65 +276,65 @@ class FileScan:
         )
 
 
+@dataclass(frozen=True)
 class Inputs:
-    """The scans that a user named, and the classes of their labels.
+    """The scans of all inputs, and the classes of their labels.
+
+    Attributes:
+        scans: in the order of the inputs.
+        taxonomies: of each input; they have the same classes.
+    """
+
+    scans: Sequence[InputScan]
+    taxonomies: Sequence[Taxonomy]
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        return self.taxonomies[0]
+
+
+def open_inputs(
+    inputs: Sequence[str],
+    options: ScanOptions,
+    taxonomy: Taxonomy | None = None,
+    adapter: ScanAdapter | None = None,
+) -> Inputs:
+    """List the scans of all inputs.
 
     Args:
+        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
         options: which scans of the inputs to use.
         taxonomy: the classes, of weights or as the user names them. If None, they are those of the
             datasets; scan files have nuScenes' if they end in `.pcd.bin`, else SemanticKITTI's.
         adapter: adapts scan files to weights; None reads them as they are.
 
-    Attributes:
-        scans: in the order of the inputs.
+    Raises:
+        InputError: if an input is missing or has no scan, or the inputs have different classes.
     """
+    reader = FileReader(adapter)
+    scans: list[InputScan] = []
+    taxonomies: list[Taxonomy] = []
+    for text in inputs:
+        dataset = open_if_dataset(text, taxonomy)
+        if dataset is not None:
+            for record in choose_records(dataset, options.sequences, options.split):
+                scans.append(DatasetScan(dataset, record))
+            taxonomies.append(dataset.taxonomy)
+        else:
+            files = list(list_scans(text, options.topic))
+            for scan in files:
+                reader.add(scan)
+                scans.append(FileScan(scan, reader))
+            taxonomies.append(taxonomy or _usual_taxonomy(files[0]))
 
-    def __init__(
-        self,
-        options: ScanOptions,
-        taxonomy: Taxonomy | None = None,
-        adapter: ScanAdapter | None = None,
-    ) -> None:
-        self.scans: list[InputScan] = []
-        self._options = options
-        self._named_taxonomy = taxonomy
-        self._taxonomies: list[Taxonomy] = []
-        self._reader = FileReader(adapter)
-
-    @property
-    def taxonomy(self) -> Taxonomy:
-        return self._taxonomies[0]
-
-    def open(self, inputs: Sequence[str]) -> None:
-        """List the scans of all inputs.
-
-        Args:
-            inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of
-                these.
-
-        Raises:
-            InputError: if an input is missing or has no scan, or the inputs have different classes.
-        """
-        options = self._options
-        for text in inputs:
-            dataset = open_if_dataset(text, self._named_taxonomy)
-            if dataset is not None:
-                for record in choose_records(dataset, options.sequences, options.split):
-                    self.scans.append(DatasetScan(dataset, record))
-                self._taxonomies.append(dataset.taxonomy)
-            else:
-                for scan in list_scans(text, options.topic):
-                    self._reader.add(scan)
-                    self.scans.append(FileScan(scan, self._reader))
-                self._taxonomies.append(self._named_taxonomy or _usual_taxonomy(self.scans[-1]))
-
-        if len({taxonomy.classes for taxonomy in self._taxonomies}) > 1:
-            raise InputError(
-                "expected inputs with the same classes, found several; "
-                "take them one after the other"
-            )
+    if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
+        raise InputError(
+            "expected inputs with the same classes, found different ones; "
+            "take them one after the other"
+        )
+    return Inputs(scans, taxonomies)
 
 
-def _usual_taxonomy(scan: InputScan) -> Taxonomy:
-    """Return the classes that labels of a scan file have if nobody names them."""
+def _usual_taxonomy(scan: NamedScan) -> Taxonomy:
+    """Return the classes of a scan file's labels if the user names none."""
     return NUSCENES if ending_of(scan.path) == NUSCENES_ENDING else SEMANTICKITTI

@@ -26,7 +26,7 @@ from amvnet.inference.segmenter import Segmentation
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 
-AHEAD = 3  # scans that are read before they are needed, and that may wait to be written
+AHEAD = 3  # scans that are read ahead of the computing, and that may wait to be written
 Result = Segmentation | InputError
 
 
@@ -63,7 +63,7 @@ class ExecutionOptions:
         at_once: on a CPU, scans that are segmented at the same time, each with its share of the
             threads. None means as many as there are threads, at most 4; 1 on a GPU, or with an
             engine other than torch, which shares out the threads itself.
-        resume: leave out what an interrupted run into the same folder has done.
+        resume: leave out the scans that an interrupted run into the same folder has done.
         processes: those that share the scans.
 
     Raises:
@@ -84,65 +84,39 @@ class ExecutionOptions:
 
 
 class SegmentScans(Protocol):
-    """Segments some loaded scans of the inputs, in their order."""
+    """Segments scans that have been read."""
 
-    def __call__(
-        self, inputs: Sequence[InputScan], scans: Sequence[Scan]
-    ) -> list[Segmentation]: ...
+    def __call__(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+        """Return the results in the order of the scans.
+
+        Args:
+            inputs: where each scan is from.
+            scans: the same scans, in memory.
+
+        Raises:
+            InputError: if one of them cannot be segmented.
+        """
 
 
 @dataclass(frozen=True)
 class Segmented:
-    """A scan on its way through the pipeline, after its turn in the networks."""
+    """A scan that waits to be written."""
 
     scan: InputScan
-    loaded: LoadedScan | None
-    result: Result
+    loaded: LoadedScan
+    result: Segmentation
 
 
-def segment_inputs(
-    scans: Sequence[InputScan],
-    pipeline: Pipeline,
-    settings: Mapping[str, Any],
-    progress: Progress = no_progress,
-) -> int:
-    """Segment scans, and write what is found for each.
+@dataclass(frozen=True)
+class Broken:
+    """A scan that could not be read or segmented, and why: one line."""
 
-    Args:
-        settings: what the labels depend on, as JSON types; an interrupted run is resumed only with
-            the same settings.
-
-    Returns:
-        The number of label files of this run and the run that it resumes.
-
-    Raises:
-        InputError: if two scans would have the same files, or all scans are broken.
-        SomeBroken: at the end, if some of several scans are broken.
-    """
-    output = pipeline.output
-    processes = pipeline.execution.processes
-    _check_names(scans)
-    for scan in scans:
-        _check_folder(scan, output)
-
-    journal = Journal(output.folder, settings, pipeline.execution.resume, processes)
-    left = [scan for scan in processes.share(scans) if str(scan.scores_path) not in journal.done]
-    faults: list[str] = []
-    for done, (scan, fault) in enumerate(pipeline.stream(left)):
-        progress(done, len(left))
-        if fault is None:
-            journal.add(str(scan.scores_path))
-        else:
-            faults.append(fault)
-    progress(len(left), len(left))
-    journal.close()
-
-    _raise_faults(list(chain.from_iterable(processes.gather(faults))), len(scans))
-    return len(scans)
+    scan: InputScan
+    fault: str
 
 
 def _raise_faults(faults: list[str], total: int) -> None:
-    """Raise an exception if some of all scans, or every one, were broken."""
+    """Raise SomeBroken if some of `total` scans are broken, InputError if all are."""
     if faults and len(faults) == total:
         others = len(faults) - 1
         more = f" (and {others} more scans, each broken)" if others else ""
@@ -155,23 +129,24 @@ def _raise_faults(faults: list[str], total: int) -> None:
 
 
 def _check_names(scans: Sequence[InputScan]) -> None:
-    names: dict[Path, str] = {}
+    """Raise InputError if two scans would have the same files."""
+    paths: set[Path] = set()
     for scan in scans:
-        if scan.scores_path in names:
+        if scan.scores_path in paths:
             raise InputError(
                 f"expected scans of different names, found {scan.name} twice "
                 f"({scan.scores_path.stem}); segment them in two runs with two folders"
             )
-        names[scan.scores_path] = scan.name
+        paths.add(scan.scores_path)
 
 
 def _check_folder(scan: InputScan, output: OutputOptions) -> None:
-    """Raise InputError if the output would lie among the scans, and be taken for one of them."""
-    labels_like_scans = f".{output.kind}" in READERS
-    scores_like_scan = output.scores and scan.path.suffix.lower() == ".npz"
+    """Raise InputError if output files would lie among the scans and could be taken for scans."""
+    labels_look_like_scans = f".{output.kind}" in READERS
+    scores_look_like_scans = output.scores and scan.path.suffix.lower() == ".npz"
     folder = (output.folder / scan.scores_path).parent
     is_own_folder = folder.resolve() == scan.path.parent.resolve()
-    if is_own_folder and (labels_like_scans or scores_like_scan):
+    if is_own_folder and (labels_look_like_scans or scores_look_like_scans):
         raise InputError(
             f"{scan.path}: expected another folder for the labels, found the scan's own; "
             "change --out"
@@ -183,21 +158,63 @@ class Pipeline:
     """Reads, segments and writes scans at the same time.
 
     Attributes:
+        scans: the scans, for all processes together.
         segment: segments scans that have been read.
         output: what is written, and where.
         taxonomy: the classes of the labels.
-        execution: how many scans at a time; `at_once` None means 1 here.
+        execution: how many scans at a time; an `at_once` of None means 1 here.
     """
 
+    scans: Sequence[InputScan]
     segment: SegmentScans
     output: OutputOptions
     taxonomy: Taxonomy
     execution: ExecutionOptions = ExecutionOptions()
 
-    def stream(self, scans: Sequence[InputScan]) -> Iterator[tuple[InputScan, str | None]]:
-        """Yield each scan when its files are written, in order, with what is wrong with it.
+    def run(self, settings: Mapping[str, Any], progress: Progress = no_progress) -> int:
+        """Segment the scans, and write the results.
 
-        Only a few scans are in memory at a time.
+        Args:
+            settings: what the labels depend on, as JSON types; an interrupted run is resumed only
+                with the same settings.
+
+        Returns:
+            The number of label files of these scans, with those of the run that is resumed.
+
+        Raises:
+            InputError: if two scans would have the same files, an output folder is that of a scan,
+                or all scans are broken.
+            SomeBroken: at the end, if some of several scans are broken.
+        """
+        processes = self.execution.processes
+        _check_names(self.scans)
+        for scan in self.scans:
+            _check_folder(scan, self.output)
+
+        journal = Journal(self.output.folder, settings, self.execution.resume, processes)
+        share = processes.share(self.scans)
+        remaining = [scan for scan in share if str(scan.scores_path) not in journal.done]
+
+        faults: list[str] = []
+        for done, (scan, fault) in enumerate(self.stream(remaining)):
+            progress(done, len(remaining))
+            if fault is None:
+                journal.add(str(scan.scores_path))
+            else:
+                faults.append(fault)
+        progress(len(remaining), len(remaining))
+        journal.close()
+
+        all_faults = list(chain.from_iterable(processes.gather(faults)))
+        _raise_faults(all_faults, len(self.scans))
+        return len(self.scans)
+
+    def stream(self, scans: Sequence[InputScan]) -> Iterator[tuple[InputScan, str | None]]:
+        """Read, segment and write scans, of which only a few are in memory at a time.
+
+        Yields:
+            Each scan and None when its files are written, in order; or a scan that is broken and a
+            line that says why, which may come before its turn.
         """
         batch = self.execution.batch
         at_once = self.execution.at_once or 1
@@ -206,12 +223,12 @@ class Pipeline:
             computing_threads(at_once) as computer,
             ThreadPoolExecutor(1) as writer,
         ):
-            # Each of the three stages works while the others do, on scans further down the line.
+            # Reading, computing and writing go on at the same time, each on other scans.
             loads = ((scan, reader.submit(scan.load)) for scan in scans)
             reading = deque(islice(loads, max(AHEAD, batch * at_once)))
-            computing = deque[Future[list[Segmented]]]()
+            computing = deque[Future[list[Segmented | Broken]]]()
             writing = deque[tuple[InputScan, Future[None]]]()
-            # One group waits, so that no thread has to.
+            # One more group than threads, so that no thread has to wait for the next.
             most_groups = at_once + 1 if at_once > 1 else 1
             try:
                 while reading or computing:
@@ -220,24 +237,28 @@ class Pipeline:
                         reading.extend(islice(loads, len(group)))
                         computing.append(computer.submit(self._segment_group, group))
 
-                    for segmented in computing.popleft().result():
-                        if isinstance(segmented.result, InputError):
-                            yield segmented.scan, str(segmented.result)
+                    for outcome in computing.popleft().result():
+                        if isinstance(outcome, Broken):
+                            yield outcome.scan, outcome.fault
                             continue
-                        writing.append((segmented.scan, writer.submit(self._write, segmented)))
+                        writing.append((outcome.scan, writer.submit(self._write, outcome)))
                         while len(writing) > AHEAD:
                             yield _wait(*writing.popleft())
                 while writing:
                     yield _wait(*writing.popleft())
             finally:
+                # After an error, what has been submitted is not needed any more.
                 for pool in (reader, computer):
                     pool.shutdown(wait=False, cancel_futures=True)
 
     def _segment_group(
         self, group: Sequence[tuple[InputScan, Future[LoadedScan]]]
-    ) -> list[Segmented]:
-        """Return the results of some scans that are being read; first those that are broken."""
-        broken: list[Segmented] = []
+    ) -> list[Segmented | Broken]:
+        """Wait for scans that are being read, and segment them together.
+
+        Scans that cannot be read come first in the result.
+        """
+        outcomes: list[Segmented | Broken] = []
         scans: list[InputScan] = []
         loaded: list[LoadedScan] = []
         for scan, load in group:
@@ -245,13 +266,18 @@ class Pipeline:
                 loaded.append(load.result())
                 scans.append(scan)
             except InputError as error:
-                broken.append(Segmented(scan, None, error))
+                outcomes.append(Broken(scan, str(error)))
 
-        results = self._segment_scans(scans, [one.scan for one in loaded])
-        return broken + [Segmented(*parts) for parts in zip(scans, loaded, results, strict=True)]
+        results = self._segment_scans(scans, [item.scan for item in loaded])
+        for scan, scan_loaded, result in zip(scans, loaded, results, strict=True):
+            if isinstance(result, InputError):
+                outcomes.append(Broken(scan, str(result)))
+            else:
+                outcomes.append(Segmented(scan, scan_loaded, result))
+        return outcomes
 
     def _segment_scans(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Result]:
-        """Segment scans together, or one by one to find which of them is broken."""
+        """Segment scans together; if that fails, one by one to find those that are broken."""
         if not scans:
             return []
         try:
@@ -266,10 +292,8 @@ class Pipeline:
         return results
 
     def _write(self, segmented: Segmented) -> None:
-        """Write what is asked for, the labels last."""
+        """Write the files of a scan, the labels last: where they are, the others are too."""
         result = segmented.result
-        assert isinstance(result, Segmentation)
-        assert segmented.loaded is not None
         folder = self.output.folder
         scores_path = folder / segmented.scan.scores_path
 
@@ -277,19 +301,20 @@ class Pipeline:
             write_scores(scores_path, result)
         if self.output.uncertain:
             write_uncertain(scores_path.with_suffix(".uncertain.npy"), result.uncertain)
-        has_both = result.rv is not None and result.bev is not None
+
+        has_two_networks = result.rv is not None and result.bev is not None
         segmented.scan.write_labels(
             folder,
             LabelFormat(self.output.kind, self.taxonomy),
             segmented.loaded,
-            Labels(result.labels, result.uncertain if has_both else None),
+            Labels(result.labels, result.uncertain if has_two_networks else None),
         )
 
 
 class CallingThread(Executor):
-    """Computes in the thread that asks, which has all of torch's threads.
+    """Computes in the thread that submits, with all of torch's threads.
 
-    A second thread with its own team of OpenMP threads would halve the speed of both.
+    A second thread would start its own team of OpenMP threads, which would halve the speed of both.
     """
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -303,7 +328,7 @@ class CallingThread(Executor):
 
 @contextmanager
 def computing_threads(at_once: int) -> Iterator[Executor]:
-    """Yield what computes `at_once` groups of scans at a time, each with a share of the threads."""
+    """Yield an executor of `at_once` jobs at a time, each with a share of torch's threads."""
     if at_once == 1:
         yield CallingThread()
         return
@@ -316,11 +341,11 @@ def computing_threads(at_once: int) -> Iterator[Executor]:
         ) as pool:
             yield pool
     finally:
-        torch.set_num_threads(threads)
+        torch.set_num_threads(threads)  # the pool's threads changed it for the whole process
 
 
 def _wait(scan: InputScan, writing: Future[None]) -> tuple[InputScan, None]:
-    writing.result()  # raises what went wrong
+    writing.result()  # raises the exception of a failed write
     return scan, None
 
 

@@ -8,8 +8,8 @@ from itertools import groupby
 from typing import Any
 
 from amvnet.errors import InputError
-from amvnet.inference.inputs import Inputs, InputScan, ScanOptions, adapter_for
-from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline, segment_inputs
+from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
@@ -29,17 +29,20 @@ def predict(
 
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
+        segmenter: labels the scans.
         output: what is written, and where.
         options: which scans of the inputs to segment.
         execution: how many scans at a time, and by which processes.
-        adapter: adapts scan files to what the weights expect; None measures all and says nothing.
+        adapter: adapts scan files to what the weights expect; None measures everything about the
+            sensor and says nothing.
 
     Returns:
-        The number of label files that there are now.
+        The number of label files of these scans, with those of the run that is resumed.
 
     Raises:
-        InputError: before anything is written, if an input is missing or its folder is that of the
-            output, or the method has no uncertain points; later, if every scan is broken.
+        InputError: before anything is written, if an input is missing, its folder is that of the
+            output, or the method has no uncertain points to write; at the end, if every scan is
+            broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
     if output.uncertain and segmenter.method in ("rv", "bev"):
@@ -49,18 +52,16 @@ def predict(
         )
 
     adapter = adapter or adapter_for(segmenter.weights)
-    opened = Inputs(options, segmenter.taxonomy, adapter)
-    opened.open(inputs)
+    opened = open_inputs(inputs, options, segmenter.taxonomy, adapter)
 
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
     segment = NetworkSegmentation(segmenter)
-    pipeline = Pipeline(segment, output, segmenter.taxonomy, execution)
-    settings = _settings(segmenter, output, adapter)
-    return segment_inputs(opened.scans, pipeline, settings, progress)
+    pipeline = Pipeline(opened.scans, segment, output, segmenter.taxonomy, execution)
+    return pipeline.run(_settings(segmenter, output, adapter), progress)
 
 
 class NetworkSegmentation:
-    """Segments scans with a segmenter, whether they are adapted to the weights or not."""
+    """Segments scans of the inputs; those that are adapted to the weights, by their rings."""
 
     def __init__(self, segmenter: Segmenter) -> None:
         self.segmenter = segmenter
@@ -83,7 +84,7 @@ def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter)
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": segmenter.method,
-        "sensor": repr(adapter.given),
+        "sensor": repr(adapter.sensor),
         "scores": output.scores,
         "uncertain": output.uncertain,
         "format": output.kind,

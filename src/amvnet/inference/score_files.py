@@ -1,11 +1,10 @@
-"""Class probabilities from files: what any two segmenters say of a scan, checked and read for the late fusion."""
+"""Read two models' scores of scans from files, and check them, for the late fusion."""
 
 from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -14,28 +13,33 @@ from zipfile import BadZipFile
 import numpy as np
 
 from amvnet.data.datasets.base import ScanRecord
-from amvnet.errors import InputError
+from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import Scan
 
-SURE = (
-    1e-7  # two models that are wholly sure of different classes have a product of 0 for every class
-)
-ROUNDING = 0.02  # by which a row of K float16 probabilities, or of ones with two decimals, may miss a sum of 1
+# The least probability in a fusion. If two models are wholly sure of different classes, the product
+# of their scores is otherwise 0 for every class.
+SURE = 1e-7
+
+ROUNDING = 0.02  # sums of rows are off 1 by up to this if rounded to float16 or two decimals
+
 ENDINGS = (".npz", ".npy")
 TAIL = 4096  # bytes at the end of a file: the checksums of an .npz, the last points of an .npy
+
+# What NumPy raises for files that are not its own, truncated or corrupt.
+READ_ERRORS = (ValueError, EOFError, OSError, BadZipFile, zlib.error)
 
 Which = Literal["a", "b", "both"]
 
 
 @dataclass(frozen=True)
 class ScoreFolder:
-    """One model's scores of some scans, a file for each.
+    """One model's scores of some scans, in one file per scan.
 
     Attributes:
         side: "a" or "b", for messages.
-        folder: where the files are, each at its scan's place.
-        key: which array of an `.npz`; None where there is just one.
-        logits: whether they are scores before softmax.
+        folder: folder of the files, in the layout of `amvnet predict --scores`.
+        key: name of the array in an `.npz`; None if there is only one.
+        logits: whether the scores are logits, not probabilities.
     """
 
     side: str
@@ -43,65 +47,87 @@ class ScoreFolder:
     key: str | None = None
     logits: bool = False
 
-    def find(self, place: Path) -> Path:
-        """The file of the scan whose prediction would lie at `place` (relative); raises InputError where none is."""
+    def find(self, prediction: Path) -> Path:
+        """Return the file of a scan's scores.
+
+        Args:
+            prediction: path of the scan's predicted labels, relative to a folder of predictions;
+                its ending is ignored.
+
+        Raises:
+            InputError: if there is no such file.
+        """
         for ending in ENDINGS:
-            if (path := (self.folder / place).with_suffix(ending)).is_file():
+            path = (self.folder / prediction).with_suffix(ending)
+            if path.is_file():
                 return path
-        first = (self.folder / place).with_suffix(ENDINGS[0])
+
+        expected = (self.folder / prediction).with_suffix(ENDINGS[0])
         raise InputError(
-            f"{first}: expected the scores of this scan there, or as .npy, found none; "
+            f"{expected}: expected the scores of this scan there, or as .npy, found none; "
             "lay them out as predict --scores does"
         )
 
-    def read(self, place: Path, scan: Scan, classes: int) -> np.ndarray:
-        """(N, K) float32 class probabilities of one scan; rows of points that are not valid are as they come.
+    def read(self, prediction: Path, scan: Scan, classes: int) -> np.ndarray:
+        """Return the (N, K) float32 class probabilities of a scan.
+
+        Rows of points that are not valid are not checked.
+
+        Args:
+            prediction: see `find`.
 
         Raises:
-            InputError: where there is no such file, or not the probabilities of this scan's points in it.
+            InputError: if there is no such file, or it does not hold scores of this scan's points.
         """
-        path = self.find(place)
-        found = self._array(path)
-        if found.ndim != 2 or len(found) != len(scan) or found.shape[1] != classes:
-            more = (
-                "drop the column of points without a class"
-                if found.shape[-1:] == (classes + 1,)
-                else "give those"
+        path = self.find(prediction)
+        scores = self._load(path)
+
+        if scores.shape != (len(scan), classes):
+            has_other_column = scores.shape[-1:] == (classes + 1,)
+            advice = (
+                "drop the column of points without a class" if has_other_column else "give those"
             )
             raise InputError(
-                f"{path}: expected scores of shape ({len(scan)}, {classes}), one row per point and one column per "
-                f"class, found {found.shape}; {more}"
+                f"{path}: expected scores of shape ({len(scan)}, {classes}), one row per point and "
+                f"one column per class, found {scores.shape}; {advice}"
             )
-        if found.dtype.kind != "f":
+
+        if scores.dtype.kind != "f":
             raise InputError(
-                f"{path}: expected float scores, found {found.dtype}; save class probabilities"
+                f"{path}: expected float scores, found {scores.dtype}; save class probabilities"
             )
-        found = found.astype(np.float32)
+
+        scores = scores.astype(np.float32)
+        valid = scores[scan.valid]
         if self.logits:
-            check_finite(found[scan.valid], str(path))
-            return _softmax(found)
-        check_probabilities(
-            found[scan.valid], str(path), f"apply softmax, or say --logits {self.side}"
-        )
-        return found
+            check_finite(valid, str(path))
+            return _softmax(scores)
 
-    def _array(self, path: Path) -> np.ndarray:
-        """The array of a file; nothing is ever unpickled."""
-        with _readable(path):
-            found = np.load(path, allow_pickle=False)
-            if isinstance(found, np.ndarray):
-                return found
-            with found:
-                return np.asarray(found[self._key(path, found.files)])
+        check_probabilities(valid, str(path), f"apply softmax, or say --logits {self.side}")
+        return scores
 
-    def _key(self, path: Path, keys: Sequence[str]) -> str:
+    def _load(self, path: Path) -> np.ndarray:
+        """Return the array of a file. Pickled objects are never loaded."""
+        message = f"{path}: expected NumPy scores, found a broken file; write it again"
+        with one_line_errors(lambda _: message, only=READ_ERRORS):
+            content = np.load(path, allow_pickle=False)
+            if isinstance(content, np.ndarray):
+                return content
+
+            with content:
+                return np.asarray(content[self._choose_key(path, content.files)])
+
+    def _choose_key(self, path: Path, keys: Sequence[str]) -> str:
+        """Return the name of the array to read, of those in an `.npz`."""
         if self.key is None and len(keys) == 1:
             return keys[0]
-        if self.key in keys:
-            return str(self.key)
-        wanted = "one array" if self.key is None else f"the array {self.key}"
+        if self.key is not None and self.key in keys:
+            return self.key
+
+        expected = "one array" if self.key is None else f"the array {self.key}"
         raise InputError(
-            f"{path}: expected {wanted}, found {', '.join(keys) or 'none'}; choose one with --key-{self.side}"
+            f"{path}: expected {expected}, found {', '.join(keys) or 'none'}; "
+            f"choose one with --key-{self.side}"
         )
 
 
@@ -116,91 +142,109 @@ class ScorePair:
     def of(
         cls, a: Path, b: Path, key_a: str | None, key_b: str | None, logits: Which | None
     ) -> ScorePair:
-        """From what a user says.
+        """Return the pair for the options of the command line.
 
         Raises:
-            InputError: where a folder is not there.
+            InputError: if a folder is missing.
         """
         for folder in (a, b):
             if not folder.is_dir():
                 raise InputError(
                     f"{folder}: expected a folder of scores, found none; check the path"
                 )
-        first = ScoreFolder("a", a, key_a, logits in ("a", "both"))
-        return cls(first, ScoreFolder("b", b, key_b, logits in ("b", "both")))
 
-    def read(self, place: Path, scan: Scan, classes: int) -> tuple[np.ndarray, np.ndarray]:
-        """f and g of a scan, as `ScoreFolder.read` has them."""
-        return self.a.read(place, scan, classes), self.b.read(place, scan, classes)
+        return cls(
+            ScoreFolder("a", a, key_a, logits in ("a", "both")),
+            ScoreFolder("b", b, key_b, logits in ("b", "both")),
+        )
+
+    def read(self, prediction: Path, scan: Scan, classes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the probabilities f and g of a scan, each as `ScoreFolder.read`."""
+        f = self.a.read(prediction, scan, classes)
+        g = self.b.read(prediction, scan, classes)
+        return f, g
 
     def to_dict(self) -> dict[str, Any]:
-        """What a user said, by model."""
-        return {one.side: asdict(one) | {"folder": str(one.folder)} for one in (self.a, self.b)}
+        """Return the settings of both folders, as JSON types."""
+        settings = {}
+        for scores in (self.a, self.b):
+            settings[scores.side] = {**asdict(scores), "folder": str(scores.folder)}
+
+        return settings
 
     def options(self) -> list[str]:
-        """The same as options of a command line."""
-        found = [
-            word for one in (self.a, self.b) for word in (f"--scores-{one.side}", str(one.folder))
-        ]
-        found += [
-            word
-            for one in (self.a, self.b)
-            if one.key is not None
-            for word in (f"--key-{one.side}", one.key)
-        ]
-        sides = [one.side for one in (self.a, self.b) if one.logits]
-        return found + (["--logits", "both" if len(sides) == 2 else sides[0]] if sides else [])
+        """Return the command-line options that give this pair."""
+        folders = (self.a, self.b)
+
+        options = []
+        for scores in folders:
+            options += [f"--scores-{scores.side}", str(scores.folder)]
+        for scores in folders:
+            if scores.key is not None:
+                options += [f"--key-{scores.side}", scores.key]
+
+        sides = [scores.side for scores in folders if scores.logits]
+        if sides:
+            options += ["--logits", "both" if len(sides) == 2 else sides[0]]
+        return options
 
     def digests(self, records: Sequence[ScanRecord]) -> dict[str, str]:
-        """Tell the scores of some scans from other ones, wherever they lie."""
-        return {one.side: _digest(one, records) for one in (self.a, self.b)}
+        """Return a digest of each model's scores of some scans, the same wherever the files lie."""
+        return {scores.side: _digest(scores, records) for scores in (self.a, self.b)}
 
 
-def check_probabilities(values: np.ndarray, name: str, cure: str) -> None:
-    """Raises InputError where (P, K) scores are not probabilities of classes; `cure` is what to do."""
+def check_probabilities(values: np.ndarray, name: str, advice: str) -> None:
+    """Check that (P, K) scores are class probabilities.
+
+    Args:
+        name: of the scores, for the message.
+        advice: what to do if they are not.
+
+    Raises:
+        InputError: if a value is negative or not finite, or a row does not add up to 1.
+    """
     check_finite(values, name)
+
     sums = values.sum(axis=1)
-    wrong = (np.abs(sums - 1) > ROUNDING) | (values < 0).any(axis=1)
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise InputError(
-            f"{name}: expected class probabilities, found a row from {values[row].min():.3g} to "
-            f"{values[row].max():.3g} with the sum {sums[row]:.3g}; {cure}"
-        )
+    is_wrong = (np.abs(sums - 1) > ROUNDING) | (values < 0).any(axis=1)
+    if not is_wrong.any():
+        return
+
+    row = int(is_wrong.argmax())
+    raise InputError(
+        f"{name}: expected class probabilities, found a row from {values[row].min():.3g} to "
+        f"{values[row].max():.3g} with the sum {sums[row]:.3g}; {advice}"
+    )
 
 
 def check_finite(values: np.ndarray, name: str) -> None:
-    """Raises InputError where a score is not a finite number."""
+    """Check that all scores are finite.
+
+    Raises:
+        InputError: if one is NaN or infinite.
+    """
     if not np.isfinite(values).all():
         raise InputError(
             f"{name}: expected finite scores, found NaN or infinity among them; give probabilities"
         )
 
 
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    """Raises InputError where NumPy cannot read a file."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (ValueError, EOFError, OSError, BadZipFile, zlib.error):
-        raise InputError(
-            f"{path}: expected NumPy scores, found a broken file; write it again"
-        ) from None
-
-
-def _softmax(values: np.ndarray) -> np.ndarray:
-    powers = np.exp(values - values.max(axis=1, keepdims=True))
+def _softmax(logits: np.ndarray) -> np.ndarray:
+    """Return the (N, K) probabilities of (N, K) logits."""
+    powers = np.exp(logits - logits.max(axis=1, keepdims=True))
     return powers / powers.sum(axis=1, keepdims=True)
 
 
 def _digest(scores: ScoreFolder, records: Sequence[ScanRecord]) -> str:
-    found = hashlib.sha256(repr((scores.key, scores.logits)).encode())
+    """Return a digest of the scores of some scans, by the size and the end of each file."""
+    digest = hashlib.sha256(repr((scores.key, scores.logits)).encode())
+
     for record in records:
         path = scores.find(Path(record.prediction))
         size = path.stat().st_size
         with path.open("rb") as file:
             file.seek(max(size - TAIL, 0))
-            found.update(f"{record.name} {size} ".encode() + file.read())
-    return found.hexdigest()[:16]
+            end = file.read()
+        digest.update(f"{record.name} {size} ".encode() + end)
+
+    return digest.hexdigest()[:16]

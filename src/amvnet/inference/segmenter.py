@@ -31,14 +31,14 @@ MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
 class Segmentation:
     """The result for the N points of a scan, in their order.
 
-    A point that is not finite has id 0, is not uncertain, and has scores of 0.
+    A point that is not valid (see `Scan.valid`) has id 0, is not uncertain, and has scores of 0.
 
     Attributes:
-        labels: (N,) uint8 train ids 1..K; 0 for points that are not finite.
+        labels: (N,) uint8 train ids 1..K; 0 for points that are not valid.
         uncertain: (N,) bool, the points on which the two networks disagree; all False for a single
             network.
-        scores: (N, K) float32 whose largest column c is the label c + 1. Rows of the geometric mean
-            (the ensemble, and AMVNet's certain points) do not sum to 1.
+        scores: (N, K) float32; the label of a point is c + 1 for its largest column c. Rows of the
+            geometric mean (the ensemble, and AMVNet's certain points) do not sum to 1.
         rv, bev: (N, K) float32 class probabilities by each network, or None if it did not run.
     """
 
@@ -63,8 +63,8 @@ class Segmenter:
             saves time for each scan. This changes the allocator of your program.
 
     Raises:
-        InputError: if the weights lack a part that the method needs, or there is no such device or
-            precision.
+        InputError: if the weights lack a part that the method needs, their assertion needs labels,
+            or there is no such method, device or precision.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Segmenter:
 
     @property
     def at_once(self) -> int:
-        """How many scans are best segmented at a time, each with its share of the threads."""
+        """The best number of scans to segment at a time, each with its share of the threads."""
         if self.device != "cpu" or self.engine != "torch":
             return 1
         return min(torch.get_num_threads(), MOST_AT_ONCE)
@@ -110,7 +110,7 @@ class Segmenter:
         """Segment one scan: (N, 4) x, y, z in metres and intensity in [0, 1], or a `Scan`.
 
         Raises:
-            InputError: if there is no finite point, or the model needs a ring index and there is
+            InputError: if there is no valid point, or the model needs a ring index and there is
                 none.
         """
         return self.many([points])[0]
@@ -124,15 +124,17 @@ class Segmenter:
         checked = [check_scan(points) for points in scans]
         batch = self._batch(checked)
         labels, scores = _fetch(self._scores(batch))
-        return [
-            _segmentation(scan.valid, labels, scores, points)
-            for scan, points in zip(checked, batch.slices(), strict=True)
-        ]
+
+        results = []
+        for scan, points in zip(checked, batch.slices(), strict=True):
+            results.append(_segmentation(scan.valid, labels, scores, points))
+        return results
 
     def by_ring(self) -> Segmenter:
         """Return a segmenter for scans whose `ring` is the row of each point, 0 the lowest.
 
-        It shares the networks with this one, whatever the rows of the weights' range view are.
+        It shares the networks with this one. The rows of its range view are rings even if those of
+        the weights' are elevations.
         """
         segmenter = copy.copy(self)
         segmenter.model = copy.copy(self.model)
@@ -143,26 +145,32 @@ class Segmenter:
     def labels_by_method(
         self, scan: Scan, methods: Sequence[str] = PAPER_METHODS
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-        """Return (N,) train ids by each method that the weights have the parts for.
+        """Label the N points of a scan by each method that the weights have the parts for.
 
         Returns:
-            The labels by method, and (N,) bool, the uncertain points; None without two networks.
+            (N,) train ids by method; and (N,) bool, the uncertain points, or None without two
+            networks.
         """
         scores, uncertain = self.scores_by_method(scan, methods)
-        labels = {
-            name: expand_labels(scores[name], scan.valid) for name in methods if name in scores
-        }
-        return labels, None if uncertain is None else expand_to_scan(uncertain, scan.valid)
+        labels = {}
+        for name in methods:
+            if name in scores:
+                labels[name] = expand_labels(scores[name], scan.valid)
+
+        if uncertain is None:
+            return labels, None
+        return labels, expand_to_scan(uncertain, scan.valid)
 
     def scores_by_method(
         self, scan: Scan, methods: Sequence[str] = PAPER_METHODS
     ) -> tuple[dict[str, Tensor], Tensor | None]:
-        """Return (P, K) scores of the P valid points of a scan, by each method.
+        """Score the P valid points of a scan by each method that the weights have the parts for.
 
-        The scores of every network that the weights have are among them.
+        Every network that the weights have is scored too, as `rv` and `bev`.
 
         Returns:
-            The scores by method, and (P,) bool, the uncertain points; None without two networks.
+            (P, K) scores by method; and (P,) bool, the uncertain points, or None without two
+            networks.
         """
         return self._scores_by_method(self._batch([scan]), methods, self.weights.parts)
 
@@ -170,11 +178,16 @@ class Segmenter:
     def _scores_by_method(
         self, batch: PointBatch, methods: Collection[str], parts: Collection[str]
     ) -> tuple[dict[str, Tensor], Tensor | None]:
-        """Run the steps of the method that some methods need, with the parts that there are."""
+        """Run the networks among `parts`, and of the other steps only those that the methods need.
+
+        Returns:
+            As `scores_by_method`.
+        """
         model = self.model
+        if "range_net" not in parts and "polar_net" not in parts:
+            return {}, None
         if "polar_net" not in parts:
-            networks = {"rv": model.score_range_view(batch)} if "range_net" in parts else {}
-            return networks, None
+            return {"rv": model.score_range_view(batch)}, None
         if "range_net" not in parts:
             return {"bev": model.score_polar_view(batch)}, None
 
@@ -185,6 +198,7 @@ class Segmenter:
             ensemble = METHODS[name].ensemble
             if ensemble is not None:
                 scores[name] = ensemble(f, g)
+
         if "amvnet" in methods and "point_head" in parts:
             h = model.refine(batch, f, g, uncertain)
             scores["amvnet"] = model.merge(f, g, uncertain, h)
@@ -197,7 +211,7 @@ class Segmenter:
         return batch.to(self.device)
 
     def _scores(self, batch: PointBatch) -> Scores:
-        """Return the scores by this segmenter's own method."""
+        """Return the scores by the method of this segmenter."""
         parts = METHODS[self.method].parts
         scores, uncertain = self._scores_by_method(batch, (self.method,), parts)
         if uncertain is None:
@@ -206,10 +220,10 @@ class Segmenter:
 
 
 def check_scan(points: np.ndarray | Scan) -> Scan:
-    """Return a scan that has at least one valid point.
+    """Make a `Scan` of points (N, 4), and check that at least one point is valid.
 
     Raises:
-        InputError: if it has no point, or no finite one.
+        InputError: if there is no point, or none is valid.
     """
     scan = points if isinstance(points, Scan) else Scan(np.asarray(points, dtype=np.float32))
     if not scan.valid.any():
@@ -237,7 +251,7 @@ def _check_method(method: MethodName, weights: Weights) -> MethodName:
 
 
 def _check_device(name: str) -> str:
-    """Return the name of a device of this machine."""
+    """Return the name, if it is that of a device of this machine; else raise InputError."""
     try:
         torch.zeros(1, device=name).item()
     except (RuntimeError, AssertionError, NotImplementedError):
@@ -260,11 +274,12 @@ def _set_up_networks(model: AMVNet, device: str, precision: Precision) -> None:
 
 def to_segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
     """Return the result for all points of a scan, given the scores of its valid points."""
-    return _segmentation(valid, *_fetch(scores), slice(None))
+    labels, fetched = _fetch(scores)
+    return _segmentation(valid, labels, fetched, slice(None))
 
 
 def _fetch(scores: Scores) -> tuple[Tensor, Scores]:
-    """Return the labels (P,) and the scores in CPU memory; waits for a GPU once."""
+    """Return the labels (P,) and the scores, in CPU memory; wait for a GPU only once."""
     on_gpu = scores.merged.is_cuda
 
     def fetch(values: Tensor) -> Tensor:
@@ -283,7 +298,14 @@ def _fetch(scores: Scores) -> tuple[Tensor, Scores]:
 
 
 def _segmentation(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> Segmentation:
-    """Return the result for one scan of a batch, whose valid points are at `points`."""
+    """Return the result for one scan of a batch.
+
+    Args:
+        valid: (N,) bool, the valid points of the scan.
+        labels: (P,) of the valid points of all scans.
+        scores: of the valid points of all scans.
+        points: the place of the scan's valid points among them.
+    """
     return Segmentation(
         labels=expand_to_scan(labels[points], valid),
         uncertain=expand_to_scan(scores.uncertain[points], valid),
@@ -295,11 +317,11 @@ def _segmentation(valid: np.ndarray, labels: Tensor, scores: Scores, points: sli
 
 def expand_to_scan(values: Tensor, valid: np.ndarray) -> np.ndarray:
     """Return (N, ...) values of all points, given (P, ...) of the valid ones; others are 0."""
-    of_valid = values.cpu().numpy()
+    valid_values = values.cpu().numpy()
     if valid.all():
-        return of_valid
-    expanded = np.zeros((len(valid), *of_valid.shape[1:]), dtype=of_valid.dtype)
-    expanded[valid] = of_valid
+        return valid_values
+    expanded = np.zeros((len(valid), *valid_values.shape[1:]), dtype=valid_values.dtype)
+    expanded[valid] = valid_values
     return expanded
 
 

@@ -1,4 +1,4 @@
-"""AMVNet: two networks segment a scan in two projections, and a point head settles disputes."""
+"""AMVNet: two networks segment a scan in two projections; a point head refines uncertain points."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeImage, RangeView
 
-Watch = Callable[[str], AbstractContextManager[Any]]  # entered around each step, by its name
+# Takes the name of a step and returns the context in which the step runs.
+Watch = Callable[[str], AbstractContextManager[Any]]
 
 
 @dataclass(frozen=True)
@@ -35,10 +36,10 @@ class Scores:
     """Class probabilities of P points.
 
     Attributes:
-        merged: (P, K) of AMVNet, or of the method that was asked for.
-        uncertain: (P,) bool, the points that the point head settles.
-        rv: (P, K) f, of the range view's network; None if it did not run.
-        bev: (P, K) g, of the bird's-eye view's network; None if it did not run.
+        merged: (P, K) y, by AMVNet or the method that was asked for.
+        uncertain: (P,) bool, the points that the point head classifies.
+        rv: (P, K) f, by the range view's network; None if it did not run.
+        bev: (P, K) g, by the bird's-eye view's network; None if it did not run.
     """
 
     merged: Tensor
@@ -48,12 +49,12 @@ class Scores:
 
 
 def unwatched(name: str) -> AbstractContextManager[None]:
-    """Do nothing around a step."""
+    """Return a context that does nothing around a step."""
     return nullcontext()
 
 
 def step(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Mark a method as a step, around which `LateFusion.watch` is entered."""
+    """Return a decorator that runs a method of `LateFusion` within `self.watch(name)`."""
 
     def mark(method: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(method)
@@ -67,14 +68,14 @@ def step(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
 
 
 class LateFusion(nn.Module):
-    """The fusion of any two networks' scores (sections 3.2 and 3.3 of the paper).
+    """The fusion of any two networks' class probabilities (sections 3.2 and 3.3 of the paper).
 
     Args:
-        assertion: says which points are uncertain.
-        point_head: settles these; without one, the result is the ensemble.
+        assertion: decides which points are uncertain.
+        point_head: classifies the uncertain points; None for the ensemble of the two networks.
 
     Attributes:
-        watch: a context manager for each step, by name, to time the steps; does nothing by default.
+        watch: returns the context in which a step runs, to time the steps; does nothing by default.
     """
 
     def __init__(self, assertion: Assertion, point_head: PointHead | None) -> None:
@@ -83,7 +84,8 @@ class LateFusion(nn.Module):
         self.point_head = point_head
         self.watch: Watch = unwatched
 
-    def fuse(self, batch: PointBatch, f: Tensor, g: Tensor) -> Scores:  # f, g: (P, K)
+    def fuse(self, batch: PointBatch, f: Tensor, g: Tensor) -> Scores:
+        """Return the fusion of f and g: (P, K) class probabilities."""
         uncertain = self.compare(batch, f, g)
         h = self.refine(batch, f, g, uncertain)
         return Scores(self.merge(f, g, uncertain, h), uncertain, f, g)
@@ -109,12 +111,21 @@ class LateFusion(nn.Module):
 
     @step("neighbours")
     def find_neighbours(self, points: Tensor, index: Tensor) -> Tensor:
+        """Return (U, n) indices of the neighbours of the points `index` (U,) of one scan."""
         assert self.point_head is not None
         return nearest_neighbours(points, index, self.point_head.config.neighbours)
 
     @step("head")
     def settle(self, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
-        """Return (U, K) for the points `index` (U,) of one scan, with neighbours `near` (U, n)."""
+        """Return (U, K) class probabilities of some points of one scan by the point head.
+
+        Args:
+            points: (P, 4), all points of the scan.
+            f: (P, K) class probabilities by the first network.
+            g: (P, K) class probabilities by the second network.
+            index: (U,) indices of the points to classify.
+            near: (U, n) indices of their neighbours.
+        """
         assert self.point_head is not None
 
         used, (index, near) = select_used_points(len(points), index, near)
@@ -126,14 +137,17 @@ class LateFusion(nn.Module):
 
     @step("merge")
     def merge(self, f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
+        """Return `merge(f, g, uncertain, h)`, as a step."""
         return merge(f, g, uncertain, h)
 
 
 class AMVNet(LateFusion):
-    """The whole method (section 3), around parts that are built outside and do not know each other.
+    """The whole method (section 3 of the paper).
+
+    Its parts are built outside and do not know each other.
 
     Attributes:
-        arrange: runs the two networks; one after the other by default.
+        arrange: runs the two networks, by default one after the other.
     """
 
     def __init__(
@@ -154,6 +168,7 @@ class AMVNet(LateFusion):
         self.arrange: Arrangement = one_after_the_other
 
     def forward(self, batch: PointBatch) -> Scores:
+        """Return the class probabilities of the points of a batch of scans."""
         image, grid = self.project(batch)
         f, g = self.score(image, grid)
         uncertain = self.compare(batch, f, g)
@@ -163,6 +178,7 @@ class AMVNet(LateFusion):
 
     @step("project")
     def project(self, batch: PointBatch) -> tuple[RangeImage, PolarGrid]:
+        """Return the two projections of a batch of scans."""
         return self.range_view.project(batch), self.polar_view.project(batch)
 
     def score(self, image: RangeImage, grid: PolarGrid) -> tuple[Tensor, Tensor]:
@@ -187,18 +203,29 @@ class AMVNet(LateFusion):
 
 
 def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
-    """Return y: h for the uncertain points, the geometric mean of f and g for the others."""
+    """Return y: h for the uncertain points, the geometric mean of f and g for the others.
+
+    Args:
+        f: (P, K) class probabilities.
+        g: (P, K) class probabilities.
+        uncertain: (P,) bool, with U uncertain points.
+        h: (U, K) class probabilities of these, in order; None for the geometric mean everywhere.
+
+    Returns:
+        (P, K).
+    """
     y = geometric_mean(f, g)
     if h is None:
         return y
     if y.is_cpu:
         return y.index_put((uncertain,), h)
-    # `index_put` would wait for a GPU; this takes twice the time on a CPU.
+
+    # `index_put` would make the CPU wait for the GPU; on a CPU it takes half the time of this.
     return y.masked_scatter(uncertain[:, None], h)
 
 
 def build_amvnet(config: ModelConfig, classes: int) -> AMVNet:
-    """Return AMVNet with fresh weights, for K classes."""
+    """Return AMVNet for K `classes`, with random weights."""
     return AMVNet(
         range_view=RangeView(config.range_view),
         polar_view=PolarView(config.polar_view),

@@ -15,15 +15,16 @@ from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import occurring
 
 POINT_VALUES = 4  # x, y, z, intensity
-PART = 1024  # uncertain points scored at a time: they fit into a CPU's cache
-PART_ON_GPU = 2**16  # as above, on a GPU: enough to keep it busy
+PART = 1024  # uncertain points scored at a time, so that they fit into a CPU's cache
+PART_ON_GPU = 2**16  # the same for a GPU: enough to keep it busy
 
 
 class PointHead(nn.Module):
-    """Uncertain points and their neighbours -> logits (U, K).
+    """The network that classifies uncertain points.
 
-    The inputs are the features p_i (U, 2 K + 4) of U uncertain points and the rows S_i
-    (U, n, 2 K + 4) of their neighbours, as `head_features` returns them.
+    Its inputs are the features p_i (U, 2 K + 4) of U uncertain points and the rows S_i
+    (U, n, 2 K + 4) of their n neighbours each, as `head_features` returns them. Its outputs are
+    logits (U, K).
     """
 
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
@@ -43,7 +44,7 @@ class PointHead(nn.Module):
         return self.fc(torch.cat([pooled, point], dim=1))
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
-        """Return the logits of `forward(*head_features(...))` at less cost.
+        """Return the (U, K) logits of `forward(*head_features(...))`, at less cost.
 
         The first layer is computed once for each point instead of once for each neighbour:
         W [f_k, g_k, x_k - x_i] = W [f_k, g_k, x_k] - W [0, 0, x_i].
@@ -58,34 +59,43 @@ class PointHead(nn.Module):
         activation = self.mlp[-1]
         assert isinstance(first, nn.Linear)
 
-        first_of_all = first(table)  # (P, hidden[0])
+        encoded = first(table)  # (P, hidden[0]): W [f_k, g_k, x_k] of every point
         part = PART if table.is_cpu else PART_ON_GPU
         logits = []
-        for index, k in zip(uncertain.split(part), near.split(part), strict=True):
-            point = table.index_select(0, index)
+        for i, k in zip(uncertain.split(part), near.split(part), strict=True):
+            point = table.index_select(0, i)
             shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
-            rows = first_of_all.index_select(0, k.flatten()).unflatten(0, k.shape)
+            rows = encoded.index_select(0, k.flatten()).unflatten(0, k.shape)
             rows = rows.sub_(shift[:, None])  # (part, n, hidden[0])
 
             # ReLU is monotonic: after the maximum it gives the same for a fraction of the work.
             pooled = activation(middle(rows.flatten(0, 1)).unflatten(0, k.shape).amax(dim=1))
+
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
             logits.append(self.fc(torch.cat([pooled, point], dim=1)))
         return torch.cat(logits)
 
 
 def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
-    """Return [f, g, x] of all points of a scan, (P, 2 K + 4), the table for `head_features`."""
+    """Return [f, g, x] of all points of a scan, (P, 2 K + 4), the table for `head_features`.
+
+    Args:
+        points: (P, 4) x: x, y, z in metres and intensity.
+        f: (P, K) class probabilities by the range view.
+        g: (P, K) class probabilities by the bird's-eye view.
+    """
     return torch.cat([f, g, points], dim=1)
 
 
 def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Select those of `count` points that occur in some tensors of indices.
+    """Select those of `count` points whose indices occur in any of the tensors `indices`.
 
-    On a GPU all points are selected: to count those that occur, the CPU would have to wait.
+    On a GPU all points are selected, because the CPU would have to wait for the number of those
+    that occur.
 
     Returns:
-        The selected points (M,), ascending, and the tensors with indices into these.
+        (M,) indices of the selected points, ascending, and the tensors `indices` as indices into
+        these.
     """
     if not indices[0].is_cpu:
         return torch.arange(count, device=indices[0].device), list(indices)
@@ -97,6 +107,8 @@ def head_features(
     config: PointHeadConfig, table: Tensor, uncertain: Tensor, near: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return p_i = [f_i, g_i, x_i] of uncertain points and the rows [f_k, g_k, x_k - x_i] of S_i.
+
+    The positions in p_i are scaled by `config.position_scale`.
 
     Args:
         table: (P, 2 K + 4) of one scan, from `point_table`.
@@ -116,8 +128,13 @@ def head_features(
 def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
     """Return (U, n) indices of the n nearest other points of each point in `index`, by x, y, z.
 
-    If a scan has fewer than n other points, the last one is repeated. A lone point is its own
+    If a scan has fewer than n other points, the farthest is repeated. A lone point is its own
     neighbour.
+
+    Args:
+        points: (P, 4), all points of a scan.
+        index: (U,) indices of the points whose neighbours are searched for.
+        n: neighbours per point.
     """
     if points.is_cuda:
         return nearest_others_by_blocks(points[:, :3], index, n)
@@ -128,6 +145,6 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
 
 def _mlp(widths: tuple[int, ...]) -> nn.Sequential:
     layers: list[nn.Module] = []
-    for channels, out in pairwise(widths):
-        layers += [PointLinear(channels, out), nn.BatchNorm1d(out), nn.ReLU(inplace=True)]
+    for inputs, outputs in pairwise(widths):
+        layers += [PointLinear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)

@@ -1,4 +1,4 @@
-"""Clusters: connected points of one kind."""
+"""Cluster points: a cluster is a set of connected points of one kind."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-CELL = 0.4  # metres: points in cells that touch are connected
-TOUCHING = 1.75  # a little over sqrt(3), in cells: they touch at a side, an edge or a corner
-APART = 4.0  # in cells: distance between points of different kinds, wherever they are
+CELL = 0.4  # metres: side of a cell; points of the same cell or of touching cells are connected
+# In cells: cells that touch, even only at a corner, are at most sqrt(3) apart, others at least 2.
+TOUCHING = 1.75
+APART = 4.0  # in cells: least distance between points of different kinds
 
 
 def cluster(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """Return which cluster each point is in, (N,) int64 from 0.
+    """Return the (N,) int64 cluster of each point, numbered from 0.
 
     Args:
         xyz: (N, 3) metres.
-        kind: (N,) ids from 0; a cluster has points of one kind.
+        kind: (N,) integers; points of different kinds are never in one cluster.
     """
     if not len(xyz):
         return np.zeros(0, dtype=np.int64)

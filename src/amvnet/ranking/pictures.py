@@ -1,4 +1,4 @@
-"""Pictures of the first clusters of a ranking from above: the two views, the label, the cluster."""
+"""Draw the first clusters of a ranking from above, as predicted by both views and as labelled."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from amvnet.ranking.rank import Criterion, Ranking, find_clusters, find_doubts
 
 PICTURES = 12  # clusters that are drawn
 REACH = 8.0  # metres from the cluster to each side
-DEPTH = 6.0  # metres above and below it: farther points, such as treetops, would hide it
+DEPTH = 6.0  # metres above and below it: higher points, such as treetops, would hide it
 
 
 def draw(
     ranking: Ranking, dataset: Dataset, segmenter: Segmenter, by: Criterion, folder: Path
 ) -> list[Path]:
-    """Draw the first clusters, each with its surroundings, and return the files, RANK.png."""
+    """Draw each of the first clusters with its surroundings, and return the files (RANK.png)."""
     paths = []
-    for number, row in enumerate(ranking.clusters[:PICTURES], start=1):
-        path = folder / f"{number:02d}.png"
+    for position, row in enumerate(ranking.clusters[:PICTURES], start=1):
+        path = folder / f"{position:02d}.png"
         _draw_cluster(row, ranking, dataset, segmenter, by=by, path=path)
         paths.append(path)
 
@@ -44,15 +44,15 @@ def _draw_cluster(
     _, cluster_ids = find_clusters(doubts)
     in_cluster = cluster_ids == cluster_ids[row["point"]]
 
-    points = scan.points[:, :3] - row["xyz"]
-    near = (np.abs(points) <= (REACH, REACH, DEPTH)).all(axis=1)
+    xyz = scan.points[:, :3] - row["xyz"]  # relative to the cluster's middle point
+    near = (np.abs(xyz) <= (REACH, REACH, DEPTH)).all(axis=1)
     panels = {"rv": doubts.rv[near], "bev": doubts.bev[near]}
     if scan.labels is not None:
         panels["label"] = doubts.label[near]
 
     x, y, z = row["xyz"]
     view = TopView(
-        points[near],
+        xyz[near],
         dataset.taxonomy,
         panels,
         uncertain=in_cluster[near],

@@ -1,6 +1,6 @@
-"""Which points to look at next: where the two views disagree, or both contradict the label.
+"""Rank points to look at: those on which the two views disagree, or both contradict the label.
 
-Such points are grouped into clusters, and the most doubtful clusters come first.
+These points are grouped into clusters, and the most doubtful clusters come first.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
-from amvnet.progress import Progress
+from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan
 
 Criterion = Literal["disagreement", "labels"]
 
-# Metres: points nearer to the sensor than this belong to the vehicle that carries it.
+# Metres: points nearer to the sensor than this belong to its vehicle and are never doubted.
 NEAR = 1.5
-# Points without doubt that enter the mean doubt of each cluster, so that stray points do not lead.
+# Number of points with doubt 0 that are added to each cluster for its mean doubt, so that clusters
+# of a few stray points do not rank first.
 FEW = 20.0
-# Scores are divided by the number of clusters with the same contradiction to this power:
-# a contradiction that is met often is a mistake of the views.
+# Scores are divided by the number of clusters of the same kind, raised to this power: a
+# contradiction that occurs often is more likely a mistake of the views than of the labels.
 COMMON = 0.5
 
 COLUMNS = ("rank", "scan", "score", "x", "y", "z", "points", "point", "rv", "bev", "label")
@@ -41,13 +42,13 @@ SCAN_COLUMNS = ("rank", "scan", "score", "points", "clusters")
 # One cluster. Its middle point is the one nearest to the mean of its points.
 ROW = np.dtype(
     [
-        ("scan", np.int32),  # number of the scan
+        ("scan", np.int32),  # index of the scan in `Ranking.records`
         ("score", np.float32),
         ("xyz", np.float32, 3),  # metres, of the middle point
-        ("points", np.int32),  # how many
+        ("points", np.int32),  # number of points
         ("point", np.int32),  # index of the middle point in the scan
-        ("rv", np.uint8),  # most common train id by the range view
-        ("bev", np.uint8),  # most common train id by the bird's-eye view
+        ("rv", np.uint8),  # most common train id predicted by the range view
+        ("bev", np.uint8),  # most common train id predicted by the bird's-eye view
         ("label", np.uint8),  # train id of the middle point's label
         ("kind", np.int32),  # as in `Doubts`
     ]
@@ -61,13 +62,13 @@ class Doubts:
     Attributes:
         xyz: (N, 3) metres.
         doubt: (N,) float32 in [0, 1]; 0 for points that are not doubted.
-        rv: (N,) train ids by the range view.
-        bev: (N,) train ids by the bird's-eye view.
+        rv: (N,) train ids predicted by the range view.
+        bev: (N,) train ids predicted by the bird's-eye view.
         label: (N,) train ids of the labels; 0 if there are none.
-        kind: (N,) the two classes that contradict each other, as one number; a cluster has points
-            of one kind.
-        whole: (N,) number of points in the labelled thing that each point is part of; None if
-            labels are not doubted.
+        kind: (N,) the two classes that contradict each other, as one number. All points of a
+            cluster have the same kind.
+        whole: (N,) number of points of the labelled thing to which each point belongs; None if
+            the ranking is not of labels.
     """
 
     xyz: np.ndarray
@@ -81,14 +82,14 @@ class Doubts:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The clusters and the scans of a dataset, the most doubtful first.
+    """The clusters and the S scans of a dataset, the most doubtful first.
 
     Attributes:
-        records: the S scans, in the order of their numbers.
-        clusters: rows of `ROW`.
-        scans: (S,) scan numbers.
-        scores: (S,) mean doubt of their points.
-        sizes: (S,) numbers of their points.
+        records: (S,) scans, in the order of the dataset.
+        clusters: (C,) rows of `ROW`.
+        scans: (S,) indices into `records`, the most doubtful scan first.
+        scores: (S,) mean doubt of the points of each scan in `scans`.
+        sizes: (S,) number of points of each scan in `scans`.
     """
 
     records: Sequence[ScanRecord]
@@ -103,47 +104,50 @@ def rank(
     records: Sequence[ScanRecord],
     segmenter: Segmenter,
     by: Criterion,
-    progress: Progress = lambda done, total: None,
+    progress: Progress = no_progress,
 ) -> Ranking:
-    """Rank the clusters of some scans; memory holds one scan, and 35 bytes for each cluster.
+    """Rank the doubtful clusters of some scans.
+
+    One scan is in memory at a time, and 35 bytes for each cluster.
 
     Args:
         dataset: the dataset that has the scans.
         records: the scans.
         segmenter: the two networks.
-        by: `disagreement` ranks where the two views disagree, labelled or not: what to label
-            next. `labels` ranks where both views contradict the label: what may be labelled
-            wrong.
-        progress: told before each scan, and at the end, how many scans are done.
+        by: `disagreement` finds points to label next: the two views disagree on them; labels are
+            not needed. `labels` finds points that may be labelled wrongly: both views contradict
+            their labels.
+        progress: called before each scan and at the end, with the number of scans done and in
+            all.
 
     Raises:
-        InputError: if the weights lack a network or have other classes than the dataset, or if
-            labels are doubted and a scan has none.
+        InputError: if the weights lack a network or do not have the dataset's classes, or if
+            `by` is `labels` and a scan has none.
     """
     check_classes(dataset, segmenter.taxonomy)
     if not {"range_net", "polar_net"} <= set(segmenter.weights.parts):
         raise InputError("expected weights with both networks, found only one; train the other")
 
-    rows_by_scan = [np.zeros(0, dtype=ROW)]
+    rows_by_scan = [np.zeros(0, dtype=ROW)]  # so that there may be no scans
     mean_doubts = np.zeros(len(records))
     sizes = np.zeros(len(records), dtype=np.int64)
-    for number, record in enumerate(records):
-        progress(number, len(records))
+    for index, record in enumerate(records):
+        progress(index, len(records))
 
         doubts = find_doubts(check_scan(dataset.read(record)), segmenter, by)
         rows, _ = find_clusters(doubts)
-        rows["scan"] = number
+        rows["scan"] = index
         rows_by_scan.append(rows)
 
-        mean_doubts[number] = doubts.doubt.mean()
-        sizes[number] = len(doubts.doubt)
+        mean_doubts[index] = doubts.doubt.mean()
+        sizes[index] = len(doubts.doubt)
     progress(len(records), len(records))
 
     clusters = np.concatenate(rows_by_scan)
     if by == "labels":
         clusters["score"] /= _frequencies(clusters["kind"]) ** COMMON
 
-    # Stable, and so the same on every machine: among equals, the dataset's order decides.
+    # A stable sort keeps equal scores in the dataset's order, on every machine.
     cluster_order = np.argsort(-clusters["score"], kind="stable")
     scan_order = np.argsort(-mean_doubts, kind="stable")
     return Ranking(
@@ -159,7 +163,7 @@ def find_doubts(scan: Scan, segmenter: Segmenter, by: Criterion) -> Doubts:
     """Return how doubtful each point of a scan is.
 
     Raises:
-        InputError: if labels are doubted and the scan has none.
+        InputError: if `by` is `labels` and the scan has none.
     """
     if by == "labels" and scan.labels is None:
         raise InputError(
@@ -178,22 +182,22 @@ def find_doubts(scan: Scan, segmenter: Segmenter, by: Criterion) -> Doubts:
 
     xyz = scan.points[:, :3]
     distance = np.hypot(xyz[valid, 0], xyz[valid, 1])
-    outside = torch.from_numpy(distance >= NEAR).to(f.device)  # (P,) not on the vehicle
+    off_vehicle = torch.from_numpy(distance >= NEAR).to(f.device)  # (P,)
 
     if by == "disagreement":
         disagreement = (1 - cosine_similarity(f, g)).clamp(0, 1)
-        doubt = expand_to_scan(disagreement * (uncertain & outside), valid)
+        doubt = expand_to_scan(disagreement * (uncertain & off_vehicle), valid)
         return Doubts(xyz, doubt, rv, bev, label, kind=_pair(rv, bev))
 
-    contradiction, ids = _contradiction(f, g, torch.from_numpy(label[valid]).to(f.device))
-    doubt = expand_to_scan(contradiction * outside, valid)
-    kind = _pair(label, expand_to_scan(ids, valid))
+    contradiction, agreed_ids = _contradiction(f, g, torch.from_numpy(label[valid]).to(f.device))
+    doubt = expand_to_scan(contradiction * off_vehicle, valid)
+    kind = _pair(label, expand_to_scan(agreed_ids, valid))
     whole = _thing_sizes(xyz, label, valid)
     return Doubts(xyz, doubt, rv, bev, label, kind=kind, whole=whole)
 
 
 def _predicted_ids(probabilities: torch.Tensor, valid: np.ndarray) -> np.ndarray:
-    """Return the (N,) train ids of a scan's points from (P, K) probabilities of its valid ones."""
+    """Return (N,) train ids of all points, 0 if not valid, from (P, K) of the valid ones."""
     ids = probabilities.argmax(dim=1) + 1
     return expand_to_scan(ids.to(torch.uint8), valid)
 
@@ -203,9 +207,9 @@ def _contradiction(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return how strongly both views contradict the labels, and the class they agree on.
 
-    The contradiction is the probability that the less confident view gives the class they agree
-    on, minus the larger of the two probabilities of the label. It is 0 if that is negative, and
-    for points without a label.
+    The contradiction is the smaller of the two probabilities of the class they agree on, minus
+    the larger of the two probabilities of the label. It is 0 if the difference is negative or
+    the point has no label.
 
     Args:
         f: (P, K) class probabilities of the range view.
@@ -225,7 +229,10 @@ def _contradiction(
 
 
 def _thing_sizes(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return for each point, (N,), the size of its thing: connected points with one label."""
+    """Return for each point the number of points in its thing, (N,).
+
+    A thing is a set of connected points with one label; points that are not valid count alone.
+    """
     things = cluster(xyz[valid], label[valid])
     sizes = np.ones(len(xyz))
     sizes[valid] = np.bincount(things)[things]
@@ -236,8 +243,8 @@ def find_clusters(doubts: Doubts) -> tuple[np.ndarray, np.ndarray]:
     """Group the doubted points of one scan into clusters.
 
     Returns:
-        The clusters, rows of `ROW` in no particular order, and the (N,) cluster of each point,
-        -1 for points that are not doubted.
+        The (C,) clusters as rows of `ROW`, and the (N,) index of each point's cluster in them, -1
+        for points that are not doubted.
     """
     doubted = np.flatnonzero(doubts.doubt > 0)
     group = cluster(doubts.xyz[doubted], doubts.kind[doubted])
@@ -263,7 +270,7 @@ def find_clusters(doubts: Doubts) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return for each group the index of the point nearest to the group's mean."""
+    """Return for each group the index of the point that is nearest to the mean of the group."""
     mean = np.stack([np.bincount(group, axis) / sizes for axis in xyz.T], axis=1)
     squared_distance = ((xyz - mean[group]) ** 2).sum(axis=1)
     order = np.lexsort((squared_distance, group))
@@ -273,19 +280,19 @@ def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.
 
 
 def _most_common(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """Return the most common id in each of `count` groups; the lowest one among equals."""
+    """Return the most common id in each of `count` groups; the lowest id if there are several."""
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
     return table.argmax(axis=1)
 
 
 def _pair(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return one number for each pair of train ids."""
+    """Return each pair of train ids as one number."""
     return first.astype(np.int64) * 256 + second
 
 
 def _frequencies(kind: np.ndarray) -> np.ndarray:
-    """Return for each element how many elements have the same value."""
+    """Return for each element the number of elements with its value."""
     _, index, counts = np.unique(kind, return_inverse=True, return_counts=True)
     return counts[index]
 
@@ -309,15 +316,16 @@ def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
 
 
 def _write(path: Path, columns: Sequence[str], rows: Iterator[list[Any]]) -> None:
+    """Write rows to a CSV file, with their ranks as the first column."""
     with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
-        for number, row in enumerate(rows, start=1):
-            writer.writerow([number, *row])
+        for position, row in enumerate(rows, start=1):
+            writer.writerow([position, *row])
 
 
 def _cluster_rows(ranking: Ranking, taxonomy: Taxonomy) -> Iterator[list[Any]]:
-    """Yield the columns of each cluster but its rank."""
+    """Yield the row of each cluster, without its rank."""
     names = ("", *taxonomy.classes)
     for row in ranking.clusters:
         x, y, z = row["xyz"]
@@ -336,7 +344,7 @@ def _cluster_rows(ranking: Ranking, taxonomy: Taxonomy) -> Iterator[list[Any]]:
 
 
 def _scan_rows(ranking: Ranking) -> Iterator[list[Any]]:
-    """Yield the columns of each scan but its rank."""
-    clusters = np.bincount(ranking.clusters["scan"], minlength=len(ranking.records))
+    """Yield the row of each scan, without its rank."""
+    cluster_counts = np.bincount(ranking.clusters["scan"], minlength=len(ranking.records))
     for scan, score, size in zip(ranking.scans, ranking.scores, ranking.sizes, strict=True):
-        yield [ranking.records[scan].name, f"{score:.5f}", size, clusters[scan]]
+        yield [ranking.records[scan].name, f"{score:.5f}", size, cluster_counts[scan]]

@@ -1,10 +1,10 @@
-"""LiDARs by name or by a YAML file: lasers, field of view, place on the vehicle, units and axes."""
+"""LiDARs by name or by a YAML file: lasers, field of view, mounting, units and axes."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,10 @@ import yaml
 
 from amvnet.errors import InputError
 
-# Metres over the ground on the cars of the data sets that weights are trained for: KITTI's and nuScenes'.
+# Metres over the ground on the cars of the datasets that weights are trained for: KITTI, nuScenes.
 HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
 
-# Rows: what of a file's x, y, z is forward, left and up.
+# Matrices that turn a file's x, y, z into forward, left, up.
 AXES = {
     "x-forward": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),  # x forward, y left, z up: ROS, KITTI
     "y-forward": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),  # x right, y forward, z up: nuScenes
@@ -29,20 +29,21 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Sensor:
-    """What is known of a LiDAR and of the frame of its scans; None is not known, and will be measured.
+    """What is known of a LiDAR and the frame of its scans; None stands for a value to be measured.
 
     Attributes:
         name: for messages.
-        beams: lasers.
+        beams: number of lasers.
         fov_up, fov_down: ends of the field of view, degrees above the horizon.
         height: metres over the ground.
-        intensity_scale: the largest intensity there can be.
+        intensity_scale: the largest possible intensity.
         axes: which way the axes point, a name in `AXES`.
-        rotate: yaw, pitch and roll in degrees, after the axes: they turn the scan level, forward being +x.
-        offset: metres that are added to x, y and z after that.
+        rotate: yaw, pitch and roll in degrees, applied after `axes`: they turn the scan level, with
+            +x forward.
+        offset: metres added to x, y and z after that.
 
     Raises:
-        InputError: where a value cannot be.
+        InputError: if a value is impossible.
     """
 
     name: str = ""
@@ -56,162 +57,197 @@ class Sensor:
     offset: Triple = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        up, down = self.fov_up, self.fov_down
-        checks = {
-            "beams": ("a whole number from 1", self.beams is None or self.beams >= 1),
-            "fov_up": ("degrees from -90 to 90", up is None or -90 <= up <= 90),
-            "fov_down": (
-                "degrees from -90 to 90, below fov_up",
-                down is None or -90 <= down < (90 if up is None else up),
-            ),
-            "height": ("metres from 0 to 100", self.height is None or 0 <= self.height <= 100),
-            "intensity_scale": (
-                "a number above 0",
-                self.intensity_scale is None or 0 < self.intensity_scale < math.inf,
-            ),
-            "axes": (f"one of {', '.join(AXES)}", self.axes in AXES),
-            "rotate": ("yaw,pitch,roll in degrees", all(map(math.isfinite, self.rotate))),
-            "offset": ("x,y,z in metres", all(map(math.isfinite, self.offset))),
-        }
-        for key, (expected, holds) in checks.items():
-            if not holds:
-                raise InputError(
-                    f"{key}: expected {expected}, found {getattr(self, key)!r}; correct the value"
-                )
+        top = 90 if self.fov_up is None else self.fov_up
+        scale = self.intensity_scale
+        is_below = self.fov_down is None or -90 <= self.fov_down < top
+
+        self._check("beams", self.beams is None or self.beams >= 1, "a whole number from 1")
+        self._check("fov_up", _is_within(self.fov_up, -90, 90), "degrees from -90 to 90")
+        self._check("fov_down", is_below, "degrees from -90 to 90, below fov_up")
+        self._check("height", _is_within(self.height, 0, 100), "metres from 0 to 100")
+        self._check("intensity_scale", scale is None or 0 < scale < math.inf, "a number above 0")
+        self._check("axes", self.axes in AXES, f"one of {', '.join(AXES)}")
+        self._check("rotate", _are_finite(self.rotate), "yaw,pitch,roll in degrees")
+        self._check("offset", _are_finite(self.offset), "x,y,z in metres")
+
+    def _check(self, key: str, is_valid: bool, expected: str) -> None:
+        """Raise an InputError about an attribute unless its value is valid."""
+        if not is_valid:
+            raise InputError(
+                f"{key}: expected {expected}, found {getattr(self, key)!r}; correct the value"
+            )
 
     @property
     def level(self) -> bool:
-        """Whether the scans are in the frame that the package works in: x forward, y left, z up."""
+        """Whether the scans already have the package's axes: x forward, y left, z up."""
         return self == dataclasses.replace(
             self, axes="x-forward", rotate=(0.0, 0.0, 0.0), offset=(0.0, 0.0, 0.0)
         )
 
     def to_level(self, xyz: np.ndarray) -> np.ndarray:
-        """(N, 3) points of a file in that frame; float64 where anything has to be done."""
+        """Return the (N, 3) points of a file in the package's axes.
+
+        They are float64 if they had to be turned or moved.
+        """
         if self.level:
             return xyz
-        turn = rotation(*self.rotate) @ np.array(AXES[self.axes], dtype=np.float64)
+
+        axes = np.array(AXES[self.axes], dtype=np.float64)
+        turn = rotation_from_degrees(*self.rotate) @ axes
         return xyz.astype(np.float64) @ turn.T + np.array(self.offset)
 
 
-def rotation(yaw: float, pitch: float, roll: float) -> np.ndarray:
-    """(3, 3) the rotation by roll about x, then pitch about y, then yaw about z, in degrees."""
-    (a, b, c), (d, e, f) = (
-        np.cos(np.radians([yaw, pitch, roll])),
-        np.sin(np.radians([yaw, pitch, roll])),
-    )
-    about_z = np.array([[a, -d, 0], [d, a, 0], [0, 0, 1]])
-    about_y = np.array([[b, 0, e], [0, 1, 0], [-e, 0, b]])
-    about_x = np.array([[1, 0, 0], [0, c, -f], [0, f, c]])
+def _is_within(value: float | None, low: float, high: float) -> bool:
+    """Return whether a value is unknown or lies between two limits."""
+    return value is None or low <= value <= high
+
+
+def _are_finite(values: Triple) -> bool:
+    return all(map(math.isfinite, values))
+
+
+def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> np.ndarray:
+    """Return the (3, 3) rotation by roll about x, then pitch about y, then yaw about z."""
+    angles = np.radians([yaw, pitch, roll])
+    cos_yaw, cos_pitch, cos_roll = np.cos(angles)
+    sin_yaw, sin_pitch, sin_roll = np.sin(angles)
+
+    about_z = np.array([[cos_yaw, -sin_yaw, 0], [sin_yaw, cos_yaw, 0], [0, 0, 1]])
+    about_y = np.array([[cos_pitch, 0, sin_pitch], [0, 1, 0], [-sin_pitch, 0, cos_pitch]])
+    about_x = np.array([[1, 0, 0], [0, cos_roll, -sin_roll], [0, sin_roll, cos_roll]])
     return about_z @ about_y @ about_x
 
 
-def _sensor(name: str, beams: int, up: float, down: float) -> Sensor:
-    return Sensor(name, beams, up, down)
-
-
-# Lasers and fields of view by the makers' data sheets; where a sensor stands on a vehicle no sheet says.
-SENSORS: dict[str, Sensor] = {
-    sensor.name: sensor
-    for sensor in (
-        _sensor("hdl64e", 64, 2.6, -24.0),
-        _sensor("hdl32e", 32, 10.67, -30.67),
-        _sensor("vlp16", 16, 15, -15),
-        _sensor("vlp32c", 32, 15, -25),
-        _sensor("vls128", 128, 15, -25),
-        _sensor("os0-32", 32, 45, -45),
-        _sensor("os0-64", 64, 45, -45),
-        _sensor("os0-128", 128, 45, -45),
-        _sensor("os1-32", 32, 22.5, -22.5),
-        _sensor("os1-64", 64, 22.5, -22.5),
-        _sensor("os1-128", 128, 22.5, -22.5),
-        _sensor("os2-64", 64, 11.25, -11.25),
-        _sensor("os2-128", 128, 11.25, -11.25),
-        _sensor("pandar40p", 40, 15, -25),
-        _sensor("pandar64", 64, 15, -25),
-        _sensor("pandar128", 128, 15, -25),
-        _sensor("xt32", 32, 15, -16),
-        _sensor("rs16", 16, 15, -15),
-        _sensor("rs32", 32, 15, -25),
-        _sensor("rs128", 128, 15, -25),
-    )
+# Number of lasers and both ends of the field of view, degrees, from the makers' data sheets. How a
+# sensor is mounted on a vehicle is in none of them.
+_DATA_SHEETS: dict[str, tuple[int, float, float]] = {
+    "hdl64e": (64, 2.6, -24.0),
+    "hdl32e": (32, 10.67, -30.67),
+    "vlp16": (16, 15, -15),
+    "vlp32c": (32, 15, -25),
+    "vls128": (128, 15, -25),
+    "os0-32": (32, 45, -45),
+    "os0-64": (64, 45, -45),
+    "os0-128": (128, 45, -45),
+    "os1-32": (32, 22.5, -22.5),
+    "os1-64": (64, 22.5, -22.5),
+    "os1-128": (128, 22.5, -22.5),
+    "os2-64": (64, 11.25, -11.25),
+    "os2-128": (128, 11.25, -11.25),
+    "pandar40p": (40, 15, -25),
+    "pandar64": (64, 15, -25),
+    "pandar128": (128, 15, -25),
+    "xt32": (32, 15, -16),
+    "rs16": (16, 15, -15),
+    "rs32": (32, 15, -25),
+    "rs128": (128, 15, -25),
 }
+SENSORS = {name: Sensor(name, *sheet) for name, sheet in _DATA_SHEETS.items()}
 
 
 def make_sensor(sensor: str | None = None, **options: Any) -> Sensor:
-    """A sensor by its name or its YAML file, and options that override what it says.
+    """Return a sensor by its name or its YAML file, with some attributes overridden.
 
     Args:
-        sensor: a name in `SENSORS`, or a YAML file with the attributes of `Sensor`; None knows nothing.
-        options: attributes of `Sensor`; None overrides nothing, `rotate` and `offset` may be texts with commas.
+        sensor: a name in `SENSORS`, or a YAML file with attributes of `Sensor`; None stands for an
+            unknown sensor.
+        options: attributes of `Sensor` that override those; None overrides nothing. `rotate` and
+            `offset` may be texts of three numbers with commas.
 
     Raises:
-        InputError: where there is no such sensor or file, or a value cannot be.
+        InputError: if there is no such sensor or file, or a value is impossible.
     """
-    known = Sensor() if sensor is None else _named(sensor)
-    given = {key: value for key, value in options.items() if value is not None}
-    return dataclasses.replace(known, **_converted(given, "--"))
+    base = Sensor() if sensor is None else _read_sensor(sensor)
+
+    changes = {key: value for key, value in options.items() if value is not None}
+    return dataclasses.replace(base, **_convert(changes, are_options=True))
 
 
-def _named(text: str) -> Sensor:
-    path = Path(text)
+def _read_sensor(text: str) -> Sensor:
+    """Return the sensor with this name, or of this YAML file."""
     if text in SENSORS:
         return SENSORS[text]
+
+    path = Path(text)
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(
-            f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {text!r}; give one of them"
+            f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {text!r}; "
+            "give one of them"
         )
+
     try:
         tree = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError, RecursionError):
         raise InputError(
             f"{path}: expected a YAML file that describes a sensor, found none; check it"
         ) from None
+
     if not isinstance(tree, Mapping):
         raise InputError(
             f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md"
         )
+
     try:
-        return Sensor(**{"name": path.stem, **_converted(tree, "")})
+        attributes = {"name": path.stem, **_convert(tree)}
+        return Sensor(**attributes)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
 
-def _converted(values: Mapping[Any, Any], mark: str) -> dict[str, Any]:
-    """The values in the types of their attributes."""
-    kinds = {field.name: _kind(field.name) for field in dataclasses.fields(Sensor)}
-    found = {}
+def _convert(values: Mapping[Any, Any], are_options: bool = False) -> dict[str, Any]:
+    """Convert values to the types of the attributes of `Sensor`.
+
+    Args:
+        are_options: whether messages should name the keys as options of the command line.
+
+    Raises:
+        InputError: if a key is no attribute, or a value cannot be converted.
+    """
+    names = [field.name for field in dataclasses.fields(Sensor)]
+    attributes = {}
     for key, value in values.items():
-        if key not in kinds:
-            raise InputError(f"expected one of {', '.join(kinds)}, found {key!r}; correct the key")
+        if key not in names:
+            raise InputError(f"expected one of {', '.join(names)}, found {key!r}; correct the key")
+
         try:
-            found[key] = kinds[key](value)
+            attributes[key] = _converter(key)(value)
         except (ValueError, TypeError, OverflowError):
-            shown = f"{mark}{key}".replace("_", "-") if mark else key
+            title = f"--{key}".replace("_", "-") if are_options else key
             raise InputError(
-                f"{shown}: expected {_example(key)}, found {value!r}; correct the value"
+                f"{title}: expected {_example(key)}, found {value!r}; correct the value"
             ) from None
-    return found
+
+    return attributes
 
 
-def _kind(key: str) -> Any:
-    return {"name": str, "axes": str, "beams": _whole, "rotate": _triple, "offset": _triple}.get(
-        key, float
-    )
+def _converter(key: str) -> Callable[[Any], Any]:
+    """Return the function that converts values of an attribute."""
+    if key in ("name", "axes"):
+        return str
+    if key == "beams":
+        return _to_whole
+    if key in ("rotate", "offset"):
+        return _to_triple
+
+    return float
 
 
 def _example(key: str) -> str:
-    return {"rotate": "yaw,pitch,roll such as 90,0,0", "offset": "x,y,z such as 0,0,1.2"}.get(
-        key, "a number"
-    )
+    if key == "rotate":
+        return "yaw,pitch,roll such as 90,0,0"
+    if key == "offset":
+        return "x,y,z such as 0,0,1.2"
+
+    return "a number"
 
 
-def _whole(value: Any) -> int:
+def _to_whole(value: Any) -> int:
     if int(value) != value:
         raise ValueError
     return int(value)
 
 
-def _triple(value: Any) -> Triple:
-    a, b, c = map(float, value.split(",") if isinstance(value, str) else value)
+def _to_triple(value: Any) -> Triple:
+    numbers = value.split(",") if isinstance(value, str) else value
+    a, b, c = map(float, numbers)
     return a, b, c

@@ -1,4 +1,4 @@
-"""What a scan says of its sensor: lasers, field of view, height over the ground."""
+"""Measure a LiDAR by one of its scans: lasers, field of view, height over the ground."""
 
 from __future__ import annotations
 
@@ -7,42 +7,47 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-NEAREST = 1.0  # metres: nearer returns are of what carries the sensor
-ENDS = (0.5, 99.5)  # percentiles of the elevation that are the ends of the field of view
-FEWEST = 100  # points that say something
+MIN_DISTANCE = 1.0  # metres: nearer returns are from the vehicle itself
+MIN_POINTS = 100  # fewer say nothing about the sensor
+FOV_PERCENTILES = (0.5, 99.5)  # of the elevations: the ends of the field of view
+MIN_BEAMS = 4
+MAX_BEAMS = 256
 
-FULL_TURN = 350  # degrees
-JUMP = 0.7  # of the width of a scan that is no full turn: where the azimuth goes back by so much, another laser begins
-STEP = 0.05  # of the width: most steps of the azimuth are smaller where a file is in an order
-MOSTLY = 0.9
-FEWEST_BEAMS, MOST_BEAMS = 4, 256
-BIN = 0.02  # degrees, of the histogram of elevations
-AROUND = 1.5  # degrees: a laser's peak is compared with the highest so near
-PEAK = 0.15  # of that height
-CRISP = 0.1  # share of the field of view that the peaks of lasers cover at most; where it is more they blur
+# Lasers counted in a file that stores one laser after the other
+FULL_TURN = 350.0  # degrees: a narrower scan is only part of a turn
+JUMP = 0.7  # of the width of a part of a turn: if the azimuth jumps by more, a new laser begins
+STEP = 0.05  # of the width: in an ordered file, most steps of the azimuth are smaller
+ORDERED_SHARE = 0.9  # of the steps that must be that small
+
+# Lasers counted as peaks in the histogram of the elevations
+BIN = 0.02  # degrees
+PEAK_WINDOW = 1.5  # degrees on each side, in which a bin is compared with the highest one
+PEAK_HEIGHT = 0.15  # of that highest bin: fuller bins belong to peaks
+MIN_PEAK_POINTS = 0.9  # share of the points that lie in peaks
+MAX_PEAK_WIDTH = 0.1  # share of the field of view that peaks cover; if it is more, they are blurred
 SECTORS = 12  # of the turn
-UNSPLIT = 0.75  # share of the peaks that a good sector has at least
-INSIDE = 0.9  # share of the points that the peaks hold at least
+MIN_SECTOR_PEAKS = 0.75  # share of all peaks that a good sector must have
 
-CELL = 1.0  # metres: side of the cells of which the lowest points are looked at
-REACH = 20.0  # metres: the ground is looked for so far
-FADE = 8.0  # metres: a cell so far away counts half
-TRIES = 400  # planes through three low points
-THICKNESS = 0.1  # metres that the ground's points are off its plane
-STEEPEST = 10.0  # degrees
-DEEPEST = -0.5  # metres: what is higher over the origin is a ceiling
-LARGE = 1.0  # square metres, twice the area of the triangle that a plane is laid through
-FEWEST_CELLS = 30
-AGREEING = 0.25  # weighted share of the cells that must be of the plane
+# The ground plane
+CELL = 1.0  # metres: side of the cells whose lowest points are used
+GROUND_RADIUS = 20.0  # metres: farther points are not used
+HALF_WEIGHT = 8.0  # metres: a cell at this distance counts half as much as one at the sensor
+TRIES = 400  # planes through three low points each
+MIN_AREA = 1.0  # square metres: twice the area of the triangle between the three points
+PLANE_TOLERANCE = 0.1  # metres between the plane and the points of the ground
+MAX_SLOPE = 10.0  # degrees
+MIN_HEIGHT = -0.5  # metres of the sensor over the plane: a plane far above the sensor is a ceiling
+MIN_CELLS = 30
+MIN_AGREEMENT = 0.25  # weighted share of the cells that must lie in the plane
 
 
 @dataclass(frozen=True)
-class Measured:
-    """What was found; None where the scan does not tell.
+class SensorGeometry:
+    """The geometry of a sensor as far as it is known; None stands for an unknown value.
 
     Attributes:
-        beams: lasers.
-        fov_up, fov_down: degrees above the horizon.
+        beams: number of lasers.
+        fov_up, fov_down: ends of the field of view, degrees above the horizon.
         height: metres of the sensor over the ground.
     """
 
@@ -52,113 +57,168 @@ class Measured:
     height: float | None = None
 
 
-def measure(points: np.ndarray, ring: np.ndarray | None = None) -> Measured:
-    """Measure a scan: (N, 3 or more) finite x, y, z in the sensor's frame and the file's order, (N,) ring or None."""
+def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:
+    """Measure the sensor of a scan.
+
+    Args:
+        points: (N, 3 or more) finite x, y, z in the sensor's frame, in the order of the file.
+        ring: (N,) indices of the lasers, or None if the file has none.
+    """
     xyz = points[:, :3].astype(np.float64)
-    distant = np.hypot(xyz[:, 0], xyz[:, 1]) > NEAREST
-    if distant.sum() < FEWEST:
-        return Measured()
-    elevation = elevations(xyz[distant])
-    down, up = np.percentile(elevation, ENDS)
-    beams = (
-        len(np.unique(ring))
-        if ring is not None
-        else beams_by_order(xyz) or beams_by_peaks(xyz[distant])
-    )
-    return Measured(beams, float(up), float(down), ground_height(xyz[distant]))
+    is_distant = np.hypot(xyz[:, 0], xyz[:, 1]) > MIN_DISTANCE
+    if is_distant.sum() < MIN_POINTS:
+        return SensorGeometry()
+
+    distant = xyz[is_distant]
+    down, up = np.percentile(elevations(distant), FOV_PERCENTILES)
+
+    if ring is not None:
+        beams: int | None = len(np.unique(ring))
+    else:
+        beams = beams_by_order(xyz) or beams_by_peaks(distant)
+    return SensorGeometry(beams, float(up), float(down), ground_height(distant))
 
 
 def elevations(xyz: np.ndarray) -> np.ndarray:
-    """(N,) degrees above the horizon."""
+    """Return the (N,) elevations of (N, 3) points, degrees above the horizon."""
     return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
 
 
 def beams_by_order(xyz: np.ndarray) -> int | None:
-    """How many lasers there are in a file that has one after the other; None where it is in another order."""
+    """Return the number of lasers of (N, 3) points that are stored laser by laser.
+
+    None if the points are in another order.
+    """
     azimuth = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))
     low, high = np.percentile(azimuth, (0.1, 99.9))
-    steps, width = np.diff(azimuth), high - low
-    turned = (steps + 180) % 360 - 180
+    width = high - low
+    steps = np.diff(azimuth)
+
     if width > FULL_TURN:
-        beams = round(abs(float(turned.sum())) / 360)
-    else:  # near the ends it may tremble to and fro: what counts is how often it went back more than forth
-        beams = 1 + abs(int((steps > JUMP * width).sum()) - int((steps < -JUMP * width).sum()))
-        turned = steps
-    in_order = np.mean(np.abs(turned) < STEP * width) > MOSTLY
-    return beams if in_order and FEWEST_BEAMS <= beams <= MOST_BEAMS else None
+        # Each laser adds a full turn to the sum of the steps.
+        steps = (steps + 180) % 360 - 180
+        beams = round(abs(float(steps.sum())) / 360)
+    else:
+        # Each new laser jumps back to where the scan begins. Points near the two ends may also be
+        # swapped, but such jumps go forth as often as back.
+        forth = int((steps > JUMP * width).sum())
+        back = int((steps < -JUMP * width).sum())
+        beams = 1 + abs(forth - back)
+
+    is_ordered = np.mean(np.abs(steps) < STEP * width) > ORDERED_SHARE
+    return beams if is_ordered and MIN_BEAMS <= beams <= MAX_BEAMS else None
 
 
 def beams_by_peaks(xyz: np.ndarray) -> int | None:
-    """How many lasers make peaks in the histogram of the elevations of (N, 3) points; None where they blur.
+    """Return the number of peaks in the histogram of the elevations of (N, 3) points.
 
-    Where the motion during the turn was taken out, a laser's peak is split: most sectors then have fewer than all.
+    None if the peaks are blurred. If the scan was corrected for the motion of the vehicle, the
+    peak of one laser may be split into several: most sectors then have fewer peaks than the scan.
     """
     elevation = elevations(xyz)
-    sector = ((np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) + 0.5) * SECTORS).astype(int)
-    beams, covered = _peaks(elevation)
-    in_sector = [
-        _peaks(elevation[sector == k])[0] for k in range(SECTORS) if (sector == k).sum() >= FEWEST
-    ]
-    parts = np.percentile(in_sector or [0], 75)
-    crisp = covered < CRISP and parts >= UNSPLIT * beams
-    return beams if crisp and FEWEST_BEAMS <= beams <= MOST_BEAMS else None
+    beams, width = _count_peaks(elevation)
+
+    turns = np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) + 0.5
+    sector = (turns * SECTORS).astype(int)
+    sector_beams = []
+    for index in range(SECTORS):
+        is_inside = sector == index
+        if is_inside.sum() >= MIN_POINTS:
+            sector_beams.append(_count_peaks(elevation[is_inside])[0])
+
+    good_sector = np.percentile(sector_beams or [0], 75)
+    is_sharp = width < MAX_PEAK_WIDTH and good_sector >= MIN_SECTOR_PEAKS * beams
+    return beams if is_sharp and MIN_BEAMS <= beams <= MAX_BEAMS else None
 
 
-def _peaks(elevation: np.ndarray) -> tuple[int, float]:
-    """How many peaks hold nearly all of some elevations, and the share of the field of view that they cover."""
+def _count_peaks(elevation: np.ndarray) -> tuple[int, float]:
+    """Count the peaks in the histogram of (N,) elevations.
+
+    Returns:
+        The number of peaks, and the share of the field of view that they cover; 0 and 1.0 if too
+        many points lie outside the peaks.
+    """
     low, high = np.percentile(elevation, (0.05, 99.95))
-    counts, _ = np.histogram(elevation, np.arange(low - AROUND, high + AROUND, BIN))
-    peak = counts > np.maximum(PEAK * maximum_filter1d(counts, int(2 * AROUND / BIN)), 1)
-    if counts[peak].sum() < INSIDE * len(elevation):
+    edges = np.arange(low - PEAK_WINDOW, high + PEAK_WINDOW, BIN)
+    counts, _ = np.histogram(elevation, edges)
+
+    highest = maximum_filter1d(counts, int(2 * PEAK_WINDOW / BIN))
+    is_peak = counts > np.maximum(PEAK_HEIGHT * highest, 1)
+    if counts[is_peak].sum() < MIN_PEAK_POINTS * len(elevation):
         return 0, 1.0
-    return int((np.diff(peak.astype(int), prepend=0) == 1).sum()), peak.sum() * BIN / max(
-        high - low, BIN
-    )
+
+    begins = np.diff(is_peak.astype(int), prepend=0) == 1
+    width = is_peak.sum() * BIN / max(high - low, BIN)
+    return int(begins.sum()), width
 
 
 def ground_height(xyz: np.ndarray) -> float | None:
-    """Metres of the origin over the ground plane; None where there is none.
+    """Return how many metres the origin is above the ground; None if no ground is found.
 
-    The plane is the one through three low points that most low points agree with, near ones counting
-    more, and few are below; then least squares.
+    The ground is the plane through three low points that most low points agree with and few are
+    below, refined by least squares. Near points count more.
+
+    Args:
+        xyz: (N, 3) points in the sensor's frame.
     """
-    low = _lowest(xyz)
-    if len(low) < FEWEST_CELLS:
+    low = _lowest_points(xyz)
+    if len(low) < MIN_CELLS:
         return None
-    weight = 1 / (1 + np.hypot(low[:, 0], low[:, 1]) / FADE)
+
+    weight = 1 / (1 + np.hypot(low[:, 0], low[:, 1]) / HALF_WEIGHT)
     plane = _best_plane(low, weight)
     if plane is None:
         return None
-    across = np.column_stack([low[:, :2], np.ones(len(low))])
+
+    xy1 = _with_ones(low)
     for _ in range(3):
-        near = np.abs(low[:, 2] - across @ plane) < THICKNESS
-        if near.sum() < FEWEST_CELLS / 2:
+        is_ground = np.abs(low[:, 2] - xy1 @ plane) < PLANE_TOLERANCE
+        if is_ground.sum() < MIN_CELLS / 2:
             return None
-        plane = np.linalg.lstsq(across[near], low[near, 2], rcond=None)[0]
-    agreed = weight[near].sum() > AGREEING * weight.sum()
-    return float(-plane[2]) if agreed and -plane[2] > DEEPEST else None
+        plane = np.linalg.lstsq(xy1[is_ground], low[is_ground, 2], rcond=None)[0]
+
+    height = -plane[2]
+    is_agreed = weight[is_ground].sum() > MIN_AGREEMENT * weight.sum()
+    return float(height) if is_agreed and height > MIN_HEIGHT else None
 
 
-def _lowest(xyz: np.ndarray) -> np.ndarray:
-    """(M, 3) the lowest point of each cell around the sensor."""
-    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) < REACH]
-    column, row = np.floor((xyz[:, :2] + REACH) / CELL).astype(np.int64).T
-    cell = column * int(2 * REACH / CELL + 1) + row
+def _lowest_points(xyz: np.ndarray) -> np.ndarray:
+    """Return the (M, 3) lowest points of the cells around the sensor."""
+    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) < GROUND_RADIUS]
+    column, row = np.floor((xyz[:, :2] + GROUND_RADIUS) / CELL).astype(np.int64).T
+    cell = column * int(2 * GROUND_RADIUS / CELL + 1) + row
+
     order = np.lexsort((xyz[:, 2], cell))
-    first = np.diff(cell[order], prepend=-1) > 0
-    return xyz[order][first]
+    is_first = np.diff(cell[order], prepend=-1) > 0
+    return xyz[order][is_first]
 
 
 def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
-    """(3,) a, b, c of z = a x + b y + c; the same for the same points."""
+    """Return (a, b, c) of the plane z = a x + b y + c that most low points agree with.
+
+    None if every plane is too steep. The draws are seeded: the same points give the same plane.
+
+    Args:
+        low: (M, 3) low points.
+        weight: (M,) their weights.
+    """
     rng = np.random.default_rng(0)
-    three = low[rng.choice(len(low), (TRIES, 3), p=weight / weight.sum())]
-    corners = np.concatenate([three[:, :, :2], np.ones((TRIES, 3, 1))], axis=2)
-    large = np.abs(np.linalg.det(corners)) > LARGE
-    planes = np.linalg.solve(corners[large], three[large][:, :, 2:])[:, :, 0]
-    planes = planes[np.hypot(planes[:, 0], planes[:, 1]) < np.tan(np.radians(STEEPEST))]
+    triples = low[rng.choice(len(low), (TRIES, 3), p=weight / weight.sum())]  # (tries, 3, 3)
+    corners = np.concatenate([triples[:, :, :2], np.ones((TRIES, 3, 1))], axis=2)
+    is_large = np.abs(np.linalg.det(corners)) > MIN_AREA
+    planes = np.linalg.solve(corners[is_large], triples[is_large][:, :, 2:])[:, :, 0]
+
+    slopes = np.hypot(planes[:, 0], planes[:, 1])
+    planes = planes[slopes < np.tan(np.radians(MAX_SLOPE))]
     if not len(planes):
         return None
-    above = low[:, 2] - planes @ np.column_stack([low[:, :2], np.ones(len(low))]).T  # (planes, M)
-    score = (np.abs(above) < THICKNESS) @ weight - (above < -3 * THICKNESS) @ weight
-    return planes[score.argmax()]
+
+    above = low[:, 2] - planes @ _with_ones(low).T  # (planes, M) metres
+    agreeing = (np.abs(above) < PLANE_TOLERANCE) @ weight
+    below = (above < -3 * PLANE_TOLERANCE) @ weight
+    return planes[(agreeing - below).argmax()]
+
+
+def _with_ones(xyz: np.ndarray) -> np.ndarray:
+    """Return (M, 3) rows x, y, 1: times (a, b, c), they are the heights of a plane."""
+    return np.column_stack([xyz[:, :2], np.ones(len(xyz))])

@@ -44,7 +44,7 @@ class Label(IntEnum):
     TRAILER = 303
 
 
-# The SemanticKITTI id of a class while it moves.
+# The raw SemanticKITTI id of moving bodies, by class. Other classes have no such id.
 MOVING = {
     Label.CAR: 252,
     Label.BICYCLIST: 253,
@@ -55,7 +55,7 @@ MOVING = {
     Label.OTHER_VEHICLE: 259,
 }
 
-# The raw SemanticKITTI ids of the classes that only nuScenes has.
+# The SemanticKITTI class that is written in place of each class that only nuScenes has.
 SEMANTICKITTI_IDS = {
     Label.BARRIER: Label.OTHER_STRUCTURE,
     Label.TRAFFIC_CONE: Label.OTHER_OBJECT,
@@ -96,7 +96,7 @@ NUSCENES_CATEGORIES = {
 
 
 class Surface(IntEnum):
-    """A kind of surface: a row of the tables below."""
+    """A kind of surface; the value is its row in `reflection_table`."""
 
     ASPHALT = 0
     PAVING = 1
@@ -124,11 +124,11 @@ class Surface(IntEnum):
 
 @dataclass(frozen=True)
 class Reflection:
-    """How one kind of surface reflects a pulse; measured on KITTI's scans."""
+    """How one kind of surface reflects a laser pulse, as measured on KITTI's scans."""
 
-    # Intensity that an HDL-64E reports if it is near and hit head-on, 0 to 1.
+    # Intensity in [0, 1] that an HDL-64E reports for a near surface that is hit head-on.
     reflectivity: float
-    # Relative standard deviation of the intensity between returns of one body.
+    # Standard deviation of the intensity between returns of one body, relative to its mean.
     spread: float
     # Standard deviation of the logarithm of the reflectivity between bodies.
     shade: float
@@ -136,7 +136,7 @@ class Reflection:
     dark: float = 0.02
     # Share of the pulses that never return, whatever the range.
     drop: float = 0.0
-    # Mean height in metres of the relief that is too small to model with triangles.
+    # Mean height in metres of relief, such as grass, that is too fine to model with triangles.
     rough: float = 0.0
 
 
@@ -166,7 +166,7 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.PLATE: Reflection(0.95, spread=0.10, shade=0.10, dark=0.0),
     Surface.PLASTIC: Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03),
     Surface.ROOF_TILE: Reflection(0.33, spread=0.13, shade=0.20, drop=0.01, rough=0.003),
-    # The window of a house: unlike a car's, it shows curtains and frames behind the pane.
+    # The window of a house. Unlike a car's, it has curtains and frames that reflect.
     Surface.WINDOW: Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01),
 }
 
@@ -185,7 +185,7 @@ GROUND_SURFACES: dict[Label, Surface] = {
 def reflection_table() -> np.ndarray:
     """Return `REFLECTIONS` as an (S, 6) float32 table.
 
-    Rows are surfaces; columns are the fields of `Reflection` in their order.
+    Rows are the S surfaces by value; columns are the fields of `Reflection` in order.
     """
     rows = [astuple(REFLECTIONS[surface]) for surface in Surface]
     return np.array(rows, dtype=np.float32)
@@ -193,7 +193,10 @@ def reflection_table() -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def ground_surface_table() -> np.ndarray:
-    """Return the surface of each class of ground, indexed by class id: (256,) uint8."""
+    """Return the (256,) uint8 surface of each class of ground, indexed by class id.
+
+    Entries of other ids are 0 and have no meaning.
+    """
     table = np.zeros(256, dtype=np.uint8)
     for label, surface in GROUND_SURFACES.items():
         table[label] = surface

@@ -1,4 +1,8 @@
-"""Fills a street: plots, roadside furniture, parked vehicles, traffic, people and work zones."""
+"""Fill a street with plots, roadside furniture, parked vehicles, traffic, people and work zones.
+
+x and t are street coordinates in metres: along the middle line, and across it (left is positive).
+A side is -1 (right) or 1 (left). Each street depends on the order of the random draws: keep it.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +34,12 @@ CLUTTER = 1.6
 SHELTERS = 0.15
 # Work zones per 100 m of street.
 WORK_ZONES = 0.25
-# Metres along the street between the places of the second row.
+# Metres between the trees, houses and copses of the second row, along the street.
 BACKGROUND_STEP = 14.0
+# Metres: least distance between two vehicles of one lane.
+VEHICLE_GAP = 14.0
+# Largest random yaw. 2 pi, rounded up: the exact value would change the streets of every seed.
+TURN = 6.3
 
 
 def populate(ground: Ground, rng: np.random.Generator, ego_speed: float, ego_x: float) -> Site:
@@ -40,8 +48,8 @@ def populate(ground: Ground, rng: np.random.Generator, ego_speed: float, ego_x: 
     Args:
         ground: the street.
         rng: draws everything.
-        ego_speed: metres per second of the car with the sensor.
-        ego_x: its place along the street at time 0, which is kept clear.
+        ego_speed: speed of the car with the sensor, metres per second.
+        ego_x: x of that car at time 0; no traffic in its lane starts near it.
     """
     site = Site(ground, rng)
     for side in (-1, 1):
@@ -59,19 +67,20 @@ def populate(ground: Ground, rng: np.random.Generator, ego_speed: float, ego_x: 
 
 
 def _fill_parking_lane(site: Site, side: int) -> None:
+    """Put parked vehicles along one side of the road, if it has a parking lane."""
     rng = site.rng
     style = site.ground.style
-    lane = style.parking[int(side > 0)]
+    lane_width = style.parking[int(side > 0)]
 
     x = rng.uniform(0, 6)
-    while lane and x < site.ground.length:
+    while lane_width and x < site.ground.length:
         make = weighted_choice(rng, PARKED_VEHICLES)
-        room = 13.0 if make is vehicles.truck else rng.uniform(5.8, 7.5)
+        space = 13.0 if make is vehicles.truck else rng.uniform(5.8, 7.5)
         if rng.random() < style.parked:
-            t = side * (style.road / 2 + lane / 2 + rng.normal(scale=0.1))
+            t = side * (style.road / 2 + lane_width / 2 + rng.normal(scale=0.1))
             yaw = _along_road(side) + rng.normal(scale=0.02)
-            site.put(make(rng), x + room / 2, t, yaw, thing=True, margin=6.0 + room / 2)
-        x += room
+            site.put(make(rng), x + space / 2, t, yaw, thing=True, margin=6.0 + space / 2)
+        x += space
 
 
 def _fill_roadside(site: Site, side: int) -> None:
@@ -80,25 +89,25 @@ def _fill_roadside(site: Site, side: int) -> None:
     ground = site.ground
     style = ground.style
 
-    kerb = side * (style.road / 2 + style.parking[int(side > 0)] + 0.35)
-    back = side * (ground.front(side) - 0.3)
+    kerb_t = side * (style.road / 2 + style.parking[int(side > 0)] + 0.35)
+    back_t = side * (ground.front(side) - 0.3)
     yaw = _along_road(side)
 
     has_wires = style.kind == "rural" or rng.random() < 0.15
     make_pole = fixtures.utility_pole if has_wires else fixtures.lamp
     for x in np.arange(rng.uniform(0, style.lamps), ground.length, style.lamps):
-        site.put(make_pole(rng), x, kerb if rng.random() < 0.7 else back, yaw)
+        site.put(make_pole(rng), x, kerb_t if rng.random() < 0.7 else back_t, yaw)
 
     if np.isfinite(style.trees):
         for x in np.arange(rng.uniform(0, style.trees), ground.length, style.trees):
             tree = random_tree(rng, rng.uniform(4, 9))
-            site.put(tree, x + rng.normal(), back, margin=2.0)
+            site.put(tree, x + rng.normal(), back_t, margin=2.0)
 
     furniture = (
-        (fixtures.sign, SIGNS, kerb),
-        (fixtures.post, POSTS, back),
-        (fixtures.clutter, CLUTTER, back),
-        (fixtures.shelter, SHELTERS, back),
+        (fixtures.sign, SIGNS, kerb_t),
+        (fixtures.post, POSTS, back_t),
+        (fixtures.clutter, CLUTTER, back_t),
+        (fixtures.shelter, SHELTERS, back_t),
     )
     for make, per_100_m, t in furniture:
         for _ in range(rng.poisson(per_100_m * ground.length / 100)):
@@ -110,7 +119,7 @@ def _fill_roadside(site: Site, side: int) -> None:
 
 
 def _fill_background(site: Site, side: int) -> None:
-    """Put trees and houses in a second row behind the plots, which closes the view."""
+    """Put a second row of trees and houses behind the plots, to close off the view."""
     rng = site.rng
     ground = site.ground
     front = ground.front(side)
@@ -144,7 +153,7 @@ def _put_background_house(site: Site, x: float, t: float) -> None:
 
 
 def _fill_side_roads(site: Site) -> None:
-    """Put waiting cars into the side roads, and a traffic light or a sign at their mouths."""
+    """Put waiting vehicles on the side roads, and a traffic light or a sign where they begin."""
     rng = site.rng
 
     for crossing in site.ground.crossings:
@@ -169,7 +178,7 @@ def _put_waiting_car(site: Site, crossing: Crossing, side: int, distance: float)
 
 
 def _add_traffic(site: Site, ego_speed: float, ego_x: float) -> None:
-    """Add vehicles to both lanes; those of one lane share a speed, so that none hits another."""
+    """Add vehicles to both lanes; all in one lane have one speed, so that none hits another."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -178,10 +187,10 @@ def _add_traffic(site: Site, ego_speed: float, ego_x: float) -> None:
     for direction, speed in ((1, ego_speed), (-1, oncoming_speed)):
         x = rng.uniform(5, 60)
         while x < ground.length - 10:
-            if direction < 0 or abs(x - ego_x) > 14:
+            if direction < 0 or abs(x - ego_x) > VEHICLE_GAP:
                 make = weighted_choice(rng, DRIVING_VEHICLES)
                 site.put_moving(make(rng), x, -direction * style.road / 4, speed)
-            x += 14 + rng.exponential(100 / max(style.traffic, 0.05))
+            x += VEHICLE_GAP + rng.exponential(100 / max(style.traffic, 0.05))
 
 
 def _add_people(site: Site) -> None:
@@ -205,11 +214,11 @@ def _add_people(site: Site) -> None:
         else:
             t = side * (ground.front(side) + rng.uniform(-1.2, 1.5))
             person = vehicles.person(rng)
-            site.put(person, x, t, rng.uniform(0, 6.3), thing=True, margin=-np.inf)
+            site.put(person, x, t, rng.uniform(0, TURN), thing=True, margin=-np.inf)
 
 
 def _park_two_wheelers(site: Site) -> None:
-    """Put bicycles and motorcycles at the fronts of the plots."""
+    """Put parked bicycles and motorcycles at the fronts of the plots."""
     rng = site.rng
     ground = site.ground
 
@@ -223,7 +232,7 @@ def _park_two_wheelers(site: Site) -> None:
 
 
 def _add_work_zones(site: Site) -> None:
-    """Put rows of barriers or cones at the edge of the road, some with an excavator behind."""
+    """Put rows of barriers or cones at the edge of the road, some with an excavator behind them."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -242,10 +251,10 @@ def _add_work_zones(site: Site) -> None:
         if rng.random() < 0.5:
             t = side * (ground.front(side) + 2.5)
             excavator = vehicles.excavator(rng)
-            yaw = rng.uniform(0, 6.3)
+            yaw = rng.uniform(0, TURN)
             site.put(excavator, start + length / 2, t, yaw, thing=True, margin=3.0)
 
 
 def _along_road(side: int) -> float:
-    """Return the yaw of the direction of travel on one side of the road."""
+    """Return the yaw, relative to the street, of vehicles on one side of the road."""
     return 0.0 if side < 0 else np.pi

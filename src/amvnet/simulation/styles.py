@@ -1,4 +1,4 @@
-"""What makes one street differ from another: the kinds of streets, and how one is drawn."""
+"""The kinds of streets, and the random numbers that make each street of a kind different."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from amvnet.simulation.chance import weighted_choice
 
 @dataclass(frozen=True)
 class Style:
-    """The numbers of one street.
+    """The numbers that describe one street.
 
-    Lengths are in metres; pairs of one number a side are (right, left) of the road.
+    Lengths are in metres. Pairs with one number per side of the road are (right, left).
     """
 
     # One of residential, urban, rural, fast.
     kind: str
     # Width of the carriageway.
     road: float
-    # Width of the lane of parked cars on each side; 0 is none.
+    # Width of the parking lane on each side; 0 if there is none.
     parking: tuple[float, float]
-    # Width of the strip of grass between kerb and sidewalk on each side.
+    # Width of the strip of grass between kerb and sidewalk on each side; 0 if there is none.
     verge: tuple[float, float]
-    # Width of the sidewalk on each side; 0 is none.
+    # Width of the sidewalk on each side; 0 if there is none.
     sidewalk: tuple[float, float]
     # Height of the kerb.
     kerb: float
-    # Slope of the ground on each side, from the sidewalk outwards.
+    # Slope (rise over run) of the ground on each side, from the sidewalk outwards.
     bank: tuple[float, float]
     # Chances that a plot has a house, a row of houses, a wood, an open field, a car park.
     plots: tuple[float, float, float, float, float]
     # Smallest and largest distance of a house from the front of its plot.
     setback: tuple[float, float]
-    # Smallest and largest height of a house's walls.
+    # Smallest and largest height of the walls of a house.
     storeys: tuple[float, float]
     # Chance that a place in the parking lane is taken.
     parked: float
-    # Distance between trees along the street; infinite is none.
+    # Distance between trees along the street; infinite if there are none.
     trees: float
     # Chance of a hedge, wall or fence along the front of a plot.
     fenced: float
@@ -46,7 +46,7 @@ class Style:
     traffic: float
     # People and cyclists per 100 m of street.
     people: float
-    # Scale of the number of plants in gardens.
+    # Factor on the number of plants in gardens.
     green: float
     # Distance between lamps or utility poles.
     lamps: float
@@ -56,7 +56,7 @@ class Style:
 
 @dataclass(frozen=True)
 class Kind:
-    """The numbers that the streets of one kind have in common; `draw_style` varies them."""
+    """The typical numbers of one kind of street; `draw_style` varies them for each street."""
 
     # Share of all streets.
     share: float
@@ -66,7 +66,7 @@ class Kind:
     parking: float
     verge: float
     sidewalk: float
-    # As in `Style`.
+    # As in `Style`; `parked` and those after it are multiplied by random factors.
     plots: tuple[float, float, float, float, float]
     setback: tuple[float, float]
     storeys: tuple[float, float]
@@ -158,9 +158,11 @@ def draw_style(rng: np.random.Generator) -> Style:
     name = weighted_choice(rng, shares)
     kind = KINDS[name]
 
-    # The larger the factor, the closer the street's shares are to those of its kind.
+    # The chances vary around those of the kind; a larger factor than 8 would make them vary less.
+    # A Dirichlet distribution does not allow 0, hence the small number.
     house, row, wood, field, lot = rng.dirichlet(np.array(kind.plots) * 8 + 1e-3).tolist()
 
+    # The order of the draws decides the street of each seed: keep it.
     return Style(
         kind=name,
         road=float(rng.uniform(*kind.road)),
@@ -186,7 +188,7 @@ def draw_style(rng: np.random.Generator) -> Style:
 def _draw_widths(
     rng: np.random.Generator, low: float, high: float, chance: float
 ) -> tuple[float, float]:
-    """Draw a width for each side of the road, which is 0 unless the chance comes true."""
+    """Draw the widths of a strip (right, left), each in low..high with the chance, else 0."""
     right = _draw_width(rng, low, high, chance)
     left = _draw_width(rng, low, high, chance)
     return right, left

@@ -1,18 +1,18 @@
-"""Archives for the benchmarks' servers, packed from predictions or checked, by the same rules."""
+"""Pack predictions for a benchmark's server, or check a packed archive, by the same rules."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from amvnet.errors import InputError
+from amvnet.progress import Progress, no_progress
 from amvnet.submission.rules import Rules, Sources
 from amvnet.submission.zips import Archive, open_archive, write_archive
 
 ENDING = ".zip"
-SHOWN = 5  # folders in a message
-Progress = Callable[[int, int], None]  # called with the number of files done, and of all
+SHOWN = 5  # names listed in a message
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Submission:
 
     Attributes:
         predictions: number of predictions in it.
-        unmatched: how many of them belong to scans that are not on disk, whose number of points
+        unmatched: number of predictions whose scan is not on disk, so that its number of points
             is unknown.
         official: how many predictions the server expects, or None if it has no fixed number.
     """
@@ -32,7 +32,7 @@ class Submission:
 
     @property
     def notes(self) -> list[str]:
-        """What a user should know about an archive although it keeps to the rules."""
+        """Remarks that a user should read, although the archive keeps to the rules."""
         notes = []
         if self.unmatched:
             notes.append(
@@ -43,14 +43,10 @@ class Submission:
         if self.official is not None and self.predictions < self.official:
             notes.append(
                 f"the benchmark has {self.official} scans in this split; "
-                "its server refuses an archive of fewer"
+                "its server refuses an archive with fewer"
             )
 
         return notes
-
-
-def _no_progress(done: int, total: int) -> None:
-    """Report nothing."""
 
 
 def write(
@@ -58,7 +54,7 @@ def write(
     folder: Path,
     out: Path,
     sources: Sources | None = None,
-    progress: Progress = _no_progress,
+    progress: Progress = no_progress,
 ) -> Submission:
     """Check a folder of predictions and pack it; the same predictions give the same bytes.
 
@@ -72,6 +68,9 @@ def write(
         sources: the data that the method uses, if the benchmark asks for them.
         progress: called before each file and at the end.
 
+    Returns:
+        A summary of the archive.
+
     Raises:
         InputError: if a prediction is missing or breaks the rules.
     """
@@ -79,7 +78,8 @@ def write(
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 
-    names = [name for name in (*rules.texts, *sorted(rules.points)) if (folder / name).is_file()]
+    possible_names = (*rules.texts, *sorted(rules.points))
+    names = [name for name in possible_names if (folder / name).is_file()]
     _check_missing(rules.required, set(names), str(folder))
     for name in names:
         path = folder / name
@@ -102,10 +102,10 @@ def write(
     return _submission(rules, names)
 
 
-def check(rules: Rules, path: Path, progress: Progress = _no_progress) -> Submission:
-    """Check an archive of any tool: all names and sizes first, then the files one by one.
+def check(rules: Rules, path: Path, progress: Progress = no_progress) -> Submission:
+    """Check an archive that any tool has packed.
 
-    One file is in memory at a time.
+    All names and sizes are checked first, then the files one by one; one is in memory at a time.
 
     Raises:
         InputError: at the first rule that the archive breaks.
@@ -127,15 +127,18 @@ def check(rules: Rules, path: Path, progress: Progress = _no_progress) -> Submis
 
 
 def _submission(rules: Rules, names: Iterable[str]) -> Submission:
-    points = [rules.points[name] for name in names if name in rules.points]
-    return Submission(len(points), unmatched=points.count(None), official=rules.official)
+    """Return the summary of an archive that holds the files of these names."""
+    point_counts = [rules.points[name] for name in names if name in rules.points]
+    return Submission(
+        len(point_counts), unmatched=point_counts.count(None), official=rules.official
+    )
 
 
 def _check_ending(path: Path) -> None:
     if path.suffix != ENDING:
         raise InputError(
             f"{path}: expected a name that ends in {ENDING}, "
-            f"found {path.suffix or 'no ending'}; name it so"
+            f"found {path.suffix or 'no ending'}; rename it"
         )
 
 
@@ -143,7 +146,7 @@ def _check_names(rules: Rules, archive: Archive) -> None:
     """Check which files and folders an archive has."""
     path = archive.path
     names = set(archive.sizes)
-    top_names = _parts(names | archive.folders, 0)
+    top_names = _names_at_depth(names | archive.folders, 0)
     _check_not_nested(rules, names, top_names, path)
 
     missing_folders = [name for name in rules.folders if name not in archive.folders]
@@ -164,47 +167,48 @@ def _check_names(rules: Rules, archive: Archive) -> None:
     unexpected = sorted(names - {*rules.points, *rules.others})
     if unexpected:
         raise InputError(
-            f"{path}: expected only predictions, found {_first_of(unexpected)}; pack it without"
+            f"{path}: expected only predictions, found {_first_of(unexpected)}; leave these out"
         )
 
 
 def _check_not_nested(rules: Rules, names: set[str], top_names: set[str], path: Path) -> None:
     """Check that the folders of the benchmark are not packed inside another folder."""
-    expected = _parts(rules.folders, 0)
+    expected = _names_at_depth(rules.folders, 0)
     if len(top_names) != 1 or top_names & expected:
         return
 
     (outer_folder,) = top_names
-    if _parts(names, 1) & expected:
+    if _names_at_depth(names, 1) & expected:
         raise InputError(
             f"{path}: expected {' and '.join(sorted(expected))} at the top, "
-            f"found all below {outer_folder!r}; pack what is in that folder, not the folder itself"
+            f"found all below {outer_folder!r}; pack the content of that folder, not the folder"
         )
 
 
-def _check_missing(required: Collection[str], names: set[str], shown: str) -> None:
+def _check_missing(required: Collection[str], names: set[str], source: str) -> None:
+    """Check that no required prediction is missing; `source` begins the message."""
     missing = sorted(set(required) - names)
     if missing:
         raise InputError(
-            f"{shown}: expected a prediction for each of {len(required)} scans, "
+            f"{source}: expected a prediction for each of {len(required)} scans, "
             f"found no {_first_of(missing)}; predict these scans too, "
-            "or name those that there are with --sequences or --split"
+            "or select predicted ones with --sequences or --split"
         )
 
 
-def _parts(names: Iterable[str], index: int) -> set[str]:
-    """Return the parts of paths at one depth (0: the top), without the paths that end above it."""
-    parts = set()
-    for name in names:
-        path_parts = name.split("/")
-        if index < len(path_parts):
-            parts.add(path_parts[index])
+def _names_at_depth(paths: Iterable[str], depth: int) -> set[str]:
+    """Return the names of files and folders at one depth of some paths; 0 is the top."""
+    names = set()
+    for path in paths:
+        path_names = path.split("/")
+        if depth < len(path_names):
+            names.add(path_names[depth])
 
-    return parts
+    return names
 
 
 def _first_of(names: list[str]) -> str:
-    """Return the first of some names, and how many more there are."""
+    """Return the first name and the number of further names, as text."""
     first = names[0] if names[0].isprintable() else repr(names[0])
     if len(names) == 1:
         return first

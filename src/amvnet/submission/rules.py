@@ -21,7 +21,8 @@ from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
-# Scans of SemanticKITTI's test sequences (KITTI odometry 11 to 21); its server wants all of them.
+# Number of scans in each test sequence of SemanticKITTI (KITTI odometry 11 to 21). Its server
+# requires all of them.
 TEST_SCANS = {
     "11": 921,
     "12": 1061,
@@ -35,9 +36,9 @@ TEST_SCANS = {
     "20": 831,
     "21": 2721,
 }
-# Of a scan that is not on disk. A full turn of these sensors has 130,000 points at most.
+# Most points accepted of a scan that is not on disk. A full turn of the sensor has 130,000.
 MOST_POINTS = 1_000_000
-MOST_TEXT = 1_000_000  # bytes of a description or of submission.json
+MOST_TEXT = 1_000_000  # most bytes of description.txt or submission.json
 
 
 @dataclass(frozen=True)
@@ -61,21 +62,21 @@ class Rules:
 
     Attributes:
         taxonomy: the classes.
-        what: the scans in words.
-        points: number of points by name of the prediction, for all predictions that the archive
-            may contain; None if the scan is not on disk.
+        description: of the scans, in words.
+        points: by name, each prediction that the archive may contain, with the number of points
+            of its scan; None if the scan is not on disk.
         required: names of the predictions that it must contain.
         dtype: number type of the ids.
-        unlabelled: whether a point may be without a class.
+        unlabelled: whether points may have no class (train id 0).
         folders: names of the folders, outer ones first, each with a trailing slash.
         needs_folders: whether the folders need entries of their own.
-        meta: name of the file of `Sources`, or None if there is none.
+        meta: name of submission.json, the file of `Sources`; None if there is none.
         texts: names of text files that the archive may contain.
         official: how many predictions the server expects, or None if it has no fixed number.
     """
 
     taxonomy: Taxonomy
-    what: str
+    description: str
     points: Mapping[str, int | None]
     required: Collection[str]
     dtype: type[np.unsignedinteger]
@@ -91,13 +92,13 @@ class Rules:
         """The names of the files that are not predictions."""
         return self.texts if self.meta is None else (*self.texts, self.meta)
 
-    def check_size(self, name: str, size: int, shown: str) -> None:
-        """Check the size of a file, before it is read.
+    def check_size(self, name: str, size: int, label: str) -> None:
+        """Check the size of a file before it is read.
 
         Args:
-            name: of the file in the archive.
-            size: bytes that the file has or declares.
-            shown: the beginning of the message.
+            name: name of the file in the archive.
+            size: bytes that the file has, or that its entry declares.
+            label: the beginning of error messages.
 
         Raises:
             InputError: if a prediction does not have one id per point, or another file is too
@@ -106,43 +107,44 @@ class Rules:
         if name in self.others:
             if size > MOST_TEXT:
                 raise InputError(
-                    f"{shown}: expected at most {MOST_TEXT} bytes of text, found {size}; shorten it"
+                    f"{label}: expected at most {MOST_TEXT} bytes of text, found {size}; shorten it"
                 )
             return
 
         count = self.points[name]
         if count is not None:
-            check_size(shown, size, count, self.dtype)
+            check_size(label, size, count, self.dtype)
             return
 
         width = np.dtype(self.dtype).itemsize
         if not 0 < size <= MOST_POINTS * width or size % width:
             raise InputError(
-                f"{shown}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; "
-                "write a scan's ids"
+                f"{label}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; "
+                "write one id per point"
             )
 
-    def check_content(self, name: str, data: bytes, shown: str) -> None:
-        """Check what is in a file of the right size.
+    def check_content(self, name: str, data: bytes, label: str) -> None:
+        """Check the content of a file whose size has been checked.
 
         Args:
-            name: of the file in the archive.
+            name: name of the file in the archive.
             data: all of its bytes.
-            shown: the beginning of the message.
+            label: the beginning of error messages.
 
         Raises:
-            InputError: if an id is not the benchmark's, or submission.json is not as it must be.
+            InputError: if an id is not one of the benchmark, if a point needs a class and has
+                none, or if submission.json is not valid (see `check_sources`).
         """
         if name == self.meta:
-            check_sources(data, shown)
+            check_sources(data, label)
             return
         if name not in self.points:
             return
 
-        ids = train_ids(shown, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
+        ids = train_ids(label, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
         if not self.unlabelled and not ids.all():
             raise InputError(
-                f"{shown}: expected a class 1..{self.taxonomy.size} for every point, "
+                f"{label}: expected a class 1..{self.taxonomy.size} for every point, "
                 f"found 0 for {np.count_nonzero(ids == 0)} of {len(ids)}; "
                 "give these points a class"
             )
@@ -152,16 +154,16 @@ def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = No
     """Return the rules for the archive of one split, or of some sequences.
 
     Args:
-        dataset: its scans determine which predictions there must be, and their sizes.
+        dataset: its scans determine which predictions are required, and their sizes.
         split: "test" is what the servers score; the others are for trials.
         sequences: only these sequences or scenes, instead of a split.
 
     Raises:
-        InputError: if the dataset belongs to no benchmark with a server, or has no such scans.
+        InputError: if the dataset's benchmark has no server, or the dataset has no such scans.
     """
     if type(dataset) not in RULES:
         raise InputError(
-            f"{dataset.root}: expected SemanticKITTI or nuScenes, found another data set; "
+            f"{dataset.root}: expected SemanticKITTI or nuScenes, found another dataset; "
             "give one of them"
         )
 
@@ -173,9 +175,9 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
 
     The archive holds sequences/11 to 21, each with predictions/NNNNNN.label, raw ids as uint32.
 
-    The official validator wants a name that ends in .zip, an entry for every folder, a file for
-    every scan in the `velodyne` folders, and 4 bytes per point. It looks neither at the ids nor
-    at other files. The server's evaluation counts all label files, reads unknown ids as
+    The official validator requires a name that ends in .zip, an entry for every folder, a file
+    for every scan in the `velodyne` folders, and 4 bytes per point. It checks neither the ids nor
+    other files. The server's evaluation counts all label files, reads unknown ids as
     "unlabeled" and stops at ids above 358; here, further label files and unknown ids are errors.
     A point may be unlabelled (it counts as missed) and the upper 16 bits are free. The file
     description.txt is optional.
@@ -195,8 +197,8 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
     required: set[str] = set()
     for sequence in wanted:
         folders += [f"sequences/{sequence}/", f"sequences/{sequence}/predictions/"]
-        for scan in range(TEST_SCANS.get(sequence, 0)):
-            name = f"sequences/{sequence}/predictions/{scan:06d}.label"
+        for index in range(TEST_SCANS.get(sequence, 0)):
+            name = f"sequences/{sequence}/predictions/{index:06d}.label"
             points[name] = None
             if sequence in absent:
                 required.add(name)
@@ -208,7 +210,7 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
     is_whole_test = split == "test" and sequences is None
     return Rules(
         taxonomy=dataset.taxonomy,
-        what=_describe(split, sequences),
+        description=_describe(split, sequences),
         points=points,
         required=required,
         dtype=np.uint32,
@@ -226,9 +228,12 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     The archive holds lidarseg/SPLIT/TOKEN_lidarseg.bin, classes 1..16 as uint8, and
     SPLIT/submission.json. TOKEN is the sample_data token of LIDAR_TOP.
 
-    The official validator wants a file for every key frame of the split in the tables, one byte
-    per point, no byte 0 or above 16, and in submission.json a "meta" with exactly the five keys
-    of `Sources`, all true or false. It does not look at other files; here they are errors.
+    The official validator requires a file for every key frame that the tables list for the split,
+    one byte per point with a value of 1..16, and in submission.json a "meta" with exactly the five
+    keys of `Sources`, all true or false. It does not check other files; here they are errors.
+
+    Raises:
+        InputError: if there are no such scenes, or they belong to several splits.
     """
     scenes = dataset.scenes(split) if sequences is None else sequences
     if not scenes:
@@ -247,13 +252,13 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     if len(splits) != 1:
         raise InputError(
             f"{dataset.root}: expected scenes of one split, found {', '.join(sorted(splits))}; "
-            "name those of one"
+            "name scenes of only one split"
         )
 
     (only_split,) = splits
     return Rules(
         taxonomy=dataset.taxonomy,
-        what=_describe(split, sequences),
+        description=_describe(split, sequences),
         points=points,
         required=points.keys(),
         dtype=np.uint8,
@@ -267,12 +272,12 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
 RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuScenes: _nuscenes}
 
 
-def check_sources(data: bytes, shown: str) -> None:
-    """Check a submission.json.
+def check_sources(data: bytes, label: str) -> None:
+    """Check the content of a submission.json.
 
     Args:
         data: all of its bytes.
-        shown: the beginning of the message.
+        label: the beginning of error messages.
 
     Raises:
         InputError: if it is not JSON, or its "meta" does not have exactly the five flags.
@@ -281,24 +286,24 @@ def check_sources(data: bytes, shown: str) -> None:
         content = json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())
-        raise InputError(f"{shown}: expected JSON, found {reason}; write it again") from None
+        raise InputError(f"{label}: expected JSON, found {reason}; write it again") from None
 
     flags = content.get("meta") if isinstance(content, dict) else None
     keys = list(asdict(Sources()))
     if not isinstance(flags, dict) or set(flags) != set(keys):
-        found = "no such object"
+        flags_text = "no such object"
         if isinstance(flags, dict):
-            found = ", ".join(map(repr, flags)) or "nothing"
+            flags_text = ", ".join(map(repr, flags)) or "nothing"
         raise InputError(
-            f'{shown}: expected {", ".join(keys)} in the object "meta", '
-            f"found {found[:200]}; write these five"
+            f'{label}: expected {", ".join(keys)} in the object "meta", '
+            f"found {flags_text[:200]}; write these five"
         )
 
     for key in keys:
         if not isinstance(flags[key], bool):
             raise InputError(
-                f"{shown}: expected true or false for {key}, "
-                f"found a value of type {type(flags[key]).__name__}; write a flag"
+                f"{label}: expected true or false for {key}, "
+                f"found a value of type {type(flags[key]).__name__}; write true or false"
             )
 
 

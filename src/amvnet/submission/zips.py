@@ -1,4 +1,4 @@
-"""Zip archives: read with every guard, and written whole, the same bytes for the same content."""
+"""Zip archives: safe reading of archives of any origin, and writing with reproducible bytes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # what every unpacker knows
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # that every unpacker supports
 ENCRYPTED = 0x1  # bit of an entry's flags
-LEVEL = 6  # of deflate: 9 takes five to eight times as long for a sixth less
-LONG_AGO = (1980, 1, 1, 0, 0, 0)  # of every entry: the same content gives the same bytes
-UNIX = 3  # the system that wrote an entry
-FOLDER_BIT = 0x10  # of MS-DOS
-# zipfile raises these for broken data. A negative offset is an OSError or an OverflowError.
+LEVEL = 6  # of deflate: 9 takes five to eight times as long and saves a sixth
+# Time of every entry, the earliest of the format: the same content gives the same bytes.
+LONG_AGO = (1980, 1, 1, 0, 0, 0)
+UNIX = 3  # code of the system that wrote an entry
+FOLDER_BIT = 0x10  # of an entry's MS-DOS attributes
+# zipfile raises these for broken data: for example OSError or OverflowError for a negative offset.
 BROKEN = (
     zipfile.BadZipFile,
     OSError,
@@ -39,8 +40,8 @@ class Archive:
     """A zip archive that is open for reading.
 
     Attributes:
-        path: its file.
-        sizes: declared bytes of every entry that is a file, by name.
+        path: path of the archive.
+        sizes: by name, the size in bytes that each file in the archive declares.
         folders: names of the entries for folders, each with its trailing slash.
     """
 
@@ -50,7 +51,9 @@ class Archive:
     _zip: zipfile.ZipFile
 
     def read(self, name: str) -> bytes:
-        """Unpack one file, at most as many bytes as it declares: check that number first.
+        """Return the content of one file.
+
+        No more bytes are unpacked than `sizes` declares: check that number before the call.
 
         Raises:
             InputError: if the data are broken.
@@ -59,7 +62,7 @@ class Archive:
             data = self._zip.read(name)
         except BROKEN as error:
             raise InputError(
-                f"{self.path}: expected {name} whole, found it broken ({_reason(error)}); "
+                f"{self.path}: expected {name} intact, found it broken ({_reason(error)}); "
                 "pack it again"
             ) from None
 
@@ -85,11 +88,13 @@ class ArchiveWriter:
 
 @contextmanager
 def open_archive(path: Path) -> Iterator[Archive]:
-    """Open an archive of any origin. Nothing is unpacked and no name in it becomes a path.
+    """Open an archive of any origin for reading.
+
+    Nothing is unpacked to disk, and no name in the archive is used as a path.
 
     Raises:
         InputError: if the file is missing or not a zip archive, or if an entry is encrypted,
-            leads out of the archive's folder, occurs twice or is packed by an uncommon method.
+            leads out of the archive's folder, occurs twice or is compressed by an uncommon method.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected a zip archive, found no file; check the path")
@@ -120,7 +125,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
 def write_archive(path: Path) -> Iterator[ArchiveWriter]:
     """Write an archive that appears whole or not at all.
 
-    Entries keep the order in which they are added; only one is in memory at a time.
+    Entries keep the order in which they are added. Only one is in memory at a time.
 
     Raises:
         InputError: if the file cannot be written.
@@ -130,7 +135,7 @@ def write_archive(path: Path) -> Iterator[ArchiveWriter]:
 
 
 def _entry(name: str) -> zipfile.ZipInfo:
-    """Return an entry that says nothing about this machine or the time."""
+    """Return the entry of a file or folder, the same on every machine and at any time."""
     entry = zipfile.ZipInfo(name, LONG_AGO)
     entry.create_system = UNIX
     if name.endswith("/"):
@@ -143,6 +148,7 @@ def _entry(name: str) -> zipfile.ZipInfo:
 
 
 def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
+    """Check every entry before any is read; see `open_archive`."""
     for entry in entries:
         if entry.flag_bits & ENCRYPTED:
             raise InputError(
@@ -171,13 +177,13 @@ def _check_entries(path: Path, entries: list[zipfile.ZipInfo]) -> None:
 
 
 def _is_inside(name: str) -> bool:
-    """Return whether a name stays below the folder that it is unpacked to, on every system."""
+    """Return whether unpacking a name stays below the target folder, on every system."""
     if "\\" in name or "\0" in name or PureWindowsPath(name).drive:
         return False
     return not name.startswith("/") and ".." not in PurePosixPath(name).parts
 
 
 def _reason(error: Exception) -> str:
-    """Return what an exception says, on one line."""
+    """Return the message of an exception on one line, or its type if it has none."""
     message = getattr(error, "strerror", None) or str(error)
     return " ".join(message.split()) or type(error).__name__

@@ -188,12 +188,12 @@ def make_loader(
 
 
 def count_classes(
-    dataset: Dataset, records: Sequence[ScanRecord], kept: Path, processes: Processes = ALONE
+    dataset: Dataset, records: Sequence[ScanRecord], path: Path, processes: Processes = ALONE
 ) -> np.ndarray:
     """Count the points of each class in some scans, or read the counts of an earlier call.
 
     Args:
-        kept: an .npz file of counts; written unless it already has those of these scans.
+        path: an .npz file of counts; written unless it already has those of these scans.
 
     Returns:
         (K,) int64.
@@ -204,7 +204,7 @@ def count_classes(
     }
 
     # The first process reads for all, as others might already see the file that it writes below.
-    earlier = processes.gather(_read_counts(kept, source))[0]
+    earlier = processes.gather(_read_counts(path, source))[0]
     if earlier is not None:
         return earlier
 
@@ -219,7 +219,7 @@ def count_classes(
     if processes.first:
         scans = np.array(source["scans"])
         classes = np.array(source["classes"])
-        with atomic_write(kept) as part:
+        with atomic_write(path) as part:
             np.savez(part, counts=totals, scans=scans, classes=classes)
     return totals
 

@@ -9,23 +9,26 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-# A rarer class weighs as much as one of this frequency, so that a few points cannot rule a step.
+# A rarer class gets the weight of one with this frequency, so that a few points cannot dominate a
+# step.
 FREQUENCY_FLOOR = 1e-4
 
-# Lovász-softmax leaves out smaller errors; together they would add less than this to a class.
+# Lovász-softmax leaves out smaller errors. Together they would add less than this to the loss of a
+# class.
 MIN_ERROR = 1e-3
 
 
 def class_weights(counts: np.ndarray) -> np.ndarray:
     """Return the square roots of the inverse class frequencies, scaled to a mean of 1.
 
-    Section 4.2 of the paper.
+    A frequency below `FREQUENCY_FLOOR` is raised to it, also that of an absent class. Section 4.2
+    of the paper.
 
     Args:
-        counts: (K,) points of each class in the training data.
+        counts: (K,) numbers of points of each class in the training data.
 
     Returns:
-        (K,) float32; frequencies below `FREQUENCY_FLOOR`, also of absent classes, count as that.
+        (K,) float32.
     """
     frequency = np.maximum(counts / max(counts.sum(), 1), FREQUENCY_FLOOR)
     weights = 1 / np.sqrt(frequency)
@@ -44,7 +47,7 @@ def range_view_loss(
         region: weight of the Dice loss; that of the cross-entropy is 1.
 
     Returns:
-        () in float32, or float64 for logits in float64; 0 if all points are ignored.
+        The loss, (), float32, or float64 if the logits are; 0 if all points are ignored.
     """
     return _loss(logits, labels, weights, region, dice)
 
@@ -54,7 +57,7 @@ def polar_view_loss(
 ) -> Tensor:
     """Return cross-entropy + Lovász-softmax loss, the loss of PolarNet.
 
-    Arguments and result are as for `range_view_loss`.
+    The arguments and the result are as for `range_view_loss`.
     """
     return _loss(logits, labels, weights, region, lovasz_softmax)
 
@@ -63,8 +66,11 @@ def dice(probabilities: Tensor, target: Tensor) -> Tensor:
     """Return the soft Dice loss: 1 - the mean of 2 |p t| / (|p| + |t|) over the classes present.
 
     Args:
-        probabilities: (P, K).
-        target: (P,) class indices in 0..K - 1.
+        probabilities: (P, K), p.
+        target: (P,) class indices in 0..K - 1; t is their one-hot encoding.
+
+    Returns:
+        The loss, ().
     """
     truth = F.one_hot(target, probabilities.shape[1]).to(probabilities.dtype)
     present = truth.sum(dim=0) > 0
@@ -78,12 +84,15 @@ def lovasz_softmax(probabilities: Tensor, target: Tensor) -> Tensor:
     """Return the Lovász extension of the Jaccard loss, averaged over the classes present.
 
     For each class the errors |t - p| are sorted, largest first. Each is weighted by the increase of
-    the Jaccard loss when its point joins the mispredicted ones. Errors up to `MIN_ERROR` are left
-    out, which saves most of the sorting (Berman et al., CVPR 2018).
+    the Jaccard loss when its point joins the mispredicted ones (Berman et al., CVPR 2018). Errors
+    up to `MIN_ERROR` are left out, which saves most of the sorting.
 
     Args:
-        probabilities: (P, K).
-        target: (P,) class indices in 0..K - 1.
+        probabilities: (P, K), p.
+        target: (P,) class indices in 0..K - 1; t is 1 for the points of the class, else 0.
+
+    Returns:
+        The loss, ().
     """
     losses = []
     for index in target.unique():
@@ -103,7 +112,10 @@ def _jaccard_increases(truth: Tensor, total: Tensor) -> Tensor:
 
     Args:
         truth: (M,) 1 for points of the class, 0 for others; sorted by falling error.
-        total: () all points of the class, including those whose error is small.
+        total: () number of all points of the class, including those with a small error.
+
+    Returns:
+        (M,).
     """
     intersection = total - truth.cumsum(0)
     union = total + (1 - truth).cumsum(0)
@@ -121,7 +133,7 @@ def _loss(
 ) -> Tensor:
     labelled = labels > 0
     if not labelled.any():
-        return logits.sum() * 0  # with a gradient, of zeros
+        return logits.sum() * 0  # so that backward() finds a graph, with gradients of 0
 
     logits = _at_least_float32(logits[labelled])
     target = labels[labelled].long() - 1

@@ -34,17 +34,18 @@ class Run:
     def stages(
         self, stage: StageName | Literal["all"] = "all", init: Weights | None = None
     ) -> Path:
-        """Train one stage, or all three.
+        """Train one stage, or all stages of the recipe.
 
         Args:
+            stage: name of the stage, or "all".
             init: weights to begin with.
 
         Returns:
-            The weights file with everything that is trained so far.
+            The weights file, with all parts that have been trained so far.
 
         Raises:
             InputError: if the head is to be trained without trained networks, or the folder holds a
-                run that is not to be resumed.
+                run that is not to be resumed or was begun with other settings.
         """
         plan = self.plan
         names = plan.recipe.stages if stage == "all" else (stage,)
@@ -75,15 +76,14 @@ class Run:
         """Return fresh weights with the parts of `init`, and of this folder's finished stages."""
         plan = self.plan
         weights = Weights(plan.recipe.model, plan.scans.dataset.taxonomy, plan.recipe.sensor)
-        # A head for other models' scores does not belong to these networks.
+        # A head for other models' scores is of no use to these networks.
         names = list(STAGES) if plan.scores is None else ["head"]
-        if init is not None:
-            used = [STAGES[name][0] for name in names]
-            for part in init.parts:
-                if part in used:
-                    weights = weights.replace_part(part, init)
         for name in names:
-            weights = self._stage(name, weights).taken_up()
+            part, _ = STAGES[name]
+            if init is not None and part in init.parts:
+                weights = weights.replace_part(part, init)
+        for name in names:
+            weights = self._stage(name, weights).finished_weights()
         return weights
 
     def _stage(self, name: str, weights: Weights) -> StageRun:
@@ -91,7 +91,7 @@ class Run:
         return kind(self.plan, name, part, weights, train_networks=train_networks)
 
     def trials(self, stage: StageName | Literal["all"]) -> Iterator[str]:
-        """Take some steps of each network, and yield what they cost; nothing is written."""
+        """Take some steps of each network; yield a line on their time and memory. Write nothing."""
         weights = self._start(None)
         for name in ("rv", "bev"):
             if stage in (name, "all"):
@@ -115,11 +115,12 @@ class Run:
         assert isinstance(trial, NetworkRun)
         speed = trial.trial(TRIAL_STEPS)
 
-        step = speed.seconds[-1]
-        steps_per_epoch = -(-len(train) // batch)
-        hours = steps_per_epoch * epochs * step / 3600
+        step_seconds = speed.seconds[-1]
+        steps_per_epoch = -(-len(train) // batch)  # rounded up
+        hours = steps_per_epoch * epochs * step_seconds / 3600
         return (
-            f"{name}: {step:.3g} s for a step of {batch} scans ({batch / step:.3g} scans/s), "
+            f"{name}: {step_seconds:.3g} s for a step of {batch} scans "
+            f"({batch / step_seconds:.3g} scans/s), "
             f"memory so far {speed.memory / 2**30:.1f} GiB; "
             f"{epochs} epochs of {len(train)} scans would take {hours:.3g} h"
         )

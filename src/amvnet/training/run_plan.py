@@ -1,4 +1,4 @@
-"""What a training run is to do, and how."""
+"""The plan of a training run: what it trains, on which scans, and how it runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class RunOptions:
 
     Attributes:
         resume: continue an earlier run in the same folder.
-        say: prints lines about what happens.
+        say: prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
         processes: those that share the run; all must see its folder.
     """
@@ -37,12 +37,12 @@ class RunPlan:
 
     Attributes:
         recipe: what to train.
-        scans: to learn from and to validate with. Without validation scans, the last weights are
-            kept.
+        scans: to train on and to validate with. Without validation scans, the last weights are
+            kept as the best.
         out: the folder of the run.
         options: how it runs.
-        scores: two other models' scores of the scans, for which the head is trained instead of the
-            networks'.
+        scores: two other models' scores of the scans; the head is trained on them instead of on
+            those of the networks. None without other models.
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, or the recipe is for
@@ -61,7 +61,7 @@ class RunPlan:
         if 0 < len(val) < size:  # a process without a scan would keep the others waiting
             raise InputError(
                 f"expected a validation scan for each of {size} processes, found {len(val)}; "
-                "name more"
+                "name more validation sequences"
             )
         for name in ("rv", "bev"):
             _check_batch(getattr(self.recipe.training, name), name, size)
@@ -70,12 +70,13 @@ class RunPlan:
         # A user's own classes fit any recipe.
         if taxonomy in TAXONOMIES and taxonomy != self.recipe.taxonomy:
             raise InputError(
-                f"expected a data set with the classes of {self.recipe.taxonomy}, "
+                f"expected a dataset with the classes of {self.recipe.taxonomy}, "
                 f"found {taxonomy}; use the recipe of that benchmark"
             )
 
 
 def _check_batch(config: NetworkTraining, name: str, processes: int) -> None:
+    """Raise InputError if a batch cannot be divided evenly."""
     if config.batch % (processes * config.accumulate):
         raise InputError(
             f"expected a batch for {processes} processes, each in {config.accumulate} parts, found "

@@ -1,4 +1,4 @@
-"""What the folder of a run records: its recipe, and how each call can be repeated."""
+"""The records in the folder of a run: its recipe, and how each call can be repeated."""
 
 from __future__ import annotations
 
@@ -16,18 +16,20 @@ from amvnet.config.nested import to_dict
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
+from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.training.fit import LAST
 from amvnet.training.run_plan import RunPlan
 from amvnet.weights.file import SIZES, Weights
 
-SETTINGS = "stage.yaml"  # in a stage's folder: what it was begun with
+SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")
 
 
 def write_record(plan: RunPlan, stage: str, init: Weights | None) -> None:
     """Write recipe.yaml, and the entry of a stage (or "all") in run.yaml.
 
-    The entry says what is made, on which data, and by which command it can be repeated.
+    The entry names the data, the versions, the weights to begin with, and the command that repeats
+    the call.
     """
     dataset = plan.scans.dataset
     entry: dict[str, Any] = {
@@ -43,7 +45,7 @@ def write_record(plan: RunPlan, stage: str, init: Weights | None) -> None:
     if plan.scores is not None:
         entry["scores"] = plan.scores.to_dict()
 
-    # Another call may have trained another stage on other scans: its entry stays, before this one.
+    # The entries of earlier calls, for other stages, stay; the new one comes last.
     entries = _entries(plan.out / "run.yaml")
     entries.pop(stage, None)
     entries[stage] = entry
@@ -57,7 +59,7 @@ def _write_yaml(path: Path, tree: dict[str, Any]) -> None:
 
 
 def _entries(path: Path) -> dict[str, Any]:
-    """Return what run.yaml holds so far, by stage; nothing if it cannot be read."""
+    """Return the entries of run.yaml so far, by stage; none if it cannot be read."""
     try:
         entries = yaml.safe_load(path.read_text())
     except (OSError, ValueError, yaml.YAMLError):
@@ -66,7 +68,7 @@ def _entries(path: Path) -> dict[str, Any]:
 
 
 def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
-    """Return the command that repeats a run."""
+    """Return the words of the command that repeats a call."""
     scans = plan.scans
     command = ["amvnet", "train", str(plan.out / "recipe.yaml")]
     command += ["--data", str(scans.dataset.root), "--stage", stage]
@@ -76,7 +78,7 @@ def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
     else:
         command += ["--with-val"]
     if has_init:
-        # The file of the initial weights has no name here; run.yaml has the digests of its parts.
+        # The path of the initial weights is not known here; run.yaml has digests of their parts.
         command += ["--init", "WEIGHTS"]
     if plan.scores is not None:
         command += plan.scores.options()
@@ -84,45 +86,49 @@ def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
 
 
 def stage_settings(plan: RunPlan, name: str, part: str, weights: Weights) -> dict[str, Any]:
-    """Return what the weights of a stage depend on.
+    """Return what the trained weights of a stage depend on, for YAML.
 
-    The data may move to another folder meanwhile.
+    Paths are left out, so that the data may move to another folder before the stage is resumed.
 
     Args:
-        name: of the stage.
-        part: of the weights, which the stage trains.
-        weights: what the stage begins with.
+        plan: of the run.
+        name: name of the stage.
+        part: the part of the weights that the stage trains.
+        weights: the weights that the stage begins with.
     """
     recipe = to_dict(plan.recipe)
+    training_keys = (name, "augment", "seed", "precision")
     train = plan.scans.train
     val = plan.scans.val
     settings: dict[str, Any] = {
         "model": {key: recipe["model"][key] for key in SIZES[part]},
-        "training": {
-            key: recipe["training"][key] for key in (name, "augment", "seed", "precision")
-        },
+        "training": {key: recipe["training"][key] for key in training_keys},
         "scans": {"train": _digest_of_scans(train), "val": _digest_of_scans(val)},
     }
+
     if plan.scores is not None:
         settings["scores"] = plan.scores.digests([*train, *val])
     elif name == "head":
-        settings["networks"] = {
-            network: weights.digest(network) for network in ("range_net", "polar_net")
-        }
+        settings["networks"] = {network: weights.digest(network) for network in BOTH_NETWORKS}
     return settings
 
 
 def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
-    """Check that a stage can begin, or resume, in a folder.
+    """Check that a stage can begin in a folder, or be resumed there.
+
+    Args:
+        folder: of the stage.
+        settings: of the stage, from `stage_settings`.
+        resume: whether to resume the stage if it was begun before.
 
     Raises:
-        InputError: if the folder holds a stage that is not to be resumed, or of another run.
+        InputError: if the stage was begun before, and is not to be resumed or had other settings.
     """
     if not (folder / LAST).is_file():
         return
     if not resume:
         raise InputError(
-            f"{folder}: expected no earlier run, found one; add --resume or give another"
+            f"{folder}: expected no earlier run, found one; add --resume or give another folder"
         )
 
     path = folder / SETTINGS
@@ -130,18 +136,18 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     if begun != settings:
         changed = [key for key in settings if begun.get(key) != settings[key]]
         raise InputError(
-            f"{folder}: expected what it was begun with ({SETTINGS}), "
-            f"found another {', '.join(changed)}; resume it with that, or give another folder"
+            f"{folder}: expected the settings of the earlier run ({SETTINGS}), found others for "
+            f"{', '.join(changed)}; resume it with those, or give another folder"
         )
 
 
 def sequence_names(records: Sequence[ScanRecord]) -> list[str]:
-    """Return the sequences of some scans, sorted."""
+    """Return the names of the sequences of some scans, sorted, each once."""
     return sorted({record.sequence for record in records})
 
 
 def _digest_of_scans(records: Sequence[ScanRecord]) -> str:
-    """Return a digest of the names and sizes of some scans."""
+    """Return a digest of the names of some scans and the sizes of their files."""
     sizes = []
     for record in records:
         path = record.points_path

@@ -1,4 +1,4 @@
-"""One stage of a training run: what it begins with, how it is fitted, and what it writes."""
+"""The stages of a training run: what each begins with, how it is fitted, and what it writes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from amvnet.training.stages import NetworkStage, PolarStage, RangeStage
 from amvnet.weights.file import Weights, load, part_state, save
 
 PICTURED_SCANS = 2
-VAL_BATCHES = 64  # the head validates with batches this many times as large
+VAL_FACTOR = 64  # a validation batch of the head is as large as this many training batches
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,11 @@ class StageRun:
 
     Attributes:
         plan: of the run.
-        name: of the stage, as --stage has it.
-        part: of the weights, which the stage trains.
-        weights: what the stage begins with.
-        train_networks: trains both networks of another plan; returns their weights file.
+        name: name of the stage, as for --stage.
+        part: the part of the weights that the stage trains.
+        weights: the weights that the stage begins with.
+        train_networks: trains both networks of another plan, as the folds of the head need them;
+            returns their weights file.
     """
 
     plan: RunPlan
@@ -60,43 +61,50 @@ class StageRun:
         return self.plan.out / self.name
 
     @property
-    def done(self) -> Path:
-        """The file that marks the stage as finished."""
+    def done_path(self) -> Path:
+        """The file whose existence marks the stage as finished."""
         return self.folder / "done"
 
     @property
-    def kept(self) -> Path:
-        """The weights of the stage that are used in the end."""
+    def weights_path(self) -> Path:
+        """The weights file of the stage that is used in the end: the best or the last."""
         return self.folder / f"{self.plan.recipe.training.keep}.safetensors"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the weights of the stage depend on."""
+        """What the trained weights of the stage depend on, for YAML."""
         return stage_settings(self.plan, self.name, self.part, self.weights)
 
     def check_begun(self) -> None:
         """Raise InputError if the folder holds a stage that cannot be resumed."""
         check_begun(self.folder, self.settings, self.plan.options.resume)
 
-    def taken_up(self) -> Weights:
-        """Return the weights with this stage's part, if the stage is finished."""
-        if self.kept.is_file() and self.done.is_file():
-            return self.weights.replace_part(self.part, load(self.kept))
+    def finished_weights(self) -> Weights:
+        """Return the weights, with the part that this stage trained if it is finished."""
+        if self.weights_path.is_file() and self.done_path.is_file():
+            return self.weights.replace_part(self.part, load(self.weights_path))
         return self.weights
 
     def train(self) -> Weights:
-        """Fit the stage; return the weights with the trained part."""
-        processes = self.plan.options.processes
-        if self.done.is_file() and self.plan.options.resume:
+        """Fit the stage; return the weights with the trained part.
+
+        Raises:
+            InputError: if the weights to begin with do not fit the recipe, or a scan is broken.
+        """
+        if self.done_path.is_file() and self.plan.options.resume:
             return self.weights
 
+        # The recipe decides the sizes of the part, whatever the weights have.
         L.seed_everything(self.plan.recipe.training.seed, verbose=False)
         resized = self.weights.resized(self.part, self.plan.recipe.model)
         dataclasses.replace(self, weights=resized).fit()
+
+        # The first process has written the weights; the others read them too.
+        processes = self.plan.options.processes
         processes.wait()
-        trained = resized.replace_part(self.part, load(self.kept))
+        trained = resized.replace_part(self.part, load(self.weights_path))
         if processes.first:
-            self.done.write_text("")
+            self.done_path.write_text("")
         return trained
 
     def fit(self) -> None:
@@ -104,7 +112,11 @@ class StageRun:
         raise NotImplementedError
 
     def model(self) -> AMVNet:
-        """Return a model whose part to be trained begins with the weights, if they have it."""
+        """Return a model; the part to train has the parameters of the weights, if they have it.
+
+        Raises:
+            InputError: if these parameters have other sizes.
+        """
         model = build_amvnet(self.weights.model, self.weights.taxonomy.size)
         if self.part in self.weights.parts:
             try:
@@ -117,7 +129,7 @@ class StageRun:
         return model
 
     def class_weights(self) -> np.ndarray:
-        """Return (K,) the weights of the classes in the loss (section 4.2 of the paper)."""
+        """Return the (K,) weights of the classes in the loss (section 4.2 of the paper)."""
         counts = count_classes(
             self.plan.scans.dataset,
             self.plan.scans.train,
@@ -131,7 +143,11 @@ class StageRun:
         return KeepWeights(PartWriter(self, self.settings, time.time()), self.folder)
 
     def pictures(self, score: Callable[[PointBatch], Tensor]) -> Pictures:
-        """Return the callback that draws validation scans, by the (P, K) scores of a batch."""
+        """Return the callback that draws validation scans.
+
+        Args:
+            score: returns the (P, K) scores of a batch.
+        """
         val = self.plan.scans.val
         indices = np.linspace(0, len(val) - 1, min(PICTURED_SCANS, len(val))).astype(int)
         dataset = self.plan.scans.dataset
@@ -142,15 +158,21 @@ class StageRun:
 
 @dataclass(frozen=True)
 class PartWriter:
-    """Writes the part that a stage trains, with a description of its training."""
+    """Writes the part that a stage trains, with a description of its training.
 
-    run: StageRun
+    Attributes:
+        stage: the stage.
+        settings: those of the stage, computed only once because that takes long.
+        started: when the training was begun or resumed, by `time.time`.
+    """
+
+    stage: StageRun
     settings: dict[str, Any]
     started: float
 
     def __call__(self, module: nn.Module, path: Path, metrics: dict[str, float]) -> None:
-        part = self.run.part
-        scans = self.run.plan.scans
+        part = self.stage.part
+        scans = self.stage.plan.scans
         description = {
             **self.settings["training"],
             "sequences": sequence_names(scans.train),
@@ -162,7 +184,7 @@ class PartWriter:
         description["seconds"] = round(time.time() - self.started)
 
         trained = dataclasses.replace(
-            self.run.weights,
+            self.stage.weights,
             tensors=part_state(part, module),
             training={part: description},
             metrics={part: metrics},
@@ -174,12 +196,12 @@ class PartWriter:
 
 @dataclass(frozen=True)
 class Network:
-    """How one of the two networks is trained, by attributes of `AMVNet`.
+    """How one of the two networks is trained.
 
     Attributes:
-        stage: its Lightning module.
-        view: the projection.
-        score: gives the scores of a batch.
+        stage: makes its Lightning module.
+        view: the attribute of `AMVNet` that projects a batch.
+        score: the method of `AMVNet` that returns the scores of a batch.
     """
 
     stage: Callable[..., NetworkStage]
@@ -210,9 +232,9 @@ class NetworkRun(StageRun):
         fit(self._stage(model, weights), self._options(), self._loaders(), callbacks)
 
     def trial(self, steps: int) -> Speed:
-        """Take some steps; nothing is written."""
+        """Take some steps, and return their speed; nothing is written."""
         model = self.model()
-        # The weights of the classes cost a look at every scan, and nothing else.
+        # To compute class weights would need every scan; their values do not change the speed.
         uniform = class_weights(np.ones(self.weights.taxonomy.size))
         stage = self._stage(model, uniform if self.config.class_weights else None)
         options = dataclasses.replace(self._options(), steps=steps)
@@ -244,6 +266,8 @@ class NetworkRun(StageRun):
         training = self.plan.recipe.training
         scans = self.plan.scans
         processes = self.plan.options.processes
+
+        # Scans that one process takes at a time.
         batch = self.config.batch // self.config.accumulate // processes.size
         train = make_loader(
             ScanSet(scans.dataset, scans.train, training.augment, training.seed),
@@ -254,6 +278,7 @@ class NetworkRun(StageRun):
         )
         if not scans.val:
             return Loaders(train, None)
+
         val = make_loader(
             ScanSet(scans.dataset, scans.val),
             1,
@@ -275,13 +300,13 @@ class HeadRun(StageRun):
         options = self.plan.options
         processes = options.processes
 
-        # The uncertain points of all scans, with their scores and neighbours.
-        validated = score_source(self.weights, self.plan.scores, scans.val)
+        # Gather the uncertain points of all scans, with their scores and neighbours.
+        val_source = score_source(self.weights, self.plan.scores, scans.val)
         gatherer = PointGatherer(scans.dataset, self.weights.model, training, processes)
         train = gatherer.gather(
             self._score_sources(), self.folder / "train", config.views, options.say
         )
-        val = gatherer.gather([validated], self.folder / "val") if scans.val else None
+        val = gatherer.gather([val_source], self.folder / "val") if scans.val else None
 
         head = self.model().point_head
         assert head is not None
@@ -295,6 +320,7 @@ class HeadRun(StageRun):
             weights=weights,
             processes=processes,
         )
+
         train_loader = make_head_loader(
             train, config.batch, shuffle=True, seed=training.seed, processes=processes
         )
@@ -302,27 +328,36 @@ class HeadRun(StageRun):
         if val is not None:
             val_loader = make_head_loader(
                 val,
-                VAL_BATCHES * config.batch,
+                VAL_FACTOR * config.batch,
                 shuffle=False,
                 seed=training.seed,
                 processes=processes,
             )
+
         callbacks: list[Callback] = [self.keep_weights()]
-        # Scores in files belong to scans that pictures cannot name.
+        # Pictures show batches of points, which do not say whose scores to read from files.
         if self.plan.scores is None:
             callbacks.append(self.pictures(scorer_with_head(self.weights, head)))
-        # Of so few multiplications, bfloat16 would save nothing.
+
+        # The head multiplies so little that a lower precision would save nothing.
         in_float32 = dataclasses.replace(training, precision="32-true")
         fit_options = FitOptions(in_float32, self.folder, config.epochs, options)
         fit(stage, fit_options, Loaders(train_loader, val_loader), callbacks)
 
+        # The gathered points take much space, and no process needs them any more.
         processes.wait()
         if processes.first:
             for folder in ("train", "val"):
                 shutil.rmtree(self.folder / folder, ignore_errors=True)
 
     def _score_sources(self) -> list[ScoreSource]:
-        """Return what scores which training scans: with folds, networks that have not seen them."""
+        """Return the sources of the scores to train on, which together have all training scans.
+
+        With folds, the scans of each are scored by networks that were trained without them.
+
+        Raises:
+            InputError: if a network is missing, or there are fewer sequences than folds.
+        """
         train = self.plan.scans.train
         folds = self.plan.recipe.training.head.folds
         if folds < 2 or self.plan.scores is not None:
@@ -332,12 +367,17 @@ class HeadRun(StageRun):
         if len(names) < folds:
             raise InputError(
                 f"expected at least {folds} training sequences for {folds} folds, "
-                f"found {len(names)}"
+                f"found {len(names)}; name more, or set --training.head.folds"
             )
         return [self._fold(index, set(names[index::folds])) for index in range(folds)]
 
     def _fold(self, index: int, left_out: set[str]) -> NetworkScores:
-        """Return networks trained without some sequences, and the scans of these."""
+        """Train networks without some sequences, and return them as the scorers of these.
+
+        Args:
+            index: number of the fold.
+            left_out: names of the sequences.
+        """
         scans = self.plan.scans
         seen = [record for record in scans.train if record.sequence not in left_out]
         unseen = [record for record in scans.train if record.sequence in left_out]

@@ -1,4 +1,4 @@
-"""Scans with everything to look at: ground truth, labels by method, uncertain points."""
+"""Scans to look at, with their ground truth, labels by method and uncertain points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from amvnet.data.datasets.select import taxonomy_named
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.inputs import Inputs, InputScan, ScanOptions, adapter_for
+from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
 from amvnet.progress import Progress, no_progress
@@ -31,15 +31,15 @@ class Frame:
     """One scan and what is known about its N points.
 
     Attributes:
-        name: for people.
+        name: the scan's short name, for people.
         points: (N, 4) float32 x, y, z in metres and intensity in [0, 1].
         valid: (N,) bool, the points that have a position.
         truth: (N,) train ids of the ground truth, or None if there is none.
-        labels: (N,) train ids by method; "labels" are those from files.
+        labels: (N,) train ids by method; the method of labels from files is "labels".
         uncertain: (N,) bool, the points on which the two networks disagree; None without two
             networks.
-        disagreement: (N,) float32 in [0, 1], 1 - the cosine similarity of the networks' scores;
-            None without two networks.
+        disagreement: (N,) float32 in [0, 1], 1 - the cosine similarity of the two networks' class
+            probabilities; None without two networks.
     """
 
     name: str
@@ -51,7 +51,10 @@ class Frame:
     disagreement: np.ndarray | None = None
 
     def errors(self, method: str) -> np.ndarray | None:
-        """Return (N,) bool: the labelled points that a method gets wrong; None without truth."""
+        """Return the points that a method gets wrong, (N,) bool; None without ground truth.
+
+        Points without a true class are never wrong.
+        """
         if self.truth is None:
             return None
         return (self.truth > 0) & (self.labels[method] != self.truth)
@@ -74,25 +77,30 @@ class LabelSource:
     taxonomy: str | None = None
 
     def named_taxonomy(self) -> Taxonomy | None:
-        """Return the classes of the weights, or those that the user named, or None."""
-        if self.segmenter is None:
-            if self.taxonomy is None:
-                return None
-            return taxonomy_named(self.taxonomy)
-        if self.taxonomy is not None:
-            raise InputError(
-                "expected no --taxonomy together with --weights, which define their classes; "
-                "leave it out"
-            )
-        return self.segmenter.taxonomy
+        """Return the classes of the weights, or those that the user named, or None.
+
+        Raises:
+            InputError: if there are both, or the named classes cannot be read.
+        """
+        if self.segmenter is not None:
+            if self.taxonomy is not None:
+                raise InputError(
+                    "expected no --taxonomy together with --weights, which define their classes; "
+                    "leave it out"
+                )
+            return self.segmenter.taxonomy
+
+        return None if self.taxonomy is None else taxonomy_named(self.taxonomy)
 
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of some scans, made when they are asked for.
+    """The frames of some scans; each is read and labelled when it is needed.
 
     Attributes:
-        taxonomy: what the ids in them mean.
+        taxonomy: the classes of the ids.
+        scans: the scans, in the order of the frames.
+        source: where their labels come from.
     """
 
     taxonomy: Taxonomy
@@ -103,7 +111,7 @@ class Frames:
         return len(self.scans)
 
     def each(self, progress: Progress = no_progress) -> Iterator[Frame]:
-        """Read and label one scan after the other.
+        """Yield the frames in order, and report the progress.
 
         Raises:
             InputError: if a file is broken or missing.
@@ -139,38 +147,39 @@ def choose_frames(
     """Choose up to `count` scans of the inputs, evenly spaced, to look at.
 
     Args:
-        inputs: each a dataset as `open_dataset` takes it, a scan file, or a folder of scan files.
+        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
+        count: the largest number of scans.
         source: where their labels come from, if anywhere.
-        sequences: of datasets, which to choose from; None means all.
+        sequences: of datasets, the sequences or scenes to choose from; None means all.
 
     Raises:
-        InputError: if an input is missing, or the inputs do not have the same classes.
+        InputError: if an input or the labels are missing, one label file is named for several
+            scans, the inputs do not have the same classes, or `count` is below 1.
     """
     if count < 1:
         raise InputError(f"expected a number of scans from 1, found {count}; say --scans 5")
-    labels = source.path
-    if labels is not None and not labels.exists():
+    labels_path = source.path
+    if labels_path is not None and not labels_path.exists():
         raise InputError(
-            f"{labels}: expected a file or a folder of labels, found none; check the path"
+            f"{labels_path}: expected a file or a folder of labels, found none; check the path"
         )
 
     adapter = None if source.segmenter is None else adapter_for(source.segmenter.weights)
     taxonomy = source.named_taxonomy()
-    opened = Inputs(ScanOptions(sequences), taxonomy, adapter)
-    opened.open(inputs)
-
+    opened = open_inputs(inputs, ScanOptions(sequences), taxonomy, adapter)
     scans = opened.scans
-    if labels is not None and labels.is_file() and len(scans) > 1:
+    if labels_path is not None and labels_path.is_file() and len(scans) > 1:
         raise InputError(
-            f"{labels}: expected a folder of labels for {len(scans)} scans, found a file; "
+            f"{labels_path}: expected a folder of labels for {len(scans)} scans, found a file; "
             "give a folder"
         )
+
     indices = np.linspace(0, len(scans) - 1, min(count, len(scans))).round().astype(int)
     return Frames(opened.taxonomy, [scans[index] for index in indices], source)
 
 
 def _segmented(frame: Frame, scan: Scan, segmenter: Segmenter) -> Frame:
-    """Return a frame with the labels by every method that the weights have."""
+    """Return a frame with labels by each of the paper's methods that the weights have parts for."""
     scores, uncertain = segmenter.scores_by_method(scan)
     labels = {name: expand_labels(values, scan.valid) for name, values in scores.items()}
     if uncertain is None:

@@ -22,16 +22,18 @@ from amvnet.files import atomic_write
 from amvnet.models.methods import METHODS, title_of
 from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
 
-# In one scan; larger ones are thinned to every second or third point, so that phones keep up.
+# Points of one scan. Of larger scans the page shows every second or third point, so that phones
+# keep up.
 MOST_POINTS = 400_000
-# Metres along each axis; farther points are left out, so that positions are off by 1.6 cm at most.
+# Metres along each axis. Farther points are left out, so that int16 is off by 1.6 cm at most.
 REACH = 500.0
-LEVELS = 32_767  # int16
+LEVELS = 32_767  # largest int16
 STOPS = 17  # colours between which the page interpolates a ramp
-# Matplotlib's colour map, and the part of it that is used.
+# The colour map of Matplotlib for each ramp, and the part of it that is used, in [0, 1].
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
-DOUBT = (RIGHT, (128, 104, 92), (190, 110, 50), UNCERTAIN, (255, 190, 60))
-# In this order: later ones use what earlier ones define.
+# From no disagreement to full disagreement of the networks, RGB in 0..255.
+UNCERTAINTY_RAMP = (RIGHT, (128, 104, 92), (190, 110, 50), UNCERTAIN, (255, 190, 60))
+# In this order: later scripts use what earlier ones define.
 SCRIPTS = (
     "scans.js",
     "camera.js",
@@ -51,11 +53,11 @@ class Packed:
 
     Attributes:
         about: name, number of points and the like, for the page's JSON.
-        planes: the values of its points, deflated and in base64.
-        present: ids of the classes in its truth and labels.
-        height: metres, (low, high); almost all points are between the two.
-        intensity: in [0, 1]; almost all points are below it.
-        ground: metres, height of the ground.
+        planes: the values of its points as `pack` lays them out, deflated and in base64.
+        present: ids of the classes that appear in its ground truth and labels.
+        height: (low, high) in metres; almost all points lie between.
+        intensity: in [0, 1]; almost no point has more.
+        ground: height of the ground in metres.
     """
 
     about: dict[str, Any]
@@ -91,9 +93,9 @@ def write_page(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy, ti
 def pack(frame: Frame) -> Packed:
     """Quantise one scan: positions to int16 within the scan's extent, all other values to bytes.
 
-    The planes are, for each of x, y and z, the low bytes and then the high bytes of the
-    differences between consecutive points, followed by one byte a point for each of
-    `about["planes"]`.
+    The planes begin with x, y and z: for each, the low bytes and then the high bytes of the
+    differences between consecutive points. The planes of `about["planes"]` follow, with one byte
+    per point.
     """
     in_reach = frame.valid & (np.abs(frame.points[:, :3]) <= REACH).all(axis=1)
     indices = np.flatnonzero(in_reach)
@@ -134,7 +136,7 @@ def pack(frame: Frame) -> Packed:
 
 
 def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
-    """Return the text of the page; names of the user's files are escaped, in HTML or in JSON."""
+    """Return the text of the page, in which the names of files cannot act as HTML or script."""
     style = _source("page.css")
     script = "\n".join(map(_source, SCRIPTS))
     policy = (
@@ -188,7 +190,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
             "intensity": (0, brightest),
         },
         "ramps": {
-            "uncertainty": DOUBT,
+            "uncertainty": UNCERTAINTY_RAMP,
             "height": _ramp(*RAMPS["height"]),
             "intensity": _ramp(*RAMPS["intensity"]),
         },
@@ -197,7 +199,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
 
 
 def _byte_planes(frame: Frame) -> dict[str, np.ndarray]:
-    """Return the values of the points other than positions, (N,) uint8 each."""
+    """Return all values of the points but their positions, (N,) uint8 each, by name."""
     planes = {"intensity": _to_bytes(np.nan_to_num(frame.points[:, 3]))}
 
     if frame.truth is not None:
@@ -217,7 +219,7 @@ def _to_bytes(values: np.ndarray) -> np.ndarray:
 
 
 def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (3,) middle of the points, and the (3,) metres of one step of an int16."""
+    """Return the (3,) middle of the points, and the (3,) length of one int16 step, in metres."""
     if not len(xyz):
         return np.zeros(3), np.ones(3)
 
@@ -227,16 +229,17 @@ def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _differences(steps: np.ndarray) -> bytes:
-    """Return the low and then the high bytes of the differences of (N,) int16, modulo 2^16.
+    """Return the differences of consecutive values, (N,) int16: all low bytes, then all high bytes.
 
-    They deflate to half the size of the positions themselves.
+    The first value is kept, and differences are modulo 2^16. They deflate to half the size of the
+    values themselves.
     """
     changes = np.diff(steps.view(np.uint16), prepend=np.uint16(0)).astype("<u2")
     return changes.view(np.uint8).reshape(-1, 2).T.tobytes()
 
 
 def _heights(z: np.ndarray) -> tuple[tuple[float, float], float]:
-    """Return the range that most heights are in, and the height of the ground, in metres."""
+    """Return the range of most heights, and the approximate height of the ground, in metres."""
     if not len(z):
         return (0.0, 1.0), 0.0
 
@@ -263,10 +266,10 @@ def _capitalise(text: str) -> str:
 
 
 def _note(left_out: int, stride: int) -> str:
-    """Return which points the page does not show, or an empty text if it shows all."""
+    """Say which points the page does not show; the text is empty if it shows all."""
     notes = []
     if left_out:
-        notes.append(f"{left_out:,} without a place or beyond {REACH:g} m")
+        notes.append(f"{left_out:,} without a position or beyond {REACH:g} m")
     if stride > 1:
         notes.append(f"one in {stride} of the scan")
 
@@ -274,7 +277,7 @@ def _note(left_out: int, stride: int) -> str:
 
 
 def _ramp(name: str, start: float, end: float) -> list[list[int]]:
-    """Return RGB colours in 0..255 from a part of one of Matplotlib's colour maps."""
+    """Return `STOPS` RGB colours in 0..255 from a part of one of Matplotlib's colour maps."""
     from matplotlib import colormaps
 
     colors = colormaps[name](np.linspace(start, end, STOPS))[:, :3]
@@ -288,7 +291,7 @@ def _source(name: str) -> str:
 
 
 def _hash(text: str) -> str:
-    """Return the name by which a content security policy allows this text and no other."""
+    """Return the hash by which a content security policy allows this text and no other."""
     digest = hashlib.sha256(text.encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
 
@@ -301,6 +304,6 @@ def _json(tree: Any) -> str:
 def _fill(template: str, parts: Mapping[str, str]) -> str:
     """Replace each @@NAME@@ of a template by the part of that name.
 
-    A part is never searched itself: any @@NAME@@ within it stays as it is.
+    The parts themselves are not searched: an @@NAME@@ within one stays as it is.
     """
     return re.sub("@@([A-Z]+)@@", lambda match: parts[match[1]], template)

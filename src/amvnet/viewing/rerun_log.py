@@ -19,8 +19,8 @@ from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
 
 TIMELINE = "scan"
 DOT = 1.2  # radius of a point on the screen, in Rerun's ui points
-LARGE_DOT = 1.8  # that of an error or an uncertain point
-GROUND = (13, 17, 24)  # colour behind the points
+LARGE_DOT = 1.8  # the same, for an error or an uncertain point
+BACKGROUND = (13, 17, 24)  # RGB in 0..255, behind the points
 
 
 def check_rerun() -> Any:
@@ -58,7 +58,7 @@ def save_recording(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy
 
     Args:
         path: the file, NAME.rrd.
-        frames: the scans in their order, at least one; each is a step of the timeline `scan`.
+        frames: the scans, at least one; each is a step of the timeline `scan`.
         taxonomy: names and colours of the classes.
 
     Returns:
@@ -74,12 +74,16 @@ def save_recording(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy
         try:
             log(stream, frames, taxonomy)
         finally:
-            stream.disconnect()  # waits until all is written
+            stream.disconnect()  # waits until everything is written
     return Path(path)
 
 
 def open_window(frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
-    """Show the same in a Rerun window, each scan as soon as it is ready.
+    """Show scans in a Rerun window, each as soon as it is ready.
+
+    Args:
+        frames: the scans, at least one; each is a step of the timeline `scan`.
+        taxonomy: names and colours of the classes.
 
     Raises:
         InputError: if Rerun is not installed, or cannot open a window.
@@ -87,7 +91,8 @@ def open_window(frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
     stream = _new_stream()
     first, frames = _peek(frames)
 
-    # If no environment is activated, the viewer next to this Python is not on the path.
+    # The viewer lies in the folder of this Python, which is on the path only if the environment is
+    # activated.
     folders = [os.environ.get("PATH", ""), str(Path(sys.executable).parent)]
     os.environ["PATH"] = os.pathsep.join(folders)
     try:
@@ -103,10 +108,10 @@ def open_window(frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
 
 
 def log(stream: Any, frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
-    """Log scans to a recording stream, one step of the timeline each.
+    """Log scans to a recording stream, each at its own step of the timeline.
 
-    The entities are `points`, `truth`, `labels/METHOD`, `errors/METHOD` and `uncertain`, and
-    below `percent` the shares of errors and uncertain points.
+    The entities are `points`, `truth`, `labels/METHOD`, `errors/METHOD` and `uncertain`. Those
+    under `percent` hold the shares of errors and of uncertain points.
     """
     rerun = check_rerun()
     names = ("unlabelled", *taxonomy.classes)
@@ -125,12 +130,13 @@ def log(stream: Any, frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
 
 
 def blueprint(frame: Frame) -> Any:
-    """Return a layout for scans that have what this frame has.
+    """Return a layout with views of all that this frame has; the others are taken to have the same.
 
-    Truth, labels, errors and uncertain points lie side by side, above a curve of the shares of
-    errors and uncertain points. The methods are tabs of one view.
+    Ground truth, labels, errors and uncertain points lie side by side, above a curve of the shares
+    of errors and uncertain points. The labels of several methods share a place, as tabs; so do
+    their errors.
     """
-    import rerun.blueprint as parts
+    import rerun.blueprint as rrb
 
     has_errors = len(frame.labels) > 0 and frame.truth is not None
     has_uncertain = frame.uncertain is not None
@@ -153,29 +159,29 @@ def blueprint(frame: Frame) -> Any:
     if not views:
         views.append(_view("points", "/points"))
 
-    layout = parts.Grid(*views)
+    layout = rrb.Grid(*views)
     if has_errors or has_uncertain:
-        shares = parts.TimeSeriesView(origin="/percent", name="percent of the points")
-        layout = parts.Vertical(layout, shares, row_shares=[5, 1])
-    return parts.Blueprint(layout, collapse_panels=True)
+        shares = rrb.TimeSeriesView(origin="/percent", name="percent of the points")
+        layout = rrb.Vertical(layout, shares, row_shares=[5, 1])
+    return rrb.Blueprint(layout, collapse_panels=True)
 
 
 def _view(name: str, *paths: str) -> Any:
-    """Return a 3D view of some entities."""
-    import rerun.blueprint as parts
+    """Return a 3D view of the entities at these paths."""
+    import rerun.blueprint as rrb
 
-    return parts.Spatial3DView(origin="/", contents=list(paths), name=name, background=GROUND)
+    return rrb.Spatial3DView(origin="/", contents=list(paths), name=name, background=BACKGROUND)
 
 
 def _tabs(views: list[Any]) -> Any:
     """Return views as tabs, the last one in front."""
-    import rerun.blueprint as parts
+    import rerun.blueprint as rrb
 
-    return parts.Tabs(*views, active_tab=len(views) - 1)
+    return rrb.Tabs(*views, active_tab=len(views) - 1)
 
 
 def _peek(frames: Iterable[Frame]) -> tuple[Frame, Iterable[Frame]]:
-    """Return the first frame, and all of them with the first."""
+    """Return the first frame, and an iterable of all frames, including the first."""
     iterator = iter(frames)
     first = next(iterator)
     return first, chain([first], iterator)
@@ -210,7 +216,7 @@ def _log_points(stream: Any, rerun: Any, frame: Frame) -> None:
 
 
 def _log_shares(stream: Any, rerun: Any, frame: Frame) -> None:
-    """Log percentages: wrong ones of the points with a true class, uncertain ones of all points."""
+    """Log how many percent of the labelled points are wrong, and of all points uncertain."""
     for method in frame.labels:
         errors = frame.errors(method)
         if errors is not None and frame.truth is not None:
@@ -222,7 +228,7 @@ def _log_shares(stream: Any, rerun: Any, frame: Frame) -> None:
 
 
 def _height_colors(xyz: np.ndarray) -> np.ndarray:
-    """Return (N, 3) uint8 colours of points by their height."""
+    """Return (N, 3) uint8 colours of (N, 3) points by their height."""
     from matplotlib import colormaps
 
     z = xyz[:, 2]

@@ -1,6 +1,6 @@
 """The model card of a weights file, as Markdown.
 
-It says what the weights are, what they were trained on, what they reach and how to use them.
+It says what the weights are, how to use them, what they were trained on and how well they score.
 """
 
 from __future__ import annotations
@@ -17,10 +17,12 @@ TITLES = {
     "polar_net": "Bird's-eye-view network",
     "point_head": "Point head",
 }
-LISTED = 12  # names that are listed in full
+LISTED = 12  # longest list that is printed in full
+# Columns of the table: key of the validation metric, and title.
 METRICS = {"val/miou": "mIoU", "val/miou_present": "mIoU, classes present", "val/acc": "accuracy"}
+# Keys of the training record that describe the data, and their titles.
 DATA = {"scans": "scans", "sequences": "sequences", "validated_on": "validated on"}
-OURS = "apache-2.0"  # licence of the built-in weights, as of the package
+OURS = "apache-2.0"  # licence of the built-in weights, and of the package
 NO_LICENCE = (
     "The file names no licence. Weights may be bound by the terms of the data that they were "
     "trained on: SemanticKITTI's and nuScenes' do not allow commercial use."
@@ -28,12 +30,12 @@ NO_LICENCE = (
 
 
 def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
-    """Return the card of some weights, for people to read.
+    """Return the card of a weights file, without the metadata of `front_matter`.
 
     Args:
-        weights: what the card describes.
+        weights: the weights that the card describes.
         name: the name by which `amvnet.load` finds the weights.
-        licence: the licence that their owner grants.
+        licence: the licence that their owner grants; None if it is not stated.
     """
     sections = [
         f"# {name}\n\n{_summary(weights)}",
@@ -51,7 +53,7 @@ def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
 
 
 def front_matter(weights: Weights, licence: str | None = None) -> str:
-    """Return the metadata that the hub reads at the top of a card, as YAML."""
+    """Return the YAML at the top of a card, from which the hub reads its metadata."""
     metadata = {
         "library_name": "amvnet",
         "tags": ["lidar", "point-cloud", "semantic-segmentation", weights.taxonomy.name],
@@ -95,7 +97,7 @@ def _usage(weights: Weights, name: str) -> str:
 
 
 def _best_method(parts: Sequence[str]) -> str:
-    """Return the best method for networks without a point head."""
+    """Return the best method for weights that lack the point head."""
     if len(parts) > 1:
         return "ensemble"
     return "rv" if "range_net" in parts else "bev"
@@ -107,7 +109,7 @@ def _classes(weights: Weights) -> str:
 
 
 def _sizes(weights: Weights) -> list[tuple[str, str]]:
-    """Return what the views of the networks cover, and which points are uncertain."""
+    """Return titles and texts: the size and extent of each view, and the assertion."""
     model = weights.model
     rows = []
     if "range_net" in weights.parts:
@@ -130,9 +132,9 @@ def _sizes(weights: Weights) -> list[tuple[str, str]]:
 
 
 def _metrics(weights: Weights) -> str:
-    """Return a table of the validation metrics in percent.
+    """Return a table of the validation metrics in percent, one row per part.
 
-    Its rows are the networks alone, and for the head the whole method.
+    The row of a network is that network alone; the row of the head is the whole method.
     """
     lines = [f"| | {' | '.join(METRICS.values())} |", "|---" * (len(METRICS) + 1) + "|"]
     for part in weights.parts:
@@ -142,7 +144,7 @@ def _metrics(weights: Weights) -> str:
             cells.append(_percent(metrics.get(key)))
         lines.append(f"| {' | '.join(cells)} |")
 
-    return "On the scans named below as validated on, %:\n\n" + "\n".join(lines)
+    return 'In percent, on the scans listed below as "validated on":\n\n' + "\n".join(lines)
 
 
 def _percent(value: Any) -> str:
@@ -150,7 +152,7 @@ def _percent(value: Any) -> str:
 
 
 def _training(weights: Weights, part: str) -> str:
-    """Return a list of what a part was trained on, and how."""
+    """Return a list of a part's size, its training data and its training settings."""
     count = 0
     for tensor in weights.part(part).values():
         count += tensor.numel()

@@ -1,4 +1,4 @@
-"""One weights file that explains itself: safetensors with its description inside."""
+"""Weights files: safetensors, with a description of the model in the metadata."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
 from amvnet.weights import hub
 
-# The parts of the method, and the fields of the configuration that set the sizes of each.
+# The parts of the method, each with the fields of `ModelConfig` that set its sizes.
 SIZES = {
     "range_net": ("range_view", "range_net"),
     "polar_net": ("polar_view", "polar_net"),
     "point_head": ("assertion", "point_head"),
 }
 PARTS = tuple(SIZES)
-FORMAT = 1
-KEY = "amvnet"  # of the description in the file's metadata
-_DESCRIPTION = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
+FORMAT = 1  # version of the description
+KEY = "amvnet"  # key of the description in the file's metadata
+_FIELD_TYPES = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
 
 
 @dataclass(frozen=True)
 class Weights:
-    """The trained parts of an AMVNet, with all that is needed to use them.
+    """The trained parts of an AMVNet, and everything needed to use them.
 
     Attributes:
         model: sizes of the views, networks and head.
         taxonomy: the classes.
-        sensor: name of the sensor that they were trained for.
-        tensors: the parameters by name; a name begins with that of its part ("range_net.",
-            "polar_net." or "point_head.").
-        training: how each part was trained, by part.
-        metrics: validation metrics, by part.
+        sensor: name of the sensor that they were trained for; "" if unknown.
+        tensors: the parameters by name; each name begins with its part: "range_net.",
+            "polar_net." or "point_head.".
+        training: by part, a record of how it was trained.
+        metrics: by part, its validation metrics.
     """
 
     model: ModelConfig
@@ -119,15 +119,18 @@ class Weights:
         )
 
     def resized(self, name: str, model: ModelConfig) -> Weights:
-        """Return these weights with the sizes of one part taken from another configuration."""
+        """Return these weights with the sizes of one part taken from another configuration.
+
+        The parameters stay as they are: replace them, too, before building the model.
+        """
         sizes = {key: getattr(model, key) for key in SIZES[name]}
         return dataclasses.replace(self, model=dataclasses.replace(self.model, **sizes))
 
     def build(self) -> AMVNet:
         """Return the model, in evaluation mode.
 
-        A network without parameters is initialised at random; without those of the point head,
-        the model has none.
+        A network that the weights lack is initialised at random. If they lack the point head,
+        `point_head` of the model is None.
 
         Raises:
             InputError: if the parameters do not fit the sizes.
@@ -183,12 +186,16 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
     """Write a weights file, whole or not at all.
 
     Args:
-        weights: what to write.
+        weights: the weights.
         path: the file.
-        half: write matrices and kernels as float16: half the size, for inference only.
+        half: write matrices and kernels as float16, for inference only; halves the file.
+
+    Returns:
+        The path of the file.
 
     Raises:
-        OSError: if the disk is full.
+        InputError: if the file cannot be written.
+        OSError: if writing fails, for example on a full disk.
     """
     description = {
         "format": FORMAT,
@@ -205,7 +212,7 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
     with atomic_write(path) as part:
         try:
             save_file(tensors, part, metadata={KEY: json.dumps(description)})
-        except SafetensorError as error:  # a full disk
+        except SafetensorError as error:  # such as a full disk
             raise OSError(errno.EIO, str(error).splitlines()[0], str(path)) from None
 
     return Path(path)
@@ -219,7 +226,7 @@ def load(name_or_path: str | Path) -> Weights:
             (`sim-hdl64e`), or weights on the hub (`hf-hub:OWNER/NAME`).
 
     Raises:
-        InputError: if there is no such file or name, or it is not a weights file of this project.
+        InputError: if there is no such file or name, or the file does not hold AMVNet weights.
     """
     path = _find(str(name_or_path))
 
@@ -247,13 +254,14 @@ def load(name_or_path: str | Path) -> Weights:
 
 
 def _check_description(description: Any, path: Path) -> None:
+    """Check that a description has this format and all fields, each of the right type."""
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise InputError(
             f"{path}: expected weights with AMVNet's description inside, found none; "
             "give AMVNet weights"
         )
 
-    for key, kind in _DESCRIPTION.items():
+    for key, kind in _FIELD_TYPES.items():
         value = description.get(key)
         if not isinstance(value, kind):
             raise InputError(
@@ -262,7 +270,7 @@ def _check_description(description: Any, path: Path) -> None:
 
 
 def built_in() -> dict[str, Path]:
-    """Return the weights that come with the package, by name."""
+    """Return the paths of the weights files that come with the package, by name."""
     folder = Path(str(resources.files("amvnet"))) / "pretrained"
     paths = {}
     for path in sorted(folder.glob("*.safetensors")):
@@ -271,7 +279,7 @@ def built_in() -> dict[str, Path]:
 
 
 def _find(name_or_path: str) -> Path:
-    """Return the path of a weights file, downloaded from the hub if need be."""
+    """Return the path of a weights file; weights on the hub are downloaded if necessary."""
     if name_or_path.startswith(hub.PREFIX):
         return hub.fetch(name_or_path)
 

@@ -34,17 +34,17 @@ def fetch(name: str) -> Path:
         return Path(path)
 
 
-def check_name(place: str, name: str) -> None:
+def check_name(repository: str, name: str) -> None:
     """Check that a repository of the hub has the form OWNER/NAME.
 
     Args:
-        place: the repository.
+        repository: what must be OWNER/NAME.
         name: what the user wrote, for the message.
 
     Raises:
         InputError: if it has another form.
     """
-    if place.count("/") != 1 or not all(place.split("/")):
+    if repository.count("/") != 1 or not all(repository.split("/")):
         raise InputError(f"expected {PREFIX}OWNER/NAME, found {name!r}; name both")
 
 

@@ -1,4 +1,4 @@
-"""Weights shared on the Hugging Face hub, with their card."""
+"""Upload weights and their model card to the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ CARD = "README.md"
 def push(
     weights: Weights | Path | str, name: str, licence: str | None = None, private: bool = False
 ) -> str:
-    """Share weights on the hub from the account that is logged in, with their card as README.md.
+    """Upload weights to the hub, with their card as README.md, from the account that is logged in.
 
     Args:
         weights: trained weights, or the name or path of a weights file.
         name: OWNER/NAME; the repository is created if it does not exist.
-        licence: its name on the hub, such as "apache-2.0" or "cc-by-nc-sa-4.0". Mind the terms
-            of the data that the weights were trained on.
-        private: show the repository to nobody else.
+        licence: the hub's name of the licence, such as "apache-2.0" or "cc-by-nc-sa-4.0". Mind
+            the terms of the data that the weights were trained on.
+        private: make the repository private if it is created.
 
     Returns:
-        The address of the commit.
+        The URL of the commit.
 
     Raises:
         InputError: if there are no such weights, the hub refuses them, or its client is not
@@ -42,7 +42,7 @@ def push(
         card = front_matter(weights, licence) + model_card(weights, f"{PREFIX}{name}", licence)
         (Path(folder) / CARD).write_text(card, encoding="utf-8")
 
-        with hub_errors(name, "check the name and the network, and log in by hf auth login"):
+        with hub_errors(name, "check the name and the network, and log in with hf auth login"):
             hub.create_repo(repo_id=name, private=private, exist_ok=True)
             commit = hub.upload_folder(
                 repo_id=name,

@@ -27,17 +27,17 @@ def bench(
     precision: Precision = "float32",
     json: Path | None = None,
 ) -> None:
-    """Time the stages from a scan's file to its labels, and compare the networks with the limit.
+    """Time each stage from a scan's file to its labels, and the networks against a matrix product.
 
     Args:
         weights: a weights file, or the name of a built-in one.
         recipe: the name of a recipe, or a YAML file, whose networks are timed with random weights
             instead.
         scan: the scan to time with; by default a simulated one.
-        runs: how often, after two warm-up runs; medians and quartiles are shown.
-        uncertain: the share of the points that counts as uncertain; by default as the weights find,
-            0.1 with --recipe.
-        engines: torch, compile, onnx, or several with commas, which are timed in turn.
+        runs: the number of timed runs, after two warm-up runs; medians and quartiles are shown.
+        uncertain: the share of the points that counts as uncertain; default: the share that the
+            networks disagree on, or 0.1 with --recipe.
+        engines: torch, compile, onnx, or several separated by commas, which are timed in turn.
         device: cpu, cuda, cuda:1, ...
         precision: of the networks; float16 on a GPU only.
         json: also write the figures to this file.
@@ -50,7 +50,7 @@ def bench(
     from amvnet.inference.timing import UNCERTAIN, time_jobs, untrained
     from amvnet.simulation import simulate
 
-    timed = weights if recipe is None else untrained(load_recipe(recipe))
+    timed_weights = weights if recipe is None else untrained(load_recipe(recipe))
     if recipe is not None and uncertain is None:
         uncertain = UNCERTAIN
 
@@ -59,13 +59,15 @@ def bench(
         if scan is None:
             simulate(folder, scans=1)
             scan = folder / "sequences/00/velodyne/000000.bin"
+
         jobs = []
         for engine in parse_names(engines) or []:
-            segmenter = Segmenter(timed, device, precision=precision, keep_memory=True)
+            segmenter = Segmenter(timed_weights, device, precision=precision, keep_memory=True)
             name = use_engine(segmenter, engine)
             if precision != "float32":
                 name = f"{name}, {precision}"
             jobs.append(_job(segmenter, scan, folder, name, uncertain))
+
         with progress("timing") as step:
             reports = time_jobs(jobs, runs, step)
 
@@ -76,7 +78,7 @@ def bench(
 
 
 def _job(segmenter: Segmenter, scan: Path, folder: Path, name: str, share: float | None) -> Job:
-    """Return what reads a scan's file and writes its labels into a folder."""
+    """Return a job that reads a scan's file and writes its labels into a folder."""
     from amvnet.data.scan_files import read_scan, write_labels
     from amvnet.inference.timing import Job
 

@@ -18,7 +18,7 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
 
     Args:
         out: folder for the scans, predictions and pictures.
-        seed: of the streets; by default one that the weights never saw.
+        seed: of the streets; the default gives streets the built-in weights were not trained on.
         weights: a weights file, or the name of a built-in one.
     """
     from amvnet.data.datasets.semantickitti import SemanticKitti
@@ -43,6 +43,6 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
     with progress("scoring") as step:
         label = label_by_weights(dataset, segmenter)
         evaluation = evaluate(dataset, records, label, pictures, step)
-    figures = out / "metrics.json"
-    show_evaluation(evaluation, f"simulated streets, seed {seed}", dataset.taxonomy, figures)
-    say(f"labels in {predictions}, pictures in {pictures}, figures in {figures}")
+    metrics_path = out / "metrics.json"
+    show_evaluation(evaluation, f"simulated streets, seed {seed}", dataset.taxonomy, metrics_path)
+    say(f"labels in {predictions}, pictures in {pictures}, figures in {metrics_path}")

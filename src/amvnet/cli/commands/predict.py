@@ -45,7 +45,7 @@ def predict(
         out: folder for the labels.
         method: the whole of AMVNet, or a part of it.
         split: of datasets, the official split.
-        sequences: of datasets, these sequences or scenes instead, with commas.
+        sequences: of datasets, these sequences or scenes instead, separated by commas.
         scores: also write the probabilities of both networks.
         resume: continue an interrupted run into the folder.
         format: of scan files' labels: raw ids alone (label, npy), or coloured points (ply, pcd,
@@ -61,13 +61,13 @@ def predict(
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
         sensor: of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default:
             measured.
-        height: of scan files, the sensor's metres over the ground; default: measured.
-        intensity_scale: of scan files, the largest possible intensity; default: 1, 255 or 65535 by
-            the values.
+        height: of scan files, the sensor's height over the ground in metres; default: measured.
+        intensity_scale: of scan files, the largest possible intensity; default: 1, 255 or 65535,
+            as the values suggest.
         axes: of scan files, x-forward (y left), y-forward (x right), z-forward (y down) or z-down
             (y right).
-        rotate: of scan files, yaw,pitch,roll in degrees that turn them level.
-        offset: of scan files, metres to add to x,y,z after that.
+        rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees.
+        offset: of scan files, what to add to x,y,z after the rotation, in metres.
     """
     from amvnet.export.engines import use_engine
     from amvnet.inference.inputs import ScanOptions, adapter_for

@@ -60,7 +60,7 @@ def submit(
             "give one or the other"
         )
     say(
-        f"{check or out}: {submission.predictions} predictions of {rules.what} "
+        f"{check or out}: {submission.predictions} predictions of {rules.description} "
         f"keep to the rules of {rules.taxonomy.name}"
     )
     for note in submission.notes:

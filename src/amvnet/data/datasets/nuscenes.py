@@ -20,12 +20,12 @@ from amvnet.scan import Scan
 CHANNEL = "LIDAR_TOP"
 MINI = "v1.0-mini"
 TEST = "v1.0-test"
-SHOWN = 20  # scenes in a message
+MAX_LISTED = 20  # scenes in a message
 
-Row = dict[str, Any]  # of a table: its columns by name
+Row = dict[str, Any]  # a row of a table: values by column name
 
 
-def _scenes(numbers: str) -> frozenset[str]:
+def _scene_names(numbers: str) -> frozenset[str]:
     """Return the scene names of "3 12-14": scene-0003, scene-0012, scene-0013, scene-0014."""
     names: set[str] = set()
     for part in numbers.split():
@@ -37,10 +37,10 @@ def _scenes(numbers: str) -> frozenset[str]:
 
 
 SPLITS = ("train", "val", "test", "all")
-# Official splits. A scene that is in none of them is for training.
-MINI_TRAIN = _scenes("61 553 655 757 796 1077 1094 1100")
-MINI_VAL = _scenes("103 916")
-VAL = _scenes(
+# The official splits. A scene in none of these belongs to "train".
+MINI_TRAIN = _scene_names("61 553 655 757 796 1077 1094 1100")
+MINI_VAL = _scene_names("103 916")
+VAL = _scene_names(
     "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 "
     "632-638 770-771 775 777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 "
     "1059-1073"
@@ -70,11 +70,11 @@ class NuScenes:
         self.taxonomy = taxonomy
 
         label_rows = self._table("lidarseg", required=False)
-        self._label_files = _columns(label_rows, "sample_data_token", "filename")
-        self._to_train = self._category_lookup() if label_rows else None
+        self._label_files = _lookup(label_rows, "sample_data_token", "filename")
+        self._category_train_ids = self._category_lookup() if label_rows else None
 
         try:
-            self._records_by_scene = self._index()
+            self._records_by_scene = self._read_records()
         except (KeyError, TypeError) as error:
             raise InputError(
                 f"{self.root / self.version}: expected the tables of nuScenes, "
@@ -109,7 +109,10 @@ class NuScenes:
         return tuple(present)
 
     def scenes(self, split: str) -> tuple[str, ...]:
-        """Return the scenes of a split that the tables list, whether on disk or not.
+        """Return the scenes of a split that the tables list, on disk or not.
+
+        Args:
+            split: "train", "val", "test" or "all".
 
         Raises:
             InputError: if the split is unknown.
@@ -131,10 +134,12 @@ class NuScenes:
         missing = sorted(set(sequences) - set(self._records_by_scene))
         if missing:
             scenes = sorted(self._records_by_scene)
-            more = f" and {len(scenes) - SHOWN} more" if len(scenes) > SHOWN else ""
+            listing = ", ".join(scenes[:MAX_LISTED])
+            if len(scenes) > MAX_LISTED:
+                listing += f" and {len(scenes) - MAX_LISTED} more"
             raise InputError(
                 f"{self.root}: expected the scene {missing[0]} in {self.version}, "
-                f"found it in no table; there is {', '.join(scenes[:SHOWN])}{more}"
+                f"found no such scene in its tables; name one of {listing}"
             )
 
         records: list[ScanRecord] = []
@@ -159,7 +164,7 @@ class NuScenes:
         return read_prediction(path, np.uint8, self._count_points(record), self.taxonomy)
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids (uint8)."""
+        """Write (N,) train ids as raw ids (uint8)."""
         ids = files.check_count(ids, record.points_path, self._count_points(record))
         path = Path(folder) / record.prediction
         return files.write_labels(path, self.taxonomy.to_raw(ids), np.uint8)
@@ -208,15 +213,19 @@ class NuScenes:
         return rows
 
     def _category_lookup(self) -> np.ndarray:
-        """Return (256,) int16: index in category.json -> train id, matched by category name."""
+        """Return (256,) int16 train ids by index in category.json, UNKNOWN for unused indices.
+
+        Raises:
+            InputError: if a category has no index, or its name is not in the taxonomy.
+        """
         path = self.root / self.version / "category.json"
         table = np.full(256, UNKNOWN, dtype=np.int16)
 
         for row in self._table("category"):
             if "index" not in row:
                 raise InputError(
-                    f"{path}: expected an index in every category, found none; "
-                    "unpack nuScenes-lidarseg over it"
+                    f"{path}: expected an index in every category, found one without; "
+                    "replace the file by that of nuScenes-lidarseg"
                 )
 
             if row["name"] not in self.taxonomy.raw_to_train:
@@ -230,45 +239,49 @@ class NuScenes:
         return table
 
     def _categories_to_train(self, indices: np.ndarray) -> np.ndarray:
-        """Turn (N,) indices of category.json into (N,) uint8 train ids."""
-        assert self._to_train is not None  # records have labels only if the table was read
-        train = self._to_train[indices]
+        """Turn (N,) indices of category.json into (N,) uint8 train ids.
 
-        if (train == UNKNOWN).any():
-            unknown = np.unique(indices[train == UNKNOWN])[:5].tolist()
+        Raises:
+            InputError: if an index is not in category.json.
+        """
+        assert self._category_train_ids is not None  # no record has labels without this table
+        train_ids = self._category_train_ids[indices]
+
+        if (train_ids == UNKNOWN).any():
+            unknown = np.unique(indices[train_ids == UNKNOWN])[:5].tolist()
             raise InputError(
                 f"expected indices of category.json, found {unknown}; "
                 "use the tables that came with the labels"
             )
 
-        return train.astype(np.uint8)
+        return train_ids.astype(np.uint8)
 
-    def _index(self) -> dict[str, list[ScanRecord]]:
-        """Return the scans of every scene, in order of time."""
-        scene_names = _columns(self._table("scene"), "token", "name")
+    def _read_records(self) -> dict[str, list[ScanRecord]]:
+        """Read the tables; return the scans of every scene, by its name, in order of time."""
+        scene_names = _lookup(self._table("scene"), "token", "name")
         scene_of_sample = {}
         for row in self._table("sample"):
             scene_of_sample[row["token"]] = scene_names[row["scene_token"]]
 
         is_lidar = self._lidar_sensors()
-        scans = []
+        rows = []
         for row in self._table("sample_data"):
             if self._is_scan(row, is_lidar):
-                scans.append(row)
-        scans.sort(key=lambda row: (row["timestamp"], row["token"]))
+                rows.append(row)
+        rows.sort(key=lambda row: (row["timestamp"], row["token"]))
 
         records: dict[str, list[ScanRecord]] = {}
-        for row in scans:
+        for row in rows:
             scene = scene_of_sample[row["sample_token"]]
             records.setdefault(scene, []).append(self._record(row, scene))
         return records
 
     def _lidar_sensors(self) -> dict[str, bool]:
-        """Return for each calibrated sensor's token whether it is the LiDAR.
+        """Return whether a calibrated sensor is the LiDAR, by its token.
 
-        Empty if the tables of the sensors are missing.
+        The dictionary is empty if the tables of the sensors are missing.
         """
-        channels = _columns(self._table("sensor", required=False), "token", "channel")
+        channels = _lookup(self._table("sensor", required=False), "token", "channel")
         is_lidar = {}
         for row in self._table("calibrated_sensor", required=False):
             is_lidar[row["token"]] = channels.get(row["sensor_token"], CHANNEL) == CHANNEL
@@ -298,7 +311,7 @@ class NuScenes:
         )
 
     def _split(self, scene: str) -> str:
-        """Return the official split of a scene in this version."""
+        """Return the official split of a scene in this version: "train", "mini_val", ..."""
         if self.version == TEST:
             return "test"
         if self.version == MINI:
@@ -313,6 +326,6 @@ class NuScenes:
         return files.count_rows(record.points_path, np.float32, files.NUSCENES_COLUMNS)
 
 
-def _columns(rows: list[Row], key: str, value: str) -> dict[str, Any]:
-    """Return one column of a table by the values of another."""
+def _lookup(rows: list[Row], key: str, value: str) -> dict[str, Any]:
+    """Return the values in column `value` by those in column `key`."""
     return {row[key]: row[value] for row in rows}

@@ -1,4 +1,4 @@
-"""Choose the scans of a training, and the classes that a user names."""
+"""Choose the scans to train on and to validate with, and the classes by name."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from amvnet.errors import InputError
 
 @dataclass(frozen=True)
 class TrainingScans:
-    """The scans of a training.
+    """The scans of a training run.
 
     Attributes:
-        dataset: where they are.
-        train: to learn from.
-        val: to validate with; empty if nothing is validated. No scan may be in both.
+        dataset: the dataset that the scans belong to.
+        train: the scans to train on.
+        val: the scans to validate with; may be empty.
 
     Raises:
-        InputError: if a scan is in both.
+        InputError: if a scan is in both `train` and `val`.
     """
 
     dataset: Dataset
@@ -32,43 +32,58 @@ class TrainingScans:
         common = names & {record.name for record in self.val}
         if common:
             raise InputError(
-                f"expected validation scans apart from training, found {min(common)} in both; "
-                "name others"
+                "expected different scans to train on and to validate with, "
+                f"found {min(common)} in both; name other sequences"
             )
 
 
 def taxonomy_named(text: str) -> Taxonomy:
-    """Return the classes of a benchmark by its name, or those of a YAML file."""
-    return TAXONOMIES[text] if text in TAXONOMIES else taxonomy_from_yaml(text)
+    """Return the classes of a benchmark, given its name, or of a label map, given its path (YAML).
+
+    Raises:
+        InputError: as `taxonomy_from_yaml`.
+    """
+    if text in TAXONOMIES:
+        return TAXONOMIES[text]
+    return taxonomy_from_yaml(text)
 
 
 def split_records(
     dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
 ) -> TrainingScans:
-    """Return the scans to train on and to validate with: as named, else by the official split.
+    """Return the scans to train on and to validate with.
 
-    If a dataset has no scan of one of the two official splits, its last sequence validates.
+    If an official split is needed and the dataset has no sequence of it, the last sequence is used
+    to validate and the others to train.
 
     Args:
-        with_val: train on both, and validate with none.
+        train: the sequences to train on; None for those of the official split.
+        val: the sequences to validate with; None for those of the official split.
+        with_val: train on the sequences of `val`, too, and validate with none.
 
     Raises:
-        InputError: if there is just one sequence.
+        InputError: if no sequence is left for one of the two, a sequence does not exist, or a scan
+            is in both.
     """
     present = dataset.sequences("all")
-    official_train = _present(dataset, "train")
-    official_val = _present(dataset, "val")
-    if not (train or official_train) or not (val or official_val):
+    official_train = _sequences_on_disk(dataset, "train")
+    official_val = _sequences_on_disk(dataset, "val")
+    has_train = train or official_train
+    has_val = val or official_val
+    if not has_train or not has_val:
         official_train = present[:-1]
         official_val = present[-1:]
 
+    # A sequence that the user named for one purpose is not used for the other by default.
     if not val:
         val = [name for name in official_val if name not in (train or ())]
     if not train:
         train = [name for name in official_train if name not in val]
+
     if with_val:
         added = [name for name in val if name not in train]
         return TrainingScans(dataset, dataset.records([*train, *added]), [])
+
     if not train or not val:
         raise InputError(
             f"{dataset.root}: expected two sequences, one to train on and one to validate with, "
@@ -77,8 +92,8 @@ def split_records(
     return TrainingScans(dataset, dataset.records(train), dataset.records(val))
 
 
-def _present(dataset: Dataset, split: str) -> tuple[str, ...]:
-    """Return the sequences of an official split that are on disk, which may be none."""
+def _sequences_on_disk(dataset: Dataset, split: str) -> tuple[str, ...]:
+    """Return the sequences of an official split that are on disk; empty if there are none."""
     try:
         return dataset.sequences(split)
     except InputError:

@@ -33,7 +33,7 @@ class SemanticKitti:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", Path(self.root))
-        if not self._present():
+        if not self._sequences_on_disk():
             raise InputError(
                 f"{self.root}: expected sequences/XX/velodyne/*.bin, found no folder XX/velodyne; "
                 "give the folder that holds `sequences`"
@@ -46,7 +46,7 @@ class SemanticKitti:
 
     def sequences(self, split: str) -> tuple[str, ...]:
         """Return the sequences of "train", "val", "test" or "all" that are on disk."""
-        present = self._present()
+        present = self._sequences_on_disk()
         splits = {**self.taxonomy.splits, "all": present}
         if split not in splits:
             raise InputError(
@@ -98,8 +98,8 @@ class SemanticKitti:
         inner = self.root / "sequences"
         return inner if inner.is_dir() else self.root
 
-    def _present(self) -> tuple[str, ...]:
-        """Return the names of the sequences on disk."""
+    def _sequences_on_disk(self) -> tuple[str, ...]:
+        """Return the names of the sequences on disk, sorted."""
         names = []
         for path in self._folder.glob("*/velodyne"):
             names.append(path.parent.name)
@@ -109,15 +109,22 @@ class SemanticKitti:
         return files.count_rows(record.points_path, np.float32, files.KITTI_COLUMNS)
 
     def _records(self, sequence: str) -> list[ScanRecord]:
-        """Return the scans of one sequence."""
+        """Return the scans of one sequence, in order.
+
+        Raises:
+            InputError: if there are none.
+        """
         folder = self._folder / sequence
+
+        # If only some scans have labels, reading one without is an error.
         has_labels = any((folder / "labels").glob("*.label"))
 
         records = []
         for path in sorted((folder / "velodyne").glob("*.bin")):
-            # A program that was killed leaves its unfinished file, hidden by a leading dot.
+            # A program that was killed may have left an unfinished file, hidden by a leading dot.
             if path.name.startswith("."):
                 continue
+
             labels_path = folder / "labels" / f"{path.stem}.label"
             record = ScanRecord(
                 name=f"{sequence}/{path.stem}",
@@ -131,7 +138,7 @@ class SemanticKitti:
         if not records:
             raise InputError(
                 f"{folder / 'velodyne'}: expected the scans *.bin of sequence {sequence}, "
-                f"found none; there is {', '.join(self._present())}"
+                f"found none; name one of {', '.join(self._sequences_on_disk())}"
             )
 
         return records

@@ -56,21 +56,21 @@ class Bag:
     def __len__(self) -> int:
         return self._count
 
-    def read(self, place: int) -> Cloud:
+    def read(self, index: int) -> Cloud:
         """Read the scan at this index, from 0. In order is fastest.
 
         Raises:
             InputError: if the message is broken, or the bag ends before it.
         """
-        if place != self._next or self._next == 0:
+        if index != self._next or self._next == 0:
             self._next = 0
             self._messages = self._read_messages()
 
-        name = f"{self.path} ({self.topic}, {place})"
+        name = f"{self.path} ({self.topic}, {index})"
         with reading(name, "a PointCloud2 message", ADVICE):
             for decode in self._messages:
                 self._next += 1
-                if self._next > place:
+                if self._next > index:
                     if self._next == self._count:
                         self._messages = iter(())  # closes the bag
                     return read_message(decode(), name)

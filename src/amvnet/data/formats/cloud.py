@@ -13,16 +13,16 @@ import numpy as np
 from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import FARTHEST, Scan
 
-# Points of one scan: 40 times as many as the largest sensors give. A header that claims more is
+# Points of one scan: 40 times as many as the largest sensors record. A header that claims more is
 # broken.
 MAX_POINTS = 10_000_000
-MOST_RINGS = 256
+MOST_RINGS = 256  # a column with larger values does not hold ring indices
 
-# The largest intensities of devices: fractions, 8 bits, 16 bits. Integers cannot be fractions.
+# The largest intensities that sensors write: fractions, 8 bits, 16 bits.
 FLOAT_RANGES = (1.0, 255.0, 65535.0)
-INTEGER_RANGES = (255.0, 65535.0)
+INTEGER_RANGES = (255.0, 65535.0)  # integers are not fractions
 
-# Names of columns in lower case. If a file has several of them, the first in this order counts.
+# Names of columns in lower case. If a file has several of them, the first in this order is used.
 COLUMN_NAMES = {
     "x": ("x",),
     "y": ("y",),
@@ -48,8 +48,8 @@ class Cloud:
         xyz: (N, 3) float32 or float64 coordinates, metres.
         intensity: (N,) numbers, or None if the file has none.
         ring: (N,) int64 index of the laser, or None.
-        name: the origin of the scan, for messages.
-        full: the largest possible intensity, if the format defines it.
+        name: where the scan comes from, for messages.
+        full: the largest possible intensity, or None if the format does not define it.
         note: what the reader had to assume about the file; empty if nothing.
     """
 
@@ -63,9 +63,9 @@ class Cloud:
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.
 
-        If the format does not define the largest intensity, the values decide: floats up to 1 are
-        divided by 1, other values up to 255 by 255, up to 65535 by 65535, and larger ones by the
-        largest of them.
+        If the format does not define the largest possible intensity, the largest value in the scan
+        decides. Up to 1 (floats only) the divisor is 1, up to 255 it is 255, up to 65535 it is
+        65535, and beyond that it is the value itself.
         """
         if self.full is not None:
             return self.full
@@ -87,7 +87,7 @@ class Cloud:
     def to_scan(self, scale: float | None = None) -> Scan:
         """Return the scan, with float32 coordinates and intensities clipped to [0, 1].
 
-        Sensors write the origin for a lost return. Points there become NaN, and so get id 0.
+        Sensors write 0, 0, 0 for a lost return. Such points become NaN, and so get train id 0.
 
         Args:
             scale: the divisor of the intensities; by default `intensity_scale()`.
@@ -98,7 +98,7 @@ class Cloud:
         scale = scale or self.intensity_scale()
         points = np.zeros((len(self.xyz), 4), dtype=np.float32)
 
-        # Numbers too large for float32 become infinite, and such points are not valid.
+        # Numbers too large for float32 become infinite, which makes their points invalid.
         with np.errstate(over="ignore", invalid="ignore"):
             points[:, :3] = self.xyz
             if self.intensity is not None and scale is not None:
@@ -141,7 +141,7 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
     """Return the number of points that a header claims, if it is plausible.
 
     Args:
-        least: bytes of the smallest file with these points; 0 if unknown.
+        least: the least size of a file with these points, bytes; 0 if unknown.
 
     Raises:
         InputError: if no scan has that many points, or the file is too short for them.
@@ -167,7 +167,7 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
     """Turn every error of a reader in this block into an InputError of one line.
 
     Readers raise all kinds of exceptions on broken bytes. An InputError passes unchanged. Warnings
-    are silenced.
+    are ignored.
 
     Args:
         path: the file, or another name of the input.
@@ -187,10 +187,13 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
 
 def find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Find the columns x, y, z, intensity and ring by the names of all columns of a file.
+    """Find x, y, z, intensity and ring among the columns of a file.
+
+    Args:
+        names: the names of all columns, in order.
 
     Returns:
-        The index of each of the five that the file has.
+        The index of each column by the key of `COLUMN_NAMES`, without those that the file lacks.
     """
     lower_names = list(map(str.lower, names))
 
@@ -204,7 +207,7 @@ def find_columns(names: Sequence[str]) -> dict[str, int]:
 
 
 def require_columns(names: Sequence[str], path: Path | str) -> dict[str, int]:
-    """Find the columns as `find_columns`, and check that the coordinates are among them.
+    """Find columns as `find_columns` does, and check that the coordinates are among them.
 
     Raises:
         InputError: if x, y or z is missing.
@@ -219,10 +222,11 @@ def require_columns(names: Sequence[str], path: Path | str) -> dict[str, int]:
 
 
 def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
-    """Return the NumPy type of records of `size` bytes. Bytes outside the columns are skipped.
+    """Return the NumPy type of records; bytes that belong to no column are skipped.
 
     Args:
         columns: for each column, its NumPy type and its offset in a record, bytes.
+        size: bytes of a record.
     """
     formats, offsets = zip(*columns.values(), strict=True)
     return np.dtype(
@@ -231,7 +235,7 @@ def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
 
 
 def split_records(records: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the (N,) columns of (N,) records, without a copy."""
+    """Return the (N,) columns of (N,) records by name, without a copy."""
     return {name: records[name] for name in records.dtype.names or ()}
 
 
@@ -249,9 +253,11 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
 
 @np.errstate(invalid="ignore")
 def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
-    """Return values as (N,) int64 ring indices, 0 for those that are not finite.
+    """Return (N,) values as int64 ring indices, 0 for those that are not finite.
 
-    None if there are no values, or one is negative, too large or not a whole number.
+    Returns:
+        (N,) int64; None if there are no values, or one is negative, too large or not a whole
+        number.
     """
     if values is None or not len(values):
         return None

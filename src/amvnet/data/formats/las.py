@@ -1,4 +1,4 @@
-"""Scans in LAS and LAZ files, by laspy. Compressed files are read in a separate process."""
+"""Read scans from LAS and LAZ files with laspy, compressed ones in a separate process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ADVICE = "write the file again"
 RECORD = np.dtype([("x", "f8"), ("y", "f8"), ("z", "f8"), ("intensity", "u2")])
 CHUNK = 1_000_000  # points read at once
 
-# The header of a file.
+# The header.
 HEADER_1_0 = 227  # bytes of the header of LAS 1.0, the shortest
 HEADER_1_4 = 375  # bytes of the header of LAS 1.4, the longest
 MIN_RECORD = 54  # bytes of the shortest variable-length record
@@ -25,8 +25,8 @@ COMPRESSED = 0x80  # flag of the point format
 
 # Limits of the process that reads a compressed file.
 MEMORY = 2 << 30  # bytes
-BASE_SECONDS = 9.0
-POINTS_PER_SECOND = 200_000
+BASE_SECONDS = 9.0  # time limit, to which the points add
+POINTS_PER_SECOND = 200_000  # the least speed: it gives the time that the points add
 
 
 def read_las(path: Path) -> Cloud:
@@ -52,21 +52,25 @@ def _check_header(path: Path) -> tuple[int, bool]:
     """Return the number of points that the header claims, and whether they are compressed.
 
     Raises:
-        InputError: if the file is too short for what its header claims.
+        InputError: if the file is too short for what its header claims, or claims too many points.
     """
     with path.open("rb") as file:
         header = file.read(HEADER_1_4)
 
     fields = struct.unpack_from("<HIIBHI", header, 94)
-    header_size, points_start, records, point_format, point_size, count = fields
+    header_size, points_start, record_count, point_format, point_size, count = fields
+
+    # Version 1.4 counts points in 64 bits, in another place.
     if len(header) == HEADER_1_4 and header[24:26] == b"\x01\x04":
         (count,) = struct.unpack_from("<Q", header, 247)
 
-    size = path.stat().st_size
-    records_end = header_size + MIN_RECORD * records
-    if header_size < HEADER_1_0 or records_end > points_start or points_start > size:
+    # The points follow the header and its variable-length records.
+    file_size = path.stat().st_size
+    records_end = header_size + MIN_RECORD * record_count
+    if header_size < HEADER_1_0 or records_end > points_start or points_start > file_size:
         raise InputError(
-            f"{path}: expected points after {records} records, found {size} bytes in all; {ADVICE}"
+            f"{path}: expected a header, {record_count} variable-length records and points, "
+            f"found {file_size} bytes in all; {ADVICE}"
         )
 
     is_compressed = bool(point_format & COMPRESSED)
@@ -100,16 +104,20 @@ def read_records(path: Path) -> np.ndarray:
 
 
 def _read_in_process(path: Path, count: int) -> np.ndarray:
-    """Read the same as `read_records`, in a process with limited memory and time.
+    """Read all points as `read_records` does, in a process with limited memory and time.
 
     On broken bytes, lazrs 0.8 can take any amount of memory or abort its process.
+
+    Raises:
+        ValueError: if the process fails.
+        subprocess.TimeoutExpired: if it takes too long for `count` points.
     """
     code = (
         "import sys; from amvnet.data.formats.las import write_records; write_records(sys.argv[1])"
     )
     environment = dict(os.environ)
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
-    # Each thread would take its share of the memory limit.
+    # With one thread, because each would use up some of the memory limit.
     environment["OMP_NUM_THREADS"] = "1"
     environment["OPENBLAS_NUM_THREADS"] = "1"
 
@@ -128,7 +136,7 @@ def _read_in_process(path: Path, count: int) -> np.ndarray:
 def write_records(path: str) -> None:
     """Write the records of a file to standard output, with limited memory.
 
-    This is what the process of `_read_in_process` runs.
+    `_read_in_process` runs this function in its process.
     """
     try:
         import resource

@@ -1,4 +1,4 @@
-"""Point clouds in PCL's format: ascii, binary and binary_compressed, with any columns in any order.
+"""Read point clouds in PCL's format: ascii, binary or binary_compressed, columns in any order.
 
 We do not use pypcd4: version 1.5 reads truncated files without an error, and ascii files only if
 single spaces separate the numbers.
@@ -34,9 +34,10 @@ TYPES = {
     "U": {1: "<u1", 2: "<u2", 4: "<u4", 8: "<u8"},
 }
 
-# The longest repetition that LZF can encode: 264 bytes in 3. Nothing is packed more tightly.
-LONGEST_REPETITION = 264
-REPETITION_CODE = 3
+# The longest repetition that LZF can encode, and the length of its code. Nothing is packed more
+# tightly.
+LONGEST_REPETITION = 264  # bytes
+REPETITION_CODE = 3  # bytes
 
 
 @dataclass(frozen=True)
@@ -46,9 +47,9 @@ class Column:
     Attributes:
         name: the name in the header.
         dtype: the NumPy type of its values.
-        count: how many values a point has in it.
-        offset: bytes of a point before this column.
-        index: values of a point before this column.
+        count: values per point in this column.
+        offset: bytes per point before this column.
+        index: values per point before this column.
     """
 
     name: str
@@ -65,7 +66,13 @@ class Column:
 
 @dataclass(frozen=True)
 class Header:
-    """The header of a PCD file: the columns, the number of points and the encoding."""
+    """The header of a PCD file.
+
+    Attributes:
+        columns: in the file's order.
+        points: the number of points.
+        encoding: "ascii", "binary" or "binary_compressed".
+    """
 
     columns: tuple[Column, ...]
     points: int
@@ -77,12 +84,12 @@ class Header:
         return sum(column.size for column in self.columns)
 
 
-Columns = dict[str, Column]  # by x, y, z, intensity, ring
-Arrays = dict[str, np.ndarray]
+Columns = dict[str, Column]  # with the keys x, y, z and, if present, intensity and ring
+Arrays = dict[str, np.ndarray]  # the (N,) values of these columns
 
 
 def read_pcd(path: Path) -> Cloud:
-    """Read one cloud, row by row if it is organised.
+    """Read one cloud; an organised one (a grid of points) row by row.
 
     Raises:
         InputError: if the file is not PCD, is truncated, or has no x, y, z.
@@ -100,6 +107,11 @@ def read_pcd(path: Path) -> Cloud:
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
+    """Read the header, up to and including the line DATA.
+
+    Raises:
+        InputError: if there is no such line, or its encoding is unknown.
+    """
     entries: dict[str, list[str]] = {}
     while "DATA" not in entries:
         line = file.readline(HEADER)
@@ -107,6 +119,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
             raise InputError(
                 f"{path}: expected the header of a PCD file, found no line DATA; {ADVICE}"
             )
+
         words = line.decode("ascii").split()
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
@@ -126,6 +139,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
 
 
 def _parse_columns(entries: dict[str, list[str]]) -> tuple[Column, ...]:
+    """Return the columns that the lines FIELDS, SIZE, TYPE and COUNT describe."""
     names = entries.get("FIELDS") or entries["COLUMNS"]
     sizes = entries["SIZE"]
     types = entries["TYPE"]
@@ -145,7 +159,7 @@ def _parse_columns(entries: dict[str, list[str]]) -> tuple[Column, ...]:
 
 
 def _read_ascii(file: BinaryIO, header: Header, columns: Columns, path: Path) -> Arrays:
-    # Each value takes at least one digit and, but for the last, a separator.
+    # Each value takes at least one digit, and each but the last a separator.
     values_per_point = sum(column.count for column in header.columns)
     count = check_point_count(header.points, path, 2 * values_per_point * header.points - 1)
 
@@ -158,13 +172,13 @@ def _read_ascii(file: BinaryIO, header: Header, columns: Columns, path: Path) ->
 def read_text(
     file: BinaryIO, count: int, columns: dict[str, tuple[int, str]], path: Path
 ) -> Arrays:
-    """Read columns of the next `count` lines of numbers.
+    """Read some columns of the next `count` lines of numbers.
 
     Args:
         columns: for each column, its index in a line and its NumPy type.
 
     Returns:
-        (count,) values of each column.
+        The (count,) values of each column.
 
     Raises:
         InputError: if there are fewer lines.
@@ -173,6 +187,7 @@ def read_text(
     table = np.zeros((0, len(columns)))
     if count:
         table = np.loadtxt(file, usecols=indices, max_rows=count, comments=None, ndmin=2)
+
     if len(table) < count:
         raise InputError(
             f"{path}: expected {count} lines of points, found {len(table)}; copy the file again"
@@ -181,7 +196,7 @@ def read_text(
     arrays = {}
     with np.errstate(invalid="ignore"):
         for key, dtype, values in zip(columns, dtypes, table.T, strict=True):
-            # A column with NaN or infinity stays float64, as integers cannot hold them.
+            # A column with NaN or infinity stays float64, because integers cannot hold these.
             arrays[key] = values.astype(dtype) if np.isfinite(values).all() else values
     return arrays
 
@@ -197,13 +212,14 @@ def _read_binary(file: BinaryIO, header: Header, columns: Columns, path: Path) -
 
 
 def read_rows(file: BinaryIO, count: int, row: int, columns: dict[str, tuple[str, int]]) -> Arrays:
-    """Read columns of the next `count` points of `row` bytes each.
+    """Read some columns of the next `count` points.
 
     Args:
+        row: bytes of a point.
         columns: for each column, its NumPy type and its offset in a point, bytes.
 
     Returns:
-        (count,) values of each column.
+        The (count,) values of each column; fewer if the file ends before.
     """
     return split_records(np.fromfile(file, dtype=record_dtype(columns, row), count=count))
 
@@ -211,13 +227,14 @@ def read_rows(file: BinaryIO, count: int, row: int, columns: dict[str, tuple[str
 def _read_compressed(file: BinaryIO, header: Header, columns: Columns, path: Path) -> Arrays:
     packed_size, size = struct.unpack("<II", file.read(8))
     count = check_point_count(header.points, path, file.tell() + packed_size)
-    is_possible = size * REPETITION_CODE <= packed_size * LONGEST_REPETITION
-    if size != count * header.row or not is_possible:
+    can_unpack = size * REPETITION_CODE <= packed_size * LONGEST_REPETITION
+    if size != count * header.row or not can_unpack:
         raise InputError(
             f"{path}: expected {count * header.row} bytes of points, found {size}; {ADVICE}"
         )
 
-    # The columns follow each other; the values of a point are adjacent within a column.
+    # One column follows the other. Within a column, the values of a point are adjacent, and the
+    # first of them is used.
     data = unpack_lzf(file.read(packed_size), size)
     arrays = {}
     for key, column in columns.items():
@@ -244,8 +261,8 @@ def unpack_lzf(data: bytes, size: int) -> bytes:
             position += control + 1
             continue
 
-        # A back reference: 3 bits of length, or another byte if they are full, and 13 bits of
-        # distance.
+        # A back reference: 3 bits of length, followed by a byte to add if all three are set, and
+        # 13 bits of distance.
         length = control >> 5
         if length == 7:
             length += data[position]
@@ -260,7 +277,11 @@ def unpack_lzf(data: bytes, size: int) -> bytes:
 
 
 def _repeat(output: bytearray, start: int, length: int) -> None:
-    """Append the `length` bytes from `start` on; if these run past the end, they start over."""
+    """Append the `length` bytes from `start` on; at the end of `output`, start over.
+
+    Raises:
+        ValueError: if `start` is negative.
+    """
     if start < 0:
         raise ValueError("a repetition of bytes before the first")
     pattern = output[start : start + length]

@@ -12,7 +12,7 @@ from torch import Tensor
 from amvnet.config.schema import PolarViewConfig
 from amvnet.models.views.points import PointBatch, occurring
 
-FEATURES = 9  # offset to the voxel's centre (3), polar coordinates (3), x, y, intensity
+FEATURES = 9  # offset from the voxel's centre (3), polar coordinates (3), x, y, intensity
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class PolarGrid:
     """A batch of scans in the polar grid, and the mapping back to the points.
 
     Attributes:
-        features: (P, 9) float32: offset to the voxel's centre (radius, angle, height), polar
-            coordinates (metres, radians, metres), x, y, intensity.
+        features: (P, 9) float32: offset from the voxel's centre (radius, angle, height), polar
+            coordinates (radius, angle, height), x, y, intensity; metres and radians.
         pillar: (P,) int64: each point's pillar, an index into the B * R * A pillars of the batch.
         voxel: (P,) int64: each point's voxel within its pillar; 0 is the lowest.
         occupied: (M,) int64: the pillars that hold points, ascending.
@@ -39,13 +39,13 @@ class PolarGrid:
     def pool(self, features: Tensor) -> Tensor:
         """Return the maximum of the points' features (P, C) in each occupied pillar, (M, C)."""
         index = self.slot[:, None].expand_as(features)
-        empty = features.new_zeros(len(self.occupied), features.shape[1])
-        return empty.scatter_reduce(0, index, features, "amax", include_self=False)
+        zeros = features.new_zeros(len(self.occupied), features.shape[1])
+        return zeros.scatter_reduce(0, index, features, "amax", include_self=False)
 
     def pool_by_parts(self, encode: Callable[[Tensor], Tensor], part: int) -> Tensor:
-        """Return `pool(encode(features))`, computed for `part` points at a time; no gradients.
+        """Return `pool(encode(self.features))`, computed for `part` points at a time.
 
-        The points of a small part stay in a CPU's cache.
+        The points of a small part stay in a CPU's cache. Use this only without gradients.
         """
         pooled = None
         for features, slot in zip(self.features.split(part), self.slot.split(part), strict=True):
@@ -58,7 +58,7 @@ class PolarGrid:
         return pooled
 
     def to_map(self, pillars: Tensor) -> Tensor:
-        """Spread features (M, C) of the occupied pillars over a map (B, C, R, A), 0 elsewhere."""
+        """Return features (M, C) of the occupied pillars as a map (B, C, R, A), 0 elsewhere."""
         b, r, a, _ = self.shape
         dense = pillars.new_zeros(b * r * a, pillars.shape[1]).index_copy(0, self.occupied, pillars)
         return dense.view(b, r, a, -1).permute(0, 3, 1, 2)
@@ -71,7 +71,7 @@ class PolarGrid:
         """Return each point's scores (P, K): those of its voxel.
 
         Args:
-            scores: (M, Z * K) of the occupied pillars, voxel by voxel.
+            scores: (M, Z * K) logits or probabilities of the occupied pillars, voxel by voxel.
         """
         vertical = self.shape[3]
         voxels = scores.unflatten(1, (vertical, scores.shape[1] // vertical)).flatten(0, 1)
@@ -87,7 +87,7 @@ class PolarView:
     def project(self, batch: PointBatch) -> PolarGrid:
         """Return the polar grids of a batch of scans.
 
-        Points outside the grid go to the nearest cell.
+        Points outside the grid go to its nearest cell.
         """
         c = self.config
 
@@ -115,6 +115,17 @@ class PolarView:
 
 
 def _cells(values: Tensor, low: float, high: float, cells: int) -> tuple[Tensor, Tensor]:
-    """Return along one axis each value's cell (P,), int64, and its offset (P,) to the centre."""
+    """Divide one axis of the grid into equal cells.
+
+    Args:
+        values: (P,) coordinates along the axis.
+        low: the start of the first cell.
+        high: the end of the last cell.
+        cells: the number of cells.
+
+    Returns:
+        (P,) int64, the cell that each value is in or nearest to; and (P,) its offset from that
+        cell's centre.
+    """
     cell = ((values - low) / (high - low) * cells).floor().clamp(0, cells - 1)
     return cell.long(), values - (low + (cell + 0.5) * (high - low) / cells)

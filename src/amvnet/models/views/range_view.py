@@ -13,7 +13,7 @@ from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 
 CHANNELS = 6  # x, y, z, intensity, range, mask
-_INDEX_BITS = 32  # lower bits of a key of `_nearest`, for a point's index; the rest is its range
+_INDEX_BITS = 32  # of the 64 bits of a key in `_nearest`: a point's index; above them is its range
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,11 @@ class RangeImage:
     nearest: Tensor
 
     def to_points(self, scores: Tensor) -> Tensor:
-        """Return each point's scores (P, K): those of its pixel, from scores (B, K, H, W)."""
+        """Return each point's scores (P, K): those of its pixel.
+
+        Args:
+            scores: (B, K, H, W) logits or probabilities.
+        """
         return scores.permute(0, 2, 3, 1).flatten(0, 2).index_select(0, self.pixel)
 
 
@@ -45,19 +49,20 @@ class RangeView:
     def project(self, batch: PointBatch) -> RangeImage:
         """Return the range images of a batch of scans.
 
-        Every point has a pixel: outside the field of view, in the first or the last row. A pixel
-        with several points is represented by the nearest to the sensor, and by the first of
-        equally near ones.
+        Every point has a pixel; points above or below the field of view are in the first or the
+        last row. A pixel with several points shows the nearest to the sensor; of equally near
+        points, it shows the first.
 
         Raises:
-            InputError: if rows are lasers and the scans have no ring index, or one out of range.
+            InputError: if rows are lasers, and the scans have no ring indices or one is out of
+                range.
         """
         c = self.config
         distance = batch.points[:, :3].norm(dim=1)
         pixel = (batch.scan * c.height + self.rows(batch)) * c.width + self.columns(batch)
         nearest = _nearest(distance, pixel, batch.count * c.height * c.width)
 
-        # A row of zeros at the end stands for pixels without a point.
+        # The row of zeros at the end is for pixels without a point.
         mask = torch.ones_like(distance)
         values = torch.cat([batch.points, distance[:, None], mask[:, None]], dim=1)
         padded = torch.cat([values, values.new_zeros(1, CHANNELS)])
@@ -89,7 +94,7 @@ class RangeView:
                 "expected a scan with a ring index, found none; use a model with rows by elevation"
             )
 
-        # Both bounds at once, so that the CPU waits for a GPU only once
+        # Both bounds at once, so that the CPU waits for a GPU only once.
         low, high = torch.stack(ring.aminmax()).tolist() if len(ring) else (0, 0)
         if not 0 <= low <= high < height:
             raise InputError(
@@ -99,14 +104,23 @@ class RangeView:
         return height - 1 - ring  # ring 0 is the lowest laser
 
 
-def _cells(share: Tensor, cells: int) -> Tensor:
-    """Return which of `cells` equal parts of [0, 1] holds a number; if outside, the nearest."""
-    return (share * cells).floor().long().clamp_(0, cells - 1)
+def _cells(fractions: Tensor, cells: int) -> Tensor:
+    """Divide [0, 1] into equal cells, and return the cell of each number, (P,) int64.
+
+    Numbers outside [0, 1] go to the nearest cell.
+    """
+    return (fractions * cells).floor().long().clamp_(0, cells - 1)
 
 
 def _nearest(distance: Tensor, pixel: Tensor, pixels: int) -> Tensor:
-    """Return the (pixels,) index of the nearest point in each pixel, -1 if it has none."""
-    # The bits of floats >= 0 sort as the floats do. So one integer minimum finds both the least
+    """Return the (pixels,) index of the nearest point in each pixel, -1 if it has none.
+
+    Args:
+        distance: (P,) metres from the sensor.
+        pixel: (P,) index of each point's pixel.
+        pixels: the number of pixels.
+    """
+    # The bits of floats >= 0 sort as the floats do, so one integer minimum finds both the least
     # distance and its point.
     index = torch.arange(len(distance), device=distance.device)
     key = (distance.float().view(torch.int32).long() << _INDEX_BITS) | index
