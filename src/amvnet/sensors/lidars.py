@@ -152,7 +152,7 @@ def make_sensor(sensor: str | None = None, **options: Any) -> Sensor:
         sensor: a name in `SENSORS`, or a YAML file with attributes of `Sensor`; None stands for an
             unknown sensor.
         options: attributes of `Sensor` that override those; None overrides nothing. `rotate` and
-            `offset` may be texts of three numbers with commas.
+            `offset` may be texts of three numbers separated by commas.
 
     Raises:
         InputError: if there is no such sensor or file, or a value is impossible.

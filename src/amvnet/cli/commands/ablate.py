@@ -23,8 +23,10 @@ def ablate(
         recipe: what to train; a built-in recipe's name or a YAML file.
         data: the dataset.
         out: folder for the four runs and the table; a second call continues an interrupted one.
-        train_sequences: sequences or scenes to train on, with commas; default: the official split.
-        val_sequences: sequences or scenes to score, with commas; default: the official split.
+        train_sequences: sequences or scenes, separated by commas, to train on; default: the
+            official split.
+        val_sequences: sequences or scenes, separated by commas, to score; default: the official
+            split.
         device: where the trained networks are scored: cpu, cuda, cuda:1, ...
     """
     from amvnet.data.datasets.select import split_records

@@ -27,12 +27,12 @@ def analyze(
         weights: a weights file, or the name of a built-in one.
         out: folder for the figures (PNG), and the same figures as CSV and Markdown.
         split: the official split to score.
-        sequences: sequences or scenes to score instead, with commas.
-        neighbours: also train a head for each of these numbers of neighbours, with commas; needs a
-            recipe.
+        sequences: sequences or scenes, separated by commas, to score instead.
+        neighbours: also train a head for each of these numbers of neighbours, separated by commas;
+            needs a recipe.
         recipe: how these heads are trained: a built-in recipe's name or a YAML file.
-        train_sequences: sequences or scenes that these heads learn from, with commas; default: the
-            official split.
+        train_sequences: sequences or scenes, separated by commas, that these heads learn from;
+            default: the official split.
         device: cpu, cuda, cuda:1, ...
     """
     from amvnet.config.recipes import load_recipe

@@ -36,8 +36,8 @@ def evaluate(
         weights: a weights file, or the name of a built-in one: all methods are scored.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
         split: the official split to score.
-        sequences: sequences or scenes to score instead, with commas.
-        methods: what to score of weights, with commas; arithmetic and maximum are the other
+        sequences: sequences or scenes, separated by commas, to score instead.
+        methods: what to score of weights, separated by commas; arithmetic and maximum are the other
             ensembles.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.

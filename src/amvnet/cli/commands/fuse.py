@@ -41,7 +41,7 @@ def fuse(
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.
         split: of datasets, the official split.
-        sequences: of datasets, these sequences or scenes instead, with commas.
+        sequences: of datasets, these sequences or scenes instead, separated by commas.
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the
             head's or the inputs'.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.

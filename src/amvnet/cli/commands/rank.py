@@ -28,7 +28,7 @@ def rank(
         by: what is doubted: disagreement of the two views (what to label next), or labels that both
             contradict.
         split: the official split.
-        sequences: sequences or scenes instead, with commas.
+        sequences: sequences or scenes instead, separated by commas.
         pictures: folder for drawings of the first clusters from above.
         device: cpu, cuda, cuda:1, ...
     """

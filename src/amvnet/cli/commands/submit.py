@@ -31,7 +31,7 @@ def submit(
         out: the archive to write, NAME.zip.
         check: an archive to check instead.
         split: the official split; the servers score test, the others are for trials.
-        sequences: sequences or scenes instead, with commas, for trials.
+        sequences: sequences or scenes instead, separated by commas, for trials.
         use_camera: nuScenes: the method was given images.
         use_lidar: nuScenes: the method was given LiDAR scans.
         use_radar: nuScenes: the method was given radar.

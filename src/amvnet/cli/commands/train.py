@@ -42,8 +42,10 @@ def train(
         stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them.
         resume: continue an earlier run in the folder.
-        train_sequences: sequences or scenes to train on, with commas; default: the official split.
-        val_sequences: sequences or scenes to validate on, with commas; default: the official split.
+        train_sequences: sequences or scenes, separated by commas, to train on; default: the
+            official split.
+        val_sequences: sequences or scenes, separated by commas, to validate on; default: the
+            official split.
         with_val: train on these too, as for a benchmark's server; then nothing is validated.
         dry_run: only take two steps of each network, and say what these and the training cost.
         taxonomy: a semantic-kitti.yaml with other classes.

@@ -35,7 +35,7 @@ def view(
         html: write a page for a browser instead of opening a window.
         save: write a recording of Rerun instead of opening a window.
         scans: at most this many, evenly spaced.
-        sequences: of datasets, which sequences or scenes, with commas; default: all.
+        sequences: of datasets, which sequences or scenes, separated by commas; default: all.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
         device: cpu, cuda, cuda:1, ...
     """

@@ -29,7 +29,7 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
     kind, _, rest = str(spec).partition(":")
     path, version = _split_version(rest if kind in READERS else str(spec))
     if not path.is_dir():
-        raise InputError(f"{path}: expected the folder of a data set, found none; check the path")
+        raise InputError(f"{path}: expected the folder of a dataset, found none; check the path")
 
     reader = READERS[kind] if kind in READERS else _guess_reader(path)
     options = {} if taxonomy is None else {"taxonomy": taxonomy}
