@@ -76,11 +76,11 @@ def is_dataset(spec: str) -> bool:
 
 
 def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
-    """Raise InputError if weights have other classes than the dataset."""
+    """Raise InputError if weights, or the user, name other classes than the dataset's."""
     if taxonomy.classes != dataset.taxonomy.classes:
         raise InputError(
-            f"expected weights for the classes of {dataset.taxonomy.name}, found weights for those "
-            f"of {taxonomy.name}; use weights trained on this benchmark"
+            f"{dataset.root}: expected the classes of {dataset.taxonomy.name}, found those of "
+            f"{taxonomy.name}; use weights, a head or a --taxonomy with the dataset's classes"
         )
 
 
