@@ -45,6 +45,7 @@ DIGESTS = "digests.json"
 LOG = "log.txt"  # what the commands say
 REAL = "real"  # a link to the real scans, so that no output names their place
 CACHE = "cache"  # of exported networks
+LAS_DATE = slice(90, 94)  # of the header: day of the year and year, two bytes each
 
 # Files with nothing to compare. Checkpoints and TensorBoard's curves hold times; the weights and
 # the metrics.csv of each stage have what matters of them.
@@ -365,6 +366,13 @@ def read_bytes(path: Path) -> dict[str, Part]:
     return {"bytes": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
+def read_las(path: Path) -> dict[str, Part]:
+    """Read the bytes of a LAS file without its date of creation."""
+    content = bytearray(path.read_bytes())
+    content[LAS_DATE] = bytes(LAS_DATE.stop - LAS_DATE.start)
+    return {"bytes": hashlib.sha256(content).hexdigest()}
+
+
 def read_labels(path: Path) -> dict[str, Part]:
     """Read the raw ids of SemanticKITTI."""
     return {"labels": np.fromfile(path, np.uint32)}
@@ -472,6 +480,7 @@ def read_graph(path: Path) -> dict[str, Part]:
 
 
 READERS: dict[str, Callable[[Path], dict[str, Part]]] = {
+    ".las": read_las,
     ".label": read_labels,
     ".bin": read_points_or_labels,
     ".npy": read_array,
