@@ -47,6 +47,7 @@ def describe_records(records: Sequence[ScanRecord]) -> str:
     text = ", ".join(names[:SHOWN])
     if len(names) > SHOWN:
         text += f" and {len(names) - SHOWN} more"
+
     return f"{len(records)} scans of {text}"
 
 
@@ -65,6 +66,7 @@ def parse_names(text: str | None) -> list[str] | None:
             f"expected names of sequences with commas, found {text!r}; "
             "name some, or leave the option out"
         )
+
     return names
 
 
@@ -80,6 +82,7 @@ def parse_methods(text: str) -> list[str]:
             raise InputError(
                 f"expected methods of {', '.join(METHODS)}, found {name!r}; use some of them"
             )
+
     return names
 
 

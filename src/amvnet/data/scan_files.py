@@ -136,4 +136,5 @@ def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
             f"{path}: expected {count} ids, one per point, found shape {ids.shape}; "
             "segment the whole scan"
         )
+
     return ids

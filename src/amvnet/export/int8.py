@@ -132,6 +132,7 @@ def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarr
         else:
             scores = runner.score_polar_view(points)
         labels.append(scores.argmax(axis=1))
+
     return np.concatenate(labels)
 
 

@@ -292,6 +292,7 @@ def _artificial_scan(segmenter: Segmenter) -> PointBatch:
     xyz = np.stack([distance * np.cos(azimuth), distance * np.sin(azimuth), height], axis=1)
     points = np.column_stack([xyz, rng.random(POINTS)]).astype(np.float32)
     ring = rng.integers(0, model.range_view.height, POINTS)
+
     return PointBatch.of([Scan(points, ring=ring)]).to(segmenter.device)
 
 

@@ -232,6 +232,7 @@ def check_scan(points: np.ndarray | Scan) -> Scan:
             f"{scan.name or 'scan'}: expected points to segment, found {problem}; "
             "leave the scan out"
         )
+
     return scan
 
 
@@ -247,6 +248,7 @@ def _check_method(method: MethodName, weights: Weights) -> MethodName:
             f"expected weights with {', '.join(needed)} for the method {method}, "
             f"found no {missing[0]}; train that part, or choose a method without it"
         )
+
     return method
 
 

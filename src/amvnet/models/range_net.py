@@ -54,6 +54,7 @@ class RangeNet(nn.Module):
             if index >= first_recurrent:
                 x = self.recurrent[index - first_recurrent](x)
             maps.append(x)
+
         return maps
 
     def decode(self, maps: list[Tensor]) -> Tensor:
@@ -77,4 +78,5 @@ def _stages(c: RangeNetConfig) -> list[nn.Module]:
         rest = [ResidualBlock(width, width) for _ in range(blocks - 1)]
         stages.append(nn.Sequential(ResidualBlock(channels, width, (stride, 2)), *rest))
         channels = width
+
     return stages

@@ -146,6 +146,7 @@ def barrier(length: float) -> Mesh:
         (-0.3, 0.08),
     ]
     along_street = prism(profile, length)[..., [1, 0, 2]]  # the profile lies across the street
+
     return part([along_street], Surface.PLASTER, Label.BARRIER)
 
 
@@ -192,6 +193,7 @@ def thicket(rng: np.random.Generator, length: float, height: float) -> Mesh:
         half_depth = rng.uniform(0.7, 1.4)
         centre = (x + rng.normal(scale=0.3), rng.normal(scale=0.5), half_height * 0.85)
         clumps.append(hull(rng, centre, (1.1, half_depth, half_height)))
+
     return _foliage(clumps, rng.uniform(0.04, 0.3))
 
 
@@ -321,6 +323,7 @@ def clutter(rng: np.random.Generator) -> Mesh:
         back = box((1.7, 0.08, 0.4), (0, 0.2, 0.5))
         foot = box((0.1, 0.4, 0.4))
         solids = [seat, back, foot]
+
     return part(solids, Surface.PLASTIC, Label.OTHER_OBJECT)
 
 

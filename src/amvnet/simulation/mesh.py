@@ -80,6 +80,7 @@ def part(
     """
     triangles = np.concatenate(solids)
     count = len(triangles)
+
     return Mesh(
         triangles=triangles.astype(np.float32),
         surface=np.full(count, surface, dtype=np.uint8),

@@ -188,6 +188,7 @@ def _boundary_segment(rng: np.random.Generator, kind: str, height: float) -> Mes
     if kind == "board fence":
         gap = 0.1 if height > 1.3 else 0.4
         return fixtures.board_fence(BOUNDARY_SEGMENT, height, gap)
+
     return fixtures.rail_fence(BOUNDARY_SEGMENT, height)
 
 

@@ -77,6 +77,7 @@ def _lower_body(shape: CarShape) -> list[tuple[float, float]]:
     """Return the side view of a car below the windows."""
     half = shape.length / 2
     bonnet = half - shape.length * shape.bonnet
+
     return [
         (-half + 0.05, 0.25),
         (half - 0.05, 0.22),
@@ -98,6 +99,7 @@ def _pillars(shape: CarShape, rear: float, cabin: float) -> list[np.ndarray]:
             bottom = (bottom_x, side * shape.width * 0.46, shape.belt)
             top = (top_x, side * shape.width * 0.39, shape.height - 0.06)
             pillars.append(tube(bottom, top, 0.05))
+
     return pillars
 
 
@@ -111,6 +113,7 @@ def _wheels(
             inside = (axle * length, side * (width / 2 - 0.2), radius)
             outside = (axle * length, side * (width / 2 + 0.01), radius)
             wheels.append(tube(inside, outside, radius))
+
     return part(wheels, Surface.RUBBER, label)
 
 

@@ -92,6 +92,7 @@ def score_source(
             raise InputError(
                 f"expected trained networks for the head, found no {part}; train it, or give --init"
             )
+
     return NetworkScores(weights, records)
 
 

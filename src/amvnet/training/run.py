@@ -84,6 +84,7 @@ class Run:
                 weights = weights.replace_part(part, init)
         for name in names:
             weights = self._stage(name, weights).finished_weights()
+
         return weights
 
     def _stage(self, name: str, weights: Weights) -> StageRun:

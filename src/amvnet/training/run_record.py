@@ -82,6 +82,7 @@ def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
         command += ["--init", "WEIGHTS"]
     if plan.scores is not None:
         command += plan.scores.options()
+
     return [*command, "--out", f"{plan.out}-again"]
 
 

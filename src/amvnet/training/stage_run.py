@@ -126,6 +126,7 @@ class StageRun:
                     f"expected weights whose {self.part} has the recipe's sizes, found others; "
                     "use the recipe of the weights"
                 ) from None
+
         return model
 
     def class_weights(self) -> np.ndarray:
@@ -387,4 +388,5 @@ class HeadRun(StageRun):
             out=self.plan.out / "folds" / str(index),
             options=dataclasses.replace(self.plan.options, resume=True),
         )
+
         return NetworkScores(load(self.train_networks(plan)), unseen)

@@ -78,6 +78,7 @@ class NeighbourStudy:
         )
         for part in ("range_net", "polar_net"):
             networks = networks.replace_part(part, self.weights)
+
         return networks
 
 
@@ -118,6 +119,7 @@ def _ablated(recipe: Recipe, gru: bool, weighted: bool) -> Recipe:
     """Return a recipe with or without the GRU and the class weights of the range view."""
     range_net = dataclasses.replace(recipe.model.range_net, gru=gru)
     rv = dataclasses.replace(recipe.training.rv, class_weights=weighted)
+
     return dataclasses.replace(
         recipe,
         model=dataclasses.replace(recipe.model, range_net=range_net),

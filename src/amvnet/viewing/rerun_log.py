@@ -75,6 +75,7 @@ def save_recording(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy
             log(stream, frames, taxonomy)
         finally:
             stream.disconnect()  # waits until everything is written
+
     return Path(path)
 
 

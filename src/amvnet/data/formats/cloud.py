@@ -218,6 +218,7 @@ def require_columns(names: Sequence[str], path: Path | str) -> dict[str, int]:
         raise InputError(
             f"{path}: expected columns x, y, z, found {listing[:200]!a}; rename the columns"
         )
+
     return columns
 
 

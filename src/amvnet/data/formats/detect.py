@@ -124,6 +124,7 @@ def read_cloud(path: Path | str) -> Cloud:
         raise InputError(
             f"{path}: expected one scan, found a bag of {len(bag)}; segment it with amvnet predict"
         )
+
     return bag.read(0)
 
 

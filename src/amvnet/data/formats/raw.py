@@ -136,4 +136,5 @@ def ring_column(values: np.ndarray, path: Path) -> np.ndarray:
             f"{path}: expected ring indices 0, 1, ... in column 5, found other values; "
             "correct the column"
         )
+
     return values.astype(np.int64)
