@@ -112,15 +112,15 @@ class InputScan(Protocol):
         """
 
     def write_labels(
-        self, out: Path, form: LabelFormat, loaded: LoadedScan, labels: Labels
+        self, out: Path, form: LabelFormat, labels: Labels, file_xyz: np.ndarray | None
     ) -> Path:
         """Write the labels into a folder of predictions.
 
         Args:
             out: the folder.
             form: the format for scan files; datasets have their own.
-            loaded: the scan.
             labels: of the scan's points.
+            file_xyz: as of `LoadedScan`.
 
         Returns:
             The path of the file.
@@ -175,7 +175,7 @@ class DatasetScan:
         return self.dataset.read_prediction(self.record, path)
 
     def write_labels(
-        self, out: Path, form: LabelFormat, loaded: LoadedScan, labels: Labels
+        self, out: Path, form: LabelFormat, labels: Labels, file_xyz: np.ndarray | None
     ) -> Path:
         return self.dataset.write_prediction(self.record, out, labels.ids)
 
@@ -263,13 +263,13 @@ class FileScan:
         return read_labels(label_path, np.uint32, count, taxonomy.to_train)
 
     def write_labels(
-        self, out: Path, form: LabelFormat, loaded: LoadedScan, labels: Labels
+        self, out: Path, form: LabelFormat, labels: Labels, file_xyz: np.ndarray | None
     ) -> Path:
-        assert loaded.file_xyz is not None
+        assert file_xyz is not None
         return write_scan_labels(
             out / self.scan.name,
             form.kind,
-            loaded.file_xyz,
+            file_xyz,
             labels.ids,
             form.taxonomy,
             uncertain=labels.uncertain,

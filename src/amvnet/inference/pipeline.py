@@ -100,10 +100,10 @@ class SegmentScans(Protocol):
 
 @dataclass(frozen=True)
 class Segmented:
-    """A scan that waits to be written."""
+    """A scan that waits to be written; of its points, only what the writing needs is kept."""
 
     scan: InputScan
-    loaded: LoadedScan
+    file_xyz: np.ndarray | None
     result: Segmentation
 
 
@@ -273,7 +273,7 @@ class Pipeline:
             if isinstance(result, InputError):
                 outcomes.append(Broken(scan, str(result)))
             else:
-                outcomes.append(Segmented(scan, scan_loaded, result))
+                outcomes.append(Segmented(scan, scan_loaded.file_xyz, result))
         return outcomes
 
     def _segment_scans(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Result]:
@@ -306,8 +306,8 @@ class Pipeline:
         segmented.scan.write_labels(
             folder,
             LabelFormat(self.output.kind, self.taxonomy),
-            segmented.loaded,
             Labels(result.labels, result.uncertain if has_two_networks else None),
+            segmented.file_xyz,
         )
 
 
