@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
+from amvnet.models.cpu_convolution import convolve
+
 
 class RingConv2d(nn.Conv2d):
     """A convolution over maps whose last axis is the azimuth.
@@ -22,10 +24,12 @@ class RingConv2d(nn.Conv2d):
         self, channels: int, out: int, kernel: int = 3, stride: tuple[int, int] = (1, 1)
     ) -> None:
         super().__init__(channels, out, kernel, stride, padding=(kernel // 2, 0), bias=False)
+        self.strides = stride
         self.wrap = kernel // 2
 
     def forward(self, input: Tensor) -> Tensor:
-        return super().forward(wrap_width(input, self.wrap, self.wrap))
+        padded = wrap_width(input, self.wrap, self.wrap)
+        return convolve(padded, self.weight, self.bias, self.strides, padding=(self.wrap, 0))
 
 
 def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
@@ -80,12 +84,15 @@ class PointLinear(nn.Linear):
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     """Apply a linear layer to rows: (N, C), with a weight (C', C), -> (N, C').
 
-    On a CPU it is computed as a convolution with kernels of one cell. There torch multiplies
-    matrices by MKL, which leaves half or more of an AMD processor's float32 performance unused.
-    oneDNN, which computes convolutions, does not.
+    Without gradients, it is computed on a CPU as a convolution with kernels of one cell. There
+    torch multiplies matrices by MKL, which leaves half or more of an AMD processor's float32
+    performance unused. oneDNN, which computes convolutions, does not; but the gradients of such a
+    convolution are slow.
     """
     # A convolution does not take an empty image.
-    if torch.compiler.is_compiling() or not x.is_cpu or not len(x):
+    needs_gradient = torch.is_grad_enabled() and (x.requires_grad or weight.requires_grad)
+    by_convolution = x.is_cpu and len(x) > 0 and not needs_gradient
+    if not by_convolution or torch.compiler.is_compiling():
         return F.linear(x, weight, bias)
 
     # (1, C, N, 1), with the channels last in memory
