@@ -232,6 +232,11 @@ def test_merging_trees_leaves_both_as_they_were() -> None:
         "training: {rv: {accumulate: 3}}",
         "training: {seed: -1}",
         "training: {augment: {flip: 1.5}}",
+        "training: {augment: {tilt: -1}}",
+        "training: {augment: {intensity_gamma: 4}}",
+        "training: {augment: {intensity_offset: 2}}",
+        "training: {augment: {laser_gain: 1}}",
+        "training: {augment: {paste: 1.1}}",
     ],
 )
 def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(

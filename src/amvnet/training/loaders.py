@@ -19,9 +19,28 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.training.augment import augment, mix
+from amvnet.training.augment import augment, mix, mix_lasers, paste
 
 Key = tuple[int, int]  # epoch, index in the list of scans
+
+# Small or rare objects of both benchmarks, which are pasted into other scans. Cars are common.
+PASTED = frozenset(
+    {
+        "barrier",
+        "bicycle",
+        "bicyclist",
+        "bus",
+        "construction_vehicle",
+        "motorcycle",
+        "motorcyclist",
+        "other-vehicle",
+        "pedestrian",
+        "person",
+        "traffic_cone",
+        "trailer",
+        "truck",
+    }
+)
 
 
 class ScanSet(data.Dataset[Scan]):
@@ -49,6 +68,9 @@ class ScanSet(data.Dataset[Scan]):
         self.augment = augment
         self.seed = seed
 
+        classes = enumerate(dataset.taxonomy.classes, start=1)
+        self.pasted = [train_id for train_id, name in classes if name in PASTED]
+
     def __len__(self) -> int:
         return len(self.records)
 
@@ -58,13 +80,23 @@ class ScanSet(data.Dataset[Scan]):
         if self.augment is None:
             return scan
 
+        # The order of the random draws decides which scan a seed gives: keep it.
+        config = self.augment
         rng = np.random.default_rng([self.seed, epoch, index])
-        scan = augment(scan, self.augment, rng)
-        if rng.random() >= self.augment.mix:
-            return scan
+        scan = augment(scan, config, rng)
+        if rng.random() < config.mix:
+            scan = mix(scan, self._draw_other(rng), rng)
+        if config.laser_mix and rng.random() < config.laser_mix:
+            scan = mix_lasers(scan, self._draw_other(rng), rng)
+        if config.paste and rng.random() < config.paste:
+            scan = paste(scan, self._draw_other(rng), self.pasted, rng)
+        return scan
 
+    def _draw_other(self, rng: np.random.Generator) -> Scan:
+        """Return a random scan, augmented, to mix with another one."""
+        assert self.augment is not None
         other = self._read(int(rng.integers(len(self))))
-        return mix(scan, augment(other, self.augment, rng), rng)
+        return augment(other, self.augment, rng)
 
     def _read(self, index: int) -> Scan:
         scan = self.dataset.read(self.records[index])
