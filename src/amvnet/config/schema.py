@@ -239,6 +239,10 @@ class NetworkTraining(Checked):
     """Share of the steps before the learning rate's peak (open)."""
     region: NotNegative = 1.0
     """Weight of the region loss (Dice or Lovász-softmax) relative to cross-entropy (open)."""
+    region_loss: Literal["default", "dice", "lovasz"] = "default"
+    """The region loss; by default the paper's: Dice for rv, Lovász-softmax for bev."""
+    loss_over: Literal["points", "voxels"] = "points"
+    """What the loss of bev is over; a voxel has the label of most of its points (PolarNet)."""
     class_weights: bool = True
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
     clip: Positive = 5.0
@@ -306,6 +310,15 @@ class TrainingConfig(Checked):
     """Lightning's accelerator: auto, cpu, gpu."""
     compile: bool = False
     """Compile the network with torch.compile: a slow start, then faster steps."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+
+        self.check(
+            holds=self.rv.loss_over == "points",
+            expected="rv.loss_over: points, as the range view has no voxels",
+            found=self.rv.loss_over,
+        )
 
 
 @dataclass(frozen=True)
