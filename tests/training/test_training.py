@@ -206,6 +206,30 @@ def test_an_interrupted_run_resumes_to_the_same_weights(
         assert not differing(load(tmp_path / "run" / path), load(run / path))
 
 
+def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    options = ("--stage", "rv", "--training.rv.ema", 0.8)
+    whole = train(world, tmp_path / "whole", *options)
+    last = tmp_path / "whole/rv/last.safetensors"
+    assert differing(load(last), load(run / "rv/last.safetensors")) == {"range_net"}
+
+    # The training itself is that without the average.
+    losses = column(tmp_path / "whole", "rv", "train/loss")
+    assert losses == column(run, "rv", "train/loss")
+    accuracies = column(tmp_path / "whole", "rv", "val/acc")
+    assert accuracies != column(run, "rv", "val/acc")
+
+    report = tmp_path / "report.json"
+    options_of_report = ("--weights", last, "--methods", "rv", "--json", report)
+    assert run_cli("evaluate", world / "data", *options_of_report)[0] == 0
+    accuracy = json.loads(report.read_text())["methods"]["rv"]["accuracy"]
+    assert accuracy == pytest.approx(accuracies[-1], abs=2e-3)
+
+    train_interrupted("rv", 1, world, tmp_path / "cut", *options)
+    assert not differing(train(world, tmp_path / "cut", *options, "--resume"), whole)
+
+
 def test_reading_in_other_processes_changes_nothing_resumed_or_not(
     world: Path, run: Path, tmp_path: Path
 ) -> None:

@@ -247,6 +247,8 @@ class NetworkTraining(Checked):
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
     clip: Positive = 5.0
     """Largest norm of the gradient; larger ones are scaled down (open)."""
+    ema: Annotated[float, Range(0, 0.99999)] = 0.0
+    """Decay of the exponential moving average of the weights that is used in the end; 0: none."""
     accumulate: Count = 1
     """Parts that each process splits its batch into, if it does not fit into memory."""
 
