@@ -227,6 +227,11 @@ class Speed(Callback):
             self._step = trainer.global_step
             self._step_start = now
 
+    @property
+    def elapsed(self) -> str:
+        """How long the current epoch has taken so far, with its validation, as h:mm:ss."""
+        return str(timedelta(seconds=round(time.perf_counter() - self._epoch_start)))
+
     def time_left(self, trainer: L.Trainer) -> str:
         """Return how long the rest of the training takes at this rate, as h:mm:ss."""
         batches = trainer.fit_loop.epoch_loop.batch_progress.current.completed
@@ -280,9 +285,10 @@ class EpochLines(Callback):
             results += f", val mIoU {miou:.4f} (classes present {miou_present:.4f})"
 
         speed = _speed_of(trainer)
-        pace = f"{speed.rate:.3g} {pl_module.unit}/s, {speed.time_left(trainer)} left"
+        pace = f"{speed.rate:.3g} {pl_module.unit}/s"
+        times = f"epoch in {speed.elapsed}, {speed.time_left(trainer)} left"
         epoch = f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
-        self.say(f"{epoch}: {results}; {pace}")
+        self.say(f"{epoch}: {results}; {pace}, {times}")
 
 
 class Pictures(Callback):
