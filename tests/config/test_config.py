@@ -113,6 +113,7 @@ def test_an_empty_tree_gives_the_defaults() -> None:
         ("model: {range_view: {fov_up: true}}", "fov_up"),
         ("model: {range_view: {rows: colour}}", "rows.*elevation, ring.*colour"),
         ("model: {range_view: {rows: [ring]}}", "rows"),
+        ("training: {rv: {region_loss: focal}}", "region_loss.*dice, lovasz.*focal"),
         ("model: {range_net: {gru: 1}}", "gru"),
         ("model: {range_net: {widths: 64}}", "widths"),
         ("model: {range_net: {widths: [64, wide]}}", "widths"),
@@ -230,8 +231,14 @@ def test_merging_trees_leaves_both_as_they_were() -> None:
         "training: {bev: {lr: 0}}",
         "training: {head: {warmup: 1}}",
         "training: {rv: {accumulate: 3}}",
+        "training: {rv: {loss_over: voxels}}",
         "training: {seed: -1}",
         "training: {augment: {flip: 1.5}}",
+        "training: {augment: {tilt: -1}}",
+        "training: {augment: {intensity_gamma: 4}}",
+        "training: {augment: {intensity_offset: 2}}",
+        "training: {augment: {laser_gain: 1}}",
+        "training: {augment: {paste: 1.1}}",
     ],
 )
 def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(

@@ -11,7 +11,17 @@ import pytest
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.scan import Scan
-from amvnet.training.augment import augment, mix, yaw_rotation
+from amvnet.training.augment import (
+    ELEVATION_BINS,
+    FAR,
+    augment,
+    lasers,
+    mix,
+    mix_lasers,
+    paste,
+    tilt_rotation,
+    yaw_rotation,
+)
 
 RandomScan = Callable[..., Scan]
 OFF = AugmentConfig(scale=0.0, flip=0.0, jitter=0.0, yaw=0.0)
@@ -28,6 +38,11 @@ def distances(scan: Scan) -> np.ndarray:
 def azimuths(scan: Scan) -> np.ndarray:
     """Return (N,) azimuths in radians."""
     return np.array([math.atan2(y, x) for x, y, _, _ in scan.points.tolist()])
+
+
+def elevations(scan: Scan) -> np.ndarray:
+    """Return (N,) angles above the horizon in radians."""
+    return np.array([math.atan2(z, math.hypot(x, y)) for x, y, z, _ in scan.points.tolist()])
 
 
 def winding(scan: Scan) -> float:
@@ -225,6 +240,257 @@ def test_a_mixed_scan_has_one_sector_of_another_scan(random_scan: RandomScan) ->
 
     assert 0.2 < min(shares) < 0.4
     assert 0.6 < max(shares) < 0.8
+
+
+def test_a_scan_of_mixed_lasers_has_bands_of_elevation_of_both(random_scan: RandomScan) -> None:
+    scan = random_scan(2000, 1)
+    other = random_scan(1500, 2)
+    counts = set()
+    for seed in range(30):
+        mixed = mix_lasers(scan, other, np.random.default_rng(seed))
+        is_foreign = from_other_scan(mixed, scan, other)
+
+        upwards = is_foreign[np.argsort(elevations(mixed))]
+        counts.add(1 + np.count_nonzero(upwards[1:] != upwards[:-1]))
+        assert 0.1 < is_foreign.sum() / len(other) < 0.9
+
+    assert counts == {3, 4, 5, 6}
+
+
+def test_scans_without_a_common_band_are_not_mixed_to_nothing() -> None:
+    high = Scan(np.array([[1, 0, 9, 0.5]], np.float32))
+    low = Scan(np.array([[1, 0, -9, 0.5]], np.float32))
+    for seed in range(30):
+        assert len(mix_lasers(high, low, np.random.default_rng(seed))) > 0
+
+
+def test_objects_are_pasted_at_their_place_and_turned_once_or_twice(
+    random_scan: RandomScan,
+) -> None:
+    scan = random_scan(200, 1)
+    other = random_scan(100, 2)
+    assert scan.labels is not None
+    assert other.labels is not None
+
+    classes = np.unique(other.labels)[1:3]
+    is_object = np.isin(other.labels, classes)
+    count = is_object.sum()
+    assert 0 < count < len(other)
+
+    copies = set()
+    for seed in range(20):
+        pasted = paste(scan, other, classes.tolist(), np.random.default_rng(seed))
+        assert np.array_equal(pasted.points[: len(scan)], scan.points)
+        added = pasted.points[len(scan) :].reshape(-1, count, 4)
+        assert np.array_equal(added[0], other.points[is_object])
+        copies.add(len(added) - 1)
+
+        # The copies keep their range, height and intensity.
+        radius = np.hypot(added[:, :, 0], added[:, :, 1])
+        np.testing.assert_allclose(radius[1:] - radius[0], 0, atol=1e-4)
+        assert (added[:, :, 2:] == added[0, :, 2:]).all()
+        assert not np.allclose(added[1], added[0])
+
+        assert pasted.labels is not None
+        assert pasted.ring is not None
+        times = len(added)
+        assert np.array_equal(pasted.labels[len(scan) :], np.tile(other.labels[is_object], times))
+        assert len(pasted.ring) == len(pasted)
+
+    assert copies == {1, 2}
+
+
+def test_without_objects_nothing_is_pasted(random_scan: RandomScan) -> None:
+    scan = random_scan(50, 1)
+    pasted = paste(scan, random_scan(50, 2), [], np.random.default_rng(0))
+    assert np.array_equal(pasted.points, scan.points)
+
+
+def test_tilting_keeps_distances_and_moves_the_vertical_within_its_limits(
+    random_scan: RandomScan,
+) -> None:
+    scan = random_scan(50)
+    scan.points[0] = (0, 0, 10, 0.5)
+    rolls = []
+    pitches = []
+    for seed in range(40):
+        changed = augmented(scan, replace(OFF, tilt=3.0), seed)
+        np.testing.assert_allclose(distances(changed), distances(scan), rtol=1e-5)
+        x, y, z, _ = changed.points[0].tolist()
+        rolls.append(math.degrees(math.asin(y / 10)))
+        pitches.append(math.degrees(math.atan2(x, z)))
+
+    for angles in (rolls, pitches):
+        assert -3 <= min(angles) < -1.5
+        assert 1.5 < max(angles) <= 3
+
+
+def test_a_roll_lifts_the_left_and_a_pitch_lowers_the_front() -> None:
+    quarter = math.pi / 2
+    np.testing.assert_allclose(tilt_rotation(quarter, 0) @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(tilt_rotation(0, quarter) @ [1, 0, 0], [0, 0, -1], atol=1e-12)
+
+
+@pytest.mark.parametrize("change", ["intensity_offset", "intensity_gamma", "intensity_noise"])
+def test_a_changed_intensity_stays_between_0_and_1_and_leaves_the_rest(
+    random_scan: RandomScan, change: str
+) -> None:
+    scan = random_scan(500)
+    for seed in range(20):
+        changed = augmented(scan, replace(OFF, **{change: 0.9}), seed)
+        assert np.array_equal(changed.points[:, :3], scan.points[:, :3])
+        assert not np.array_equal(changed.points[:, 3], scan.points[:, 3])
+        assert changed.points[:, 3].min() >= 0
+        assert changed.points[:, 3].max() <= 1
+
+
+def test_an_offset_and_an_exponent_are_those_of_the_whole_scan(random_scan: RandomScan) -> None:
+    scan = random_scan(500)
+    scan.points[:, 3] = np.linspace(0.3, 0.7, 500)
+    intensity = scan.points[:, 3]
+    offsets = []
+    exponents = []
+    for seed in range(30):
+        shifted = augmented(scan, replace(OFF, intensity_offset=0.2), seed).points[:, 3]
+        np.testing.assert_allclose(shifted - intensity, shifted[0] - intensity[0], atol=1e-6)
+        offsets.append(shifted[0] - intensity[0])
+
+        bent = augmented(scan, replace(OFF, intensity_gamma=0.5), seed).points[:, 3]
+        ratio = np.log(bent) / np.log(intensity)
+        np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
+        exponents.append(math.log(ratio[0]))
+
+    assert -0.2 <= min(offsets) < -0.1
+    assert 0.1 < max(offsets) <= 0.2
+    assert -0.5 <= min(exponents) < -0.25
+    assert 0.25 < max(exponents) <= 0.5 + 1e-4
+
+
+def test_every_laser_is_dimmed_by_one_factor_of_its_own(random_scan: RandomScan) -> None:
+    scan = random_scan(2000)
+    assert scan.ring is not None
+    scan.points[:, 3] = np.random.default_rng(0).uniform(0.1, 0.6, len(scan))
+    gains = augmented(scan, replace(OFF, laser_gain=0.4)).points[:, 3] / scan.points[:, 3]
+
+    factors = []
+    for ring in np.unique(scan.ring):
+        of_ring = gains[scan.ring == ring]
+        np.testing.assert_allclose(of_ring, of_ring[0], rtol=1e-5)
+        factors.append(of_ring[0])
+    assert 0.6 <= min(factors) < max(factors) <= 1.4
+    assert len(np.unique(np.round(factors, 4))) > len(factors) / 2
+
+
+def test_a_scan_without_intensity_gets_none(random_scan: RandomScan) -> None:
+    config = replace(OFF, no_intensity=1.0, intensity_offset=0.5, intensity_noise=0.5)
+    assert not augmented(random_scan(50), config).points[:, 3].any()
+
+
+def test_lasers_without_rings_are_bins_of_elevation(random_scan: RandomScan) -> None:
+    scan = replace(random_scan(5000), ring=None)
+    scan.points[3, 0] = math.nan
+    bins = lasers(scan)
+    assert bins.min() == 0
+    assert bins.max() == ELEVATION_BINS - 1
+
+    valid = scan.valid
+    order = np.argsort(elevations(scan)[valid])
+    assert (np.diff(bins[valid][order]) >= 0).all()
+
+
+def test_whole_lasers_are_dropped_every_second_or_at_random(random_scan: RandomScan) -> None:
+    scan = random_scan(3000)
+    assert scan.ring is not None
+    all_rings = range(scan.ring.max() + 1)
+    halves = [set(all_rings[::2]), set(all_rings[1::2])]
+    second = 0
+    shares = []
+    for seed in range(60):
+        changed = augmented(scan, replace(OFF, laser_drop=1.0), seed)
+        assert changed.ring is not None
+        rings = set(changed.ring.tolist())
+        assert len(changed) == np.isin(scan.ring, list(rings)).sum()
+
+        is_every_second = rings in halves
+        second += is_every_second
+        if not is_every_second:
+            shares.append(1 - len(rings) / len(all_rings))
+
+    assert 15 < second < 45
+    assert min(shares) < 0.15
+    assert 0.3 < max(shares) < 0.9
+
+
+def test_dropped_blocks_are_rectangles_of_azimuth_and_elevation(random_scan: RandomScan) -> None:
+    scan = random_scan(4000)
+    index_of = index_by_point(scan)
+    shares = []
+    for seed in range(30):
+        changed = augmented(scan, replace(OFF, block_drop=1.0), seed)
+        kept = [index_of[tuple(row)] for row in changed.points.tolist()]
+        is_lost = np.ones(len(scan), bool)
+        is_lost[kept] = False
+        shares.append(is_lost.mean())
+
+        # Most of the neighbours of a lost point are lost, too.
+        angles = np.stack([azimuths(scan) * np.cos(elevations(scan)), elevations(scan)], axis=1)
+        if is_lost.sum() > 50:
+            distance = np.abs(angles[is_lost][:, None] - angles[None]).max(axis=2)
+            nearest = np.argsort(distance, axis=1)[:, :12]
+            assert is_lost[nearest].mean() > 0.5
+
+    assert 0 < np.mean(shares) < 0.2
+    assert max(shares) < 0.5
+
+
+def test_points_beyond_a_range_are_dropped_together(random_scan: RandomScan) -> None:
+    scan = random_scan(1000)
+    scan.points[:, :3] *= 80 / np.median(distances(scan))
+    before = distances(scan)
+    for seed in range(20):
+        after = distances(augmented(scan, replace(OFF, far_drop=1.0), seed))
+        reach = after.max()
+        assert reach <= FAR[1]
+        assert len(after) == (before <= reach).sum()
+        assert (before <= FAR[0]).sum() <= len(after)
+
+
+@pytest.mark.parametrize("drop", ["laser_drop", "block_drop", "far_drop"])
+def test_what_is_dropped_with_a_probability_leaves_other_scans_alone(
+    random_scan: RandomScan, drop: str
+) -> None:
+    scan = random_scan(3000)
+    scan.points[:, :3] *= 80 / np.median(distances(scan))
+    whole = 0
+    for seed in range(60):
+        whole += len(augmented(scan, replace(OFF, **{drop: 0.3}), seed)) == len(scan)
+    assert 30 < whole < 58
+
+
+def test_a_scan_of_one_point_outlasts_every_kind_of_drop() -> None:
+    scan = Scan(np.array([[90, 0, 1, 0.5]], np.float32), ring=np.zeros(1, np.int64))
+    config = replace(OFF, laser_drop=1.0, block_drop=1.0, far_drop=1.0, drop=0.9)
+    for seed in range(30):
+        assert len(augmented(scan, config, seed)) == 1
+
+
+def test_what_is_off_takes_no_random_numbers(random_scan: RandomScan) -> None:
+    """A seed gives the same scan as before there were these kinds of augmentation."""
+    scan = random_scan(50)
+    rng = np.random.default_rng(3)
+    changed = augment(scan, AugmentConfig(drop=0.2, intensity=0.1), rng)
+
+    expected = np.random.default_rng(3)
+    expected.random(len(scan))
+    expected.uniform(0, 0.2)
+    expected.uniform(-0.05, 0.05)
+    expected.random(2)
+    expected.standard_normal((len(changed), 3), dtype=np.float32)
+    expected.uniform(-180, 180)
+    expected.uniform(0, 0)
+    expected.random()
+    expected.uniform(-0.1, 0.1)
+    assert rng.bit_generator.state == expected.bit_generator.state
 
 
 def from_other_scan(mixed: Scan, scan: Scan, other: Scan) -> np.ndarray:

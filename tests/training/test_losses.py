@@ -15,6 +15,7 @@ from amvnet.training.losses import (
     class_weights,
     dice,
     lovasz_softmax,
+    majority_labels,
     polar_view_loss,
     range_view_loss,
 )
@@ -113,6 +114,34 @@ def test_a_loss_is_cross_entropy_plus_the_weighted_region_loss(
     region = region_loss(logits[labelled].softmax(dim=1), labels[labelled] - 1)
     expected = loss(logits, labels, None, 0.0) + 1.5 * region
     torch.testing.assert_close(loss(logits, labels, None, 1.5), expected)
+
+
+@LOSSES
+@pytest.mark.parametrize("region_loss", [dice, lovasz_softmax])
+def test_either_network_may_have_either_region_loss(
+    loss: Callable[..., Tensor], region_loss: Callable[..., Tensor]
+) -> None:
+    logits, labels = example()
+    labelled = labels > 0
+    region = region_loss(logits[labelled].softmax(dim=1), labels[labelled] - 1)
+    expected = loss(logits, labels, None, 0.0) + region
+    torch.testing.assert_close(loss(logits, labels, None, 1.0, region_loss), expected)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_voxel_has_the_label_of_most_of_its_labelled_points(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    cells = torch.randint(0, 40, (150,), generator=generator)
+    labels = torch.randint(0, K + 1, (150,), generator=generator)
+    labels[torch.rand(150, generator=generator) < 0.5] = 0
+
+    expected = []
+    for cell in range(40):
+        inside = labels[cells == cell].tolist()
+        counts = [inside.count(train_id) for train_id in range(1, K + 1)]
+        expected.append(counts.index(max(counts)) + 1 if max(counts) else 0)
+    assert 0 in expected
+    assert majority_labels(cells, labels, 40, K).tolist() == expected
 
 
 @pytest.mark.parametrize("seed", range(4))

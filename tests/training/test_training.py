@@ -18,6 +18,7 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from amvnet.data.datasets import simulated
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import PointGatherer
 from amvnet.weights.file import PARTS, Weights, load
@@ -28,6 +29,7 @@ from fixtures.worlds import (
     GOLDEN,
     ROAD,
     SIDEWALK,
+    fake_drive,
     files,
     label_map,
     make_streets,
@@ -204,6 +206,54 @@ def test_an_interrupted_run_resumes_to_the_same_weights(
     for name in ("best", "last"):
         path = f"{stage}/{name}.safetensors"
         assert not differing(load(tmp_path / "run" / path), load(run / path))
+
+
+def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    options = ("--stage", "rv", "--training.rv.ema", 0.8)
+    whole = train(world, tmp_path / "whole", *options)
+    last = tmp_path / "whole/rv/last.safetensors"
+    assert differing(load(last), load(run / "rv/last.safetensors")) == {"range_net"}
+
+    # The training itself is that without the average.
+    losses = column(tmp_path / "whole", "rv", "train/loss")
+    assert losses == column(run, "rv", "train/loss")
+    accuracies = column(tmp_path / "whole", "rv", "val/acc")
+    assert accuracies != column(run, "rv", "val/acc")
+
+    report = tmp_path / "report.json"
+    options_of_report = ("--weights", last, "--methods", "rv", "--json", report)
+    assert run_cli("evaluate", world / "data", *options_of_report)[0] == 0
+    accuracy = json.loads(report.read_text())["methods"]["rv"]["accuracy"]
+    assert accuracy == pytest.approx(accuracies[-1], abs=2e-3)
+
+    train_interrupted("rv", 1, world, tmp_path / "cut", *options)
+    assert not differing(train(world, tmp_path / "cut", *options, "--resume"), whole)
+
+
+def test_every_second_epoch_on_simulated_streets_has_fresh_ones_resumed_or_not(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simulated, "drive_street", fake_drive)
+    monkeypatch.setattr(simulated, "SCANS", 2)
+    options = ("--stage", "rv", "--train-sequences", "0,1", "--val-sequences", "900000")
+    data = ("--data", f"simulated-hdl64e:{tmp_path / 'cache'}")
+    whole = train(world, tmp_path / "whole", *options, *data)
+    streets = {path.name for path in tmp_path.glob("cache/streets-*/*")}
+    assert streets == {"000000", "000001", "001000", "001001", "900000"}
+    with np.load(tmp_path / "whole/class_counts.npz") as file:
+        assert {name[:6] for name in file["scans"].tolist()} == {"000000", "000001"}
+
+    # Another cache, which a worker fills.
+    others = ("--data", f"simulated-hdl64e:{tmp_path / 'other'}", "--training.workers", 1)
+    train_interrupted("rv", 1, world, tmp_path / "cut", *options, *others)
+    shutil.rmtree(tmp_path / "other")
+    resumed = train(world, tmp_path / "cut", *options, *others, "--resume")
+    assert not differing(resumed, whole)
+
+    repeat = yaml.safe_load((tmp_path / "cut/run.yaml").read_text())["rv"]["repeat"]
+    assert f"--data simulated-hdl64e:{tmp_path / 'other'}" in repeat
 
 
 def test_reading_in_other_processes_changes_nothing_resumed_or_not(

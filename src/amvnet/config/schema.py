@@ -193,14 +193,34 @@ class AugmentConfig(Checked):
     """Rotation about the vertical by up to +- this, degrees."""
     height: NotNegative = 0.0
     """Vertical shift by up to +- this, metres: sensors are mounted at various heights (open)."""
+    tilt: Annotated[float, Range(0, 45)] = 0.0
+    """Roll and pitch of the sensor by up to +- this each, degrees (open)."""
     intensity: Annotated[float, Range(0, 0.99)] = 0.0
     """Scaling of the intensity by 1 +- this, one factor per scan: calibrations differ (open)."""
+    intensity_offset: Share = 0.0
+    """Shift of the intensity by up to +- this, the same in all of a scan (open)."""
+    intensity_gamma: Annotated[float, Range(0, 3)] = 0.0
+    """Intensity to the power of exp(+- up to this), one exponent per scan (open)."""
+    intensity_noise: Share = 0.0
+    """Standard deviation of the noise on the intensity of each point (open)."""
+    laser_gain: Annotated[float, Range(0, 0.99)] = 0.0
+    """Scaling of the intensity by 1 +- this, one factor per scan and laser (open)."""
     no_intensity: Share = 0.0
     """Probability of removing the intensity of a scan (open)."""
     drop: Annotated[float, Range(0, 0.99)] = 0.0
     """Largest share of the points that is dropped from a scan at random (open)."""
+    laser_drop: Share = 0.0
+    """Probability of dropping every second laser of a scan, or up to half of them (open)."""
+    block_drop: Share = 0.0
+    """Probability of dropping a few rectangles of azimuth and elevation, as if hidden (open)."""
+    far_drop: Share = 0.0
+    """Probability of dropping all points beyond some range from 25 to 60 m (open)."""
     mix: Share = 0.0
     """Probability of replacing a sector by that of another training scan (PolarMix; open)."""
+    laser_mix: Share = 0.0
+    """Probability of taking every second band of elevation from another scan (LaserMix; open)."""
+    paste: Share = 0.0
+    """Probability of adding the rare objects of another scan, also turned (PolarMix; open)."""
 
 
 @dataclass(frozen=True)
@@ -219,10 +239,16 @@ class NetworkTraining(Checked):
     """Share of the steps before the learning rate's peak (open)."""
     region: NotNegative = 1.0
     """Weight of the region loss (Dice or Lovász-softmax) relative to cross-entropy (open)."""
+    region_loss: Literal["default", "dice", "lovasz"] = "default"
+    """The region loss; by default the paper's: Dice for rv, Lovász-softmax for bev."""
+    loss_over: Literal["points", "voxels"] = "points"
+    """What the loss of bev is over; a voxel has the label of most of its points (PolarNet)."""
     class_weights: bool = True
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
     clip: Positive = 5.0
     """Largest norm of the gradient; larger ones are scaled down (open)."""
+    ema: Annotated[float, Range(0, 0.99999)] = 0.0
+    """Decay of the exponential moving average of the weights that is used in the end; 0: none."""
     accumulate: Count = 1
     """Parts that each process splits its batch into, if it does not fit into memory."""
 
@@ -286,6 +312,15 @@ class TrainingConfig(Checked):
     """Lightning's accelerator: auto, cpu, gpu."""
     compile: bool = False
     """Compile the network with torch.compile: a slow start, then faster steps."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+
+        self.check(
+            holds=self.rv.loss_over == "points",
+            expected="rv.loss_over: points, as the range view has no voxels",
+            found=self.rv.loss_over,
+        )
 
 
 @dataclass(frozen=True)

@@ -3,20 +3,38 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.scan import Scan
 
+ELEVATION_BINS = 64  # take the place of the lasers of a scan without ring indices
+OUTLIERS = 0.5  # percent of the points below the lowest bin, and above the highest
+
+MOST_LASERS = 0.5  # largest share of the lasers that is dropped at random
+MOST_BLOCKS = 4  # dropped from one scan
+BLOCK_WIDTH = (5.0, 40.0)  # degrees of azimuth
+BLOCK_HEIGHT = (3.0, 12.0)  # degrees of elevation
+FAR = (25.0, 60.0)  # metres: the range of a dimmed or fogged sensor
+BANDS = (3, 6)  # bands of elevation of mixed scans, fewest and most; LaserMix's own numbers
+TURNS = (1, 2)  # turned copies of pasted objects, fewest and most
+
 
 def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan:
     """Return a randomly changed copy of a scan; the same generator state gives the same copy.
 
-    Points are dropped, scaled, mirrored, jittered, rotated about the vertical and lifted.
-    Intensities are scaled, or all set to zero.
+    Points are dropped, scaled, mirrored, jittered, rotated about the vertical, lifted and tilted.
+    Intensities are scaled, distorted, shifted, or all set to zero.
     """
     # The order of the random draws decides which scan a seed gives: keep it.
+    if config.laser_drop and rng.random() < config.laser_drop:
+        scan = _drop_lasers(scan, rng)
+    if config.block_drop and rng.random() < config.block_drop:
+        scan = _drop_blocks(scan, rng)
+    if config.far_drop and rng.random() < config.far_drop:
+        scan = _keep(scan, ~(_ranges(scan) > rng.uniform(*FAR)))
     if config.drop:
         scan = _drop_points(scan, config.drop, rng)
 
@@ -29,8 +47,14 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
     yaw = np.radians(rng.uniform(-config.yaw, config.yaw))
     xyz[:, :2] = xyz[:, :2] @ yaw_rotation(yaw).T
     xyz[:, 2] += rng.uniform(-config.height, config.height)
+    if config.tilt:
+        roll, pitch = np.radians(rng.uniform(-config.tilt, config.tilt, 2))
+        xyz = xyz @ tilt_rotation(roll, pitch).T
 
-    intensity = np.minimum(scan.points[:, 3:] * _intensity_gain(config, rng), 1)
+    intensity = np.minimum(scan.points[:, 3] * _intensity_gain(config, rng), 1)
+    # What has no intensity stays without one.
+    if intensity.any():
+        intensity = _distort_intensity(intensity, scan, config, rng)
     points = np.column_stack([xyz, intensity]).astype(np.float32)
     return dataclasses.replace(scan, points=points)
 
@@ -46,13 +70,52 @@ def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
 
     outside = _select(scan, ~_in_sector(scan, start, width))
     inside = _select(other, _in_sector(other, start, width))
-    points = np.concatenate([outside.points, inside.points])
-    if len(points) == 0:
-        return scan
+    mixed = _join(outside, inside)
+    return mixed if len(mixed) else scan
 
-    labels = _concatenate(outside.labels, inside.labels)
-    ring = _concatenate(outside.ring, inside.ring)
-    return dataclasses.replace(scan, points=points, labels=labels, ring=ring)
+
+def mix_lasers(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
+    """Replace every second band of elevation with that of another scan (Kong et al., 2023).
+
+    The bands are equally high and cover both scans. The scan is returned as it is if no point would
+    be left.
+    """
+    bands = int(rng.integers(BANDS[0], BANDS[1] + 1))
+    first = int(rng.integers(2))
+
+    elevation = _elevations(scan)
+    other_elevation = _elevations(other)
+    lowest, highest = _spread(np.concatenate([elevation, other_elevation]))
+    borders = np.linspace(lowest, highest, bands + 1)[1:-1]
+
+    rows = np.searchsorted(borders, elevation, side="right")
+    other_rows = np.searchsorted(borders, other_elevation, side="right")
+    mixed = _join(_select(scan, rows % 2 == first), _select(other, other_rows % 2 != first))
+    return mixed if len(mixed) else scan
+
+
+def paste(scan: Scan, other: Scan, classes: Sequence[int], rng: np.random.Generator) -> Scan:
+    """Add the points of some classes of another scan (Xiao et al., 2022).
+
+    They are added at their place, and once or twice more, rotated by a random yaw. What they hide
+    stays in the scan.
+
+    Args:
+        scan: the scan to add to.
+        other: a scan with labels.
+        classes: the train ids to add.
+    """
+    assert other.labels is not None
+    objects = _select(other, np.isin(other.labels, classes) & other.valid)
+    copies = [objects]
+    for yaw in rng.uniform(-np.pi, np.pi, rng.integers(TURNS[0], TURNS[1] + 1)):
+        points = objects.points.copy()
+        points[:, :2] = points[:, :2] @ yaw_rotation(yaw).T
+        copies.append(dataclasses.replace(objects, points=points))
+
+    for copy in copies:
+        scan = _join(scan, copy)
+    return scan
 
 
 def yaw_rotation(yaw: float) -> np.ndarray:
@@ -62,11 +125,66 @@ def yaw_rotation(yaw: float) -> np.ndarray:
     return np.array([[cos, -sin], [sin, cos]])
 
 
+def tilt_rotation(roll: float, pitch: float) -> np.ndarray:
+    """Return the (3, 3) matrix that rotates x, y, z about x by `roll`, then about y by `pitch`.
+
+    Both are in radians.
+    """
+    about_x = np.eye(3)
+    about_x[1:, 1:] = yaw_rotation(roll)
+    about_y = np.eye(3)
+    about_y[::2, ::2] = yaw_rotation(pitch).T
+    return about_y @ about_x
+
+
+def lasers(scan: Scan) -> np.ndarray:
+    """Return the (N,) index of each point's laser, 0 or above.
+
+    Without ring indices, it is one of `ELEVATION_BINS` equal bins of elevation, which come near to
+    the lasers of an HDL-64E.
+    """
+    if scan.ring is not None:
+        return scan.ring
+
+    elevation = np.nan_to_num(_elevations(scan))
+    lowest, highest = _spread(elevation)
+    borders = np.linspace(lowest, highest, ELEVATION_BINS + 1)[1:-1]
+    return np.searchsorted(borders, elevation, side="right")
+
+
 def _drop_points(scan: Scan, most: float, rng: np.random.Generator) -> Scan:
     """Drop a random share of the points, up to `most`; keep all if none would be left."""
     draws = rng.random(len(scan))
-    keep = draws >= rng.uniform(0, most)
-    return _select(scan, keep) if keep.any() else scan
+    return _keep(scan, draws >= rng.uniform(0, most))
+
+
+def _drop_lasers(scan: Scan, rng: np.random.Generator) -> Scan:
+    """Drop every second laser, or a random share of them up to `MOST_LASERS`."""
+    laser = lasers(scan)
+    count = laser.max(initial=0) + 1
+    draws = rng.random(count)
+    share = rng.uniform(0, MOST_LASERS)
+    odd = rng.integers(2)
+
+    keep = draws >= share
+    if rng.random() < 0.5:
+        keep = np.arange(count) % 2 == odd
+    return _keep(scan, keep[laser])
+
+
+def _drop_blocks(scan: Scan, rng: np.random.Generator) -> Scan:
+    """Drop up to `MOST_BLOCKS` rectangles of azimuth and elevation."""
+    elevation = np.degrees(_elevations(scan))
+    lowest, highest = _spread(elevation)
+
+    is_hidden = np.zeros(len(scan), dtype=bool)
+    for _ in range(rng.integers(1, MOST_BLOCKS + 1)):
+        start = rng.uniform(-np.pi, np.pi)
+        width = np.radians(rng.uniform(*BLOCK_WIDTH))
+        height = rng.uniform(*BLOCK_HEIGHT)
+        middle = rng.uniform(lowest, highest)
+        is_hidden |= _in_sector(scan, start, width) & (np.abs(elevation - middle) < height / 2)
+    return _keep(scan, ~is_hidden)
 
 
 def _intensity_gain(config: AugmentConfig, rng: np.random.Generator) -> float:
@@ -75,16 +193,70 @@ def _intensity_gain(config: AugmentConfig, rng: np.random.Generator) -> float:
     return 1 + rng.uniform(-config.intensity, config.intensity)
 
 
+def _distort_intensity(
+    intensity: np.ndarray, scan: Scan, config: AugmentConfig, rng: np.random.Generator
+) -> np.ndarray:
+    """Return (N,) intensities of a scan in [0, 1], as another calibration would give them."""
+    if config.intensity_gamma:
+        exponent = np.exp(rng.uniform(-config.intensity_gamma, config.intensity_gamma))
+        intensity = np.maximum(intensity, 0) ** exponent
+    if config.laser_gain:
+        laser = lasers(scan)
+        gains = 1 + rng.uniform(-config.laser_gain, config.laser_gain, laser.max(initial=0) + 1)
+        intensity = np.minimum(intensity * gains[laser], 1)
+    if config.intensity_offset:
+        offset = rng.uniform(-config.intensity_offset, config.intensity_offset)
+        intensity = np.clip(intensity + offset, 0, 1)
+    if config.intensity_noise:
+        noise = rng.normal(scale=config.intensity_noise, size=len(scan))
+        intensity = np.clip(intensity + noise, 0, 1)
+    return intensity
+
+
 def _in_sector(scan: Scan, start: float, width: float) -> np.ndarray:
     """Return (N,) bool: the points whose azimuth is at most `width` radians beyond `start`."""
     azimuth = np.arctan2(scan.points[:, 1], scan.points[:, 0])
     return (azimuth - start) % (2 * np.pi) < width
 
 
+def _elevations(scan: Scan) -> np.ndarray:
+    """Return (N,) angles above the horizon, radians."""
+    x, y, z = scan.points[:, :3].T
+    return np.arctan2(z, np.hypot(x, y))
+
+
+def _ranges(scan: Scan) -> np.ndarray:
+    """Return (N,) distances from the sensor, metres."""
+    return np.linalg.norm(scan.points[:, :3], axis=1)
+
+
+def _spread(values: np.ndarray) -> np.ndarray:
+    """Return the lowest and the highest finite value without `OUTLIERS`, or zeros without any."""
+    finite = values[np.isfinite(values)]
+    if len(finite) == 0:
+        return np.zeros(2)
+    return np.percentile(finite, [OUTLIERS, 100 - OUTLIERS])
+
+
+def _keep(scan: Scan, mask: np.ndarray) -> Scan:
+    """Return a part of a scan, or the scan itself if no point would be left."""
+    return _select(scan, mask) if mask.any() else scan
+
+
 def _select(scan: Scan, mask: np.ndarray) -> Scan:
     labels = None if scan.labels is None else scan.labels[mask]
     ring = None if scan.ring is None else scan.ring[mask]
     return dataclasses.replace(scan, points=scan.points[mask], labels=labels, ring=ring)
+
+
+def _join(scan: Scan, other: Scan) -> Scan:
+    """Return the first scan with the points of both."""
+    return dataclasses.replace(
+        scan,
+        points=np.concatenate([scan.points, other.points]),
+        labels=_concatenate(scan.labels, other.labels),
+        ring=_concatenate(scan.ring, other.ring),
+    )
 
 
 def _concatenate(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,78 @@ from amvnet.scan import Scan
 
 PICTURE_ROUNDS = 10  # about how many times in a training pictures are drawn
 PICTURE_DPI = 60
+
+
+class AverageWeights(Callback):
+    """Keeps an exponential moving average of the weights, which is validated and written.
+
+    The statistics of batch norms are averaged, too. The training itself goes on with the weights of
+    its own.
+
+    Args:
+        decay: share of the average that a step keeps. Early steps keep less, so that the initial
+            weights are soon forgotten.
+    """
+
+    def __init__(self, decay: float) -> None:
+        self.decay = decay
+        self.average: dict[str, Tensor] = {}
+        self.steps = 0  # that are in the average
+        self._raw: dict[str, Tensor] = {}  # the weights of the training, while it is validated
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"average": self.average, "steps": self.steps}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.average = state_dict["average"]
+        self.steps = state_dict["steps"]
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        weights = _trained_part(pl_module).state_dict()
+        if not self.average:
+            self.average = _copies(weights)
+
+        for name, value in weights.items():
+            self.average[name] = self.average[name].to(value.device)
+
+    @torch.no_grad()
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        # A step may take several batches, whose gradients are accumulated.
+        if trainer.global_step == self.steps:
+            return
+
+        decay = min(self.decay, (1 + self.steps) / (10 + self.steps))
+        for name, value in _trained_part(pl_module).state_dict().items():
+            if value.is_floating_point():
+                self.average[name].lerp_(value, 1 - decay)
+            else:
+                self.average[name].copy_(value)
+        self.steps = trainer.global_step
+
+    def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._insert(_trained_part(pl_module))
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._remove(_trained_part(pl_module))
+
+    @contextmanager
+    def inserted(self, part: nn.Module) -> Iterator[None]:
+        """Let a module have the averaged weights within the block."""
+        self._insert(part)
+        try:
+            yield
+        finally:
+            self._remove(part)
+
+    def _insert(self, part: nn.Module) -> None:
+        self._raw = _copies(part.state_dict())
+        part.load_state_dict(self.average)
+
+    def _remove(self, part: nn.Module) -> None:
+        part.load_state_dict(self._raw)
+        self._raw = {}
 
 
 class KeepWeights(Callback):
@@ -63,10 +136,10 @@ class KeepWeights(Callback):
             self.highest = max(self.highest, miou)
 
         if trainer.is_global_zero:
-            part = _trained_part(pl_module)
-            self.write(part, self.last, metrics)
-            if is_best:
-                self.write(part, self.best, metrics)
+            with _weights_to_keep(trainer, pl_module) as part:
+                self.write(part, self.last, metrics)
+                if is_best:
+                    self.write(part, self.best, metrics)
 
 
 class Curves(Callback):
@@ -154,6 +227,11 @@ class Speed(Callback):
             self._step = trainer.global_step
             self._step_start = now
 
+    @property
+    def elapsed(self) -> str:
+        """How long the current epoch has taken so far, with its validation, as h:mm:ss."""
+        return str(timedelta(seconds=round(time.perf_counter() - self._epoch_start)))
+
     def time_left(self, trainer: L.Trainer) -> str:
         """Return how long the rest of the training takes at this rate, as h:mm:ss."""
         batches = trainer.fit_loop.epoch_loop.batch_progress.current.completed
@@ -207,9 +285,10 @@ class EpochLines(Callback):
             results += f", val mIoU {miou:.4f} (classes present {miou_present:.4f})"
 
         speed = _speed_of(trainer)
-        pace = f"{speed.rate:.3g} {pl_module.unit}/s, {speed.time_left(trainer)} left"
+        pace = f"{speed.rate:.3g} {pl_module.unit}/s"
+        times = f"epoch in {speed.elapsed}, {speed.time_left(trainer)} left"
         epoch = f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
-        self.say(f"{epoch}: {results}; {pace}")
+        self.say(f"{epoch}: {results}; {pace}, {times}")
 
 
 class Pictures(Callback):
@@ -234,13 +313,13 @@ class Pictures(Callback):
         if not (trainer.is_global_zero and is_due):
             return
 
-        part = _trained_part(pl_module)
-        parameter = next(part.parameters())
-        part.eval()
-        for scan in self.scans:
-            batch = PointBatch.of([scan]).to(parameter.device).to(parameter.dtype)
-            self._draw(scan, batch, trainer)
-        part.train()
+        with _weights_to_keep(trainer, pl_module) as part:
+            parameter = next(part.parameters())
+            part.eval()
+            for scan in self.scans:
+                batch = PointBatch.of([scan]).to(parameter.device).to(parameter.dtype)
+                self._draw(scan, batch, trainer)
+            part.train()
 
     @torch.no_grad()
     def _draw(self, scan: Scan, batch: PointBatch, trainer: L.Trainer) -> None:
@@ -266,6 +345,24 @@ def _speed_of(trainer: L.Trainer) -> Speed:
     """Return the callback that measures the speed of this training."""
     callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
     return next(callback for callback in callbacks if isinstance(callback, Speed))
+
+
+@contextmanager
+def _weights_to_keep(trainer: L.Trainer, module: L.LightningModule) -> Iterator[nn.Module]:
+    """Yield the trained part, with the averaged weights within the block if there are any."""
+    part = _trained_part(module)
+    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    averages = [callback for callback in callbacks if isinstance(callback, AverageWeights)]
+    if not averages:
+        yield part
+        return
+
+    with averages[0].inserted(part):
+        yield part
+
+
+def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name: tensor.clone() for name, tensor in tensors.items()}
 
 
 def _trained_part(module: L.LightningModule) -> nn.Module:

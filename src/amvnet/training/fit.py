@@ -19,7 +19,7 @@ from torch.utils.data import DataLoader
 from amvnet.config.schema import TrainingConfig
 from amvnet.distributed import device_of, environment
 from amvnet.errors import InputError
-from amvnet.training.callbacks import Bar, Curves, EpochLines, SeedBatches, Speed
+from amvnet.training.callbacks import AverageWeights, Bar, Curves, EpochLines, SeedBatches, Speed
 from amvnet.training.run_plan import RunOptions
 from amvnet.training.stages import Stage
 from amvnet.training.sync_batch_norm import synchronise_batch_norms
@@ -40,6 +40,7 @@ class FitOptions:
         run: how the run goes: resumed or not, with which processes.
         accumulate: parts of a batch, whose gradients are accumulated before a step.
         clip: largest norm of the gradient; None does not clip.
+        ema: decay of the moving average of the weights; 0 for none.
         steps: end after this many, for a trial; then nothing is validated or written.
     """
 
@@ -49,6 +50,7 @@ class FitOptions:
     run: RunOptions
     accumulate: int = 1
     clip: float | None = None
+    ema: float = 0.0
     steps: int | None = None
 
 
@@ -103,6 +105,8 @@ def _trainer(options: FitOptions, loaders: Loaders, callbacks: Sequence[Callback
     bars = options.run.bars and processes.first
 
     all_callbacks = [*callbacks, SeedBatches(training.seed, processes.rank)]
+    if options.ema:
+        all_callbacks.append(AverageWeights(options.ema))
     if not is_trial:
         all_callbacks += [
             Curves(folder / "metrics.csv"),

@@ -19,16 +19,35 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.training.augment import augment, mix
+from amvnet.training.augment import augment, mix, mix_lasers, paste
 
 Key = tuple[int, int]  # epoch, index in the list of scans
+
+# Small or rare objects of both benchmarks, which are pasted into other scans. Cars are common.
+PASTED = frozenset(
+    {
+        "barrier",
+        "bicycle",
+        "bicyclist",
+        "bus",
+        "construction_vehicle",
+        "motorcycle",
+        "motorcyclist",
+        "other-vehicle",
+        "pedestrian",
+        "person",
+        "traffic_cone",
+        "trailer",
+        "truck",
+    }
+)
 
 
 class ScanSet(data.Dataset[Scan]):
     """Labelled scans by epoch and index.
 
     The augmentation depends on nothing but seed, epoch and index: it is the same on any number of
-    processes.
+    processes. Augmented scans are those of the epoch (`Dataset.at_epoch`).
 
     Args:
         dataset: reads the scans.
@@ -49,25 +68,43 @@ class ScanSet(data.Dataset[Scan]):
         self.augment = augment
         self.seed = seed
 
+        classes = enumerate(dataset.taxonomy.classes, start=1)
+        self.pasted = [train_id for train_id, name in classes if name in PASTED]
+
     def __len__(self) -> int:
         return len(self.records)
 
     def __getitem__(self, key: Key) -> Scan:
         epoch, index = key
-        scan = self._read(index)
         if self.augment is None:
-            return scan
+            return self._read(self.records[index])
 
+        # The order of the random draws decides which scan a seed gives: keep it.
+        config = self.augment
         rng = np.random.default_rng([self.seed, epoch, index])
-        scan = augment(scan, self.augment, rng)
-        if rng.random() >= self.augment.mix:
-            return scan
+        scan = self._draw(key, rng)
+        if rng.random() < config.mix:
+            scan = mix(scan, self._draw_other(epoch, rng), rng)
+        if config.laser_mix and rng.random() < config.laser_mix:
+            scan = mix_lasers(scan, self._draw_other(epoch, rng), rng)
+        if config.paste and rng.random() < config.paste:
+            scan = paste(scan, self._draw_other(epoch, rng), self.pasted, rng)
+        return scan
 
-        other = self._read(int(rng.integers(len(self))))
-        return mix(scan, augment(other, self.augment, rng), rng)
+    def _draw_other(self, epoch: int, rng: np.random.Generator) -> Scan:
+        """Return a random scan of an epoch, augmented, to mix with another one."""
+        index = int(rng.integers(len(self)))
+        return self._draw((epoch, index), rng)
 
-    def _read(self, index: int) -> Scan:
-        scan = self.dataset.read(self.records[index])
+    def _draw(self, key: Key, rng: np.random.Generator) -> Scan:
+        """Return a scan of an epoch, augmented."""
+        assert self.augment is not None
+        epoch, index = key
+        record = self.dataset.at_epoch(self.records[index], epoch)
+        return augment(self._read(record), self.augment, rng)
+
+    def _read(self, record: ScanRecord) -> Scan:
+        scan = self.dataset.read(record)
         if scan.labels is None:
             raise InputError(
                 f"{scan.name}: expected labels to train with, found none; name labelled sequences"

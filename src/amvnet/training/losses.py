@@ -13,6 +13,8 @@ from torch.nn import functional as F
 # step.
 FREQUENCY_FLOOR = 1e-4
 
+RegionLoss = Callable[[Tensor, Tensor], Tensor]  # of probabilities and target, as `dice`
+
 # Lovász-softmax leaves out smaller errors. Together they would add less than this to the loss of a
 # class.
 MIN_ERROR = 1e-3
@@ -36,30 +38,63 @@ def class_weights(counts: np.ndarray) -> np.ndarray:
 
 
 def range_view_loss(
-    logits: Tensor, labels: Tensor, weights: Tensor | None, region: float
+    logits: Tensor,
+    labels: Tensor,
+    weights: Tensor | None,
+    region: float,
+    region_loss: RegionLoss | None = None,
 ) -> Tensor:
-    """Return cross-entropy + Dice loss, the loss of the range-view network.
+    """Return cross-entropy + a region loss: in the paper the Dice loss for the range view.
 
     Args:
         logits: (P, K).
         labels: (P,) train ids; points with 0 are ignored.
         weights: (K,) class weights of the cross-entropy, or None for equal weights.
-        region: weight of the Dice loss; that of the cross-entropy is 1.
+        region: weight of the region loss; that of the cross-entropy is 1.
+        region_loss: `dice` or `lovasz_softmax`; `dice` if None.
 
     Returns:
         The loss, (), float32, or float64 if the logits are; 0 if all points are ignored.
     """
-    return _loss(logits, labels, weights, region, dice)
+    return _loss(logits, labels, weights, region, region_loss or dice)
 
 
 def polar_view_loss(
-    logits: Tensor, labels: Tensor, weights: Tensor | None, region: float
+    logits: Tensor,
+    labels: Tensor,
+    weights: Tensor | None,
+    region: float,
+    region_loss: RegionLoss | None = None,
 ) -> Tensor:
-    """Return cross-entropy + Lovász-softmax loss, the loss of PolarNet.
+    """Return cross-entropy + a region loss: Lovász-softmax if None, as PolarNet.
 
     The arguments and the result are as for `range_view_loss`.
     """
-    return _loss(logits, labels, weights, region, lovasz_softmax)
+    return _loss(logits, labels, weights, region, region_loss or lovasz_softmax)
+
+
+def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> Tensor:
+    """Return the most frequent train id of the points of each cell.
+
+    Points without a label (id 0) count only if their cell has no others. Of equally frequent ids,
+    the lowest is returned.
+
+    Args:
+        cells: (P,) int64 cell of each point, 0..count - 1.
+        labels: (P,) int64 train ids, 0..classes.
+        count: M, the number of cells.
+        classes: K.
+
+    Returns:
+        (M,) int64; 0 for a cell without points.
+    """
+    ids = classes + 1
+    points = torch.bincount(cells * ids + labels, minlength=count * ids).view(count, ids)
+
+    # The lowest id first among those with equally many points, on any device.
+    ranks = torch.arange(classes, 0, -1, device=cells.device)
+    order = points[:, 1:] * ids + ranks
+    return torch.where(points[:, 1:].any(dim=1), order.argmax(dim=1) + 1, 0)
 
 
 def dice(probabilities: Tensor, target: Tensor) -> Tensor:
@@ -129,7 +164,7 @@ def _loss(
     labels: Tensor,
     weights: Tensor | None,
     region: float,
-    region_loss: Callable[[Tensor, Tensor], Tensor],
+    region_loss: RegionLoss,
 ) -> Tensor:
     labelled = labels > 0
     if not labelled.any():

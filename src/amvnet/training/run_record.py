@@ -36,7 +36,7 @@ def write_record(plan: RunPlan, stage: str, init: Weights | None) -> None:
         "repeat": shlex.join(_repeat_command(plan, stage, init is not None)),
         "versions": {name: version(name) for name in PACKAGES},
         "python": platform.python_version(),
-        "data": str(dataset.root),
+        "data": dataset.spec,
         "classes": dataset.taxonomy.name,
         "train": sequence_names(plan.scans.train),
         "val": sequence_names(plan.scans.val),
@@ -71,7 +71,7 @@ def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
     """Return the words of the command that repeats a call."""
     scans = plan.scans
     command = ["amvnet", "train", str(plan.out / "recipe.yaml")]
-    command += ["--data", str(scans.dataset.root), "--stage", stage]
+    command += ["--data", scans.dataset.spec, "--stage", stage]
     command += ["--train-sequences", ",".join(sequence_names(scans.train))]
     if scans.val:
         command += ["--val-sequences", ",".join(sequence_names(scans.val))]

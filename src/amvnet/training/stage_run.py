@@ -261,6 +261,7 @@ class NetworkRun(StageRun):
             self.plan.options,
             accumulate=config.accumulate,
             clip=config.clip,
+            ema=config.ema,
         )
 
     def _loaders(self) -> Loaders:

@@ -15,12 +15,24 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion, metrics
-from amvnet.models.views.points import PointBatch
-from amvnet.models.views.polar_view import PolarView
+from amvnet.models.views.points import PointBatch, occurring
+from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
-from amvnet.training.losses import polar_view_loss, range_view_loss
+from amvnet.training.losses import (
+    RegionLoss,
+    dice,
+    lovasz_softmax,
+    majority_labels,
+    polar_view_loss,
+    range_view_loss,
+)
 
 Batch = tuple[PointBatch, Tensor]  # points, and their (P,) train ids
+REGION_LOSSES: dict[str, RegionLoss | None] = {
+    "default": None,
+    "dice": dice,
+    "lovasz": lovasz_softmax,
+}
 MOMENTUM_CYCLE = 0.1  # the one-cycle schedule lowers the momentum by this much
 
 
@@ -185,6 +197,11 @@ class NetworkStage(Stage):
         """Return the loss of one scan, given (M, K) logits and (M,) train ids."""
         raise NotImplementedError
 
+    @property
+    def region_loss(self) -> RegionLoss | None:
+        """The region loss of the recipe; None for that of the paper."""
+        return REGION_LOSSES[self.config.region_loss]
+
     def size_of(self, batch: Batch) -> int:
         return batch[0].count
 
@@ -235,11 +252,12 @@ class RangeStage(NetworkStage):
         return list(pixel_logits), list(pixel_labels), pixels[view.pixel]
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
-        return range_view_loss(logits, labels, self.class_weights, self.config.region)
+        region = self.config.region
+        return range_view_loss(logits, labels, self.class_weights, region, self.region_loss)
 
 
 class PolarStage(NetworkStage):
-    """Stage `bev`: the loss is over points, each with the logits of its voxel."""
+    """Stage `bev`: the loss is over points, each with the logits of its voxel, or over voxels."""
 
     name = "bev"
     view: PolarView
@@ -248,7 +266,11 @@ class PolarStage(NetworkStage):
         self, batch: PointBatch, labels: Tensor
     ) -> tuple[list[Tensor], list[Tensor], Tensor]:
         view = self.view.project(batch)
-        points = view.to_points(self.trained(view))  # (P, K)
+        scores = self.trained(view)  # (M, Z * K)
+        points = view.to_points(scores)  # (P, K)
+        if self.config.loss_over == "voxels":
+            voxel_logits, voxel_labels = _split_voxels(view, scores, labels)
+            return voxel_logits, voxel_labels, points
 
         slices = batch.slices()
         point_logits = [points[part] for part in slices]
@@ -256,4 +278,29 @@ class PolarStage(NetworkStage):
         return point_logits, point_labels, points
 
     def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
-        return polar_view_loss(logits, labels, self.class_weights, self.config.region)
+        region = self.config.region
+        return polar_view_loss(logits, labels, self.class_weights, region, self.region_loss)
+
+
+def _split_voxels(
+    view: PolarGrid, scores: Tensor, labels: Tensor
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Return the logits and the majority labels of the voxels with points, scan by scan.
+
+    Args:
+        view: the grids of B scans.
+        scores: (M, Z * K) logits of the pillars with points.
+        labels: (P,) train ids.
+
+    Returns:
+        B tensors (V, K), and B tensors (V,).
+    """
+    scans, radial, angular, vertical = view.shape
+    logits = scores.unflatten(1, (vertical, -1)).flatten(0, 1)  # (M * Z, K)
+    voxels, (cells,) = occurring(len(logits), view.slot * vertical + view.voxel)
+    voxel_logits = logits.index_select(0, voxels)
+    voxel_labels = majority_labels(cells, labels, len(voxels), logits.shape[1])
+
+    scan = view.occupied[voxels // vertical] // (radial * angular)  # ascending
+    sizes = torch.bincount(scan, minlength=scans).tolist()
+    return list(voxel_logits.split(sizes)), list(voxel_labels.split(sizes))

@@ -37,7 +37,9 @@ def train(
 
     Args:
         recipe: what to train; a built-in recipe's name or a YAML file.
-        data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts.
+        data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts;
+            simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
+            the training, with their cache in the folder.
         out: folder of the run.
         stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them.

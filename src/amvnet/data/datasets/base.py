@@ -44,6 +44,10 @@ class Dataset(Protocol):
     def root(self) -> Path:
         """The folder that was opened."""
 
+    @property
+    def spec(self) -> str:
+        """What `open_dataset` opens the same dataset with."""
+
     def sequences(self, split: str) -> tuple[str, ...]:
         """Return the sequences of a split that are on disk.
 
@@ -60,6 +64,9 @@ class Dataset(Protocol):
         Raises:
             InputError: if a sequence does not exist; the message lists those that do.
         """
+
+    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+        """Return the scan to train on in place of a scan in an epoch: most datasets, the scan."""
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan.

@@ -81,6 +81,11 @@ class NuScenes:
                 f"found no entry {error}; unpack them"
             ) from None
 
+    @property
+    def spec(self) -> str:
+        """The folder."""
+        return str(self.root)
+
     @staticmethod
     def matches(root: Path) -> bool:
         """Return whether a folder has this layout."""
@@ -146,6 +151,10 @@ class NuScenes:
         for scene in sorted(set(sequences)):
             records.extend(self._records_by_scene[scene])
         return records
+
+    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+        """Return the scan itself."""
+        return record
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan, with the ring of every point."""

@@ -7,12 +7,15 @@ from pathlib import Path
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
+from amvnet.simulation import SENSORS
 
 Reader = type[SemanticKitti] | type[NuScenes]
 
 READERS: dict[str, Reader] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
+SIMULATED = {f"simulated-{sensor}": sensor for sensor in SENSORS}  # names of sensors by prefix
 
 
 def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
@@ -20,13 +23,18 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
 
     Args:
         spec: `semantickitti:PATH`, `nuscenes:PATH`, `nuscenes:PATH@v1.0-mini`, or a plain path with
-            the layout of one of them.
+            the layout of one of them; or `simulated-hdl64e:PATH` or `simulated-hdl32e:PATH`, for
+            streets that are simulated when they are read and cached in a folder.
         taxonomy: the classes, if they are not the benchmark's own.
 
     Raises:
-        InputError: if the path does not exist or does not have the layout.
+        InputError: if the path does not exist or does not have the layout, or simulated streets are
+            to have other classes.
     """
     kind, _, rest = str(spec).partition(":")
+    if kind in SIMULATED:
+        return _open_simulated(kind, rest, taxonomy)
+
     path, version = _split_version(rest if kind in READERS else str(spec))
     if not path.is_dir():
         raise InputError(f"{path}: expected the folder of a dataset, found none; check the path")
@@ -70,7 +78,7 @@ def is_dataset(spec: str) -> bool:
     """Return whether a text names a dataset, by its prefix or by the layout of its folder."""
     path, version = _split_version(spec)
     kind = spec.partition(":")[0]
-    if kind in READERS or version is not None:
+    if kind in READERS or kind in SIMULATED or version is not None:
         return True
     return path.is_dir() and any(reader.matches(path) for reader in READERS.values())
 
@@ -82,6 +90,16 @@ def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
             f"{dataset.root}: expected the classes of {dataset.taxonomy.name}, found those of "
             f"{taxonomy.name}; use weights, a head or a --taxonomy with the dataset's classes"
         )
+
+
+def _open_simulated(kind: str, path: str, taxonomy: Taxonomy | None) -> SimulatedStreets:
+    """Return the simulated streets of a sensor."""
+    if taxonomy is not None:
+        raise InputError(
+            f"{kind}: expected the classes of its benchmark, found those of {taxonomy.name}; "
+            "leave --taxonomy out, or write the streets with amvnet simulate"
+        )
+    return SimulatedStreets(Path(path).expanduser(), SIMULATED[kind])
 
 
 def _split_version(text: str) -> tuple[Path, str | None]:

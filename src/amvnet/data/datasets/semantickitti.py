@@ -39,6 +39,11 @@ class SemanticKitti:
                 "give the folder that holds `sequences`"
             )
 
+    @property
+    def spec(self) -> str:
+        """The folder."""
+        return str(self.root)
+
     @staticmethod
     def matches(root: Path) -> bool:
         """Return whether a folder has this layout."""
@@ -70,6 +75,10 @@ class SemanticKitti:
         for sequence in sorted(set(sequences)):
             records.extend(self._records(sequence))
         return records
+
+    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+        """Return the scan itself."""
+        return record
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan."""

@@ -1,0 +1,279 @@
+"""Simulated streets as a dataset: made when they are first read, and cached in a folder."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from amvnet import simulation
+from amvnet.data import scan_files as files
+from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.predictions import read_prediction
+from amvnet.data.formats.raw import FULL_INTENSITY
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.errors import InputError
+from amvnet.files import make_folder
+from amvnet.scan import Scan
+from amvnet.simulation import SENSORS, SimulatedScan, drive_street
+from amvnet.simulation.layouts import nuscenes_indices, semantickitti_ids
+from amvnet.simulation.materials import NUSCENES_CATEGORIES
+
+SCANS = 6  # of a street
+TRAIN_STREETS = {"hdl64e": 140, "hdl32e": 84}
+VAL_STREETS = 6
+FIRST_VAL_STREET = 900_000  # training uses the streets below
+LAST_STREET = 999_999
+
+# A training uses a street in this many epochs, then that whose number is `STREET_STEP` higher.
+EPOCHS_PER_STREET = 2
+STREET_STEP = 1000
+
+SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
+CACHE_BYTES = 12 * 10**9
+ABANDONED = 3600  # seconds after which an unfinished street is that of a killed process
+
+
+@dataclass(frozen=True)
+class SimulatedStreets:
+    """Streets of a simulated sensor. `Dataset` documents the arguments and errors of its methods.
+
+    A sequence is a street, named by its number: "000012". Streets with any number exist. A street
+    is simulated when one of its scans is first read, and depends on its number alone. Several
+    processes may share the folder of the cache. If it exceeds `CACHE_BYTES`, the streets that have
+    not been read for the longest time are removed.
+
+    Attributes:
+        root: the folder of the cache; made if there is none.
+        sensor: the name of a sensor in `SENSORS`.
+    """
+
+    root: Path
+    sensor: str = "hdl64e"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "root", Path(self.root))
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        """The classes of the benchmark that uses the sensor."""
+        return NUSCENES if self._is_nuscenes else SEMANTICKITTI
+
+    @property
+    def spec(self) -> str:
+        """What `open_dataset` opens this dataset with."""
+        return f"simulated-{self.sensor}:{self.root}"
+
+    def sequences(self, split: str) -> tuple[str, ...]:
+        """Return the streets of "train", "val" or "all"."""
+        train = range(TRAIN_STREETS[self.sensor])
+        val = range(FIRST_VAL_STREET, FIRST_VAL_STREET + VAL_STREETS)
+        splits = {"train": [*train], "val": [*val], "all": [*train, *val]}
+        if split not in splits:
+            raise InputError(
+                f"{self.spec}: expected a split of {', '.join(splits)}, "
+                f"found {split!r}; give one of them"
+            )
+        return tuple(map(_name, splits[split]))
+
+    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+        """Return the scans of these streets, in order."""
+        numbers = {self._number(sequence) for sequence in sequences}
+        records = []
+        for number in sorted(numbers):
+            for index in range(SCANS):
+                records.append(self._record(number, index))
+        return records
+
+    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+        """Return the same scan of the street that takes the place of its street in an epoch.
+
+        Streets to validate with stay.
+        """
+        number = int(record.sequence)
+        if number >= FIRST_VAL_STREET:
+            return record
+
+        shift = epoch // EPOCHS_PER_STREET * STREET_STEP
+        index = int(record.points_path.name)
+        return self._record((number + shift) % FIRST_VAL_STREET, index)
+
+    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+        """Read one scan; simulate its street if it is not in the cache."""
+        street = record.points_path.parent
+        with suppress(FileNotFoundError):
+            os.utime(street)  # so that others do not remove it
+            return self._load(record, labels)
+
+        self._simulate(int(record.sequence), street)
+        try:
+            return self._load(record, labels)
+        except FileNotFoundError:
+            raise InputError(
+                f"{street}: expected {SCANS} scans of a simulated street, found a part of them; "
+                "delete the folder"
+            ) from None
+
+    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
+        """Read the predicted (N,) uint8 train ids of one scan."""
+        count = len(self.read(record, labels=False))
+        return read_prediction(Path(folder) / record.prediction, np.uint32, count, self.taxonomy)
+
+    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
+        """Write (N,) train ids as raw ids (uint32)."""
+        count = len(self.read(record, labels=False))
+        ids = files.check_count(ids, record.points_path, count)
+        return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids))
+
+    @property
+    def _is_nuscenes(self) -> bool:
+        return SENSORS[self.sensor].layout == "nuscenes"
+
+    def _number(self, sequence: str) -> int:
+        if not sequence.isdecimal() or int(sequence) > LAST_STREET:
+            raise InputError(
+                f"{self.spec}: expected streets 0 to {LAST_STREET}, found {sequence!r}; "
+                "give their numbers"
+            )
+        return int(sequence)
+
+    def _record(self, number: int, index: int) -> ScanRecord:
+        sequence = _name(number)
+        scan = _name(index)
+        folder = self.root / f"streets-{self.sensor}-{_simulator()}" / sequence / scan
+        return ScanRecord(
+            name=f"{sequence}/{scan}",
+            sequence=sequence,
+            points_path=folder,
+            labels_path=folder / "labels.npy",
+            prediction=f"sequences/{sequence}/predictions/{scan}.label",
+        )
+
+    def _load(self, record: ScanRecord, labels: bool) -> Scan:
+        """Read a scan from the cache.
+
+        Raises:
+            FileNotFoundError: if it is not there.
+            InputError: if a file is broken.
+        """
+        folder = record.points_path
+        try:
+            return Scan(
+                np.load(folder / "points.npy"),
+                labels=np.load(folder / "labels.npy") if labels else None,
+                ring=np.load(folder / "ring.npy").astype(np.int64) if self._is_nuscenes else None,
+                name=record.name,
+            )
+        except (ValueError, EOFError):
+            raise InputError(
+                f"{folder}: expected a simulated scan, found a broken file; "
+                f"delete the folder {folder.parent}"
+            ) from None
+
+    def _simulate(self, number: int, street: Path) -> None:
+        """Simulate a street and put all its scans into the cache at once."""
+        part = street.with_name(f".{uuid.uuid4().hex}.part")
+        make_folder(part)
+        try:
+            seed = np.random.SeedSequence((SEED, number))
+            for index, scan in enumerate(drive_street(SENSORS[self.sensor], SCANS, seed)):
+                self._write(part / _name(index), scan)
+            _put(part, street)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+
+        _make_room(self.root, street)
+
+    def _write(self, folder: Path, scan: SimulatedScan) -> None:
+        """Write a scan as reading the files of `amvnet simulate` would return it."""
+        folder.mkdir()
+        points = scan.points
+        if self._is_nuscenes:
+            points = _as_nuscenes(points)
+            labels = _nuscenes_train_ids()[nuscenes_indices(scan.labels)]
+            np.save(folder / "ring.npy", scan.ring)
+        else:
+            labels = self.taxonomy.to_train(semantickitti_ids(scan.labels))
+
+        np.save(folder / "points.npy", points.astype(np.float32))
+        np.save(folder / "labels.npy", labels)
+
+
+def _name(number: int) -> str:
+    return f"{number:06d}"
+
+
+@cache
+def _simulator() -> str:
+    """Return a digest of the simulator's code: another simulator makes other streets."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(simulation.__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:8]
+
+
+@cache
+def _nuscenes_train_ids() -> np.ndarray:
+    """Return (256,) uint8 train ids by the index of nuScenes' category; 0 for noise."""
+    table = np.zeros(256, dtype=np.uint8)
+    for label, category in NUSCENES_CATEGORIES.items():
+        index = nuscenes_indices(np.array([label], dtype=np.uint32))
+        table[index] = NUSCENES.raw_to_train[category]
+    return table
+
+
+def _as_nuscenes(points: np.ndarray) -> np.ndarray:
+    """Return points with nuScenes' axes (x right, y forward), and intensities in steps of 1/255."""
+    x, y, z, intensity = points.T
+    steps = np.round(intensity * FULL_INTENSITY)
+    return np.column_stack([-y, x, z, steps / FULL_INTENSITY])
+
+
+def _put(part: Path, street: Path) -> None:
+    """Rename a finished folder, unless another process has put the same street there before."""
+    try:
+        part.rename(street)
+    except OSError:
+        if not street.is_dir():
+            raise
+
+
+def _make_room(root: Path, latest: Path) -> None:
+    """Remove the streets that were read the longest time ago until the cache is small enough.
+
+    Args:
+        root: the folder of the cache.
+        latest: a street that stays.
+    """
+    for part in root.glob("streets-*/.*.part"):
+        with suppress(FileNotFoundError):  # another process may be removing it
+            if time.time() - part.stat().st_mtime > ABANDONED:
+                shutil.rmtree(part, ignore_errors=True)
+
+    streets = []
+    total = 0
+    for street in root.glob(f"streets-*/{'[0-9]' * 6}"):
+        with suppress(FileNotFoundError):
+            size = sum(path.stat().st_size for path in street.rglob("*.npy"))
+            streets.append((street.stat().st_mtime, street, size))
+            total += size
+
+    for _, street, size in sorted(streets):
+        if total <= CACHE_BYTES:
+            return
+        if street != latest:
+            # Renamed first: nobody may see a part of a street.
+            removed = street.with_name(f".{uuid.uuid4().hex}.part")
+            with suppress(FileNotFoundError):
+                street.rename(removed)
+            shutil.rmtree(removed, ignore_errors=True)
+            total -= size

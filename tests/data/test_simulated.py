@@ -1,0 +1,295 @@
+"""Simulated streets are made when they are read, equal those in files, and share a cache."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amvnet.config.schema import AugmentConfig
+from amvnet.data.datasets import simulated
+from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.open import is_dataset, open_dataset
+from amvnet.data.datasets.select import split_records
+from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.simulation import SENSORS, SimulatedScan, simulate
+from amvnet.training.loaders import ScanSet, make_loader
+
+from fixtures.worlds import fails, fake_drive
+
+BENCHMARKS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
+REAL_DRIVE = simulated.drive_street
+
+
+@pytest.fixture(params=SENSORS)
+def sensor(request: pytest.FixtureRequest) -> str:
+    name: str = request.param
+    return name
+
+
+@pytest.fixture(autouse=True)
+def simulated_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulated, "drive_street", fake_drive)
+
+
+def streets(folder: Path) -> list[str]:
+    """Return the names of the streets in a cache, and of its unfinished folders."""
+    return sorted(path.name for path in folder.glob("streets-*/*"))
+
+
+def test_a_scan_equals_that_of_the_files_of_a_simulation(
+    sensor: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("embreex")
+    monkeypatch.setattr(simulated, "drive_street", REAL_DRIVE)
+    monkeypatch.setattr(simulated, "SCANS", 2)
+    options: dict[str, Any] = {"sensor": sensor, "scans": 2, "seed": simulated.SEED}
+    written = open_dataset(str(simulate(tmp_path / "files", first_sequence=12, **options)))
+
+    dataset = SimulatedStreets(tmp_path / "cache", sensor)
+    expected = written.records(written.sequences("all"))
+    records = dataset.records(["12"])
+    for record, written_record in zip(records, expected, strict=True):
+        scan = dataset.read(record)
+        other = written.read(written_record)
+        assert np.array_equal(scan.points, other.points)
+        assert scan.points.dtype == other.points.dtype
+        assert scan.labels is not None
+        assert other.labels is not None
+        assert np.array_equal(scan.labels, other.labels)
+        assert scan.labels.dtype == other.labels.dtype
+        assert (scan.ring is None) == (other.ring is None)
+        if scan.ring is not None and other.ring is not None:
+            assert np.array_equal(scan.ring, other.ring)
+            assert scan.ring.dtype == other.ring.dtype
+
+
+def test_streets_are_opened_by_the_name_of_their_sensor(sensor: str, tmp_path: Path) -> None:
+    spec = f"simulated-{sensor}:{tmp_path / 'not' / 'there'}"
+    assert is_dataset(spec)
+    dataset = open_dataset(spec)
+    assert isinstance(dataset, Dataset)
+    assert dataset.taxonomy is BENCHMARKS[sensor]
+    assert dataset.spec == spec
+    assert pickle.loads(pickle.dumps(dataset)) == dataset
+
+
+def test_other_classes_are_refused(tmp_path: Path) -> None:
+    fails(lambda: open_dataset(f"simulated-hdl64e:{tmp_path}", NUSCENES), "classes", "nuscenes")
+
+
+def test_the_splits_are_different_streets(sensor: str, tmp_path: Path) -> None:
+    dataset = SimulatedStreets(tmp_path, sensor)
+    train = dataset.sequences("train")
+    assert train[:2] == ("000000", "000001")
+    assert len(train) == {"hdl64e": 140, "hdl32e": 84}[sensor]
+    assert dataset.sequences("val") == tuple(f"90000{index}" for index in range(6))
+    assert dataset.sequences("all") == (*train, *dataset.sequences("val"))
+    fails(lambda: dataset.sequences("test"), "train, val, all", "test")
+
+    scans = split_records(dataset, None, None)
+    assert len(scans.train) == 6 * len(train)
+    assert len(scans.val) == 36
+
+
+def test_any_number_is_a_street(tmp_path: Path) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    records = dataset.records(["31", "000007", "7"])
+    assert [record.sequence for record in records] == ["000007"] * 6 + ["000031"] * 6
+    assert [record.name for record in records[4:8]] == [
+        "000007/000004",
+        "000007/000005",
+        "000031/000000",
+        "000031/000001",
+    ]
+
+
+@pytest.mark.parametrize("name", ["-1", "first", "1000000"])
+def test_anything_but_a_number_is_no_street(name: str, tmp_path: Path) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    fails(lambda: dataset.records([name]), "streets 0 to 999999", name)
+
+
+def test_a_street_depends_on_its_number_alone(tmp_path: Path) -> None:
+    first = SimulatedStreets(tmp_path / "a")
+    second = SimulatedStreets(tmp_path / "b")
+    records = first.records(["3", "4"])
+    points = {record.name: first.read(record).points for record in records}
+    for record in reversed(second.records(["3", "4"])):
+        assert np.array_equal(second.read(record).points, points[record.name])
+    assert not np.array_equal(points["000003/000000"], points["000004/000000"])
+
+
+def test_a_street_is_simulated_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    first, *others = dataset.records(["3"])
+    dataset.read(first)
+    monkeypatch.delattr(simulated, "drive_street")
+    for record in others:
+        dataset.read(record)
+    assert streets(tmp_path) == ["000003"]
+
+
+def test_a_street_is_used_in_two_epochs_and_then_another_one(tmp_path: Path) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    train = dataset.records(["139"])[4]
+    val = dataset.records(["900001"])[4]
+    names = [dataset.at_epoch(train, epoch).name for epoch in range(5)]
+    assert names == [
+        "000139/000004",
+        "000139/000004",
+        "001139/000004",
+        "001139/000004",
+        "002139/000004",
+    ]
+    for epoch in range(0, 5000, 7):
+        assert int(dataset.at_epoch(train, epoch).sequence) < 900_000
+        assert dataset.at_epoch(val, epoch) == val
+    assert dataset.at_epoch(train, 2) == dataset.records(["1139"])[4]
+
+
+def test_the_street_of_a_faster_process_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    record = dataset.records(["5"])[0]
+
+    def overtaken(*arguments: Any) -> Iterator[SimulatedScan]:
+        monkeypatch.setattr(simulated, "drive_street", fake_drive)
+        dataset.read(record)  # as another process, in the middle of this one's simulation
+        yield from fake_drive(*arguments)
+
+    monkeypatch.setattr(simulated, "drive_street", overtaken)
+    assert len(dataset.read(record)) > 0
+    assert streets(tmp_path) == ["000005"]
+
+
+def test_a_street_that_fails_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = SimulatedStreets(tmp_path)
+
+    def broken(*arguments: Any) -> Iterator[SimulatedScan]:
+        yield from list(fake_drive(*arguments))[:2]
+        raise OSError("no space left")
+
+    monkeypatch.setattr(simulated, "drive_street", broken)
+    with pytest.raises(OSError, match="no space"):
+        dataset.read(dataset.records(["5"])[0])
+    assert streets(tmp_path) == []
+
+
+def test_the_streets_read_the_longest_time_ago_make_room(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    records = [dataset.records([str(number)])[0] for number in range(6)]
+    for age, record in enumerate(records[:4]):
+        dataset.read(record)
+        long_ago = time.time() - 100 * (10 - age)
+        os.utime(record.points_path.parent, (long_ago, long_ago))
+    dataset.read(records[0])  # now the latest
+
+    files = records[0].points_path.parent.rglob("*.npy")
+    size = sum(path.stat().st_size for path in files)
+    monkeypatch.setattr(simulated, "CACHE_BYTES", int(3.5 * size))
+    dataset.read(records[4])
+    assert streets(tmp_path) == ["000000", "000003", "000004"]
+
+    # A street that is larger than the whole cache is read all the same.
+    monkeypatch.setattr(simulated, "CACHE_BYTES", 1)
+    assert len(dataset.read(records[5])) > 0
+    assert streets(tmp_path) == ["000005"]
+    assert len(dataset.read(records[1])) > 0
+
+
+def test_only_streets_are_ever_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = tmp_path / "sequences/00/velodyne/000000.bin"
+    kept.parent.mkdir(parents=True)
+    kept.write_bytes(bytes(1000))
+    monkeypatch.setattr(simulated, "CACHE_BYTES", 1)
+    dataset = SimulatedStreets(tmp_path)
+    for record in dataset.records(["1", "2"]):
+        dataset.read(record)
+    assert kept.is_file()
+
+
+def test_the_unfinished_street_of_a_killed_process_is_removed_later(tmp_path: Path) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    first = dataset.records(["1"])[0]
+    second = dataset.records(["2"])[0]
+    folder = first.points_path.parent.parent
+    for name in ("old", "new"):
+        (folder / f".{name}.part/000000").mkdir(parents=True)
+    long_ago = time.time() - 7200
+    os.utime(folder / ".old.part", (long_ago, long_ago))
+
+    dataset.read(first)
+    dataset.read(second)
+    assert streets(tmp_path) == [".new.part", "000001", "000002"]
+
+
+def test_broken_files_are_named(tmp_path: Path) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    first, second = dataset.records(["1"])[:2]
+    dataset.read(first)
+    (first.points_path / "points.npy").write_bytes(b"")
+    (second.points_path / "labels.npy").unlink()
+    fails(lambda: dataset.read(first), first.points_path, "broken", "delete")
+    fails(lambda: dataset.read(second), second.points_path.parent, "a part of them", "delete")
+
+
+def test_predictions_of_streets_round_trip(sensor: str, tmp_path: Path) -> None:
+    dataset = SimulatedStreets(tmp_path / "cache", sensor)
+    record = dataset.records(["8"])[1]
+    ids = dataset.read(record).labels
+    assert ids is not None
+    dataset.write_prediction(record, tmp_path / "out", ids)
+    assert np.array_equal(dataset.read_prediction(record, tmp_path / "out"), ids)
+    fails(lambda: dataset.write_prediction(record, tmp_path / "out", ids[1:]), len(ids))
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_epoch_of_fresh_streets_is_the_same_with_any_number_of_workers(
+    workers: int, tmp_path: Path
+) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    config = AugmentConfig(mix=0.5, laser_mix=0.5, paste=0.5)
+    scans = ScanSet(dataset, dataset.records(["0", "1"]), config)
+    loader = make_loader(scans, batch=3, workers=workers, shuffle=True)
+    for epoch in (0, 2):
+        loader.sampler.set_epoch(epoch)  # type: ignore[attr-defined]
+        keys = list(loader.sampler)
+        names = []
+        for batch in loader:
+            assert isinstance(batch, tuple)
+            points, _ = batch
+            for name, part in zip(points.names, points.slices(), strict=True):
+                names.append(name)
+                key = keys[len(names) - 1]
+                assert np.array_equal(points.points[part].numpy(), scans[key].points)
+        assert {name[:6] for name in names} == {f"00{epoch // 2}000", f"00{epoch // 2}001"}
+    assert streets(tmp_path) == ["000000", "000001", "001000", "001001"]
+
+
+def test_validation_has_the_same_streets_in_every_epoch(tmp_path: Path) -> None:
+    dataset = SimulatedStreets(tmp_path)
+    scans = ScanSet(dataset, dataset.records(["7"]))
+    assert scans[4, 2].name == scans[0, 2].name == "000007/000002"
+
+
+@pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES])
+def test_objects_to_paste_are_rare_classes_of_both_benchmarks(
+    taxonomy: Taxonomy, tmp_path: Path
+) -> None:
+    dataset = SimulatedStreets(tmp_path, "hdl64e" if taxonomy is SEMANTICKITTI else "hdl32e")
+    names = {taxonomy.classes[train_id - 1] for train_id in ScanSet(dataset, []).pasted}
+    assert {"bicycle", "motorcycle", "truck"} <= names
+    assert not names & {"car", "road", "sidewalk", "driveable_surface", "vegetation"}

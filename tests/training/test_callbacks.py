@@ -1,0 +1,91 @@
+"""The averaged weights equal a plain loop, and are those that are validated and written."""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import nn
+
+from amvnet.training.callbacks import AverageWeights
+
+
+def small_net() -> nn.Module:
+    torch.manual_seed(0)
+    return nn.Sequential(nn.Linear(3, 2), nn.BatchNorm1d(2))
+
+
+def take_steps(net: nn.Module, callback: AverageWeights, first: int, count: int) -> list[Any]:
+    """Change the weights in some steps, as an optimizer would; return the weights after each."""
+    module: Any = SimpleNamespace(trained=net)
+    history = []
+    for step in range(first, first + count):
+        torch.manual_seed(step)
+        with torch.no_grad():
+            for parameter in net.parameters():
+                parameter.add_(torch.randn_like(parameter))
+        net(torch.randn(5, 3))  # changes the statistics of the batch norm
+
+        trainer: Any = SimpleNamespace(global_step=step + 1)
+        for _ in range(2):  # the second batch belongs to the next step
+            callback.on_train_batch_end(trainer, module, None, None, 0)
+        history.append(deepcopy(net.state_dict()))
+    return history
+
+
+def begin(net: nn.Module, callback: AverageWeights) -> None:
+    module: Any = SimpleNamespace(trained=net)
+    callback.on_fit_start(SimpleNamespace(), module)  # type: ignore[arg-type]
+
+
+def test_the_average_of_weights_and_statistics_equals_a_loop() -> None:
+    net = small_net()
+    callback = AverageWeights(0.5)
+    begin(net, callback)
+    expected = deepcopy(net.state_dict())
+
+    for step, weights in enumerate(take_steps(net, callback, 0, 12)):
+        decay = min(0.5, (1 + step) / (10 + step))
+        for name, value in weights.items():
+            if value.is_floating_point():
+                expected[name] = decay * expected[name] + (1 - decay) * value
+
+    assert callback.average["1.num_batches_tracked"] == 12
+    del expected["1.num_batches_tracked"]
+    for name, value in expected.items():
+        torch.testing.assert_close(callback.average[name], value)
+    assert not torch.equal(callback.average["1.running_mean"], net.state_dict()["1.running_mean"])
+
+
+def test_an_average_that_is_saved_and_loaded_goes_on_as_before() -> None:
+    net = small_net()
+    whole = AverageWeights(0.9)
+    begin(net, whole)
+    take_steps(net, whole, 0, 3)
+    state = deepcopy(whole.state_dict())
+    half_way = deepcopy(net.state_dict())
+    take_steps(net, whole, 3, 3)
+
+    net.load_state_dict(half_way)
+    resumed = AverageWeights(0.9)
+    resumed.load_state_dict(state)
+    begin(net, resumed)
+    take_steps(net, resumed, 3, 3)
+    for name, value in whole.average.items():
+        assert torch.equal(resumed.average[name], value)
+
+
+def test_a_network_has_the_averaged_weights_only_within_the_block() -> None:
+    net = small_net()
+    callback = AverageWeights(0.9)
+    begin(net, callback)
+    take_steps(net, callback, 0, 4)
+
+    before = deepcopy(net.state_dict())
+    with callback.inserted(net):
+        for name, value in net.state_dict().items():
+            assert torch.equal(value, callback.average[name])
+    for name, value in net.state_dict().items():
+        assert torch.equal(value, before[name])
