@@ -49,7 +49,9 @@ def test_a_layer_learns_the_same_on_processors_of_both_kinds(
     layer = RingConv2d(6, 10, stride=(2, 2))
     gradients = []
     for capability in ("AVX2", "AVX512"):
-        monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda value=capability: value)
+        monkeypatch.setattr(
+            torch.backends.cpu, "get_cpu_capability", lambda value=capability: value
+        )
         x = torch.arange(6 * 8 * 16.0).sin().view(1, 6, 8, 16).requires_grad_()
         layer.zero_grad()
         layer(x).square().sum().backward()

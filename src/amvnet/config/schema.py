@@ -282,6 +282,8 @@ class HeadTraining(Checked):
     """Weight the classes as in the networks' losses (section 3.3: plain cross-entropy)."""
     views: Annotated[int, Range(0)] = 0
     """Augmented copies of each training scan to score for the head; 0: the scan itself."""
+    disturb: Share = 0.0
+    """Probability of disturbing the scores of a network in a view of a scan (open)."""
     points: Count = 300_000
     """Limit on the uncertain points of all scans, shared equally; 1.3 kB each on disk (K = 19)."""
     folds: Count = 1

@@ -24,6 +24,7 @@ from amvnet.evaluation.metrics import confusion
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
+from amvnet.training.disturb import disturb
 from amvnet.training.head_scores import Scorer, ScoreSource
 from amvnet.training.loaders import ScanSet, collate
 
@@ -291,6 +292,8 @@ class PointGatherer:
         labels = labels.to(device)
 
         f, g = scorer(job.source.records[job.index], scan, batch)
+        if job.scans.augment is not None:
+            f, g = self._disturbed(f, g, batch.points, job)
         uncertain = assertion(f, g, batch.points, labels) & (labels > 0)
         matrices = _ensemble_matrices(f, g, labels, uncertain)
 
@@ -309,6 +312,14 @@ class PointGatherer:
         points["labels"] = labels[index].cpu().numpy()
         points["stands_for"] = len(candidates) / max(len(index), 1)
         return points, matrices
+
+    def _disturbed(self, f: Tensor, g: Tensor, points: Tensor, job: _Job) -> tuple[Tensor, Tensor]:
+        """Return the scores of both networks, each disturbed with the recipe's probability."""
+        chance = self.training.head.disturb
+        rng = np.random.default_rng([self.training.seed, job.view, job.index, 1])
+        disturbed_f = disturb(f, points, rng) if rng.random() < chance else f
+        disturbed_g = disturb(g, points, rng) if rng.random() < chance else g
+        return disturbed_f, disturbed_g
 
     @property
     def _device(self) -> str:

@@ -216,7 +216,7 @@ def _name(number: int) -> str:
 def _simulator() -> str:
     """Return a digest of the simulator's code: another simulator makes other streets."""
     digest = hashlib.sha256()
-    for path in sorted(Path(simulation.__file__).parent.glob("*.py")):
+    for path in sorted(Path(simulation.__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 
