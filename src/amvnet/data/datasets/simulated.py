@@ -35,11 +35,11 @@ FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
 # A training uses a street in this many epochs, then that whose number is `STREET_STEP` higher.
-EPOCHS_PER_STREET = 2
+EPOCHS_PER_STREET = 3
 STREET_STEP = 1000
 
 SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
-CACHE_BYTES = 12 * 10**9
+CACHE_BYTES = 25 * 10**9
 ABANDONED = 3600  # seconds after which an unfinished street is that of a killed process
 
 
