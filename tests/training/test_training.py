@@ -232,11 +232,12 @@ def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
     assert not differing(train(world, tmp_path / "cut", *options, "--resume"), whole)
 
 
-def test_every_second_epoch_on_simulated_streets_has_fresh_ones_resumed_or_not(
+def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(simulated, "drive_street", fake_drive)
     monkeypatch.setattr(simulated, "SCANS", 2)
+    monkeypatch.setattr(simulated, "EPOCHS_PER_STREET", 2)
     options = ("--stage", "rv", "--train-sequences", "0,1", "--val-sequences", "900000")
     data = ("--data", f"simulated-hdl64e:{tmp_path / 'cache'}")
     whole = train(world, tmp_path / "whole", *options, *data)
