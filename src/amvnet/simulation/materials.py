@@ -120,6 +120,8 @@ class Surface(IntEnum):
     PLASTIC = 19
     ROOF_TILE = 20
     WINDOW = 21
+    STONE = 22
+    TWIG = 23
 
 
 @dataclass(frozen=True)
@@ -150,8 +152,8 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.BRICK: Reflection(0.38, spread=0.12, shade=0.25, drop=0.01, rough=0.002),
     Surface.GLASS: Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65),
     Surface.WOOD: Reflection(0.38, spread=0.13, shade=0.25, rough=0.003),
-    Surface.LEAF: Reflection(0.38, spread=0.28, shade=0.15, dark=0.06, drop=0.03),
-    Surface.BARK: Reflection(0.40, spread=0.25, shade=0.15, dark=0.04, rough=0.008),
+    Surface.LEAF: Reflection(0.37, spread=0.19, shade=0.17, dark=0.05, drop=0.03),
+    Surface.BARK: Reflection(0.36, spread=0.22, shade=0.20, dark=0.05, rough=0.009),
     Surface.METAL: Reflection(0.28, spread=0.22, shade=0.50, dark=0.12, drop=0.03),
     Surface.SIGN_FACE: Reflection(0.42, spread=0.20, shade=0.40),
     Surface.CLOTH: Reflection(0.46, spread=0.20, shade=0.25, rough=0.006),
@@ -168,6 +170,8 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.ROOF_TILE: Reflection(0.33, spread=0.13, shade=0.20, drop=0.01, rough=0.003),
     # The window of a house. Unlike a car's, it has curtains and frames that reflect.
     Surface.WINDOW: Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01),
+    Surface.STONE: Reflection(0.36, spread=0.16, shade=0.25, rough=0.014),
+    Surface.TWIG: Reflection(0.28, spread=0.28, shade=0.20, dark=0.08, drop=0.05),
 }
 
 # The surface of each class of ground.
