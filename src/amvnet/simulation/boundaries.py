@@ -14,7 +14,7 @@ from amvnet.simulation.plot import Plot
 SEGMENT = 2.5
 DRIVE_WIDTH = 3.0
 # Chance that a boundary is a hedge, and that one has a hedge before or behind a fence.
-HEDGE = 0.42
+HEDGE = 0.55
 FENCE_AND_HEDGE = 0.14
 
 
@@ -23,7 +23,7 @@ class Boundary:
     """One kind of boundary: a fence, a hedge, or both, one behind the other.
 
     Attributes:
-        layers: each fence or hedge and how many metres it is off the line.
+        layers: each fence or hedge and how many metres it is off the line, in order.
         missing: share of the segments that are not there.
     """
 
@@ -83,7 +83,7 @@ def line_up(
 
         for layer, offset in boundary.layers:
             segment = layer.segment(rng, piece)
-            plot.put(segment, x, distance + offset, yaw, margin=1.5)
+            plot.put_as_is(segment, x, distance + offset, yaw, margin=1.5)
 
 
 def enclose(plot: Plot, drive_x: float | None, depth: float) -> None:

@@ -27,7 +27,7 @@ def _pole(
 def lamp(rng: np.random.Generator) -> Mesh:
     """Return a street lamp: with an arm over the road (towards +y), or a head on the mast."""
     height = rng.uniform(3, 10)
-    radius = rng.uniform(0.045, 0.12)
+    radius = rng.uniform(0.035, 0.09)
     solids = [_pole(rng, height, radius, radius * rng.uniform(0.4, 1.0))]
 
     kind = rng.random()
@@ -94,7 +94,7 @@ def guide_post(rng: np.random.Generator) -> Mesh:
 def utility_pole(rng: np.random.Generator) -> Mesh:
     """Return a pole of wood or concrete that carries wires; some stand in pairs."""
     height = rng.uniform(6, 10)
-    radius = rng.uniform(0.09, 0.17)
+    radius = rng.uniform(0.08, 0.14)
 
     solids = [_pole(rng, height, radius, radius * 0.7)]
     if rng.random() < 0.12:

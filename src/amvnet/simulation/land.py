@@ -255,11 +255,19 @@ def _lay_turf(plot: Plot, near: float, far: float) -> None:
     """Cover a plot with uncut grass or stubble between two distances from the middle line."""
     rng = plot.rng
     height = rng.uniform(0.06, 0.25)
+    size = (MEADOW_TILE, MEADOW_TILE)
     for x in np.arange(plot.x, plot.end, MEADOW_TILE) + MEADOW_TILE / 2:
         for distance in np.arange(near, min(far, near + 20), MEADOW_TILE) + MEADOW_TILE / 2:
             if rng.random() < 0.85:
-                tile = fixtures.turf(rng, (MEADOW_TILE, MEADOW_TILE), height)
-                plot.put(tile, x, distance, margin=3.0)
+                tile = fixtures.turf(rng, size, height, tint=_ground_tint(plot, x, distance))
+                plot.put_as_is(tile, x, distance, margin=3.0)
+
+
+def _ground_tint(plot: Plot, x: float, distance: float) -> float:
+    """Return the tint of the grass at a place."""
+    ground = plot.site.ground
+    px, py, _ = ground.pose_at(x, plot.side * distance)
+    return float(ground.tint(np.array([px]), np.array([py]), np.array([Label.TERRAIN]))[0])
 
 
 def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> None:
@@ -281,7 +289,7 @@ def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> 
         height = float(np.clip(height + rng.normal(scale=change), 0.8, highest))
         if rng.random() < filled:
             piece = thicket.segment(rng, 4.0, height)
-            plot.put(piece, x, distance + rng.normal(scale=0.2), margin=2.5)
+            plot.put_as_is(piece, x, distance + rng.normal(scale=0.2), margin=2.5)
 
 
 def plant_bushes(plot: Plot, count: int, depth: float = 6.0) -> None:

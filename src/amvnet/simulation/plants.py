@@ -166,13 +166,15 @@ def tall_grass(rng: np.random.Generator, length: float) -> Mesh:
     return foliage([blades], rng.uniform(0.06, 0.5), rng.normal(scale=0.5))
 
 
-def turf(rng: np.random.Generator, size: tuple[float, float], height: float) -> Mesh:
+def turf(
+    rng: np.random.Generator, size: tuple[float, float], height: float, tint: float = 0.0
+) -> Mesh:
     """Return a patch of uncut grass or stubble on the ground, which is labelled terrain.
 
     Pulses that arrive at a low angle end in it at very different ranges.
     """
     blades = box((size[0], size[1], height + FOOT), (0, 0, -FOOT))
-    return part([blades], Surface.GRASS, Label.TERRAIN, rng.uniform(0.3, 1.6))
+    return part([blades], Surface.GRASS, Label.TERRAIN, rng.uniform(0.3, 1.6), tint=tint)
 
 
 def thicket(rng: np.random.Generator, length: float, height: float) -> Mesh:
@@ -190,6 +192,7 @@ class Thicket:
         depth: as in `Mesh`; from nearly solid to so thin that most pulses pass.
         uneven: how far the surface is off the section, as a share of the height.
         stems: trunks per metre that are seen through the leaves.
+        tint: as in `Mesh`.
     """
 
     section: str
@@ -197,6 +200,7 @@ class Thicket:
     depth: float
     uneven: float
     stems: float
+    tint: float
 
     def segment(self, rng: np.random.Generator, length: float, height: float) -> Mesh:
         """Return a piece, `length` metres along x."""
@@ -217,17 +221,21 @@ class Thicket:
             stems.append(tube((x, y, -FOOT), tip, rng.uniform(0.03, 0.12), 0.03, 5, closed=False))
 
         trunks = part(stems, Surface.BARK, Label.TRUNK)
-        return join([trunks, foliage(leaves, self.depth, rng.normal(scale=0.4))])
+        return join([trunks, foliage(leaves, self.depth, self.tint + rng.normal(scale=0.3))])
 
 
 def draw_thicket(rng: np.random.Generator) -> Thicket:
     """Draw a kind of undergrowth: a dense green wall, a wild bank or a thin wood edge."""
+    tint = float(rng.normal(scale=0.8))
     kind = rng.random()
-    if kind < 0.35:
-        return Thicket("dome", (1.2, 3.0), rng.uniform(0.02, 0.12), rng.uniform(0.01, 0.05), 0.0)
-    if kind < 0.75:
-        return Thicket("bulge", (1.0, 3.0), rng.uniform(0.08, 0.5), rng.uniform(0.05, 0.12), 0.05)
-    return Thicket("bulge", (2.0, 6.0), rng.uniform(0.5, 1.8), rng.uniform(0.06, 0.15), 0.25)
+    if kind < 0.42:
+        depth = rng.uniform(0.015, 0.12)
+        return Thicket("dome", (1.2, 3.0), depth, rng.uniform(0.01, 0.05), 0.0, tint)
+    if kind < 0.78:
+        depth = rng.uniform(0.05, 0.4)
+        return Thicket("bulge", (1.0, 3.0), depth, rng.uniform(0.04, 0.12), 0.05, tint)
+    depth = rng.uniform(0.4, 1.8)
+    return Thicket("bulge", (2.0, 6.0), depth, rng.uniform(0.06, 0.15), 0.25, tint)
 
 
 def ivy(rng: np.random.Generator, length: float, height: float) -> Mesh:

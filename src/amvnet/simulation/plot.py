@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amvnet.simulation.materials import Label
-from amvnet.simulation.mesh import Mesh
+from amvnet.simulation.mesh import Mesh, place
 from amvnet.simulation.site import Site
 from amvnet.simulation.streets import Patch
 from amvnet.simulation.styles import Style
@@ -73,6 +73,19 @@ class Plot:
     ) -> None:
         """Put a body at a distance from the middle line of the street; see `Site.put`."""
         self.site.put(mesh, x, self.side * distance, yaw, thing=thing, margin=margin)
+
+    def put_as_is(
+        self, mesh: Mesh, x: float, distance: float, yaw: float = 0.0, margin: float = 0.8
+    ) -> None:
+        """Put a piece of something larger, without a brightness of its own; see `put`."""
+        t = self.side * distance
+        if not self.site.is_free(x, t, margin):
+            return
+
+        ground = self.site.ground
+        px, py, heading = ground.pose_at(x, t)
+        z = float(ground.height(px, py))
+        self.site.fixed.append(place(mesh, px, py, z, heading + yaw))
 
     def pave(self, x: tuple[float, float], distance: tuple[float, float], label: Label) -> None:
         """Make a rectangle ground of another class; `distance` is from the middle line."""

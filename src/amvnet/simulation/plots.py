@@ -77,7 +77,7 @@ def _add_guide_posts(site: Site, side: int) -> None:
         return
 
     t = side * (style.road / 2 + style.parking[int(side > 0)] + rng.uniform(0.4, 1.2))
-    spacing = rng.uniform(15, 50)
+    spacing = rng.uniform(25, 50)
     for x in np.arange(rng.uniform(0, spacing), site.ground.length, spacing):
         site.put(fixtures.guide_post(rng), x, t, 0.0 if side < 0 else np.pi)
 
