@@ -14,7 +14,7 @@ from amvnet.simulation.plot import Plot
 SEGMENT = 2.5
 DRIVE_WIDTH = 3.0
 # Chance that a boundary is a hedge, and that one has a hedge before or behind a fence.
-HEDGE = 0.55
+HEDGE = 0.58
 FENCE_AND_HEDGE = 0.14
 
 

@@ -61,7 +61,7 @@ def draw_facade(rng: np.random.Generator, height: float) -> Facade:
         plinth=float(rng.uniform(0.3, 1.0) if rng.random() < 0.4 else 0),
         shutters=bool(rng.random() < 0.25),
         timber=bool(rng.random() < 0.06),
-        patchy=float(rng.choice([0.0, 0.4, 1.2], p=[0.4, 0.4, 0.2])),
+        patchy=float(rng.choice([0.0, 0.3, 0.9], p=[0.4, 0.4, 0.2])),
         shop=bool(rng.random() < (0.25 if is_tall else 0.04)),
         balconies=float(rng.choice([0.0, 0.2, 0.9], p=[0.6, 0.25, 0.15])),
     )
@@ -168,42 +168,54 @@ def _balconies(rng: np.random.Generator, middles: np.ndarray, floor: float) -> l
 
 def _extras(rng: np.random.Generator, facade: Facade, width: float, height: float) -> list[Mesh]:
     """Return what hangs on a wall or stands before it."""
-    plaster: list[np.ndarray] = []
-    wood: list[np.ndarray] = []
+    parts = [_pipes(rng, width, height)]
     x = rng.uniform(-0.35, 0.35) * width
 
-    if facade.plinth:
-        plaster.append(box((width + 0.1, 0.12, FOOT + facade.plinth), (0, 0, -FOOT)))
+    solids = _annexes(rng, facade, width, height)
     if facade.timber:
-        wood.append(planks(_spaced(width, 1.2), 0.18, 0.5, height, -0.04))
-        wood.append(planks(0, width, np.array([0.5, 2.6]), np.array([0.7, 2.8]), -0.045))
+        beams = planks(_spaced(width, 1.2), 0.18, 0.5, height, -0.04)
+        cross = planks(0, width, np.array([0.5, 2.6]), np.array([0.7, 2.8]), -0.045)
+        parts.append(part([beams, cross], Surface.WOOD, Label.BUILDING))
     if rng.random() < 0.5:
-        wood.append(planks(x, rng.uniform(0.9, 1.4), 0, 2.1, -0.03))  # a door
-        plaster.append(box((1.8, 0.9, 0.12), (x, -0.45, 2.3)))  # and its canopy
-    if rng.random() < 0.15:
-        posts = box((0.15, 0.15, 2.4 + FOOT), (0, -1.3, -FOOT))
-        plaster.append(copies(posts, x=[x - 1.2, x + 1.2]))
-        plaster.append(box((2.8, 1.6, 0.2), (x, -0.75, 2.4)))
-    if rng.random() < 0.2:
-        size = (rng.uniform(1.5, 3.5), rng.uniform(0.5, 1.2), rng.uniform(2.4, max(height, 2.5)))
-        plaster.append(box((size[0], 2 * size[1], size[2] + FOOT), (-x, 0, -FOOT)))  # a bay
-    if rng.random() < 0.08:
-        size = (width * 0.4, rng.uniform(2, 4), height * rng.uniform(0.4, 0.8))
-        plaster.append(box((size[0], 2 * size[1], size[2] + FOOT), (x, 0, -FOOT)))  # a wing
-
-    parts = [_pipes(rng, width, height)]
-    if plaster:
-        parts.append(part(plaster, facade.surface, Label.BUILDING, tint=rng.normal(scale=0.6)))
-    if wood:
-        parts.append(part(wood, Surface.WOOD, Label.BUILDING, tint=rng.normal(scale=0.6)))
+        door = planks(x, rng.uniform(0.9, 1.4), 0, 2.1, -0.03)
+        parts.append(part([door], Surface.WOOD, Label.BUILDING, tint=rng.normal(scale=0.6)))
+        solids.append(box((1.8, 0.9, 0.12), (x, -0.45, 2.3)))  # the door's canopy
     if facade.shop or rng.random() < 0.06:
         awning = leaning(planks(x, rng.uniform(2, 5), -0.9, 0.0), 0, 1.2)
         awning = moved(awning, (0, -0.05, rng.uniform(2.6, 3.0)))
         parts.append(part([awning], Surface.CLOTH, Label.BUILDING))
+
+    if solids:
+        parts.append(part(solids, facade.surface, Label.BUILDING, tint=rng.normal(scale=0.5)))
     if rng.random() < 0.06:
         leaves = ivy(rng, width * rng.uniform(0.3, 0.9), height * rng.uniform(0.4, 0.9))
         parts.append(leaves)
     return parts
+
+
+def _annexes(
+    rng: np.random.Generator, facade: Facade, width: float, height: float
+) -> list[np.ndarray]:
+    """Return the plinth, a porch on posts, a bay and a wing of a wall, (T, 3, 3) each."""
+    solids = []
+    x = rng.uniform(-0.35, 0.35) * width
+
+    if facade.plinth:
+        solids.append(box((width + 0.1, 0.12, FOOT + facade.plinth), (0, 0, -FOOT)))
+    if rng.random() < 0.15:
+        post = box((0.15, 0.15, 2.4 + FOOT), (0, -1.3, -FOOT))
+        solids.append(copies(post, x=[x - 1.2, x + 1.2]))
+        solids.append(box((2.8, 1.6, 0.2), (x, -0.75, 2.4)))
+    if rng.random() < 0.2:
+        reach = rng.uniform(0.5, 1.2)
+        bay_height = rng.uniform(2.4, max(height, 2.5))
+        size = (rng.uniform(1.5, 3.5), 2 * reach, bay_height + FOOT)
+        solids.append(box(size, (-x, 0, -FOOT)))
+    if rng.random() < 0.08:
+        reach = rng.uniform(2, 4)
+        size = (width * 0.4, 2 * reach, height * rng.uniform(0.4, 0.8) + FOOT)
+        solids.append(box(size, (x, 0, -FOOT)))
+    return solids
 
 
 def _spaced(width: float, pitch: float) -> np.ndarray:

@@ -301,10 +301,9 @@ def _wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 def _stone_wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     """Return a wall of rough stones, out of line by a few centimetres."""
     half = 0.15 + fence.pitch
-    section = np.array(
-        [(half, -FOOT), (half, 0.5 * fence.height), (0.8 * half, fence.height)]
-        + [(-0.8 * half, fence.height), (-half, 0.5 * fence.height), (-half, -FOOT)]
-    )
+    middle = 0.5 * fence.height
+    flank = np.array([(half, -FOOT), (half, middle), (0.8 * half, fence.height)])
+    section = np.concatenate([flank, flank[::-1] * (-1, 1)])
     count = max(2, round(length / 0.35)) + 1
     rings = np.empty((count, len(section), 3))
     rings[..., 0] = np.linspace(-length / 2, length / 2, count)[:, None]

@@ -27,7 +27,7 @@ def _pole(
 def lamp(rng: np.random.Generator) -> Mesh:
     """Return a street lamp: with an arm over the road (towards +y), or a head on the mast."""
     height = rng.uniform(3, 10)
-    radius = rng.uniform(0.035, 0.09)
+    radius = rng.uniform(0.03, 0.08)
     solids = [_pole(rng, height, radius, radius * rng.uniform(0.4, 1.0))]
 
     kind = rng.random()
@@ -74,7 +74,7 @@ def post(rng: np.random.Generator) -> Mesh:
         return part([body, arms], Surface.DARK_PAINT, Label.POLE)
 
     height = rng.uniform(0.5, 1.3)
-    radius = rng.uniform(0.03, 0.12)
+    radius = rng.uniform(0.03, 0.08)
     surface = (Surface.METAL, Surface.PLASTER, Surface.WOOD)[rng.choice(3, p=[0.6, 0.2, 0.2])]
     return part([tube((0, 0, -0.2), (0, 0, height), radius)], surface, Label.POLE)
 
@@ -146,7 +146,7 @@ def _two_sided(rng: np.random.Generator, front: np.ndarray, back: np.ndarray) ->
     return join(
         [
             part([front], Surface.SIGN_FACE, Label.TRAFFIC_SIGN, tint=rng.normal(scale=0.8)),
-            part([back], Surface.METAL, Label.TRAFFIC_SIGN, tint=rng.normal(scale=0.5)),
+            part([back], Surface.METAL, Label.TRAFFIC_SIGN, tint=rng.normal(0.5, 0.5)),
         ]
     )
 

@@ -70,10 +70,10 @@ def _furnish(plot: Plot, setback: float) -> None:
     rng = plot.rng
     front = plot.front
 
-    for _ in range(rng.poisson(0.8)):
+    for _ in range(rng.poisson(1.0)):
         distance = front + rng.uniform(0.3, setback + 1)
         plot.put(fixtures.yard_clutter(rng), plot.random_x(), distance, rng.uniform(0, np.pi))
-    for _ in range(rng.poisson(0.4)):
+    for _ in range(rng.poisson(0.7)):
         distance = front + rng.uniform(0.4, 1.5)
         plot.put(fixtures.clutter(rng), plot.random_x(), distance, plot.facing)
     if rng.random() < 0.15:
@@ -129,7 +129,7 @@ def fill_row(plot: Plot) -> None:
         line_up(plot, draw_boundary(rng), (plot.x, front + 0.2), (plot.end, front + 0.2))
     if rng.random() < 0.4:
         _park_two_wheelers(plot)
-    for _ in range(rng.poisson(1.2)):
+    for _ in range(rng.poisson(1.8)):
         distance = front + rng.uniform(-0.3, max(setback, 0.3))
         plot.put(fixtures.clutter(rng), plot.random_x(), distance, plot.facing)
     if rng.random() < 0.12:

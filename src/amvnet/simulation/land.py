@@ -16,14 +16,18 @@ from amvnet.simulation.plot import Plot
 MEADOW_TILE = 5.0  # metres: side of a patch of uncut grass, which lies flat on the ground
 
 
+_Fillers = dict[Callable[[Plot], None], float]
+
+
 def fill_wood(plot: Plot) -> None:
     """Plant a wood, its edge as a wall of leaves, an orchard or a park."""
-    _draw(plot, {_wood: 0.45, _wood_edge: 0.33, _orchard: 0.08, _park: 0.14})(plot)
+    fillers: _Fillers = {_wood: 0.45, _wood_edge: 0.33, _orchard: 0.08, _park: 0.14}
+    weighted_choice(plot.rng, fillers)(plot)
 
 
 def fill_field(plot: Plot) -> None:
     """Leave open land: a meadow, a crop field, allotments, a railway line or a playground."""
-    fillers = {
+    fillers: _Fillers = {
         _meadow: 0.62,
         _crop_field: 0.12,
         _allotments: 0.08,
@@ -31,11 +35,7 @@ def fill_field(plot: Plot) -> None:
         _playground: 0.07,
         _building_site: 0.05,
     }
-    _draw(plot, fillers)(plot)
-
-
-def _draw(plot: Plot, shares: dict[Callable[[Plot], None], float]) -> Callable[[Plot], None]:
-    return weighted_choice(plot.rng, shares)
+    weighted_choice(plot.rng, fillers)(plot)
 
 
 def _wood(plot: Plot) -> None:
@@ -123,7 +123,7 @@ def _meadow(plot: Plot) -> None:
     rng = plot.rng
     front = plot.front
 
-    if rng.random() < 0.16:
+    if rng.random() < 0.2:
         gravel = (front + 1, front + rng.uniform(4, 20))
         plot.pave((plot.x, plot.end), gravel, Label.OTHER_GROUND)
     elif rng.random() < 0.5:
@@ -141,7 +141,7 @@ def _meadow(plot: Plot) -> None:
     if rng.random() < 0.3:
         tree = fixtures.tree(rng, rng.uniform(6, 12))
         plot.put(tree, plot.x + plot.width * 0.7, front + rng.uniform(3, 10))
-    if rng.random() < 0.1:
+    if rng.random() < 0.25:
         plot.put(fixtures.yard_clutter(rng), plot.random_x(), front + rng.uniform(2, 9))
 
 

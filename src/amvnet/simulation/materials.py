@@ -148,7 +148,7 @@ class Reflection:
 REFLECTIONS: dict[Surface, Reflection] = {
     Surface.ASPHALT: Reflection(0.30, spread=0.11, shade=0.14, dark=0.004),
     Surface.PAVING: Reflection(0.33, spread=0.09, shade=0.12, dark=0.003),
-    Surface.GRASS: Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.020),
+    Surface.GRASS: Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.018),
     Surface.GRAVEL: Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004),
     Surface.ROAD_PAINT: Reflection(0.55, spread=0.20, shade=0.15),
     Surface.PLASTER: Reflection(0.44, spread=0.10, shade=0.25, drop=0.01),
@@ -156,7 +156,7 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.GLASS: Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65, ghost=0.04),
     Surface.WOOD: Reflection(0.38, spread=0.13, shade=0.25, rough=0.003),
     Surface.LEAF: Reflection(0.36, spread=0.23, shade=0.17, dark=0.05, drop=0.03),
-    Surface.BARK: Reflection(0.37, spread=0.28, shade=0.20, dark=0.05, rough=0.012),
+    Surface.BARK: Reflection(0.37, spread=0.28, shade=0.20, dark=0.05, rough=0.010),
     Surface.METAL: Reflection(0.28, spread=0.26, shade=0.50, dark=0.12, drop=0.03, rough=0.004),
     Surface.SIGN_FACE: Reflection(0.55, spread=0.20, shade=0.40),
     Surface.CLOTH: Reflection(0.46, spread=0.20, shade=0.25, rough=0.006),

@@ -99,7 +99,7 @@ def _cloud(
     half = (height - low) / 2
     centre = (fork[0], fork[1], low + half)
     crown = hull(rng, centre, (spread, spread * rng.uniform(0.8, 1.2), half))
-    depth = float(np.exp(rng.uniform(np.log(0.2), np.log(2.5))))
+    depth = float(np.exp(rng.uniform(np.log(0.1), np.log(2.0))))
     return join([part(boughs, Surface.BARK, Label.VEGETATION), foliage([crown], depth)])
 
 
