@@ -143,7 +143,8 @@ def test_a_mesh_fence_lets_more_pulses_through_than_boards() -> None:
     rng = np.random.default_rng(0)
     boards = fences.draw_fence(rng, {"boards": 1.0})
     boards = replace(boards, height=1.4, gap=0.1, overgrown=0.0, lean=0.0)
-    mesh = replace(fences.draw_fence(rng, {"mesh": 1.0}), height=1.4, gap=0.8, overgrown=0.0)
+    mesh = fences.draw_fence(rng, {"mesh": 1.0})
+    mesh = replace(mesh, height=1.4, pitch=0.2, gap=0.9, overgrown=0.0, lean=0.0)
     hits_of_boards = len(hits_of(row_of(boards)).label)
     hits_of_mesh = len(hits_of(row_of(mesh)).label)
     assert hits_of_boards > 2000

@@ -108,7 +108,7 @@ def enclose(plot: Plot, drive_x: float | None, depth: float) -> None:
     line_up(plot, boundary, (plot.x, front), (plot.end, front), gap)
 
     sides = boundary if rng.random() < 0.6 else draw_boundary(rng)
-    if rng.random() < 0.6:
+    if rng.random() < 0.5:
         line_up(plot, sides, (plot.x, front), (plot.x + rng.normal(scale=0.5), back))
     if rng.random() < 0.3:
         line_up(plot, sides, (plot.x, back), (plot.end, back))

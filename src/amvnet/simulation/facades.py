@@ -61,7 +61,7 @@ def draw_facade(rng: np.random.Generator, height: float) -> Facade:
         plinth=float(rng.uniform(0.3, 1.0) if rng.random() < 0.4 else 0),
         shutters=bool(rng.random() < 0.25),
         timber=bool(rng.random() < 0.06),
-        patchy=float(rng.choice([0.0, 0.3, 0.9], p=[0.4, 0.4, 0.2])),
+        patchy=float(rng.choice([0.0, 0.25, 0.7], p=[0.4, 0.4, 0.2])),
         shop=bool(rng.random() < (0.25 if is_tall else 0.04)),
         balconies=float(rng.choice([0.0, 0.2, 0.9], p=[0.6, 0.25, 0.15])),
     )

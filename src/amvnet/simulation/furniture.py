@@ -94,7 +94,7 @@ def guide_post(rng: np.random.Generator) -> Mesh:
 def utility_pole(rng: np.random.Generator) -> Mesh:
     """Return a pole of wood or concrete that carries wires; some stand in pairs."""
     height = rng.uniform(6, 10)
-    radius = rng.uniform(0.08, 0.14)
+    radius = rng.uniform(0.07, 0.12)
 
     solids = [_pole(rng, height, radius, radius * 0.7)]
     if rng.random() < 0.12:
@@ -154,9 +154,9 @@ def _two_sided(rng: np.random.Generator, front: np.ndarray, back: np.ndarray) ->
 def sign(rng: np.random.Generator) -> Mesh:
     """Return one or two signs on a post, a board on two posts, or a chevron, facing -x."""
     kind = rng.random()
-    if kind < 0.12:
+    if kind < 0.06:
         mesh = _large_board(rng)
-    elif kind < 0.18:
+    elif kind < 0.10:
         mesh = _chevron(rng)
     else:
         height = rng.uniform(1.6, 2.8)  # of the lower edge of the upper sign
@@ -173,12 +173,12 @@ def sign(rng: np.random.Generator) -> Mesh:
 
 def _large_board(rng: np.random.Generator) -> Mesh:
     """Return a direction sign, a town sign or a notice board on two posts."""
-    width = rng.uniform(1.0, 4.0)
+    width = rng.uniform(0.8, 3.2)
     rise = rng.uniform(0.5, 1.0) * min(width, 2.5)
     height = rng.uniform(0.6, 2.4)
 
     post_y = np.array([-0.35, 0.35]) * width
-    post_solid = tube((0, 0, -FOOT), (0, 0, height + rise), rng.uniform(0.03, 0.08), closed=False)
+    post_solid = tube((0, 0, -FOOT), (0, 0, height + rise), rng.uniform(0.03, 0.06), closed=False)
     posts = part([copies(post_solid, y=post_y)], Surface.METAL, Label.POLE)
     front = box((0.03, width, rise), (-0.1, 0, height))
     back = box((0.02, width, rise), (-0.074, 0, height))

@@ -151,7 +151,7 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.GRASS: Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.018),
     Surface.GRAVEL: Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004),
     Surface.ROAD_PAINT: Reflection(0.55, spread=0.20, shade=0.15),
-    Surface.PLASTER: Reflection(0.44, spread=0.10, shade=0.25, drop=0.01),
+    Surface.PLASTER: Reflection(0.42, spread=0.10, shade=0.25, drop=0.01),
     Surface.BRICK: Reflection(0.38, spread=0.12, shade=0.25, drop=0.01, rough=0.002),
     Surface.GLASS: Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65, ghost=0.04),
     Surface.WOOD: Reflection(0.38, spread=0.13, shade=0.25, rough=0.003),

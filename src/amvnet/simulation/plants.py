@@ -131,13 +131,13 @@ def bush(rng: np.random.Generator, radius: float) -> Mesh:
 
     if kind < 0.15:
         return join([_sticks(rng, radius, 1.7 * height), _ball(rng, radius, height, 0.9)])
-    if kind < 0.4:
-        return _ball(rng, radius, height, rng.uniform(0.25, 0.9))
+    if kind < 0.33:
+        return _ball(rng, radius, height, rng.uniform(0.15, 0.9))
     if kind < 0.5:
         clipped = hull(rng, (0, 0, height), (radius, radius, height), square=0.6, fine=False)
         return foliage([clipped], rng.uniform(0.01, 0.04))
 
-    return _ball(rng, radius, height, rng.uniform(0.03, 0.25))
+    return _ball(rng, radius, height, rng.uniform(0.02, 0.15))
 
 
 def _ball(rng: np.random.Generator, radius: float, height: float, depth: float) -> Mesh:
@@ -228,11 +228,11 @@ def draw_thicket(rng: np.random.Generator) -> Thicket:
     """Draw a kind of undergrowth: a dense green wall, a wild bank or a thin wood edge."""
     tint = float(rng.normal(scale=0.8))
     kind = rng.random()
-    if kind < 0.42:
-        depth = rng.uniform(0.015, 0.12)
+    if kind < 0.5:
+        depth = rng.uniform(0.012, 0.1)
         return Thicket("dome", (1.2, 3.0), depth, rng.uniform(0.01, 0.05), 0.0, tint)
-    if kind < 0.78:
-        depth = rng.uniform(0.05, 0.4)
+    if kind < 0.82:
+        depth = rng.uniform(0.04, 0.3)
         return Thicket("bulge", (1.0, 3.0), depth, rng.uniform(0.04, 0.12), 0.05, tint)
     depth = rng.uniform(0.4, 1.8)
     return Thicket("bulge", (2.0, 6.0), depth, rng.uniform(0.06, 0.15), 0.25, tint)

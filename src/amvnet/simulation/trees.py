@@ -71,7 +71,7 @@ def _clumps(
     rng: np.random.Generator, fork: Vector, height: float, spread: float, radius: float
 ) -> Mesh:
     """Return a crown of several clumps of leaves, each on a bough."""
-    depth = rng.uniform(0.05, 0.7)
+    depth = rng.uniform(0.03, 0.5)
     boughs = []
     clumps = []
     for _ in range(int(rng.integers(3, 8))):
@@ -127,7 +127,7 @@ def _bare_boughs(
 def _distant_crown(rng: np.random.Generator, fork: Vector, height: float, spread: float) -> Mesh:
     half = (height - fork[2] * 0.8) / 2
     crown = hull(rng, (*fork[:2], height - half), (spread, spread, half), fine=False)
-    return foliage([crown], rng.uniform(0.2, 1.5), rng.normal(scale=0.4))
+    return foliage([crown], rng.uniform(0.1, 1.2), rng.normal(scale=0.4))
 
 
 def conifer(rng: np.random.Generator, height: float) -> Mesh:
@@ -190,4 +190,4 @@ def copse(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """Return the edge of a wood, to be seen from far away."""
     size = (rng.uniform(4, 9), height * rng.uniform(0.8, 1.2))
     edge = bank(rng, length + 2, "bulge", size, height * rng.uniform(0.03, 0.12), step=2.5)
-    return foliage([edge], rng.uniform(0.15, 1.2), rng.normal(scale=0.4))
+    return foliage([edge], rng.uniform(0.06, 0.9), rng.normal(scale=0.4))
