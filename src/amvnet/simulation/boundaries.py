@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amvnet.simulation.fences import Fence, draw_fence, gate
+from amvnet.simulation.fence_shapes import gate
+from amvnet.simulation.fences import Fence, draw_fence
 from amvnet.simulation.plants import Hedge, draw_hedge
 from amvnet.simulation.plot import Plot
 

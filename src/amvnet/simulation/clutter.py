@@ -217,6 +217,44 @@ def pump(rng: np.random.Generator) -> Mesh:
     return _object([island, body], Surface.PLASTIC, rng)
 
 
+def structure(rng: np.random.Generator) -> Mesh:
+    """Return something large without a class: a pergola, a billboard, a ramp or a scaffold."""
+    kind = rng.random()
+    length = rng.uniform(2.5, 7.0)
+    height = rng.uniform(1.8, 3.5)
+
+    if kind < 0.3:
+        y = np.array([-0.5, 0.5]) * rng.uniform(1.5, 3.5)
+        x = np.linspace(-length / 2, length / 2, 4)
+        posts = box((0.12, 0.12, height + FOOT), (0, 0, -FOOT))
+        beam = box((0.08, y[1] - y[0] + 0.6, 0.14), (0, 0, height))
+        return _structure(
+            [copies(posts, x=x[:, None], y=y), copies(beam, x=np.append(x, x + 0.4))],
+            Surface.WOOD,
+            rng,
+        )
+    if kind < 0.5:
+        board = box((length, 0.1, rng.uniform(1.2, 2.8)), (0, 0, rng.uniform(0.1, 1.0)))
+        posts = copies(box((0.12, 0.12, height)), x=np.array([-0.4, 0.4]) * length, y=0.12)
+        return join(
+            [_structure([board], Surface.PLASTER, rng), _structure([posts], Surface.METAL, rng)]
+        )
+    if kind < 0.7:
+        ramp = box((length, 1.6, 1.1 + FOOT), (0, 0, -FOOT), top=(rng.uniform(0.3, 1.0), 1.0))
+        rail = planks(0, length, np.array([1.5, 1.95]), np.array([1.55, 2.0]), -0.75)
+        return _structure([ramp, rail], Surface.PLASTER, rng)
+    if kind < 0.85:
+        x = np.linspace(-length / 2, length / 2, max(2, round(length / 2)))
+        pole = tube((0, 0, 0), (0, 0, 6), 0.025, sides=4, closed=False)
+        decks = copies(box((length, 0.7, 0.08)), z=[2.0, 4.0])
+        rails = planks(0, length, np.array([1.0, 3.0]), np.array([1.05, 3.05]))
+        poles = copies(pole, x=x[:, None], y=[-0.35, 0.35])
+        return _structure([poles, decks, rails], Surface.METAL, rng)
+
+    block = box((length, rng.uniform(1.0, 3.0), height + FOOT), (0, 0, -FOOT))
+    return _structure([block], Surface.PLASTER, rng)
+
+
 # Shares of the objects at the edge of a street, and of those in gardens and yards.
 _STREET: dict[Callable[[np.random.Generator], Mesh], float] = {
     bins: 0.36,
@@ -226,6 +264,7 @@ _STREET: dict[Callable[[np.random.Generator], Mesh], float] = {
     letter_box: 0.08,
     planter: 0.07,
     container: 0.05,
+    structure: 0.04,
     bike_rack: 0.05,
     statue: 0.03,
 }
@@ -240,6 +279,7 @@ _YARD: dict[Callable[[np.random.Generator], Mesh], float] = {
     tent: 0.05,
     statue: 0.04,
     container: 0.05,
+    structure: 0.14,
 }
 
 

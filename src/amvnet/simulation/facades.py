@@ -94,7 +94,8 @@ def wall(rng: np.random.Generator, facade: Facade, width: float, height: float) 
             top = min(2.5, height)
             openings = 0.85 * facade.pitch
 
-        parts += _storey(rng, facade, width, middles, (bottom, low, top), openings)
+        levels = (bottom, low, top)
+        parts += _storey(rng, facade, width, middles, levels=levels, opening=openings)
         if facade.shutters and not (storey == 0 and facade.shop):
             parts.append(_shutters(facade, middles, (low, top)))
         bottom = top

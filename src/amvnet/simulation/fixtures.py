@@ -11,7 +11,8 @@ from amvnet.simulation.buildings import (
     shed,
 )
 from amvnet.simulation.clutter import bridge, clutter, pump, shelter, steps, yard_clutter
-from amvnet.simulation.fences import draw_fence, gate, guard_rail
+from amvnet.simulation.fence_shapes import gate, guard_rail
+from amvnet.simulation.fences import draw_fence
 from amvnet.simulation.furniture import (
     barrier,
     flag_pole,

@@ -13,6 +13,7 @@ from amvnet.simulation.materials import Label, Surface
 from amvnet.simulation.mesh import Mesh, box, copies, join, leaning, part, place, prism, tube
 
 FOOT = 0.4  # metres by which poles reach below the ground
+DARK_METAL = -0.8  # tint: poles are painted, and darker than other metal
 
 
 def _pole(
@@ -45,7 +46,7 @@ def lamp(rng: np.random.Generator) -> Mesh:
         foot_height = rng.uniform(0.5, 1.4)
         solids.append(tube((0, 0, 0), (0, 0, foot_height), radius * 1.4, closed=False))
     surface = Surface.METAL if rng.random() < 0.8 else Surface.PLASTER
-    pole = part(solids, surface, Label.POLE, tint=rng.normal(scale=0.6))
+    pole = part(solids, surface, Label.POLE, tint=rng.normal(DARK_METAL, 0.6))
     return join([pole, *_carried(rng)])
 
 
@@ -76,7 +77,8 @@ def post(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(0.5, 1.3)
     radius = rng.uniform(0.03, 0.08)
     surface = (Surface.METAL, Surface.PLASTER, Surface.WOOD)[rng.choice(3, p=[0.6, 0.2, 0.2])]
-    return part([tube((0, 0, -0.2), (0, 0, height), radius)], surface, Label.POLE)
+    body = tube((0, 0, -0.2), (0, 0, height), radius)
+    return part([body], surface, Label.POLE, tint=DARK_METAL)
 
 
 def guide_post(rng: np.random.Generator) -> Mesh:
@@ -160,7 +162,12 @@ def sign(rng: np.random.Generator) -> Mesh:
         mesh = _chevron(rng)
     else:
         height = rng.uniform(1.6, 2.8)  # of the lower edge of the upper sign
-        mast = part([_pole(rng, height + 0.5, rng.uniform(0.025, 0.05))], Surface.METAL, Label.POLE)
+        mast = part(
+            [_pole(rng, height + 0.5, rng.uniform(0.025, 0.05))],
+            Surface.METAL,
+            Label.POLE,
+            tint=DARK_METAL,
+        )
         parts = [mast, _face(rng, height)]
         if rng.random() < 0.3:
             parts.append(_face(rng, height - rng.uniform(0.4, 0.9)))

@@ -158,7 +158,7 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.LEAF: Reflection(0.36, spread=0.23, shade=0.17, dark=0.05, drop=0.03),
     Surface.BARK: Reflection(0.37, spread=0.28, shade=0.20, dark=0.05, rough=0.010),
     Surface.METAL: Reflection(0.28, spread=0.26, shade=0.50, dark=0.12, drop=0.03, rough=0.004),
-    Surface.SIGN_FACE: Reflection(0.55, spread=0.20, shade=0.40),
+    Surface.SIGN_FACE: Reflection(0.50, spread=0.20, shade=0.40),
     Surface.CLOTH: Reflection(0.46, spread=0.20, shade=0.25, rough=0.006),
     Surface.SKIN: Reflection(0.45, spread=0.20, shade=0.10, dark=0.03),
     Surface.DARK_PAINT: Reflection(

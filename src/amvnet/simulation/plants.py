@@ -230,12 +230,12 @@ def draw_thicket(rng: np.random.Generator) -> Thicket:
     kind = rng.random()
     if kind < 0.5:
         depth = rng.uniform(0.012, 0.1)
-        return Thicket("dome", (1.2, 3.0), depth, rng.uniform(0.01, 0.05), 0.0, tint)
+        return Thicket("dome", (1.2, 3.0), depth, rng.uniform(0.01, 0.05), stems=0.0, tint=tint)
     if kind < 0.82:
         depth = rng.uniform(0.04, 0.3)
-        return Thicket("bulge", (1.0, 3.0), depth, rng.uniform(0.04, 0.12), 0.05, tint)
+        return Thicket("bulge", (1.0, 3.0), depth, rng.uniform(0.04, 0.12), stems=0.05, tint=tint)
     depth = rng.uniform(0.4, 1.8)
-    return Thicket("bulge", (2.0, 6.0), depth, rng.uniform(0.06, 0.15), 0.25, tint)
+    return Thicket("bulge", (2.0, 6.0), depth, rng.uniform(0.06, 0.15), stems=0.25, tint=tint)
 
 
 def ivy(rng: np.random.Generator, length: float, height: float) -> Mesh:

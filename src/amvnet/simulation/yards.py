@@ -76,7 +76,8 @@ def _petrol_station(plot: Plot) -> None:
     rng = plot.rng
     front = plot.front
 
-    plot.pave((plot.x, plot.end), (front, front + 22), Label.PARKING)
+    label = Label.PARKING if rng.random() < 0.5 else Label.OTHER_GROUND
+    plot.pave((plot.x, plot.end), (front, front + 22), label)
     plot.put(fixtures.canopy(rng), plot.middle, front + 8, plot.facing, margin=8.0)
     for x in (-4, 0, 4):
         plot.put(fixtures.pump(rng), plot.middle + x, front + 8, np.pi / 2, margin=3.0)
