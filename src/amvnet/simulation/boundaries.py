@@ -15,7 +15,7 @@ from amvnet.simulation.plot import Plot
 SEGMENT = 2.5
 DRIVE_WIDTH = 3.0
 # Chance that a boundary is a hedge, and that one has a hedge before or behind a fence.
-HEDGE = 0.58
+HEDGE = 0.62
 FENCE_AND_HEDGE = 0.14
 
 

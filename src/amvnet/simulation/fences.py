@@ -86,10 +86,10 @@ OPEN_KINDS = {
 }
 # Shares of what stands along fast roads.
 ROADSIDE_KINDS = {
-    "guard rail": 0.50,
+    "guard rail": 0.56,
     "double guard rail": 0.14,
     "wire rope": 0.06,
-    "noise barrier": 0.18,
+    "noise barrier": 0.12,
     "glass barrier": 0.04,
     "parapet": 0.08,
 }

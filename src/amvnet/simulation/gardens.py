@@ -32,7 +32,7 @@ def fill_house(plot: Plot) -> None:
 
     drive_x = plot.x + 0.3 if rng.random() < 0.5 else plot.end - 3.3
     _add_drive(plot, drive_x, setback + 5.0)
-    if rng.random() < 0.85 * style.fenced:
+    if rng.random() < 0.75 * style.fenced:
         enclose(plot, drive_x, setback + rng.uniform(4, 20))
     if rng.random() < 0.5:
         plot.put(fixtures.steps(rng), x, plot.front + setback, plot.facing)

@@ -17,7 +17,7 @@ from amvnet.simulation.yards import fill_yard
 __all__ = ["Plot", "fill_plots", "plant_thickets", "random_tree"]
 
 # Chance of a long barrier or fence along one side of a street, by the kind of street.
-LONG_BARRIER = {"fast": 0.75, "rural": 0.35, "residential": 0.08, "urban": 0.08}
+LONG_BARRIER = {"fast": 0.65, "rural": 0.25, "residential": 0.05, "urban": 0.05}
 # Chances of a gantry and of a bridge over a street.
 GANTRY = {"fast": 0.35, "urban": 0.04}
 BRIDGE = 0.05
