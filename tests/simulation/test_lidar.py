@@ -166,7 +166,7 @@ def test_some_pulses_pass_a_thin_crown() -> None:
     """Their share is that of exponential free paths: exp(-thickness / depth)."""
     scene = join([slab(14.5, 15.5, 0.5), wall(20)])
     # A leaf reflects less than the wall and is lost a little more often.
-    assert share_through(scene) == pytest.approx(np.exp(-1 / 0.5), rel=0.08)
+    assert share_through(scene) == pytest.approx(np.exp(-1 / 0.5), rel=0.12)
 
     points, labels, _ = scan_mesh(scene)
     is_near_axis = np.abs(points[:, 1]) < 5

@@ -17,6 +17,7 @@ from amvnet.simulation.layouts import semantickitti_ids
 
 # Raw ids of SemanticKITTI.
 THING_IDS = {10, 11, 13, 15, 18, 20, 30, 31, 32}
+OUTLIER_ID = 1
 STUFF_IDS = {40, 44, 48, 49, 50, 51, 52, 60, 70, 71, 72, 80, 81, 99}
 MOVING_IDS = {252, 253, 254, 255, 257, 258, 259}
 CAR_IDS = [10, 252]
@@ -140,7 +141,7 @@ def test_without_motion_every_point_lies_on_its_beam_within_the_sensors_ranges(
 def test_raw_ids_are_official_and_many(scans: list[SimulatedScan]) -> None:
     labels = semantickitti_ids(np.concatenate([scan.labels for scan in scans]))
     ids = set(np.unique(labels & 0xFFFF).tolist())
-    assert ids <= THING_IDS | STUFF_IDS | MOVING_IDS
+    assert ids <= THING_IDS | STUFF_IDS | MOVING_IDS | {OUTLIER_ID}
     assert ids & MOVING_IDS
     assert ids >= {10, 40, 48, 50, 51, 70, 71, 72, 80, 81}
 

@@ -15,6 +15,7 @@ class Label(IntEnum):
     The values are raw SemanticKITTI ids; those from 300 are classes that only nuScenes has.
     """
 
+    OUTLIER = 1
     CAR = 10
     BICYCLE = 11
     BUS = 13
@@ -63,7 +64,7 @@ SEMANTICKITTI_IDS = {
     Label.TRAILER: Label.OTHER_VEHICLE,
 }
 
-# The nuScenes-lidarseg category of each class.
+# The nuScenes-lidarseg category of each class; those without one, outliers, are noise.
 NUSCENES_CATEGORIES = {
     Label.CAR: "vehicle.car",
     Label.BICYCLE: "vehicle.bicycle",
@@ -120,6 +121,8 @@ class Surface(IntEnum):
     PLASTIC = 19
     ROOF_TILE = 20
     WINDOW = 21
+    STONE = 22
+    TWIG = 23
 
 
 @dataclass(frozen=True)
@@ -138,22 +141,24 @@ class Reflection:
     drop: float = 0.0
     # Mean height in metres of relief, such as grass, that is too fine to model with triangles.
     rough: float = 0.0
+    # Share of the returns that come from a mirrored body and so from farther along the ray.
+    ghost: float = 0.0
 
 
 REFLECTIONS: dict[Surface, Reflection] = {
     Surface.ASPHALT: Reflection(0.30, spread=0.11, shade=0.14, dark=0.004),
     Surface.PAVING: Reflection(0.33, spread=0.09, shade=0.12, dark=0.003),
-    Surface.GRASS: Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.022),
+    Surface.GRASS: Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.018),
     Surface.GRAVEL: Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004),
     Surface.ROAD_PAINT: Reflection(0.55, spread=0.20, shade=0.15),
-    Surface.PLASTER: Reflection(0.44, spread=0.10, shade=0.25, drop=0.01),
+    Surface.PLASTER: Reflection(0.42, spread=0.10, shade=0.25, drop=0.01),
     Surface.BRICK: Reflection(0.38, spread=0.12, shade=0.25, drop=0.01, rough=0.002),
-    Surface.GLASS: Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65),
+    Surface.GLASS: Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65, ghost=0.04),
     Surface.WOOD: Reflection(0.38, spread=0.13, shade=0.25, rough=0.003),
-    Surface.LEAF: Reflection(0.38, spread=0.28, shade=0.15, dark=0.06, drop=0.03),
-    Surface.BARK: Reflection(0.40, spread=0.25, shade=0.15, dark=0.04, rough=0.008),
-    Surface.METAL: Reflection(0.28, spread=0.22, shade=0.50, dark=0.12, drop=0.03),
-    Surface.SIGN_FACE: Reflection(0.42, spread=0.20, shade=0.40),
+    Surface.LEAF: Reflection(0.36, spread=0.23, shade=0.17, dark=0.05, drop=0.03),
+    Surface.BARK: Reflection(0.37, spread=0.28, shade=0.20, dark=0.05, rough=0.010),
+    Surface.METAL: Reflection(0.28, spread=0.26, shade=0.50, dark=0.12, drop=0.03, rough=0.004),
+    Surface.SIGN_FACE: Reflection(0.50, spread=0.20, shade=0.40),
     Surface.CLOTH: Reflection(0.46, spread=0.20, shade=0.25, rough=0.006),
     Surface.SKIN: Reflection(0.45, spread=0.20, shade=0.10, dark=0.03),
     Surface.DARK_PAINT: Reflection(
@@ -167,7 +172,11 @@ REFLECTIONS: dict[Surface, Reflection] = {
     Surface.PLASTIC: Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03),
     Surface.ROOF_TILE: Reflection(0.33, spread=0.13, shade=0.20, drop=0.01, rough=0.003),
     # The window of a house. Unlike a car's, it has curtains and frames that reflect.
-    Surface.WINDOW: Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01),
+    Surface.WINDOW: Reflection(
+        0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01, ghost=0.02
+    ),
+    Surface.STONE: Reflection(0.36, spread=0.16, shade=0.25, rough=0.014),
+    Surface.TWIG: Reflection(0.28, spread=0.28, shade=0.20, dark=0.08, drop=0.05),
 }
 
 # The surface of each class of ground.
@@ -183,7 +192,7 @@ GROUND_SURFACES: dict[Label, Surface] = {
 
 @lru_cache(maxsize=1)
 def reflection_table() -> np.ndarray:
-    """Return `REFLECTIONS` as an (S, 6) float32 table.
+    """Return `REFLECTIONS` as an (S, 7) float32 table.
 
     Rows are the S surfaces by value; columns are the fields of `Reflection` in order.
     """

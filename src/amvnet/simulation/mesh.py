@@ -26,18 +26,19 @@ _BOX_CORNERS = np.array(
         (0.5, 0.5, 1.0),
     ]
 )
+# Counter-clockwise seen from outside.
 _BOX_FACES = np.array(
     [
-        (0, 1, 3),
-        (0, 3, 2),
+        (0, 3, 1),
+        (0, 2, 3),
         (4, 5, 7),
         (4, 7, 6),
         (0, 1, 5),
         (0, 5, 4),
-        (2, 3, 7),
-        (2, 7, 6),
-        (0, 2, 6),
-        (0, 6, 4),
+        (2, 7, 3),
+        (2, 6, 7),
+        (0, 6, 2),
+        (0, 4, 6),
         (1, 3, 7),
         (1, 7, 5),
     ]
@@ -72,11 +73,16 @@ class Mesh:
 
 
 def part(
-    solids: Sequence[np.ndarray], surface: Surface, label: Label | int, depth: float = 0
+    solids: Sequence[np.ndarray],
+    surface: Surface,
+    label: Label | int,
+    depth: float = 0,
+    *,
+    tint: float = 0,
 ) -> Mesh:
     """Return solids, (T, 3, 3) each, as one mesh of one surface and one class.
 
-    See `Mesh` for the depth.
+    See `Mesh` for the depth and the tint.
     """
     triangles = np.concatenate(solids)
     count = len(triangles)
@@ -87,7 +93,7 @@ def part(
         label=np.full(count, label, dtype=np.uint16),
         instance=np.zeros(count, dtype=np.uint16),
         depth=np.full(count, depth, dtype=np.float32),
-        tint=np.zeros(count, dtype=np.float32),
+        tint=np.full(count, tint, dtype=np.float32),
     )
 
 
@@ -105,11 +111,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
 
 def place(mesh: Mesh, x: float, y: float, z: float, yaw: float) -> Mesh:
     """Return the mesh turned by `yaw` (radians) about its vertical axis, then moved."""
-    cos = np.cos(yaw)
-    sin = np.sin(yaw)
-    rotation = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # transposed: corners are rows
-
-    corners = mesh.triangles @ rotation + np.array([x, y, z])
+    corners = moved(mesh.triangles, (x, y, z), yaw)
     return replace(mesh, triangles=corners.astype(np.float32))
 
 
@@ -119,9 +121,9 @@ def with_instance(mesh: Mesh, instance: int) -> Mesh:
 
 
 def with_random_tint(mesh: Mesh, rng: np.random.Generator) -> Mesh:
-    """Return the mesh with each of its surfaces a little brighter or darker than usual."""
+    """Return the mesh with each of its surfaces a little brighter or darker than before."""
     tints = rng.standard_normal(len(Surface), dtype=np.float32)
-    return replace(mesh, tint=tints[mesh.surface])
+    return replace(mesh, tint=mesh.tint + tints[mesh.surface])
 
 
 def with_labels(mesh: Mesh, labels: dict[Label, int]) -> Mesh:
@@ -161,11 +163,18 @@ def copies(
 
 
 def tube(
-    start: Vector, end: Vector, radius: float, end_radius: float | None = None, sides: int = 8
+    start: Vector,
+    end: Vector,
+    radius: float,
+    end_radius: float | None = None,
+    sides: int = 8,
+    *,
+    closed: bool = True,
 ) -> np.ndarray:
-    """Return the (4 sides, 3, 3) triangles of a closed round bar between two points.
+    """Return the (4 sides, 3, 3) triangles of a round bar between two points.
 
-    Its radius is `radius`, or goes from `radius` at the start to `end_radius` at the end.
+    Its radius is `radius`, or goes from `radius` at the start to `end_radius` at the end. Without
+    its two ends, if it is not closed, it has (2 sides, 3, 3) triangles.
     """
     if end_radius is None:
         end_radius = radius
@@ -175,25 +184,26 @@ def tube(
     axis = (end_point - start_point) / np.linalg.norm(end_point - start_point)
 
     # A circle about the axis, (sides, 3).
-    across = np.cross(axis, (1.0, 0, 0) if abs(axis[0]) < 0.9 else (0, 1.0, 0))
+    x, y, z = axis
+    across = np.array([0, z, -y]) if abs(x) < 0.9 else np.array([-z, 0, x])
     across /= np.linalg.norm(across)
+    a, b, c = across
+    upward = np.array([y * c - z * b, z * a - x * c, x * b - y * a])  # axis x across
     angle = np.arange(sides) * 2 * np.pi / sides
-    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(axis, across)
+    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * upward
 
     low = start_point + circle * radius
     high = end_point + circle * end_radius
     next_low = np.roll(low, -1, axis=0)
     next_high = np.roll(high, -1, axis=0)
+    side = [_triangles(low, next_low, next_high), _triangles(low, next_high, high)]
+    if not closed:
+        return np.concatenate(side)
+
     start_points = np.broadcast_to(start_point, low.shape)
     end_points = np.broadcast_to(end_point, high.shape)
-    return np.concatenate(
-        [
-            _triangles(low, next_low, next_high),
-            _triangles(low, next_high, high),
-            _triangles(start_points, next_low, low),
-            _triangles(end_points, high, next_high),
-        ]
-    )
+    ends = [_triangles(start_points, next_low, low), _triangles(end_points, high, next_high)]
+    return np.concatenate(side + ends)
 
 
 def prism(
@@ -227,6 +237,75 @@ def prism(
             _triangles(right_middle, right, next_right),
         ]
     )
+
+
+def loft(rings: np.ndarray) -> np.ndarray:
+    """Return the triangles of the closed body through rings of corners.
+
+    Args:
+        rings: (n, k, 3) corners; seen from the last ring, each runs counter-clockwise.
+
+    Returns:
+        (2 n k, 3, 3) triangles, counter-clockwise seen from outside.
+    """
+    following = np.roll(rings, -1, axis=1)
+    low = rings[:-1].reshape(-1, 3)
+    next_low = following[:-1].reshape(-1, 3)
+    high = rings[1:].reshape(-1, 3)
+    next_high = following[1:].reshape(-1, 3)
+
+    start = np.broadcast_to(rings[0].mean(axis=0), rings[0].shape)
+    end = np.broadcast_to(rings[-1].mean(axis=0), rings[-1].shape)
+    return np.concatenate(
+        [
+            _triangles(low, next_low, next_high),
+            _triangles(low, next_high, high),
+            _triangles(start, following[0], rings[0]),
+            _triangles(end, rings[-1], following[-1]),
+        ]
+    )
+
+
+def planks(
+    x: ArrayLike,
+    width: ArrayLike,
+    bottom: ArrayLike,
+    top: ArrayLike,
+    y: ArrayLike = 0.0,
+) -> np.ndarray:
+    """Return upright rectangles that face along y, as (2 n, 3, 3) triangles.
+
+    The arguments are in metres and are broadcast against each other: `x` is the middle of each
+    rectangle, `bottom` and `top` are the heights of its edges.
+    """
+    x, width, bottom, top, y = np.broadcast_arrays(x, width, bottom, top, y)
+    left = (x - width / 2).ravel()
+    right = (x + width / 2).ravel()
+    bottom = bottom.ravel()
+    top = top.ravel()
+    y = y.ravel()
+
+    a = np.stack([left, y, bottom], axis=1)
+    b = np.stack([right, y, bottom], axis=1)
+    c = np.stack([right, y, top], axis=1)
+    d = np.stack([left, y, top], axis=1)
+    return np.concatenate([_triangles(a, b, c), _triangles(a, c, d)])
+
+
+def moved(triangles: np.ndarray, at: Vector, yaw: float = 0.0) -> np.ndarray:
+    """Return (T, 3, 3) triangles turned by `yaw` (radians) about the vertical axis, then moved."""
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    rotation = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # transposed: corners are rows
+    return triangles @ rotation + np.array(at)
+
+
+def leaning(triangles: np.ndarray, x: float, y: float) -> np.ndarray:
+    """Return (T, 3, 3) triangles moved by x and y metres for each metre above the ground."""
+    offset = np.zeros_like(triangles)
+    offset[..., 0] = x * triangles[..., 2]
+    offset[..., 1] = y * triangles[..., 2]
+    return triangles + offset
 
 
 def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from amvnet.simulation.lidar import Hits
-from amvnet.simulation.materials import reflection_table
+from amvnet.simulation.materials import Label, reflection_table
 from amvnet.simulation.sensors import LidarModel
 
 # Power of a return, relative to a head-on one at 10 m, at which the device reports half of the
@@ -14,6 +14,11 @@ HALF_POWER = 0.007
 # Metres: smallest and largest step in depth within which one pulse gives one return in between.
 SMALLEST_MIXED_STEP = 0.3
 LARGEST_MIXED_STEP = 3.0
+# Spread of the size of the relief from place to place: standard deviation of its logarithm.
+RELIEF_SPREAD = 0.65
+# Metres: least and mean additional distance of a ghost, which a mirror shows behind itself.
+GHOST_NEAREST = 0.5
+GHOST_MEAN = 6.0
 # Degrees between neighbouring shots of one laser, at most.
 NEIGHBOUR_ANGLE = 0.5
 
@@ -43,7 +48,7 @@ def receive(
         (N, 4) float32 x, y, z, intensity; (N,) uint32 class ids with the instance in the upper
         half; (N,) uint8 rings.
     """
-    base, spread, shade, dark, drop, relief = reflection_table()[hits.surface].T
+    base, spread, shade, dark, drop, relief, ghost = reflection_table()[hits.surface].T
     count = len(hits.distance)
     reflectivity = base * np.exp(shade * hits.tint)
 
@@ -52,6 +57,9 @@ def receive(
     chance = 1 / (1 + (hits.distance / reach) ** 6) * (1 - drop) * (1 - sensor.drop)
 
     distance = _measured_distance(hits, sensor, relief, rng)
+    is_ghost = rng.random(count, np.float32) < ghost
+    beyond = GHOST_NEAREST + GHOST_MEAN * rng.standard_exponential(is_ghost.sum())
+    distance[is_ghost] += beyond.astype(np.float32)
     chance[(distance < sensor.min_range) | (distance > sensor.max_range)] = 0
 
     # The device compensates for range and incidence until the power is too small.
@@ -68,8 +76,9 @@ def receive(
 
     returned = rng.random(count, np.float32) < chance
     points = np.column_stack([xyz, intensity])[returned].astype(np.float32)
-    instances = hits.instance[returned].astype(np.uint32)
-    labels = hits.label[returned].astype(np.uint32) | instances << np.uint32(16)
+    instances = np.where(is_ghost, 0, hits.instance)[returned].astype(np.uint32)
+    classes = np.where(is_ghost, np.uint16(Label.OUTLIER), hits.label)[returned].astype(np.uint32)
+    labels = classes | instances << np.uint32(16)
     rings = hits.ring[returned]
     if not sensor.keeps_lost_returns:
         return points, labels, rings
@@ -92,7 +101,8 @@ def _measured_distance(
     fall = rng.standard_exponential(count, np.float32)
     mixed = _mixed_distance(hits, sensor, rng)
     noise = rng.standard_normal(count, np.float32)
-    return mixed + relief * (rise - fall) + sensor.range_noise * noise
+    size = relief * np.exp(RELIEF_SPREAD * rng.standard_normal(count, np.float32))
+    return mixed + size * (rise - fall) + sensor.range_noise * noise
 
 
 def _mixed_distance(hits: Hits, sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:
