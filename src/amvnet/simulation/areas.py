@@ -17,7 +17,7 @@ from amvnet.simulation.streets import Patch
 from amvnet.simulation.traffic import car_with_trailer, length_of
 
 # Open areas per 100 m of street on each side.
-AREAS = {"urban": 0.30, "avenue": 0.30, "residential": 0.16, "living": 0.2, "rural": 0.12}
+AREAS = {"urban": 0.24, "avenue": 0.24, "residential": 0.13, "living": 0.16, "rural": 0.10}
 LOT_VEHICLES = {
     vehicles.car: 0.90,
     vehicles.trailer: 0.03,

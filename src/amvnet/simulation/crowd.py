@@ -13,8 +13,8 @@ from amvnet.simulation.vehicles.two_wheelers import fallen_bicycle
 
 # What people do, and the share of the occasions.
 OCCASIONS = {
-    "ride": 0.22,
-    "walk": 0.30,
+    "ride": 0.16,
+    "walk": 0.36,
     "stand": 0.13,
     "meet": 0.14,
     "cross": 0.09,
@@ -22,7 +22,7 @@ OCCASIONS = {
     "stand by a car": 0.06,
 }
 # Occasions per person that `Style.people` counts, and parked two-wheelers per such person.
-PEOPLE_FACTOR = 1.25
+PEOPLE_FACTOR = 2.0
 TWO_WHEELER_FACTOR = 0.8
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from amvnet.simulation.areas import AISLE, Area, add_lot, has_room
 from amvnet.simulation.layouts import SimulatedScan
 from amvnet.simulation.lidar import RayScene, trace
 from amvnet.simulation.mesh import Mesh, join
-from amvnet.simulation.areas import AISLE, Area, add_lot, has_room
 from amvnet.simulation.plans import SideRoad
 from amvnet.simulation.populate import populate
 from amvnet.simulation.returns import laser_gains, receive
@@ -131,6 +131,7 @@ def _drive_one_street(
     for index in range(scans):
         time = index * drive.spacing / speed
         scenes = [fixed_scene]
+        site.course = np.array([course.pose_at(index)[:2]])
         moving = _moving_mesh(site, course.street_x(index), time)
         if len(moving):
             scenes.append(RayScene(moving))
@@ -219,7 +220,9 @@ def _moving_mesh(site: Site, ego_x: float, time: float) -> Mesh:
     for mover in site.movers:
         x = mover.place(site.ground, time)
         if abs(x - ego_x) < SIGHT and site.ground.is_street(x, 2.0):
-            bodies.append(mover.at(site.ground, time))
+            px, py, yaw = mover.pose_at(site.ground, time)
+            if not site.covers_course(mover.mesh, px, py, yaw):
+                bodies.append(mover.at(site.ground, time))
     return join(bodies)
 
 

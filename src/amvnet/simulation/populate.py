@@ -90,6 +90,16 @@ def _fill_roadside(site: Site, side: int) -> None:
         for _ in range(rng.poisson(per_100_m * ground.length / 100)):
             _put_beside(site, make(rng), rng.uniform(0, ground.length), t, yaw)
 
+    _put_guard_rail(site, side)
+
+
+def _put_guard_rail(site: Site, side: int) -> None:
+    """Put a crash barrier along one side of most fast roads."""
+    rng = site.rng
+    ground = site.ground
+    style = ground.style
+    yaw = along_road(side)
+
     has_rail = {"motorway": 0.75, "fast": 0.6, "rural": 0.15}.get(style.kind, 0.0)
     if rng.random() < has_rail:
         t = side * (style.road / 2 + rng.uniform(0.5, 0.9))

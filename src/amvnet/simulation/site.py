@@ -39,10 +39,15 @@ class Mover:
 
     def at(self, ground: Ground, time: float) -> Mesh:
         """Return the body at its place at a time."""
+        x, y, yaw = self.pose_at(ground, time)
+        return place(self.mesh, x, y, float(ground.height(x, y)), yaw)
+
+    def pose_at(self, ground: Ground, time: float) -> tuple[float, float, float]:
+        """Return its (x, y, yaw) at a time."""
         x, y, yaw = ground.lane_pose(self.place(ground, time), self.t)
         if self.speed < 0:
             yaw += np.pi
-        return place(self.mesh, x, y, float(ground.height(x, y)), yaw)
+        return x, y, yaw
 
 
 @dataclass
@@ -104,7 +109,7 @@ class Site:
 
     def put_at(self, mesh: Mesh, x: float, y: float, yaw: float, *, thing: bool = False) -> None:
         """Put a body on the ground at x, y, unless it would cover a place of the sensor."""
-        if self._covers_course(mesh, x, y, yaw):
+        if self.covers_course(mesh, x, y, yaw):
             return
 
         z = float(self.ground.height(x, y))
@@ -113,24 +118,9 @@ class Site:
             body = with_instance(body, self.next_instance())
         self.fixed.append(body)
 
-    def _covers_course(self, mesh: Mesh, x: float, y: float, yaw: float) -> bool:
-        """Return whether a body would stand at a place of the sensor."""
-        offset = self.course - np.array([x, y])
-        if not len(offset) or np.abs(offset).sum(axis=1).min() > LONGEST_BODY:
-            return False
-
-        # Crowns and arms over the road are no obstacle.
-        corners = mesh.triangles.reshape(-1, 3)
-        corners = corners[corners[:, 2] < OBSTACLE_HEIGHT, :2]
-        if not len(corners):
-            return False
-
-        cos = np.cos(yaw)
-        sin = np.sin(yaw)
-        inside = offset @ np.array([[cos, -sin], [sin, cos]])
-        low = corners.min(axis=0) - CLEARANCE
-        high = corners.max(axis=0) + CLEARANCE
-        return bool(((inside > low) & (inside < high)).all(axis=1).any())
+    def covers_course(self, mesh: Mesh, x: float, y: float, yaw: float) -> bool:
+        """Return whether a body that is put at x, y would be at a place of the sensor."""
+        return _covers(mesh, (x, y, yaw), self.course)
 
     def put_moving(self, mesh: Mesh, x: float, t: float, speed: float) -> None:
         """Add a body that drives or walks; see `Mover`."""
@@ -142,3 +132,24 @@ class Site:
         """Return a new instance id, from 1."""
         self.instances += 1
         return self.instances
+
+
+def _covers(mesh: Mesh, pose: tuple[float, float, float], places: np.ndarray) -> bool:
+    """Return whether a body at (x, y, yaw) covers one of (P, 2) places."""
+    x, y, yaw = pose
+    offset = places - np.array([x, y])
+    if not len(offset) or np.abs(offset).sum(axis=1).min() > LONGEST_BODY:
+        return False
+
+    # Crowns and arms over the road are no obstacle.
+    corners = mesh.triangles.reshape(-1, 3)
+    corners = corners[corners[:, 2] < OBSTACLE_HEIGHT, :2]
+    if not len(corners):
+        return False
+
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
+    inside = offset @ np.array([[cos, -sin], [sin, cos]])
+    low = corners.min(axis=0) - CLEARANCE
+    high = corners.max(axis=0) + CLEARANCE
+    return bool(((inside > low) & (inside < high)).all(axis=1).any())

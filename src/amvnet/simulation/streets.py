@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -217,7 +218,7 @@ class Ground:
         gaps.append(self.length + 50.0)
 
         islands = []
-        for left, right in zip(gaps[:-1], gaps[1:], strict=True):
+        for left, right in pairwise(gaps):
             opening = rng.uniform(7, 12)
             start = max(left + opening, self.start + 10)
             stop = min(right - opening, self.end - 10)
@@ -443,7 +444,7 @@ class Ground:
             painted |= (np.abs(t) < 0.07) & (places.x % 9 < 4)
 
         centres = sorted(abs(lane) for lane, _ in style.lanes)
-        for inner, outer in zip(centres[:-1], centres[1:], strict=True):
+        for inner, outer in pairwise(centres):
             if outer - inner > 1:
                 line = (inner + outer) / 2
                 painted |= (np.abs(np.abs(t) - line) < 0.08) & (places.x % 18 < 6)

@@ -144,8 +144,8 @@ KINDS = {
         lanes=(1.0, 0.0, 0.0),
         median=0.0,
         islands=0.05,
-        parking=0.32,
-        sides={"sidewalk": 0.62, "verge": 0.25, "cycle path": 0.04, "gravel": 0.05, "none": 0.04},
+        parking=0.24,
+        sides={"sidewalk": 0.74, "verge": 0.15, "cycle path": 0.04, "gravel": 0.04, "none": 0.03},
         relief=1.6,
         plots=(0.54, 0.20, 0.15, 0.09, 0.02),
         setback=(2, 9),
@@ -166,7 +166,7 @@ KINDS = {
         lanes=(1.0, 0.0, 0.0),
         median=0.0,
         islands=0.0,
-        parking=0.35,
+        parking=0.3,
         sides={"sidewalk": 0.30, "verge": 0.05, "gravel": 0.20, "none": 0.45},
         relief=1.2,
         plots=(0.50, 0.30, 0.10, 0.08, 0.02),
@@ -189,7 +189,7 @@ KINDS = {
         lanes=(0.8, 0.2, 0.0),
         median=0.05,
         islands=0.2,
-        parking=0.42,
+        parking=0.33,
         sides={
             "sidewalk": 0.60,
             "verge": 0.15,
@@ -217,11 +217,11 @@ KINDS = {
         lanes=(0.4, 0.5, 0.1),
         median=0.75,
         islands=0.25,
-        parking=0.35,
+        parking=0.28,
         sides={
-            "sidewalk": 0.30,
-            "verge": 0.25,
-            "cycle path": 0.25,
+            "sidewalk": 0.45,
+            "verge": 0.15,
+            "cycle path": 0.20,
             "paved verge": 0.05,
             "service road": 0.15,
         },
@@ -399,7 +399,7 @@ def _draw_lanes(
 def _draw_parking(
     rng: np.random.Generator, kind: Kind
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Draw width of the lanes for parking and angle of the cars on them: two (right, left) pairs."""
+    """Draw widths of the lanes for parking and angles of the cars on them, (right, left) each."""
     widths = []
     angles = []
     for _ in range(2):
@@ -418,7 +418,7 @@ def _draw_parking(
 def _draw_strips(rng: np.random.Generator, sides: dict[str, float]) -> tuple[Strip, ...]:
     """Draw what lies between the kerb and the plots on one side, from the road outwards."""
     name = weighted_choice(rng, sides)
-    walk = float(rng.uniform(1.2, 2.8) if rng.random() < 0.7 else rng.uniform(2.8, 5.0))
+    walk = float(rng.uniform(1.3, 3.0) if rng.random() < 0.65 else rng.uniform(3.0, 5.5))
     verge = float(rng.uniform(0.6, 3.5))
     cycle_path = Strip(float(rng.uniform(1.4, 2.4)), Label.SIDEWALK)
     sidewalk = Strip(walk, Label.SIDEWALK)

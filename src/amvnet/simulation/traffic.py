@@ -14,24 +14,24 @@ from amvnet.simulation.vehicles.parts import moved
 
 # Shares of the vehicles that park along the street, and of those that drive.
 PARKED_VEHICLES = {
-    vehicles.car: 0.865,
-    vehicles.truck: 0.045,
-    vehicles.trailer: 0.035,
-    vehicles.motorcycle: 0.04,
-    vehicles.bus: 0.01,
-    vehicles.machine: 0.005,
+    vehicles.car: 0.89,
+    vehicles.truck: 0.03,
+    vehicles.trailer: 0.03,
+    vehicles.motorcycle: 0.042,
+    vehicles.bus: 0.004,
+    vehicles.machine: 0.004,
 }
 DRIVING_VEHICLES = {
-    vehicles.car: 0.78,
-    vehicles.truck: 0.11,
-    vehicles.bus: 0.04,
-    vehicles.motorcyclist: 0.045,
-    vehicles.machine: 0.01,
-    vehicles.tram: 0.015,
+    vehicles.car: 0.845,
+    vehicles.truck: 0.065,
+    vehicles.bus: 0.02,
+    vehicles.motorcyclist: 0.06,
+    vehicles.machine: 0.006,
+    vehicles.tram: 0.004,
 }
 MOTORWAY_VEHICLES = {
-    vehicles.car: 0.74,
-    vehicles.truck: 0.23,
+    vehicles.car: 0.80,
+    vehicles.truck: 0.17,
     vehicles.bus: 0.02,
     vehicles.motorcyclist: 0.01,
 }
@@ -112,7 +112,7 @@ def park_anywhere(site: Site, side: int) -> None:
     if style.parking[int(side > 0)] or style.kind in ("fast", "avenue"):
         return
 
-    rate = 0.25 if style.kind in ("motorway", "rural") else 1.6 * min(style.parked, 0.7)
+    rate = 0.25 if style.kind in ("motorway", "rural") else 0.9 * min(style.parked, 0.7)
     for start in np.arange(0.0, ground.length, 100.0):
         x = start + rng.uniform(0, 30)
         for _ in range(rng.poisson(rate)):
@@ -181,9 +181,10 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
         factor = 1.0 if is_ego_lane else rng.uniform(0.75, 1.35)
         speed = direction * ego_speed * factor
         # Some lanes are full, as before a traffic light.
-        is_queue = rng.random() < 0.1 and style.kind != "living"
-        mean_gap = rng.uniform(1, 8) if is_queue else 70 / max(style.traffic, 0.05)
+        is_queue = rng.random() < 0.06 and style.kind != "living"
+        mean_gap = rng.uniform(1, 8) if is_queue else 90 / max(style.traffic, 0.05)
 
+        clearance = 4.5 if rng.random() < 0.15 else 11.0
         x = rng.uniform(5, 40)
         while True:
             mesh = weighted_choice(rng, fleet)(rng)
@@ -192,7 +193,7 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
             if x > ground.length - half - BUMPER_GAP:
                 break
 
-            if not is_ego_lane or abs(x - ego_x) > half + 4.5:
+            if not is_ego_lane or abs(x - ego_x) > half + clearance:
                 t = lane + rng.normal(scale=0.15)
                 site.put_moving(mesh, x, t, speed)
             x += half + BUMPER_GAP + rng.exponential(mean_gap)
@@ -203,7 +204,7 @@ def fill_bus_stops(site: Site) -> None:
     rng = site.rng
     ground = site.ground
     style = ground.style
-    if style.kind not in ("urban", "avenue", "residential") or rng.random() > 0.25:
+    if style.kind not in ("urban", "avenue", "residential") or rng.random() > 0.18:
         return
 
     side = int(rng.choice([-1, 1]))
@@ -213,7 +214,7 @@ def fill_bus_stops(site: Site) -> None:
     if not ground.is_street(x, 12):
         return
 
-    if rng.random() < 0.6:
+    if rng.random() < 0.35:
         t = side * (style.road / 2 - (0.9 if not style.parking[int(side > 0)] else -0.8))
         site.put(vehicles.bus(rng), x, t, along_road(side), thing=True, margin=8.0)
     site.put(fixtures.shelter(rng), x, side * (ground.kerb_t(side) + 2.4), facing)

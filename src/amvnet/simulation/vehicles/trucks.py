@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,10 @@ from amvnet.simulation.chance import weighted_choice
 from amvnet.simulation.materials import Label, Surface
 from amvnet.simulation.mesh import Mesh, box, copies, join, part, prism, tube
 from amvnet.simulation.vehicles.parts import draw_paint, glass, lamps, plates, wheels
+
+# Shares of semi-trailers and of motor homes among the trucks.
+SEMI_TRAILERS = 0.10
+CAMPERS = 0.12
 
 
 @dataclass(frozen=True)
@@ -37,10 +42,10 @@ class _Load:
 
 def truck(rng: np.random.Generator) -> Mesh:
     """Return a truck of any kind, from a small box truck to a semi-trailer."""
-    maker = weighted_choice(rng, TRUCKS)
-    if maker is _semi_trailer:
+    kind = rng.random()
+    if kind < SEMI_TRAILERS:
         return _semi_trailer(rng)
-    if maker is _camper:
+    if kind < SEMI_TRAILERS + CAMPERS:
         return _camper(rng)
 
     length = rng.uniform(5.2, 7.0) if rng.random() < 0.45 else rng.uniform(7.0, 11.0)
@@ -62,7 +67,7 @@ def truck(rng: np.random.Generator) -> Mesh:
         [
             cab(rng, half, cab_length, width * rng.uniform(0.92, 1.0), cab_height),
             _chassis(rng, length, width, load.floor, radius),
-            *maker(rng, load),
+            *weighted_choice(rng, LOADS)(rng, load),
         ]
     )
 
@@ -399,14 +404,12 @@ def _camper(rng: np.random.Generator) -> Mesh:
 
 
 # What trucks carry, and their shares.
-TRUCKS = {
-    _box_load: 0.40,
-    _flatbed: 0.12,
-    _tipper: 0.08,
-    _tanker: 0.04,
-    _mixer: 0.04,
-    _refuse: 0.06,
-    _fire_engine: 0.04,
-    _semi_trailer: 0.10,
-    _camper: 0.12,
+LOADS: dict[Callable[[np.random.Generator, _Load], list[Mesh]], float] = {
+    _box_load: 0.52,
+    _flatbed: 0.15,
+    _tipper: 0.10,
+    _tanker: 0.05,
+    _mixer: 0.05,
+    _refuse: 0.08,
+    _fire_engine: 0.05,
 }

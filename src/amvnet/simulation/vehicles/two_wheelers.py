@@ -112,11 +112,8 @@ def fallen_bicycle(rng: np.random.Generator) -> Mesh:
 
 def motorcycle(rng: np.random.Generator, label: Label = Label.MOTORCYCLE) -> Mesh:
     """Return a motorcycle, a scooter or a moped, sometimes under a cover."""
-    choice = rng.random()
-    if choice < 0.45:
-        mesh = _scooter(rng, label)
-    else:
-        mesh = _motorbike(rng, label)
+    make = _scooter if rng.random() < 0.45 else _motorbike
+    mesh = make(rng, label)
     if label == Label.MOTORCYCLE:
         if rng.random() < 0.1:
             mesh = _covered(rng)
