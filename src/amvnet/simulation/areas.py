@@ -26,11 +26,11 @@ LOT_VEHICLES = {
     vehicles.bus: 0.01,
 }
 YARD_VEHICLES = {
-    vehicles.truck: 0.40,
-    vehicles.trailer: 0.17,
-    vehicles.machine: 0.20,
-    vehicles.bus: 0.06,
-    vehicles.car: 0.17,
+    vehicles.truck: 0.50,
+    vehicles.trailer: 0.15,
+    vehicles.machine: 0.12,
+    vehicles.bus: 0.04,
+    vehicles.car: 0.19,
 }
 # Metres from the front of a car park to the middle of its aisle, and of its two rows from there.
 AISLE = 9.0
@@ -67,7 +67,7 @@ def add_areas(site: Site) -> None:
         for _ in range(rng.poisson(rate)):
             start = rng.uniform(5, ground.length - 40)
             area = Area(side, start, start + rng.uniform(16, 45), rng.uniform(9, 28))
-            kinds = {add_lot: 0.5, add_yard: 0.25, add_square: 0.25}
+            kinds = {add_lot: 0.5, add_yard: 0.22, add_square: 0.28}
             fill = weighted_choice(rng, kinds)
             if has_room(site, area):
                 fill(site, area)

@@ -259,9 +259,9 @@ class Ground:
     def _draw_tints(self, rng: np.random.Generator) -> None:
         """Draw how bright each class of ground is in this street."""
         self._tints = 0.9 * rng.standard_normal(256)
-        wanted = {Label.ROAD: rng.lognormal(np.log(0.30), 0.2)}
+        wanted = {Label.ROAD: rng.lognormal(np.log(0.28), 0.17)}
         if rng.random() < 0.12:
-            wanted[Label.ROAD] = rng.uniform(0.33, 0.5)  # concrete or cobbles
+            wanted[Label.ROAD] = rng.uniform(0.33, 0.44)  # concrete or cobbles
 
         # Half of the sidewalks, lots and paved verges are asphalt or as bright as it.
         for label in (Label.SIDEWALK, Label.PARKING, Label.OTHER_GROUND):
@@ -376,7 +376,6 @@ class Ground:
         lowered = 0.2 + 0.8 * np.clip((from_drive - self._drive_width) / 0.8, 0, 1)
         kerb = style.kerb * lowered
 
-        off = np.full(np.shape(x), np.inf)
         for strips, is_here in self._profiles(places):
             rise = np.zeros(np.shape(x))
             edge = 0.0
@@ -388,9 +387,11 @@ class Ground:
                 level = next_level
                 edge += strip.width
             z = z + np.where(is_here, kerb * rise, 0)
-            off = np.where(is_here, places.kerb - edge, off)
 
-        return z + self._relief.beyond(off, places.t, places.x, x, y)
+        # Along side roads, the land begins as far from the kerb as along the street.
+        right, left = (sum(strip.width for strip in strips) for strips in style.strips)
+        pavement = right + (left - right) * np.clip(0.5 + places.t / 4, 0, 1)
+        return z + self._relief.beyond(places.kerb - pavement, places.t, places.x, x, y)
 
     def _profiles(self, places: _Places) -> list[tuple[tuple[Strip, ...], np.ndarray]]:
         """Return the strips of each road next to the places where it is the nearest."""
@@ -579,9 +580,9 @@ def _draw_side_strips(rng: np.random.Generator, style: Style) -> tuple[Strip, ..
             return strips
 
     choice = rng.random()
-    if choice < 0.4:
-        return (Strip(float(rng.uniform(1.0, 2.5)), Label.SIDEWALK),)
-    if choice < 0.6:
+    if choice < 0.65:
+        return (Strip(float(rng.uniform(1.0, 3.0)), Label.SIDEWALK),)
+    if choice < 0.8:
         return (Strip(float(rng.uniform(0.4, 1.5)), Label.OTHER_GROUND, raised=False),)
 
     return ()

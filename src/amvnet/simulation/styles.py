@@ -139,13 +139,13 @@ class Kind:
 
 KINDS = {
     "residential": Kind(
-        share=0.36,
+        share=0.40,
         lane=(2.4, 3.9),
         lanes=(1.0, 0.0, 0.0),
         median=0.0,
         islands=0.05,
-        parking=0.24,
-        sides={"sidewalk": 0.74, "verge": 0.15, "cycle path": 0.04, "gravel": 0.04, "none": 0.03},
+        parking=0.21,
+        sides={"sidewalk": 0.74, "verge": 0.15, "cycle path": 0.04, "gravel": 0.03, "none": 0.04},
         relief=1.6,
         plots=(0.54, 0.20, 0.15, 0.09, 0.02),
         setback=(2, 9),
@@ -240,7 +240,7 @@ KINDS = {
         junctions=0.9,
     ),
     "rural": Kind(
-        share=0.16,
+        share=0.13,
         lane=(2.3, 3.7),
         lanes=(1.0, 0.0, 0.0),
         median=0.0,
@@ -248,10 +248,10 @@ KINDS = {
         parking=0.0,
         sides={
             "soft verge": 0.40,
-            "sidewalk": 0.14,
-            "cycle path": 0.12,
-            "gravel": 0.12,
-            "none": 0.22,
+            "sidewalk": 0.25,
+            "cycle path": 0.17,
+            "gravel": 0.08,
+            "none": 0.10,
         },
         relief=4.0,
         plots=(0.14, 0.0, 0.54, 0.31, 0.01),
@@ -268,7 +268,7 @@ KINDS = {
         junctions=0.7,
     ),
     "fast": Kind(
-        share=0.05,
+        share=0.04,
         lane=(3.2, 3.8),
         lanes=(0.5, 0.5, 0.0),
         median=0.3,
@@ -372,7 +372,7 @@ def _draw_median(rng: np.random.Generator, is_long: bool, has_islands: bool) -> 
 
 
 def _draw_median_label(rng: np.random.Generator, is_long: bool) -> Label:
-    chances = {Label.TERRAIN: 0.65, Label.OTHER_GROUND: 0.25, Label.SIDEWALK: 0.10}
+    chances = {Label.TERRAIN: 0.55, Label.OTHER_GROUND: 0.20, Label.SIDEWALK: 0.25}
     if not is_long:
         chances = {Label.TERRAIN: 0.15, Label.OTHER_GROUND: 0.55, Label.SIDEWALK: 0.30}
     return weighted_choice(rng, chances)
@@ -418,8 +418,8 @@ def _draw_parking(
 def _draw_strips(rng: np.random.Generator, sides: dict[str, float]) -> tuple[Strip, ...]:
     """Draw what lies between the kerb and the plots on one side, from the road outwards."""
     name = weighted_choice(rng, sides)
-    walk = float(rng.uniform(1.3, 3.0) if rng.random() < 0.65 else rng.uniform(3.0, 5.5))
-    verge = float(rng.uniform(0.6, 3.5))
+    walk = float(rng.uniform(1.4, 3.2) if rng.random() < 0.55 else rng.uniform(3.2, 6.0))
+    verge = float(rng.uniform(0.5, 2.6))
     cycle_path = Strip(float(rng.uniform(1.4, 2.4)), Label.SIDEWALK)
     sidewalk = Strip(walk, Label.SIDEWALK)
 

@@ -15,16 +15,16 @@ from amvnet.simulation.vehicles.parts import moved
 # Shares of the vehicles that park along the street, and of those that drive.
 PARKED_VEHICLES = {
     vehicles.car: 0.89,
-    vehicles.truck: 0.03,
-    vehicles.trailer: 0.03,
+    vehicles.truck: 0.04,
+    vehicles.trailer: 0.02,
     vehicles.motorcycle: 0.042,
     vehicles.bus: 0.004,
     vehicles.machine: 0.004,
 }
 DRIVING_VEHICLES = {
     vehicles.car: 0.845,
-    vehicles.truck: 0.065,
-    vehicles.bus: 0.02,
+    vehicles.truck: 0.075,
+    vehicles.bus: 0.010,
     vehicles.motorcyclist: 0.06,
     vehicles.machine: 0.006,
     vehicles.tram: 0.004,
@@ -204,7 +204,7 @@ def fill_bus_stops(site: Site) -> None:
     rng = site.rng
     ground = site.ground
     style = ground.style
-    if style.kind not in ("urban", "avenue", "residential") or rng.random() > 0.18:
+    if style.kind not in ("urban", "avenue", "residential") or rng.random() > 0.13:
         return
 
     side = int(rng.choice([-1, 1]))

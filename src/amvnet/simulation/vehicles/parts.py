@@ -73,7 +73,7 @@ def plates(half: float, z: float, label: Label) -> Mesh:
 
 def lamps(half: float, width: float, z: float, label: Label) -> Mesh:
     """Return the lamps at the four corners of a vehicle, which reflect towards the sensor."""
-    lamp = box((0.05, 0.3, 0.16))
+    lamp = box((0.05, 0.22, 0.11))
     x = [[-(half - 0.01)], [half - 0.02]]
     four = copies(lamp, x=x, y=[-(width / 2 - 0.2), width / 2 - 0.2], z=z)
     return part([four], Surface.SIGN_FACE, label)
