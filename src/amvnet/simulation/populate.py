@@ -8,6 +8,7 @@ from amvnet.simulation import fixtures, vehicles
 from amvnet.simulation.areas import add_areas
 from amvnet.simulation.crowd import add_people, park_two_wheelers
 from amvnet.simulation.mesh import Mesh
+from amvnet.simulation.plans import SideRoad
 from amvnet.simulation.plots import Plot, fill_plots, plant_thickets, random_tree
 from amvnet.simulation.site import Site
 from amvnet.simulation.traffic import (
@@ -38,6 +39,7 @@ def populate(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
         ego_speed: speed of the car with the sensor, metres per second.
         ego: x and t of that car at time 0; no traffic in its lane starts near it.
     """
+    ground = site.ground
     add_areas(site)
     for side in (-1, 1):
         fill_plots(site, side)
@@ -48,6 +50,9 @@ def populate(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
 
     _close_ends(site)
     _fill_islands(site)
+    for road in ground.crossings:
+        for side in (-1, 1):
+            _line_side_road(site, road, side)
     fill_side_roads(site)
     fill_bus_stops(site)
     add_traffic(site, ego_speed, ego)
@@ -190,6 +195,56 @@ def _close_ends(site: Site) -> None:
             else:
                 segment = fixtures.bush(rng, rng.uniform(0.8, 1.8))
             site.put(segment, x + outwards * rng.uniform(1.5, 2.0), t + 1.2, np.pi / 2)
+
+
+def _line_side_road(site: Site, road: SideRoad, side: int) -> None:
+    """Put hedges, walls, fences, trees and houses along one side of a side road."""
+    rng = site.rng
+    ground = site.ground
+    if ground.style.kind == "motorway":
+        return
+
+    edge = road.width / 2 + sum(strip.width for strip in road.strips)
+    first = ground.front(road.side) + rng.uniform(1, 5)
+    last = min(road.length, first + rng.uniform(8, 32))
+    make = rng.choice(4)
+    height = rng.uniform(0.7, 1.9)
+
+    for along in np.arange(first, last, 2.5):
+        if make == 0:
+            segment = fixtures.hedge(rng, 2.5, height)
+        elif make == 1:
+            segment = fixtures.wall(2.5, height)
+        elif make == 2:
+            segment = fixtures.board_fence(2.5, height, 0.3)
+        else:
+            break
+        _put_along(site, road, segment, along, side * (edge + 0.4))
+
+    has_houses = ground.style.kind in ("residential", "urban", "living", "avenue")
+    for along in np.arange(first + 5, last + 10, rng.uniform(10, 20)):
+        width = rng.uniform(7, 12)
+        depth = rng.uniform(7, 11)
+        across = side * (edge + depth / 2 + rng.uniform(0.5, 6.0))
+        if has_houses and rng.random() < 0.5:
+            storeys = rng.uniform(*ground.style.storeys)
+            house = fixtures.building(rng, width, depth, storeys, flat=rng.random() < 0.2)
+            _put_along(site, road, house, along + width / 2, across, reach=width / 2)
+        else:
+            _put_along(site, road, random_tree(rng, rng.uniform(4, 9)), along, across)
+
+
+def _put_along(
+    site: Site, road: SideRoad, mesh: Mesh, along: float, across: float, reach: float = 1.0
+) -> None:
+    """Put a body next to a side road, unless the street or another road is within its reach."""
+    ground = site.ground
+    px, py, yaw = road.pose_at(along, across)
+    x, y = np.array([px]), np.array([py])
+    _, t = ground.street_coordinates(x, y)
+    is_clear = abs(t[0]) > ground.front(road.side) + reach
+    if is_clear and ground.distance_from_crossings(x, y)[0] > reach:
+        site.put_at(mesh, px, py, yaw)
 
 
 def _fill_islands(site: Site) -> None:
