@@ -67,7 +67,7 @@ def add_areas(site: Site) -> None:
         for _ in range(rng.poisson(rate)):
             start = rng.uniform(5, ground.length - 40)
             area = Area(side, start, start + rng.uniform(16, 45), rng.uniform(9, 28))
-            kinds = {add_lot: 0.5, add_yard: 0.22, add_square: 0.28}
+            kinds = {add_lot: 0.48, add_yard: 0.26, add_square: 0.26}
             fill = weighted_choice(rng, kinds)
             if has_room(site, area):
                 fill(site, area)

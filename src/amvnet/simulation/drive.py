@@ -16,7 +16,7 @@ from amvnet.simulation.plans import SideRoad
 from amvnet.simulation.populate import populate
 from amvnet.simulation.returns import laser_gains, receive
 from amvnet.simulation.sensors import LidarModel, draw_device
-from amvnet.simulation.site import Site
+from amvnet.simulation.site import MOVING_CLEARANCE, Site, covers
 from amvnet.simulation.streets import Ground
 from amvnet.simulation.styles import Style, draw_style
 
@@ -131,8 +131,7 @@ def _drive_one_street(
     for index in range(scans):
         time = index * drive.spacing / speed
         scenes = [fixed_scene]
-        site.course = np.array([course.pose_at(index)[:2]])
-        moving = _moving_mesh(site, course.street_x(index), time)
+        moving = _moving_mesh(site, course, index, time)
         if len(moving):
             scenes.append(RayScene(moving))
 
@@ -214,14 +213,16 @@ def _near_side_road(ground: Ground, length: float, drive: Drive) -> SideRoad | N
     return None
 
 
-def _moving_mesh(site: Site, ego_x: float, time: float) -> Mesh:
-    """Return the moving bodies that the sensor at `ego_x` can see at a time."""
+def _moving_mesh(site: Site, course: Course, index: int, time: float) -> Mesh:
+    """Return the moving bodies that the sensor can see at a scan."""
+    ego_x = course.street_x(index)
+    ego = np.array([course.pose_at(index)[:2]])
     bodies = []
     for mover in site.movers:
         x = mover.place(site.ground, time)
         if abs(x - ego_x) < SIGHT and site.ground.is_street(x, 2.0):
-            px, py, yaw = mover.pose_at(site.ground, time)
-            if not site.covers_course(mover.mesh, px, py, yaw):
+            pose = mover.pose_at(site.ground, time)
+            if not covers(mover.mesh, pose, ego, MOVING_CLEARANCE):
                 bodies.append(mover.at(site.ground, time))
     return join(bodies)
 

@@ -324,7 +324,7 @@ def _add_work_zones(site: Site) -> None:
             segment = fixtures.barrier(2.0) if has_barriers else fixtures.traffic_cone(rng)
             site.put(segment, x, edge)
 
-        if rng.random() < 0.35:
+        if rng.random() < 0.45:
             t = side * (ground.front(side) + 2.5)
             machine = vehicles.machine(rng)
             yaw = rng.uniform(0, 2 * np.pi)

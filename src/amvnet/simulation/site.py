@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from amvnet.simulation.materials import MOVING
+from amvnet.simulation.materials import MOVING, Label
 from amvnet.simulation.mesh import Mesh, place, with_instance, with_labels, with_random_tint
 from amvnet.simulation.streets import Ground
 
 # Metres: half the longest body that may cover the sensor, the height up to which bodies are in its
-# way, and how near they may come to it.
+# way, and how near those that stand and those that move may come to it.
 LONGEST_BODY = 30.0
 OBSTACLE_HEIGHT = 2.2
-CLEARANCE = 1.4
+CLEARANCE = 2.1
+MOVING_CLEARANCE = 1.4
 
 
 @dataclass(frozen=True)
@@ -115,17 +116,17 @@ class Site:
         z = float(self.ground.height(x, y))
         body = place(with_random_tint(mesh, self.rng), x, y, z, yaw)
         if thing:
-            body = with_instance(body, self.next_instance())
+            body = _as_thing(body, self.next_instance())
         self.fixed.append(body)
 
     def covers_course(self, mesh: Mesh, x: float, y: float, yaw: float) -> bool:
         """Return whether a body that is put at x, y would be at a place of the sensor."""
-        return _covers(mesh, (x, y, yaw), self.course)
+        return covers(mesh, (x, y, yaw), self.course, CLEARANCE)
 
     def put_moving(self, mesh: Mesh, x: float, t: float, speed: float) -> None:
         """Add a body that drives or walks; see `Mover`."""
         body = with_labels(with_random_tint(mesh, self.rng), dict(MOVING))
-        body = with_instance(body, self.next_instance())
+        body = _as_thing(body, self.next_instance())
         self.movers.append(Mover(body, x, t, speed))
 
     def next_instance(self) -> int:
@@ -134,8 +135,17 @@ class Site:
         return self.instances
 
 
-def _covers(mesh: Mesh, pose: tuple[float, float, float], places: np.ndarray) -> bool:
-    """Return whether a body at (x, y, yaw) covers one of (P, 2) places."""
+def _as_thing(mesh: Mesh, instance: int) -> Mesh:
+    """Return the mesh as one instance; what people lead, such as dogs, is none."""
+    thing = with_instance(mesh, instance)
+    is_thing = mesh.label != Label.OTHER_OBJECT
+    return replace(thing, instance=np.where(is_thing, thing.instance, 0).astype(np.uint16))
+
+
+def covers(
+    mesh: Mesh, pose: tuple[float, float, float], places: np.ndarray, clearance: float
+) -> bool:
+    """Return whether a body at (x, y, yaw) is within the clearance of one of (P, 2) places."""
     x, y, yaw = pose
     offset = places - np.array([x, y])
     if not len(offset) or np.abs(offset).sum(axis=1).min() > LONGEST_BODY:
@@ -150,6 +160,6 @@ def _covers(mesh: Mesh, pose: tuple[float, float, float], places: np.ndarray) ->
     cos = np.cos(yaw)
     sin = np.sin(yaw)
     inside = offset @ np.array([[cos, -sin], [sin, cos]])
-    low = corners.min(axis=0) - CLEARANCE
-    high = corners.max(axis=0) + CLEARANCE
+    low = corners.min(axis=0) - clearance
+    high = corners.max(axis=0) + clearance
     return bool(((inside > low) & (inside < high)).all(axis=1).any())

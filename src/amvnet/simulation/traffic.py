@@ -14,18 +14,18 @@ from amvnet.simulation.vehicles.parts import moved
 
 # Shares of the vehicles that park along the street, and of those that drive.
 PARKED_VEHICLES = {
-    vehicles.car: 0.89,
+    vehicles.car: 0.884,
     vehicles.truck: 0.04,
-    vehicles.trailer: 0.02,
+    vehicles.trailer: 0.026,
     vehicles.motorcycle: 0.042,
     vehicles.bus: 0.004,
     vehicles.machine: 0.004,
 }
 DRIVING_VEHICLES = {
-    vehicles.car: 0.845,
+    vehicles.car: 0.860,
     vehicles.truck: 0.075,
-    vehicles.bus: 0.010,
-    vehicles.motorcyclist: 0.06,
+    vehicles.bus: 0.015,
+    vehicles.motorcyclist: 0.04,
     vehicles.machine: 0.006,
     vehicles.tram: 0.004,
 }
