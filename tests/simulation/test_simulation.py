@@ -14,6 +14,8 @@ import pytest
 from amvnet.errors import InputError
 from amvnet.simulation import SENSORS, Drive, SimulatedScan, drive_street, simulate
 from amvnet.simulation.layouts import semantickitti_ids
+from amvnet.simulation.sensors import LidarModel, draw_device
+from amvnet.simulation.styles import KINDS
 
 # Raw ids of SemanticKITTI.
 THING_IDS = {10, 11, 13, 15, 18, 20, 30, 31, 32}
@@ -23,6 +25,18 @@ MOVING_IDS = {252, 253, 254, 255, 257, 258, 259}
 CAR_IDS = [10, 252]
 ROAD_IDS = [40, 60]
 HDL64E = SENSORS["hdl64e"]
+
+
+def exact_device(sensor: LidarModel) -> LidarModel:
+    """Return a type of LiDAR whose devices are all alike."""
+    return replace(
+        sensor,
+        height_spread=0.0,
+        mounting_spread=0.0,
+        elevation_spread=0.0,
+        laser_spread=0.0,
+        response_spread=0.0,
+    )
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -95,12 +109,13 @@ def test_progress_counts_every_scan(tmp_path: Path) -> None:
 def test_values_are_in_range(scans: list[SimulatedScan]) -> None:
     # The points are corrected to the middle of the rotation, so the sensor was at most half a
     # rotation's way from there.
-    moved = Drive().speed[1] * HDL64E.rotation_period / 2
+    fastest = Drive().speed[1] * 1.2 * max(kind.speed for kind in KINDS.values())
+    moved = fastest * HDL64E.rotation_period / 2
     for scan in scans:
         assert scan.points.dtype == np.float32
         assert scan.labels.dtype == np.uint32
         assert len(scan.points) == len(scan.labels)
-        assert 70_000 < len(scan.points) < 64 * HDL64E.azimuth_steps
+        assert 40_000 < len(scan.points) < 64 * HDL64E.azimuth_steps
         assert np.isfinite(scan.points).all()
         assert scan.points[:, 3].min() >= 0
         assert scan.points[:, 3].max() <= 1
@@ -117,7 +132,7 @@ def test_without_motion_every_point_lies_on_its_beam_within_the_sensors_ranges(
 ) -> None:
     """A rotation that takes no time leaves nothing to correct."""
     pytest.importorskip("embreex")
-    sensor = replace(SENSORS[name], rotation_period=0.0)
+    sensor = exact_device(replace(SENSORS[name], rotation_period=0.0))
     beams = np.array(sensor.elevations)[::-1]
     for scan in drive_street(sensor, 2, np.random.SeedSequence(seed)):
         # Lost returns have no label, and no place on a beam.
@@ -163,8 +178,8 @@ def test_a_car_is_as_small_as_a_car(scans: list[SimulatedScan]) -> None:
             # Without the few returns that mix with what is behind.
             low, high = np.quantile(xyz, (0.04, 0.96), axis=0)
             extent = high - low
-            assert np.linalg.norm(extent[:2]) < 6.5
-            assert extent[2] < 2.5
+            assert np.linalg.norm(extent[:2]) < 7.0
+            assert extent[2] < 3.0
 
 
 def test_road_points_lie_on_the_road(scans: list[SimulatedScan]) -> None:
@@ -172,9 +187,9 @@ def test_road_points_lie_on_the_road(scans: list[SimulatedScan]) -> None:
         near = np.linalg.norm(scan.points[:, :2], axis=1) < 10
         is_road = np.isin(scan.labels & 0xFFFF, ROAD_IDS)
         height = scan.points[near & is_road, 2] + HDL64E.height
-        assert len(height) > 1000
-        assert abs(np.median(height)) < 0.2
-        assert np.abs(height).max() < 1.0
+        assert len(height) > 300
+        assert abs(np.median(height)) < 0.4
+        assert np.quantile(np.abs(height), 0.99) < 1.0
 
 
 def test_the_sensor_drives_on(scans: list[SimulatedScan]) -> None:
@@ -184,6 +199,19 @@ def test_the_sensor_drives_on(scans: list[SimulatedScan]) -> None:
         assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
         assert np.linalg.norm(second.pose[:3, 3]) == pytest.approx(Drive().spacing, rel=0.15)
         assert second.time > first.time
+
+
+def test_devices_of_a_type_differ_a_little() -> None:
+    devices = [draw_device(HDL64E, np.random.default_rng(seed)) for seed in range(20)]
+    for device in devices:
+        assert abs(device.height - HDL64E.height) <= 0.15
+        assert abs(device.pitch) <= 1.5
+        assert abs(device.roll) <= 1.5
+        offsets = np.array(device.elevations) - np.array(HDL64E.elevations)
+        assert np.abs(offsets).max() < 0.7
+        assert (np.diff(device.elevations) <= 0).all()
+    assert len({device.height for device in devices}) == 20
+    assert draw_device(exact_device(HDL64E), np.random.default_rng(0)) == exact_device(HDL64E)
 
 
 def test_a_long_sequence_continues_in_another_street() -> None:

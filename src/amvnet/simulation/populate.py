@@ -1,32 +1,25 @@
-"""Fill a street with plots, roadside furniture, parked vehicles, traffic, people and work zones.
-
-x and t are street coordinates in metres: along the middle line, and across it (left is positive).
-A side is -1 (right) or 1 (left). Each street depends on the order of the random draws: keep it.
-"""
+"""Fills a street with everything that stands and moves in it."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from amvnet.simulation import fixtures, vehicles
-from amvnet.simulation.chance import weighted_choice
+from amvnet.simulation.areas import add_areas
+from amvnet.simulation.crowd import add_people, park_two_wheelers
+from amvnet.simulation.mesh import Mesh
+from amvnet.simulation.plans import SideRoad
 from amvnet.simulation.plots import Plot, fill_plots, plant_thickets, random_tree
 from amvnet.simulation.site import Site
-from amvnet.simulation.streets import Crossing, Ground
+from amvnet.simulation.traffic import (
+    add_traffic,
+    along_road,
+    fill_bus_stops,
+    fill_parking_lane,
+    fill_side_roads,
+    park_anywhere,
+)
 
-# Shares of the vehicles that park along the street, and of those that drive.
-PARKED_VEHICLES = {
-    vehicles.car: 0.91,
-    vehicles.truck: 0.03,
-    vehicles.trailer: 0.03,
-    vehicles.motorcycle: 0.03,
-}
-DRIVING_VEHICLES = {
-    vehicles.car: 0.80,
-    vehicles.truck: 0.10,
-    vehicles.bus: 0.04,
-    vehicles.motorcyclist: 0.06,
-}
 # Roadside furniture per 100 m of street on each side.
 SIGNS = 3.0
 POSTS = 0.5
@@ -36,51 +29,36 @@ SHELTERS = 0.15
 WORK_ZONES = 0.25
 # Metres between the trees, houses and copses of the second row, along the street.
 BACKGROUND_STEP = 14.0
-# Metres: least distance between two vehicles of one lane.
-VEHICLE_GAP = 14.0
-# Largest random yaw. 2 pi, rounded up: the exact value would change the streets of every seed.
-TURN = 6.3
 
 
-def populate(ground: Ground, rng: np.random.Generator, ego_speed: float, ego_x: float) -> Site:
-    """Return a street with everything that stands and moves in it.
+def populate(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
+    """Fill a street with everything that stands and moves in it.
 
     Args:
-        ground: the street.
-        rng: draws everything.
+        site: the street; its open areas may be reserved already.
         ego_speed: speed of the car with the sensor, metres per second.
-        ego_x: x of that car at time 0; no traffic in its lane starts near it.
+        ego: x and t of that car at time 0; no traffic in its lane starts near it.
     """
-    site = Site(ground, rng)
+    ground = site.ground
+    add_areas(site)
     for side in (-1, 1):
         fill_plots(site, side)
-        _fill_parking_lane(site, side)
+        fill_parking_lane(site, side)
+        park_anywhere(site, side)
         _fill_roadside(site, side)
         _fill_background(site, side)
 
-    _fill_side_roads(site)
-    _add_traffic(site, ego_speed, ego_x)
-    _add_people(site)
-    _park_two_wheelers(site)
+    _close_ends(site)
+    _fill_islands(site)
+    for road in ground.crossings:
+        for side in (-1, 1):
+            _line_side_road(site, road, side)
+    fill_side_roads(site)
+    fill_bus_stops(site)
+    add_traffic(site, ego_speed, ego)
+    add_people(site)
+    park_two_wheelers(site)
     _add_work_zones(site)
-    return site
-
-
-def _fill_parking_lane(site: Site, side: int) -> None:
-    """Put parked vehicles along one side of the road, if it has a parking lane."""
-    rng = site.rng
-    style = site.ground.style
-    lane_width = style.parking[int(side > 0)]
-
-    x = rng.uniform(0, 6)
-    while lane_width and x < site.ground.length:
-        make = weighted_choice(rng, PARKED_VEHICLES)
-        space = 13.0 if make is vehicles.truck else rng.uniform(5.8, 7.5)
-        if rng.random() < style.parked:
-            t = side * (style.road / 2 + lane_width / 2 + rng.normal(scale=0.1))
-            yaw = _along_road(side) + rng.normal(scale=0.02)
-            site.put(make(rng), x + space / 2, t, yaw, thing=True, margin=6.0 + space / 2)
-        x += space
 
 
 def _fill_roadside(site: Site, side: int) -> None:
@@ -89,19 +67,21 @@ def _fill_roadside(site: Site, side: int) -> None:
     ground = site.ground
     style = ground.style
 
-    kerb_t = side * (style.road / 2 + style.parking[int(side > 0)] + 0.35)
-    back_t = side * (ground.front(side) - 0.3)
-    yaw = _along_road(side)
+    kerb_t = side * (ground.kerb_t(side) + 0.35)
+    back_t = side * (max(ground.front(side), ground.kerb_t(side) + 0.5) - 0.3)
+    yaw = along_road(side)
 
     has_wires = style.kind == "rural" or rng.random() < 0.15
     make_pole = fixtures.utility_pole if has_wires else fixtures.lamp
     for x in np.arange(rng.uniform(0, style.lamps), ground.length, style.lamps):
-        site.put(make_pole(rng), x, kerb_t if rng.random() < 0.7 else back_t, yaw)
+        _put_beside(site, make_pole(rng), x, kerb_t if rng.random() < 0.7 else back_t, yaw)
 
     if np.isfinite(style.trees):
         for x in np.arange(rng.uniform(0, style.trees), ground.length, style.trees):
             tree = random_tree(rng, rng.uniform(4, 9))
             site.put(tree, x + rng.normal(), back_t, margin=2.0)
+    if np.isfinite(style.parking_period) and style.parking[int(side > 0)] and rng.random() < 0.6:
+        _plant_parking_islands(site, side)
 
     furniture = (
         (fixtures.sign, SIGNS, kerb_t),
@@ -110,12 +90,43 @@ def _fill_roadside(site: Site, side: int) -> None:
         (fixtures.shelter, SHELTERS, back_t),
     )
     for make, per_100_m, t in furniture:
+        if make is fixtures.shelter and style.kind == "motorway":
+            continue
         for _ in range(rng.poisson(per_100_m * ground.length / 100)):
-            site.put(make(rng), rng.uniform(0, ground.length), t, yaw)
+            _put_beside(site, make(rng), rng.uniform(0, ground.length), t, yaw)
 
-    if style.kind == "fast" and rng.random() < 0.7:
+    _put_guard_rail(site, side)
+
+
+def _put_guard_rail(site: Site, side: int) -> None:
+    """Put a crash barrier along one side of most fast roads."""
+    rng = site.rng
+    ground = site.ground
+    style = ground.style
+    yaw = along_road(side)
+
+    has_rail = {"motorway": 0.75, "fast": 0.6, "rural": 0.15}.get(style.kind, 0.0)
+    if rng.random() < has_rail:
+        t = side * (style.road / 2 + rng.uniform(0.5, 0.9))
+        if style.strips[int(side > 0)] and style.kind == "motorway":
+            t = side * (ground.front(side) - rng.uniform(0.3, 0.8))
         for x in np.arange(0, ground.length, 4.0):
-            site.put(fixtures.guard_rail(4.1), x, side * (style.road / 2 + 0.7), yaw)
+            site.put(fixtures.guard_rail(4.1), x, t, yaw)
+
+
+def _put_beside(site: Site, mesh: Mesh, x: float, t: float, yaw: float) -> None:
+    """Put a body beside the road, unless the street has ended there."""
+    if site.ground.is_street(x):
+        site.put(mesh, x, t, yaw)
+
+
+def _plant_parking_islands(site: Site, side: int) -> None:
+    """Plant trees on the islands between parking bays."""
+    style = site.ground.style
+    t = side * (style.road / 2 + style.parking[int(side > 0)] * 0.6)
+    for x in np.arange(1.0, site.ground.length, style.parking_period):
+        tree = random_tree(site.rng, site.rng.uniform(3, 8))
+        site.put(tree, x, t, margin=2.0)
 
 
 def _fill_background(site: Site, side: int) -> None:
@@ -123,9 +134,14 @@ def _fill_background(site: Site, side: int) -> None:
     rng = site.rng
     ground = site.ground
     front = ground.front(side)
-    has_houses = ground.style.kind in ("residential", "urban")
+    has_houses = ground.style.kind in ("residential", "urban", "living", "avenue")
+    # Some streets have a free view.
+    density = rng.choice([1.0, 0.6, 0.2], p=[0.6, 0.25, 0.15])
 
     for x in np.arange(rng.uniform(0, 10), ground.length, BACKGROUND_STEP):
+        if rng.random() > density:
+            continue
+
         t = side * (front + rng.uniform(32, 45))
         if rng.random() < 0.45:
             plot = Plot(site, side, x, BACKGROUND_STEP)
@@ -152,95 +168,155 @@ def _put_background_house(site: Site, x: float, t: float) -> None:
     site.put(house, x, t, rng.normal(scale=0.3), margin=6.0)
 
 
-def _fill_side_roads(site: Site) -> None:
-    """Put waiting vehicles on the side roads, and a traffic light or a sign where they begin."""
-    rng = site.rng
-
-    for crossing in site.ground.crossings:
-        for side in crossing.sides:
-            for _ in range(rng.poisson(0.8)):
-                distance = rng.uniform(4.5, 25)
-                _put_waiting_car(site, crossing, side, distance)
-
-            make = fixtures.traffic_light if rng.random() < 0.3 else fixtures.sign
-            corner_x = crossing.x - crossing.width / 2 - 2.5
-            corner_t = side * (site.ground.style.road / 2 + 1.2)
-            site.put(make(rng), corner_x, corner_t, margin=0.3)
-
-
-def _put_waiting_car(site: Site, crossing: Crossing, side: int, distance: float) -> None:
-    """Put a car or a bus on the right half of a side road, facing the street."""
-    rng = site.rng
-    vehicle = vehicles.car(rng) if rng.random() < 0.93 else vehicles.bus(rng)
-    x = crossing.x + side * crossing.width / 4
-    t = side * (site.ground.style.road / 2 + distance)
-    site.put(vehicle, x, t, -side * np.pi / 2, thing=True, margin=-np.inf)
-
-
-def _add_traffic(site: Site, ego_speed: float, ego_x: float) -> None:
-    """Add vehicles to both lanes; all in one lane have one speed, so that none hits another."""
+def _close_ends(site: Site) -> None:
+    """Put a hedge, a fence, a wall or a house behind the end of a street."""
     rng = site.rng
     ground = site.ground
-    style = ground.style
 
-    oncoming_speed = -ego_speed * rng.uniform(0.8, 1.3)
-    for direction, speed in ((1, ego_speed), (-1, oncoming_speed)):
-        x = rng.uniform(5, 60)
-        while x < ground.length - 10:
-            if direction < 0 or abs(x - ego_x) > VEHICLE_GAP:
-                make = weighted_choice(rng, DRIVING_VEHICLES)
-                site.put_moving(make(rng), x, -direction * style.road / 4, speed)
-            x += VEHICLE_GAP + rng.exponential(100 / max(style.traffic, 0.05))
+    for x, outwards in ((ground.start, -1), (ground.end, 1)):
+        if not np.isfinite(x):
+            continue
+
+        reach = max(ground.front(-1), ground.front(1))
+        if rng.random() < 0.4:
+            house = fixtures.building(
+                rng, 2 * reach, 9.0, rng.uniform(*ground.style.storeys), flat=False
+            )
+            away = rng.uniform(9, 18)
+            site.put(house, x + outwards * away, 0.0, np.pi / 2, margin=5.0)
+            continue
+
+        make = rng.choice(3)
+        for t in np.arange(-reach, reach, 2.5):
+            if make == 0:
+                segment = fixtures.hedge(rng, 2.5, 1.5)
+            elif make == 1:
+                segment = fixtures.board_fence(2.5, 1.5, 0.2)
+            else:
+                segment = fixtures.bush(rng, rng.uniform(0.8, 1.8))
+            site.put(segment, x + outwards * rng.uniform(1.5, 2.0), t + 1.2, np.pi / 2)
 
 
-def _add_people(site: Site) -> None:
-    """Add riders at the edges of the road, and people who walk or stand on the sidewalks."""
+def _line_side_road(site: Site, road: SideRoad, side: int) -> None:
+    """Put hedges, walls, fences, trees and houses along one side of a side road."""
     rng = site.rng
     ground = site.ground
-    style = ground.style
+    if ground.style.kind == "motorway":
+        return
 
-    for _ in range(rng.poisson(style.people * ground.length / 100)):
-        side = int(rng.choice([-1, 1]))
-        x = rng.uniform(0, ground.length)
+    edge = road.width / 2 + sum(strip.width for strip in road.strips)
+    first = ground.front(road.side) + rng.uniform(1, 5)
+    last = min(road.length, first + rng.uniform(8, 32))
+    make = rng.choice(4)
+    height = rng.uniform(0.7, 1.9)
 
-        if rng.random() < 0.3:
-            make = vehicles.bicyclist if rng.random() < 0.85 else vehicles.motorcyclist
-            t = side * (style.road / 2 - 0.5)
-            site.put_moving(make(rng), x, t, -side * rng.uniform(3, 6))
-        elif rng.random() < 0.6:
-            t = side * (ground.front(side) - rng.uniform(0.3, 1.3))
-            walker = vehicles.person(rng)
-            site.put_moving(walker, x, t, rng.choice([-1, 1]) * rng.uniform(0.8, 1.7))
+    for along in np.arange(first, last, 2.5):
+        if make == 0:
+            segment = fixtures.hedge(rng, 2.5, height)
+        elif make == 1:
+            segment = fixtures.wall(2.5, height)
+        elif make == 2:
+            segment = fixtures.board_fence(2.5, height, 0.3)
         else:
-            t = side * (ground.front(side) + rng.uniform(-1.2, 1.5))
-            person = vehicles.person(rng)
-            site.put(person, x, t, rng.uniform(0, TURN), thing=True, margin=-np.inf)
+            break
+        _put_along(site, road, segment, along, side * (edge + 0.4))
+
+    has_houses = ground.style.kind in ("residential", "urban", "living", "avenue")
+    for along in np.arange(first + 5, last + 10, rng.uniform(10, 20)):
+        width = rng.uniform(7, 12)
+        depth = rng.uniform(7, 11)
+        across = side * (edge + depth / 2 + rng.uniform(0.5, 6.0))
+        if has_houses and rng.random() < 0.5:
+            storeys = rng.uniform(*ground.style.storeys)
+            house = fixtures.building(rng, width, depth, storeys, flat=rng.random() < 0.2)
+            _put_along(site, road, house, along + width / 2, across, reach=width / 2)
+        else:
+            _put_along(site, road, random_tree(rng, rng.uniform(4, 9)), along, across)
 
 
-def _park_two_wheelers(site: Site) -> None:
-    """Put parked bicycles and motorcycles at the fronts of the plots."""
+def _put_along(
+    site: Site, road: SideRoad, mesh: Mesh, along: float, across: float, reach: float = 1.0
+) -> None:
+    """Put a body next to a side road, unless the street or another road is within its reach."""
+    ground = site.ground
+    px, py, yaw = road.pose_at(along, across)
+    x, y = np.array([px]), np.array([py])
+    _, t = ground.street_coordinates(x, y)
+    is_clear = abs(t[0]) > ground.front(road.side) + reach
+    if is_clear and ground.distance_from_crossings(x, y)[0] > reach:
+        site.put_at(mesh, px, py, yaw)
+
+
+def _fill_islands(site: Site) -> None:
+    """Put crash barriers, trees, bushes, lamps and signs on the islands in the road."""
     rng = site.rng
     ground = site.ground
+    style = ground.style
+    has_trees = rng.random() < 0.45
+    barrier = rng.choice(["rail", "concrete", "none"], p=[0.5, 0.3, 0.2])
 
-    for _ in range(rng.poisson(0.8 * ground.style.people * ground.length / 100)):
-        side = int(rng.choice([-1, 1]))
-        make = vehicles.bicycle if rng.random() < 0.7 else vehicles.motorcycle
-        two_wheeler = make(rng)
-        x = rng.uniform(0, ground.length)
-        t = side * (ground.front(side) - 0.4)
-        site.put(two_wheeler, x, t, rng.normal(scale=0.2), thing=True)
+    for island in ground.islands:
+        start = max(island.x[0], 0.0)
+        stop = min(island.x[1], ground.length)
+        middle = sum(island.t) / 2
+        if style.kind in ("motorway", "fast") and style.has_long_median and barrier != "none":
+            _put_barriers(site, (start, stop), middle, str(barrier))
+            continue
+        if not style.has_long_median:
+            for x in (start + 0.7, stop - 0.7):
+                site.put(fixtures.sign(rng), x, middle, along_road(-1), margin=-np.inf)
+            continue
+
+        for x in np.arange(start + 3, stop - 3, rng.uniform(7, 16)):
+            if has_trees and style.median > 1.5:
+                site.put(random_tree(rng, rng.uniform(4, 9)), x, middle)
+            elif rng.random() < 0.3:
+                site.put(fixtures.lamp(rng), x, middle)
+            elif rng.random() < 0.4:
+                site.put(fixtures.hedge(rng, 4.0, rng.uniform(0.6, 1.4)), x, middle)
+
+    if ground.roundabout:
+        _fill_roundabout(site)
+
+
+def _put_barriers(site: Site, x: tuple[float, float], t: float, kind: str) -> None:
+    """Put a crash barrier along the middle of the road from one x to another."""
+    for place in np.arange(x[0], x[1], 4.0):
+        if kind == "rail":
+            site.put(fixtures.guard_rail(4.1), place, t + 0.3, margin=-np.inf)
+            site.put(fixtures.guard_rail(4.1), place, t - 0.3, np.pi, margin=-np.inf)
+        else:
+            site.put(fixtures.barrier(4.05), place, t, margin=-np.inf)
+
+
+def _fill_roundabout(site: Site) -> None:
+    """Plant the island of the roundabout."""
+    rng = site.rng
+    roundabout = site.ground.roundabout
+    if roundabout is None:
+        return
+
+    reach = roundabout.island - 1.5
+    for _ in range(rng.poisson(0.3 * max(reach, 0) ** 1.5)):
+        angle = rng.uniform(0, 2 * np.pi)
+        radius = reach * np.sqrt(rng.random())
+        if rng.random() < 0.3:
+            plant = random_tree(rng, rng.uniform(3, 8))
+        else:
+            plant = fixtures.bush(rng, rng.uniform(0.3, 1.2))
+        x = roundabout.x + radius * np.cos(angle)
+        site.put_at(plant, x, roundabout.y + radius * np.sin(angle), 0.0)
 
 
 def _add_work_zones(site: Site) -> None:
-    """Put rows of barriers or cones at the edge of the road, some with an excavator behind them."""
+    """Put rows of barriers or cones at the edge of the road, some with a machine behind them."""
     rng = site.rng
     ground = site.ground
-    style = ground.style
 
     for _ in range(rng.poisson(WORK_ZONES * ground.length / 100)):
         side = int(rng.choice([-1, 1]))
         start = rng.uniform(0, ground.length)
-        edge = side * (style.road / 2 + style.parking[int(side > 0)] - 0.4)
+        edge = side * (ground.kerb_t(side) - 0.4)
         has_barriers = rng.random() < 0.5
         length = rng.uniform(8, 25)
 
@@ -248,13 +324,12 @@ def _add_work_zones(site: Site) -> None:
             segment = fixtures.barrier(2.0) if has_barriers else fixtures.traffic_cone(rng)
             site.put(segment, x, edge)
 
-        if rng.random() < 0.5:
+        if rng.random() < 0.45:
             t = side * (ground.front(side) + 2.5)
-            excavator = vehicles.excavator(rng)
-            yaw = rng.uniform(0, TURN)
-            site.put(excavator, start + length / 2, t, yaw, thing=True, margin=3.0)
-
-
-def _along_road(side: int) -> float:
-    """Return the yaw, relative to the street, of vehicles on one side of the road."""
-    return 0.0 if side < 0 else np.pi
+            machine = vehicles.machine(rng)
+            yaw = rng.uniform(0, 2 * np.pi)
+            site.put(machine, start + length / 2, t, yaw, thing=True, margin=3.0)
+        for _ in range(rng.poisson(0.8)):
+            t = side * (ground.front(side) + rng.uniform(0.5, 3))
+            worker = vehicles.person(rng)
+            site.put(worker, start + rng.uniform(0, length), t, rng.uniform(0, 6.3), thing=True)

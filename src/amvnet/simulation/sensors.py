@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,18 @@ class LidarModel:
     layout: str
     # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
     shadow: tuple[tuple[float, float, float, float], ...]
+    # Angles in degrees between the device and the car: nose up, and left side up.
+    pitch: float = 0.0
+    roll: float = 0.0
+    # How much these numbers differ between drives: standard deviations of the height in metres, of
+    # the mounting angles in degrees, of the elevations of all lasers together and of each laser in
+    # degrees, and of the logarithms of `range_noise`, `drop` and `gain_spread`; `gain` varies
+    # by a quarter of it.
+    height_spread: float = 0.0
+    mounting_spread: float = 0.0
+    elevation_spread: float = 0.0
+    laser_spread: float = 0.0
+    response_spread: float = 0.0
 
 
 # Degrees, from the top down: medians over the points of KITTI's scans, laser by laser.
@@ -78,6 +92,11 @@ HDL64E = LidarModel(
     motion_corrected=True,
     keeps_lost_returns=False,
     layout="semantickitti",
+    height_spread=0.06,
+    mounting_spread=0.6,
+    elevation_spread=0.15,
+    laser_spread=0.04,
+    response_spread=0.35,
     shadow=(
         (-14, 14, -90, -20.9),
         (-22, 22, -90, -21.9),
@@ -115,6 +134,11 @@ HDL32E = LidarModel(
     motion_corrected=True,
     keeps_lost_returns=True,
     layout="nuscenes",
+    height_spread=0.10,
+    mounting_spread=0.6,
+    elevation_spread=0.15,
+    laser_spread=0.04,
+    response_spread=0.35,
     shadow=(
         (-50, 50, -90, -23.5),
         (-52, 55, -90, -26),
@@ -133,3 +157,32 @@ HDL32E = LidarModel(
 )
 
 SENSORS: dict[str, LidarModel] = {"hdl64e": HDL64E, "hdl32e": HDL32E}
+
+
+def draw_device(sensor: LidarModel, rng: np.random.Generator) -> LidarModel:
+    """Return one device of a type of LiDAR as it is mounted on one car.
+
+    No number is farther than two and a half standard deviations from that of the type. Devices of a
+    type whose spreads are 0 are equal to it.
+    """
+
+    def draw() -> float:
+        return float(np.clip(rng.standard_normal(), -2.5, 2.5))
+
+    offset = sensor.elevation_spread * draw()
+    own = sensor.laser_spread * np.clip(rng.standard_normal(len(sensor.elevations)), -2.5, 2.5)
+    elevations = np.array(sensor.elevations) + offset + own
+    # From the top down, as neighbours may have changed places.
+    ordered = np.sort(elevations)[::-1]
+
+    return replace(
+        sensor,
+        elevations=tuple(ordered.tolist()),
+        height=sensor.height + sensor.height_spread * draw(),
+        pitch=sensor.pitch + sensor.mounting_spread * draw(),
+        roll=sensor.roll + sensor.mounting_spread * draw(),
+        range_noise=sensor.range_noise * float(np.exp(sensor.response_spread * draw())),
+        drop=sensor.drop * float(np.exp(sensor.response_spread * draw())),
+        gain=sensor.gain * float(np.exp(0.25 * sensor.response_spread * draw())),
+        gain_spread=sensor.gain_spread * float(np.exp(sensor.response_spread * draw())),
+    )
