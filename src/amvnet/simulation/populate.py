@@ -6,6 +6,7 @@ import numpy as np
 
 from amvnet.simulation import fixtures, vehicles
 from amvnet.simulation.areas import add_areas
+from amvnet.simulation.boundaries import draw_boundary
 from amvnet.simulation.crowd import add_people, park_two_wheelers
 from amvnet.simulation.mesh import Mesh
 from amvnet.simulation.plans import SideRoad
@@ -186,14 +187,13 @@ def _close_ends(site: Site) -> None:
             site.put(house, x + outwards * away, 0.0, np.pi / 2, margin=5.0)
             continue
 
-        make = rng.choice(3)
+        is_wild = rng.random() < 0.33
+        layer, _ = draw_boundary(rng).layers[0]
         for t in np.arange(-reach, reach, 2.5):
-            if make == 0:
-                segment = fixtures.hedge(rng, 2.5, 1.5)
-            elif make == 1:
-                segment = fixtures.board_fence(2.5, 1.5, 0.2)
-            else:
+            if is_wild:
                 segment = fixtures.bush(rng, rng.uniform(0.8, 1.8))
+            else:
+                segment = layer.segment(rng, 2.5)
             site.put(segment, x + outwards * rng.uniform(1.5, 2.0), t + 1.2, np.pi / 2)
 
 
@@ -207,19 +207,11 @@ def _line_side_road(site: Site, road: SideRoad, side: int) -> None:
     edge = road.width / 2 + sum(strip.width for strip in road.strips)
     first = ground.front(road.side) + rng.uniform(1, 5)
     last = min(road.length, first + rng.uniform(8, 32))
-    make = rng.choice(4)
-    height = rng.uniform(0.7, 1.9)
 
-    for along in np.arange(first, last, 2.5):
-        if make == 0:
-            segment = fixtures.hedge(rng, 2.5, height)
-        elif make == 1:
-            segment = fixtures.wall(2.5, height)
-        elif make == 2:
-            segment = fixtures.board_fence(2.5, height, 0.3)
-        else:
-            break
-        _put_along(site, road, segment, along, side * (edge + 0.4))
+    if rng.random() < 0.75:
+        layer, _ = draw_boundary(rng).layers[0]
+        for along in np.arange(first, last, 2.5):
+            _put_along(site, road, layer.segment(rng, 2.5), along, side * (edge + 0.4))
 
     has_houses = ground.style.kind in ("residential", "urban", "living", "avenue")
     for along in np.arange(first + 5, last + 10, rng.uniform(10, 20)):
