@@ -206,7 +206,7 @@ def _line_side_road(site: Site, road: SideRoad, side: int) -> None:
 
     edge = road.width / 2 + sum(strip.width for strip in road.strips)
     first = ground.front(road.side) + rng.uniform(1, 5)
-    last = min(road.length, first + rng.uniform(8, 32))
+    last = min(road.length, first + rng.uniform(6, 22))
 
     if rng.random() < 0.75:
         layer, _ = draw_boundary(rng).layers[0]

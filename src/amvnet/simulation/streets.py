@@ -15,7 +15,7 @@ from amvnet.simulation.relief import Relief
 from amvnet.simulation.styles import Strip, Style
 
 # Metres: spacing of the two grids of the ground, and how far from the middle line they reach.
-FINE_STEP = 0.55
+FINE_STEP = 0.62
 FINE_REACH = 32.0
 COARSE_STEP = 4.0
 COARSE_REACH = 110.0
