@@ -1,0 +1,79 @@
+"""Score weights place by place, as one easy place may carry the mean over all of them.
+
+    python benchmarks/places.py DATA WEIGHTS [--no-intensity]
+
+DATA is a dataset such as semantickitti:PATH; each of its sequences is a place. Print mIoU over all
+classes and accuracy of each method, and the share of uncertain points, for each place and for all.
+With --no-intensity, the intensities of all scans are set to 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.open import open_dataset
+from amvnet.evaluation.metrics import Evaluation
+from amvnet.inference.segmenter import Segmenter
+from amvnet.models.methods import PAPER_METHODS
+from amvnet.scan import Scan
+
+
+def score(dataset: Dataset, place: str, segmenter: Segmenter, intensity: bool) -> Evaluation:
+    """Score all methods on the scans of one place."""
+    evaluation = Evaluation(dataset.taxonomy)
+    for record in dataset.records([place]):
+        scan = dataset.read(record)
+        shown = scan if intensity else without_intensity(scan)
+        ids, uncertain = segmenter.labels_by_method(shown, PAPER_METHODS)
+        assert scan.labels is not None
+        evaluation.add(scan.points, scan.labels, ids, uncertain)
+    return evaluation
+
+
+def without_intensity(scan: Scan) -> Scan:
+    """Return the scan with intensities of 0."""
+    points = scan.points.copy()
+    points[:, 3] = 0
+    return replace(scan, points=points)
+
+
+def add_row(table: Table, name: str, evaluation: Evaluation, classes: int) -> None:
+    """Add the figures of one place to a table, in percent."""
+    report = evaluation.report(name)
+    cells = [name]
+    for method in PAPER_METHODS:
+        values = report["methods"][method]
+        ious = [iou for iou in values["iou"].values() if iou is not None]
+        cells.append(f"{100 * np.sum(ious) / classes:.1f} ({100 * values['accuracy']:.1f})")
+    cells.append(f"{100 * report['uncertain_fraction']:.1f}")
+    table.add_row(*cells)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("data")
+    parser.add_argument("weights")
+    parser.add_argument("--no-intensity", action="store_true")
+    options = parser.parse_args()
+
+    dataset = open_dataset(options.data)
+    segmenter = Segmenter(options.weights)
+    table = Table("place", *PAPER_METHODS, "uncertain, %")
+    total = Evaluation(dataset.taxonomy)
+    for place in dataset.sequences("all"):
+        evaluation = score(dataset, place, segmenter, intensity=not options.no_intensity)
+        add_row(table, place, evaluation, dataset.taxonomy.size)
+        total.merge(evaluation)
+    add_row(table, "all", total, dataset.taxonomy.size)
+    Console().print(table)
+
+
+if __name__ == "__main__":
+    main()
