@@ -2,7 +2,7 @@
 
 from amvnet.simulation.drive import Drive, drive_street
 from amvnet.simulation.layouts import SimulatedScan
-from amvnet.simulation.sensors import SENSORS, LidarModel
+from amvnet.simulation.sensing.sensors import SENSORS, LidarModel
 from amvnet.simulation.writing import simulate, simulate_scan
 
 __all__ = [

@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from amvnet.simulation.areas import AISLE, Area, add_lot, has_room
 from amvnet.simulation.layouts import SimulatedScan
-from amvnet.simulation.lidar import RayScene, trace
 from amvnet.simulation.mesh import Mesh, join
-from amvnet.simulation.plans import SideRoad
-from amvnet.simulation.populate import populate
-from amvnet.simulation.returns import laser_gains, receive
-from amvnet.simulation.sensors import LidarModel, draw_device
-from amvnet.simulation.site import MOVING_CLEARANCE, Site, covers
-from amvnet.simulation.streets import Ground
-from amvnet.simulation.styles import Style, draw_style
+from amvnet.simulation.sensing.lidar import RayScene, trace
+from amvnet.simulation.sensing.returns import laser_gains, receive
+from amvnet.simulation.sensing.sensors import LidarModel, draw_device
+from amvnet.simulation.sites.areas import AISLE, Area, add_lot, has_room
+from amvnet.simulation.sites.populate import populate
+from amvnet.simulation.sites.site import MOVING_CLEARANCE, Site, covers
+from amvnet.simulation.streets.ground import Ground
+from amvnet.simulation.streets.plans import SideRoad
+from amvnet.simulation.streets.styles import Style, draw_style
 
 SIGHT = 90.0  # metres along the street within which moving bodies are placed
 WHEELBASE = 2.8  # metres

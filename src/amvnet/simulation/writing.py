@@ -19,8 +19,8 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan
-from amvnet.simulation.lidar import require_embree
-from amvnet.simulation.sensors import SENSORS, LidarModel
+from amvnet.simulation.sensing.lidar import require_embree
+from amvnet.simulation.sensing.sensors import SENSORS, LidarModel
 
 Progress = Callable[[int, int], None]  # scans written, scans in all
 # Environment variables that set the number of threads of the numerical libraries.
