@@ -204,7 +204,7 @@ def _free_half_width(style: Style) -> float:
 def _near_side_road(ground: Ground, length: float, drive: Drive) -> SideRoad | None:
     """Return a side road that the sensor could come from, or None if there is none."""
     middle = drive.margin + length / 2
-    for road in ground.crossings:
+    for road in ground.plan.crossings:
         near = abs(road.street_x - middle) < length / 2 + 50
         is_long = road.length > ground.style.road / 2 + length + 16
         if near and is_long and road.width > 3.5:

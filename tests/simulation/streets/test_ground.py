@@ -13,8 +13,9 @@ from amvnet.simulation.materials import MOVING, Label
 from amvnet.simulation.mesh import Mesh
 from amvnet.simulation.sites.site import Site
 from amvnet.simulation.streets.ground import Ground, Patch
+from amvnet.simulation.streets.kinds import KINDS
 from amvnet.simulation.streets.plans import Island, SideRoad, rounded_union, strip_at
-from amvnet.simulation.streets.styles import KINDS, Strip, Style, draw_style
+from amvnet.simulation.streets.styles import Strip, Style, draw_style
 
 LENGTH = 240.0
 COURSE = (90.0, 130.0)
@@ -36,7 +37,7 @@ def plain_places(ground: Ground) -> np.ndarray:
     xs = np.arange(5.0, LENGTH - 5, 1.0)
     x, y = np.array([ground.pose_at(x, 0.0)[:2] for x in xs]).T
     is_plain = ground.distance_from_crossings(x, y) > 25
-    is_plain &= (xs > ground.start + 5) & (xs < ground.end - 5)
+    is_plain &= (xs > ground.plan.start + 5) & (xs < ground.plan.end - 5)
     return xs[is_plain]
 
 
@@ -88,7 +89,7 @@ def test_a_patch_covers_plots_but_no_road() -> None:
 
 
 def test_side_roads_are_roads(ground: Ground) -> None:
-    for road in ground.crossings:
+    for road in ground.plan.crossings:
         along = ground.style.road / 2 + 6.0
         if along < road.length - 1:
             x, y, _ = road.pose_at(along, 0.0)
@@ -102,7 +103,7 @@ def test_side_roads_are_roads(ground: Ground) -> None:
 
 
 def test_islands_have_their_class(ground: Ground) -> None:
-    for island in ground.islands:
+    for island in ground.plan.islands:
         x = np.clip(sum(island.x) / 2, 0, LENGTH)
         assert label_at(ground, float(x), sum(island.t) / 2) == island.label
 

@@ -61,7 +61,7 @@ def populate(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
 
     _close_ends(site)
     _fill_islands(site)
-    for road in ground.crossings:
+    for road in ground.plan.crossings:
         for side in (-1, 1):
             _line_side_road(site, road, side)
     fill_side_roads(site)
@@ -184,7 +184,7 @@ def _close_ends(site: Site) -> None:
     rng = site.rng
     ground = site.ground
 
-    for x, outwards in ((ground.start, -1), (ground.end, 1)):
+    for x, outwards in ((ground.plan.start, -1), (ground.plan.end, 1)):
         if not np.isfinite(x):
             continue
 
@@ -257,7 +257,7 @@ def _fill_islands(site: Site) -> None:
     has_trees = rng.random() < 0.45
     barrier = rng.choice(["rail", "concrete", "none"], p=[0.5, 0.3, 0.2])
 
-    for island in ground.islands:
+    for island in ground.plan.islands:
         start = max(island.x[0], 0.0)
         stop = min(island.x[1], ground.length)
         middle = sum(island.t) / 2
@@ -277,7 +277,7 @@ def _fill_islands(site: Site) -> None:
             elif rng.random() < 0.4:
                 site.put(plants.hedge(rng, 4.0, rng.uniform(0.6, 1.4)), x, middle)
 
-    if ground.roundabout:
+    if ground.plan.roundabout:
         _fill_roundabout(site)
 
 
@@ -294,7 +294,7 @@ def _put_barriers(site: Site, x: tuple[float, float], t: float, kind: str) -> No
 def _fill_roundabout(site: Site) -> None:
     """Plant the island of the roundabout."""
     rng = site.rng
-    roundabout = site.ground.roundabout
+    roundabout = site.ground.plan.roundabout
     if roundabout is None:
         return
 

@@ -133,7 +133,7 @@ def fill_side_roads(site: Site) -> None:
     """Put waiting and parked vehicles on side roads, and lights or signs where they begin."""
     rng = site.rng
 
-    for road in site.ground.crossings:
+    for road in site.ground.plan.crossings:
         distance = site.ground.style.road / 2 + rng.uniform(3.5, 12)
         for _ in range(rng.poisson(0.7)):
             mesh = weighted_choice(rng, DRIVING_VEHICLES)(rng)

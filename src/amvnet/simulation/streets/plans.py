@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amvnet.simulation.materials import Label
-from amvnet.simulation.streets.styles import Strip
+from amvnet.simulation.streets.styles import Strip, Style, width_of
 
 # A bent side road goes on straight once its direction has changed by about this tangent.
 LARGEST_TURN = 0.9
@@ -106,6 +106,14 @@ class Roundabout:
         """Radius on which vehicles drive."""
         return (self.radius + self.island) / 2
 
+    def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the distance from the outer edge of the ring; negative within it."""
+        return np.hypot(x - self.x, y - self.y) - self.radius
+
+    def island_distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the distance from the edge of the island; negative on it."""
+        return np.hypot(x - self.x, y - self.y) - self.island
+
 
 @dataclass(frozen=True)
 class Island:
@@ -130,6 +138,32 @@ class Island:
         outside_x = np.maximum(np.abs(along - sum(self.x) / 2) - half_x, 0)
         outside_t = np.maximum(np.abs(t - sum(self.t) / 2) - half_t, 0)
         return np.hypot(outside_x, outside_t) - radius
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The plan of one street; lengths are in metres.
+
+    Attributes:
+        style: the numbers of the street.
+        length: of the simulated land along x, from 0.
+        start, end: x where the street begins and ends; infinite if it does so out of sight.
+        roundabout: None if there is none.
+        crossings: the side roads.
+        islands: in the middle of the road.
+        humps: (H, 2) x and height of the humps of the road.
+        crosswalks: x from and to of each zebra crossing.
+    """
+
+    style: Style
+    length: float
+    start: float
+    end: float
+    roundabout: Roundabout | None
+    crossings: tuple[SideRoad, ...]
+    islands: tuple[Island, ...]
+    humps: np.ndarray
+    crosswalks: tuple[tuple[float, float], ...]
 
 
 def rounded_union(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
@@ -161,7 +195,7 @@ def strip_at(
         (N,) uint16 class ids; (N,) distances from the outer edge of the last strip.
     """
     label = np.full(np.shape(kerb), beyond, dtype=np.uint16)
-    outer = sum(strip.width for strip in strips)
+    outer = width_of(strips)
     edge = outer
     for strip in reversed(strips):
         label[kerb < edge] = strip.label
