@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -36,6 +36,10 @@ class Mesh:
 
     def __len__(self) -> int:
         return len(self.triangles)
+
+
+# Draws one body.
+Maker = Callable[[np.random.Generator], Mesh]
 
 
 def part(
@@ -75,10 +79,23 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(**columns)
 
 
-def place(mesh: Mesh, x: float, y: float, z: float, yaw: float) -> Mesh:
-    """Return the mesh turned by `yaw` (radians) about its vertical axis, then moved."""
+def place(mesh: Mesh, x: float = 0, y: float = 0, z: float = 0, yaw: float = 0) -> Mesh:
+    """Return the mesh turned by `yaw` radians about the z axis, then moved by metres."""
     corners = moved(mesh.triangles, (x, y, z), yaw)
     return replace(mesh, triangles=corners.astype(np.float32))
+
+
+def scaled(mesh: Mesh, factor: float) -> Mesh:
+    """Return the mesh, its size multiplied by a factor."""
+    return replace(mesh, triangles=mesh.triangles * np.float32(factor))
+
+
+def rolled(mesh: Mesh, roll: float) -> Mesh:
+    """Return the mesh turned by `roll` radians about the x axis: it leans to the right."""
+    cos = np.cos(roll)
+    sin = np.sin(roll)
+    rotation = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    return replace(mesh, triangles=(mesh.triangles @ rotation.T).astype(np.float32))
 
 
 def with_instance(mesh: Mesh, instance: int) -> Mesh:

@@ -200,12 +200,17 @@ def planks(
     return np.concatenate([_triangles(a, b, c), _triangles(a, c, d)])
 
 
-def moved(triangles: np.ndarray, at: Vector, yaw: float = 0.0) -> np.ndarray:
-    """Return (T, 3, 3) triangles turned by `yaw` (radians) about the vertical axis, then moved."""
+def turned(triangles: np.ndarray, yaw: float) -> np.ndarray:
+    """Return (T, 3, 3) triangles turned by `yaw` radians about the z axis."""
     cos = np.cos(yaw)
     sin = np.sin(yaw)
     rotation = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # transposed: corners are rows
-    return triangles @ rotation + np.array(at)
+    return triangles @ rotation
+
+
+def moved(triangles: np.ndarray, at: Vector, yaw: float = 0.0) -> np.ndarray:
+    """Return (T, 3, 3) triangles turned by `yaw` radians about the z axis, then moved."""
+    return turned(triangles, yaw) + np.array(at)
 
 
 def leaning(triangles: np.ndarray, x: float, y: float) -> np.ndarray:

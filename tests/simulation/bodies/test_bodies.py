@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +11,11 @@ from amvnet.simulation import SENSORS, SimulatedScan, drive_street
 from amvnet.simulation.bodies import buildings, clutter, fences, furniture, plants, trees
 from amvnet.simulation.layouts import semantickitti_ids
 from amvnet.simulation.materials import Label
-from amvnet.simulation.mesh import Mesh, join, place
+from amvnet.simulation.mesh import Maker, Mesh, join, place
 from amvnet.simulation.sensing.lidar import Hits, RayScene, trace
 from amvnet.simulation.sensing.returns import receive
 
 HDL64E = SENSORS["hdl64e"]
-Maker = Callable[[np.random.Generator], Mesh]
 
 WITHOUT_CLASS = {Label.OTHER_OBJECT, Label.OTHER_STRUCTURE}
 POLE_AND_SIGN = {Label.POLE, Label.TRAFFIC_SIGN, Label.OTHER_OBJECT, Label.OTHER_STRUCTURE}

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from amvnet.simulation.bodies import vehicles
-from amvnet.simulation.bodies.vehicles import Maker
 from amvnet.simulation.bodies.vehicles.parts import facing_outwards, glass
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh
+from amvnet.simulation.mesh import Maker, Mesh
 from amvnet.simulation.solids import box
 
 # Per maker: class, smallest and largest length, width and height in metres.

@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from amvnet.simulation.drive import Drive, _build_site
+from amvnet.simulation.course import Drive
+from amvnet.simulation.drive import build_site as fill_street
 from amvnet.simulation.materials import MOVING, Label
 from amvnet.simulation.mesh import Mesh
 from amvnet.simulation.sites.site import Site
@@ -218,7 +219,7 @@ def build_site(seed: int) -> tuple[Site, np.ndarray]:
     drive = Drive()
     way = (drive.margin, drive.margin + 4 * drive.spacing)
     ground = Ground(one_lane_of(draw_style(rng)), way[1] + drive.margin, rng, way)
-    site, course = _build_site(ground, 4, 8.0, rng, drive)
+    site, course = fill_street(ground, 4, 8.0, rng, drive)
     return site, np.array([course.pose_at(index) for index in range(4)])
 
 

@@ -5,22 +5,23 @@ They are labelled other-object or other-structure, which a benchmark counts as u
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
+from amvnet.simulation.chance import normalised, weighted_choice
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh, join, part
+from amvnet.simulation.mesh import Maker, Mesh, join, part
 from amvnet.simulation.solids import box, copies, hull, leaning, moved, planks, tube
 
 FOOT = 0.3  # metres by which objects reach below the ground, so that a slope leaves no gap
 
 
 def _object(solids: list[np.ndarray], surface: Surface, rng: np.random.Generator) -> Mesh:
+    """Return solids as an other-object of a random brightness."""
     return part(solids, surface, Label.OTHER_OBJECT, tint=rng.normal(scale=0.6))
 
 
 def _structure(solids: list[np.ndarray], surface: Surface, rng: np.random.Generator) -> Mesh:
+    """Return solids as an other-structure of a random brightness."""
     return part(solids, surface, Label.OTHER_STRUCTURE, tint=rng.normal(scale=0.6))
 
 
@@ -51,7 +52,7 @@ def cabinet(rng: np.random.Generator) -> Mesh:
 
 
 def bench(rng: np.random.Generator) -> Mesh:
-    """Return a bench, perhaps with a table before it."""
+    """Return a bench, perhaps with a table in front of it."""
     seat = box((1.7, 0.45, 0.06), (0, 0, 0.42))
     back = planks(0, 1.7, np.array([0.55, 0.75]), np.array([0.68, 0.9]), 0.22)
     feet = copies(box((0.08, 0.4, 0.42)), x=[-0.7, 0.7])
@@ -257,49 +258,45 @@ def structure(rng: np.random.Generator) -> Mesh:
 
 
 # Shares of the objects at the edge of a street, and of those in gardens and yards.
-_STREET: dict[Callable[[np.random.Generator], Mesh], float] = {
-    bins: 0.36,
-    cabinet: 0.22,
-    bench: 0.08,
-    column: 0.06,
-    letter_box: 0.08,
-    planter: 0.07,
-    container: 0.05,
-    structure: 0.04,
-    bike_rack: 0.05,
-    statue: 0.03,
-}
-_YARD: dict[Callable[[np.random.Generator], Mesh], float] = {
-    bins: 0.20,
-    bench: 0.10,
-    parasol: 0.10,
-    planter: 0.10,
-    playground: 0.10,
-    trampoline: 0.06,
-    heap: 0.20,
-    tent: 0.05,
-    statue: 0.04,
-    container: 0.05,
-    structure: 0.14,
-}
+_STREET: dict[Maker, float] = normalised(
+    {
+        bins: 0.36,
+        cabinet: 0.22,
+        bench: 0.08,
+        column: 0.06,
+        letter_box: 0.08,
+        planter: 0.07,
+        container: 0.05,
+        structure: 0.04,
+        bike_rack: 0.05,
+        statue: 0.03,
+    }
+)
+_YARD: dict[Maker, float] = normalised(
+    {
+        bins: 0.20,
+        bench: 0.10,
+        parasol: 0.10,
+        planter: 0.10,
+        playground: 0.10,
+        trampoline: 0.06,
+        heap: 0.20,
+        tent: 0.05,
+        statue: 0.04,
+        container: 0.05,
+        structure: 0.14,
+    }
+)
 
 
 def clutter(rng: np.random.Generator) -> Mesh:
     """Return an object that stands at the edge of a street."""
-    return _draw(rng, _STREET)(rng)
+    return weighted_choice(rng, _STREET)(rng)
 
 
 def yard_clutter(rng: np.random.Generator) -> Mesh:
     """Return an object that stands in a garden or a yard."""
-    return _draw(rng, _YARD)(rng)
-
-
-def _draw(
-    rng: np.random.Generator, shares: dict[Callable[[np.random.Generator], Mesh], float]
-) -> Callable[[np.random.Generator], Mesh]:
-    makers = list(shares)
-    weights = np.array(list(shares.values()))
-    return makers[rng.choice(len(makers), p=weights / weights.sum())]
+    return weighted_choice(rng, _YARD)(rng)
 
 
 def shelter(rng: np.random.Generator) -> Mesh:
@@ -320,12 +317,12 @@ def shelter(rng: np.random.Generator) -> Mesh:
 
 
 def steps(rng: np.random.Generator) -> Mesh:
-    """Return the steps before a door, or a low ramp."""
+    """Return the steps in front of a door, perhaps with a rail."""
     count = int(rng.integers(2, 6))
     width = rng.uniform(1.2, 2.5)
     slabs = []
     for step in range(count):
-        treads = count - step  # that this slab lies under, its own included
+        treads = count - step  # number of treads that rest on this slab, its own included
         slabs.append(box((width, 0.3 * treads, 0.17), (0, -0.15 * treads, 0.17 * step)))
 
     parts = [part(slabs, Surface.PAVING, Label.OTHER_STRUCTURE)]

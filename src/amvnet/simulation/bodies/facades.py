@@ -169,7 +169,7 @@ def _balconies(rng: np.random.Generator, middles: np.ndarray, floor: float) -> l
 
 
 def _extras(rng: np.random.Generator, facade: Facade, width: float, height: float) -> list[Mesh]:
-    """Return what hangs on a wall or stands before it."""
+    """Return what hangs on a wall or stands in front of it."""
     parts = [_pipes(rng, width, height)]
     x = rng.uniform(-0.35, 0.35) * width
 

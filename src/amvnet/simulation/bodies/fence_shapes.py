@@ -1,11 +1,11 @@
-"""The shapes of the kinds of fences; see `amvnet.simulation.fences.Fence`.
+"""The measures and the shapes of fences of all kinds; `fences` draws them.
 
-A segment lies along x; each function returns one that is `length` metres long.
+Each function returns one segment, which lies along x and is `length` metres long.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,14 +14,58 @@ from amvnet.simulation.materials import Label, Surface
 from amvnet.simulation.mesh import Mesh, join, part
 from amvnet.simulation.solids import box, copies, leaning, loft, planks, prism, tube
 
-if TYPE_CHECKING:
-    from amvnet.simulation.bodies.fences import Fence
-
 FOOT = 0.5  # metres by which fences reach below the ground, so that a slope leaves no gap
-POROUS_THICKNESS = 0.04  # metres
+POROUS_THICKNESS = 0.04  # metres: of wire meshes and lattices
+# Section (y, z) of the beam of a guard rail, which has two waves, in metres; its height, and the
+# distance between two beams, one above the other.
+BEAM = (
+    (0.0, 0.0),
+    (-0.06, 0.05),
+    (-0.06, 0.11),
+    (0.0, 0.155),
+    (-0.06, 0.2),
+    (-0.06, 0.26),
+    (0.0, 0.31),
+    (0.02, 0.155),
+)
+BEAM_HEIGHT = 0.31
+BEAM_PITCH = 0.42
 
 
-def creepers(rng: np.random.Generator, fence: Fence, length: float) -> Mesh:
+@dataclass(frozen=True)
+class FenceMeasures:
+    """The kind and the measures of a fence; lengths are in metres.
+
+    Attributes:
+        kind: one of `fences.KINDS`.
+        height: above the ground.
+        pitch: distance between two boards, bars or stones.
+        gap: open share between boards; the share of the pulses that pass a mesh.
+        surface: of boards and walls.
+        lean: metres that it is off the vertical, for each metre of height.
+        uneven: how far boards and stones are out of line.
+        overgrown: chance that plants grow through a segment.
+        tint: as in `Mesh`.
+    """
+
+    kind: str
+    height: float
+    pitch: float
+    gap: float
+    surface: Surface
+    lean: float
+    uneven: float
+    overgrown: float
+    tint: float
+
+    def solid(self, solids: list[np.ndarray], surface: Surface | None = None) -> Mesh:
+        """Return parts of the fence that let no pulse through; (T, 3, 3) triangles each."""
+        triangles = leaning(np.concatenate(solids), 0, self.lean)
+        surface = self.surface if surface is None else surface
+        return part([triangles], surface, Label.FENCE, tint=self.tint)
+
+
+def creepers(rng: np.random.Generator, fence: FenceMeasures, length: float) -> Mesh:
     """Return leaves that grow through a fence, or along one of its sides."""
     width = rng.uniform(0.15, 0.9)
     height = fence.height * rng.uniform(0.4, 1.25)
@@ -43,7 +87,7 @@ def _middles(length: float, pitch: float) -> np.ndarray:
     return (np.arange(count) + 0.5) / count * length - length / 2
 
 
-def boards(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def boards(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return upright boards on two rails."""
     x = _middles(length, fence.pitch)
     tops = fence.height + rng.normal(scale=0.6 * fence.uneven, size=len(x))
@@ -57,7 +101,7 @@ def boards(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     return fence.solid([boards, rails, _posts(length, fence.height, 0.05, 0.05)])
 
 
-def slats(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def slats(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return horizontal boards between posts."""
     bottom = np.arange(0.05, fence.height - 0.06, fence.pitch)
     width = fence.pitch * (1 - 0.6 * fence.gap)
@@ -66,7 +110,7 @@ def slats(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     return fence.solid([boards, _posts(length, fence.height, 0.05, 0.03)])
 
 
-def pickets(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def pickets(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return a palisade or pickets: narrow, pointed boards with gaps."""
     x = _middles(length, fence.pitch)
     width = fence.pitch * rng.uniform(0.35, 0.75)
@@ -85,7 +129,7 @@ def _beams(length: float, heights: np.ndarray, thickness: float, y: float = 0.02
 
 
 def _porous(
-    fence: Fence, length: float, bottom: float, top: float, surface: Surface, passing: float
+    fence: FenceMeasures, length: float, bottom: float, top: float, surface: Surface, passing: float
 ) -> Mesh:
     """Return an upright sheet that lets a share of the head-on pulses pass."""
     sheet = box((length, POROUS_THICKNESS, top - bottom), (0, 0, bottom))
@@ -95,7 +139,7 @@ def _porous(
     )
 
 
-def mesh(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def mesh(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return a wire mesh between thin posts, perhaps on a low base."""
     posts = _posts(length, fence.height + 0.05, rng.uniform(0.02, 0.04))
     wires = _beams(length, np.array([0.06, fence.height]), 0.02)
@@ -107,14 +151,16 @@ def mesh(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     return join(parts)
 
 
-def lattice(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def lattice(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return a panel of crossed laths in a frame."""
     frame = _beams(length, np.array([0.12, fence.height - 0.04]), 0.08)
     sheet = _porous(fence, length, 0.1, fence.height, fence.surface, passing=0.25 + 0.8 * fence.gap)
     return join([fence.solid([frame, _posts(length, fence.height, 0.05)]), sheet])
 
 
-def railing(fence: Fence, rng: np.random.Generator, length: float, foot: float = 0.0) -> Mesh:
+def railing(
+    fence: FenceMeasures, rng: np.random.Generator, length: float, foot: float = 0.0
+) -> Mesh:
     """Return thin upright bars between two beams; they begin `foot` metres above the ground."""
     rise = max(fence.height - foot, 0.4)
     x = _middles(length, max(fence.pitch, 0.11))
@@ -124,7 +170,7 @@ def railing(fence: Fence, rng: np.random.Generator, length: float, foot: float =
     return fence.solid([bars, beams, posts], Surface.METAL)
 
 
-def rails(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def rails(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return a paddock fence or a pipe barrier: a few horizontal bars between posts."""
     count = int(rng.integers(1, 4))
     heights = fence.height * np.linspace(1, 0.35, count)
@@ -137,13 +183,13 @@ def rails(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     return fence.solid([*beams, _posts(length, fence.height + 0.05, 0.06)])
 
 
-def wire(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def wire(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return wires between wooden posts: most pulses pass."""
     sheet = _porous(fence, length, 0.2, fence.height, Surface.METAL, passing=rng.uniform(0.9, 0.97))
     return join([fence.solid([_posts(length, fence.height, rng.uniform(0.03, 0.07))]), sheet])
 
 
-def wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def wall(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return a garden wall with a coping and perhaps a pillar."""
     thickness = 0.15 + fence.pitch
     solids = [box((length, thickness, fence.height + FOOT), (0, 0, -FOOT))]
@@ -155,7 +201,7 @@ def wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     return fence.solid(solids)
 
 
-def stone_wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def stone_wall(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return a wall of rough stones, out of line by a few centimetres."""
     half = 0.15 + fence.pitch
     middle = 0.5 * fence.height
@@ -168,7 +214,7 @@ def stone_wall(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     return fence.solid([loft(rings)], Surface.STONE)
 
 
-def wall_and_railing(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def wall_and_railing(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return a low wall that carries a railing, or boards in place of it."""
     low = fence.height * (0.2 + fence.gap)
     wall = fence.solid([box((length, 0.15 + fence.pitch, low + FOOT), (0, 0, -FOOT))])
@@ -179,7 +225,7 @@ def wall_and_railing(fence: Fence, rng: np.random.Generator, length: float) -> M
     return join([wall, fence.solid([boards], Surface.WOOD)])
 
 
-def panels(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def panels(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return thin panels of concrete between posts that stick out."""
     panel = box((length, 0.05, fence.height + FOOT), (0, 0, -FOOT))
     posts = copies(box((0.14, 0.16, fence.height + FOOT + 0.08), (0, 0, -FOOT)), x=[-length / 2])
@@ -187,54 +233,44 @@ def panels(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     return fence.solid([panel, posts, bands])
 
 
-def screen(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def screen(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return a smooth privacy screen between posts."""
     panel = planks(0, length, 0.04, fence.height)
     return fence.solid([panel, _posts(length, fence.height + 0.06, 0.05)])
 
 
 def guard_rail(length: float, height: float = 0.75, beams: int = 1) -> Mesh:
-    """Return a segment of the crash barrier along a fast road."""
-    # The beam has two waves.
-    section = [
-        (0.0, 0.0),
-        (-0.06, 0.05),
-        (-0.06, 0.11),
-        (0.0, 0.155),
-        (-0.06, 0.2),
-        (-0.06, 0.26),
-        (0.0, 0.31),
-        (0.02, 0.155),
-    ]
-    profile = [(y, z + height - 0.31) for y, z in section]
-    beam = prism(profile, length)[..., [1, 0, 2]]
+    """Return a segment of the crash barrier along a fast road; its upper beam is at `height`."""
+    profile = [(y, z + height - BEAM_HEIGHT) for y, z in BEAM]
+    beam = prism(profile, length)[..., [1, 0, 2]]  # the profile lies across the street
     solids = [beam]
     if beams > 1:
-        solids.append(beam + np.array([0, 0, 0.42]))
+        solids.append(beam + np.array([0, 0, BEAM_PITCH]))
 
     post = box((0.1, 0.1, height + FOOT - 0.05), (0, 0.08, -FOOT))
     solids.append(copies(post, x=[-length / 4, length / 4]))
     return part(solids, Surface.METAL, Label.FENCE)
 
 
-def crash_barrier(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def crash_barrier(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
+    """Return a guard rail with one beam or two."""
     beams = 2 if fence.kind == "double guard rail" else 1
     return guard_rail(length, fence.height, beams)
 
 
-def wire_rope(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def wire_rope(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return four ropes between posts along a road."""
     ropes = _beams(length, fence.height * np.array([0.55, 0.7, 0.85, 1.0]), 0.03)
     return fence.solid([ropes, _posts(length, fence.height, 0.05)])
 
 
-def parapet(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def parapet(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return the low concrete wall along a fast road or a bridge."""
     body = box((length, 0.5, fence.height + FOOT), (0, 0, -FOOT), top=(1.0, 0.45))
     return fence.solid([body])
 
 
-def noise_barrier(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
+def noise_barrier(fence: FenceMeasures, rng: np.random.Generator, length: float) -> Mesh:
     """Return panels with horizontal ribs between steel posts; the upper part may be of glass."""
     base = box((length, 0.18, 0.5 + FOOT), (0, 0, -FOOT))
     posts = copies(box((0.2, 0.24, fence.height + FOOT), (0, 0, -FOOT)), x=[-length / 2])

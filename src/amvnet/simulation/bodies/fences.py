@@ -12,37 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from amvnet.simulation.bodies import fence_shapes
+from amvnet.simulation.bodies.fence_shapes import FenceMeasures
 from amvnet.simulation.chance import weighted_choice
-from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh, join, part
-from amvnet.simulation.solids import leaning
+from amvnet.simulation.materials import Surface
+from amvnet.simulation.mesh import Mesh, join
 
 
 @dataclass(frozen=True)
-class Fence:
-    """A kind of fence; lengths are in metres.
-
-    Attributes:
-        kind: one of `KINDS`.
-        height: above the ground.
-        pitch: distance between two boards, bars or stones.
-        gap: open share between boards; the share of the pulses that pass a mesh.
-        surface: of boards and walls.
-        lean: metres that it is off the vertical, for each metre of height.
-        uneven: how far boards and stones are out of line.
-        overgrown: chance that plants grow through a segment.
-        tint: as in `Mesh`.
-    """
-
-    kind: str
-    height: float
-    pitch: float
-    gap: float
-    surface: Surface
-    lean: float
-    uneven: float
-    overgrown: float
-    tint: float
+class Fence(FenceMeasures):
+    """One kind of fence, which is drawn segment by segment."""
 
     def segment(self, rng: np.random.Generator, length: float) -> Mesh:
         """Return a piece of the fence, `length` metres along x."""
@@ -50,12 +28,6 @@ class Fence:
         if rng.random() < self.overgrown:
             mesh = join([mesh, fence_shapes.creepers(rng, self, length)])
         return mesh
-
-    def solid(self, solids: list[np.ndarray], surface: Surface | None = None) -> Mesh:
-        """Return parts of the fence that let no pulse through; (T, 3, 3) triangles each."""
-        triangles = leaning(np.concatenate(solids), 0, self.lean)
-        surface = self.surface if surface is None else surface
-        return part([triangles], surface, Label.FENCE, tint=self.tint)
 
 
 # Shares of the fences along a garden.
@@ -151,7 +123,7 @@ def draw_fence(rng: np.random.Generator, kinds: dict[str, float] | None = None) 
     )
 
 
-_Maker = Callable[[Fence, np.random.Generator, float], Mesh]
+_Maker = Callable[[FenceMeasures, np.random.Generator, float], Mesh]
 _MAKERS: dict[str, _Maker] = {
     "boards": fence_shapes.boards,
     "slats": fence_shapes.slats,

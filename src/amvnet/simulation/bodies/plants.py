@@ -60,7 +60,7 @@ def bank(
         length: metres.
         section: one of `SECTIONS`.
         size: width and height in metres.
-        uneven: standard deviation in metres by which the corners are off.
+        uneven: standard deviation of the corners in metres.
         step: metres between two rings of corners.
     """
     width, height = size

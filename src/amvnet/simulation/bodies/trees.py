@@ -62,7 +62,7 @@ def _stem(
 
 
 def _ivy(rng: np.random.Generator, fork: Vector, radius: float) -> Mesh:
-    """Return ivy around a stem."""
+    """Return ivy around a stem of a radius, up to a fork."""
     half = max(fork[2], 0.6) * rng.uniform(0.3, 0.6)
     wide = radius * rng.uniform(1.3, 2.0) + 0.05
     return foliage([hull(rng, (0, 0, half * 0.8), (wide, wide, half), fine=False)], 0.05)
@@ -71,7 +71,7 @@ def _ivy(rng: np.random.Generator, fork: Vector, radius: float) -> Mesh:
 def _clumps(
     rng: np.random.Generator, fork: Vector, height: float, spread: float, radius: float
 ) -> Mesh:
-    """Return a crown of several clumps of leaves, each on a bough."""
+    """Return a crown of several clumps of leaves, each at the end of a bough."""
     depth = rng.uniform(0.03, 0.5)
     boughs = []
     clumps = []
@@ -126,6 +126,7 @@ def _bare_boughs(
 
 
 def _distant_crown(rng: np.random.Generator, fork: Vector, height: float, spread: float) -> Mesh:
+    """Return a crown that is one hull."""
     half = (height - fork[2] * 0.8) / 2
     crown = hull(rng, (*fork[:2], height - half), (spread, spread, half), fine=False)
     return foliage([crown], rng.uniform(0.1, 1.2), rng.normal(scale=0.4))
@@ -188,7 +189,7 @@ def random_tree(rng: np.random.Generator, height: float, fine: bool = True) -> M
 
 
 def copse(rng: np.random.Generator, length: float, height: float) -> Mesh:
-    """Return the edge of a wood, to be seen from far away."""
+    """Return the edge of a distant wood."""
     size = (rng.uniform(4, 9), height * rng.uniform(0.8, 1.2))
     edge = bank(rng, length + 2, "bulge", size, height * rng.uniform(0.03, 0.12), step=2.5)
     return foliage([edge], rng.uniform(0.06, 0.9), rng.normal(scale=0.4))

@@ -48,6 +48,7 @@ class Area:
 
     @property
     def middle(self) -> float:
+        """Middle of the area along the street."""
         return (self.start + self.stop) / 2
 
     def label(self, site: Site, label: Label) -> None:
@@ -111,8 +112,12 @@ def add_lot(site: Site, area: Area) -> None:
 def add_yard(site: Site, area: Area) -> None:
     """Add a yard with trucks, trailers, machines and containers at any angle."""
     rng = site.rng
-    chances = {Label.OTHER_GROUND: 0.5, Label.PARKING: 0.25, Label.SIDEWALK: 0.15}
-    chances[Label.TERRAIN] = 0.10
+    chances = {
+        Label.OTHER_GROUND: 0.5,
+        Label.PARKING: 0.25,
+        Label.SIDEWALK: 0.15,
+        Label.TERRAIN: 0.10,
+    }
     area.label(site, weighted_choice(rng, chances))
 
     front = site.ground.front(area.side)
@@ -128,7 +133,7 @@ def add_yard(site: Site, area: Area) -> None:
 
 
 def _put_large(site: Site, x: float, t: float, heading: float) -> float:
-    """Put a vehicle or a container at x, the end of the space before it; return its length."""
+    """Put a vehicle or a container behind x along the street; return its length."""
     rng = site.rng
     yaw = heading + np.pi * (rng.random() < 0.5) + rng.normal(scale=0.1)
     if rng.random() < 0.15:
@@ -169,7 +174,7 @@ def add_square(site: Site, area: Area) -> None:
 
 
 def _put_people(site: Site, area: Area, mean: float) -> None:
-    """Put people and groups of people at any place of an area."""
+    """Put people and groups of people anywhere in an area; `mean` is their average number."""
     rng = site.rng
     front = site.ground.front(area.side)
     for _ in range(rng.poisson(mean)):

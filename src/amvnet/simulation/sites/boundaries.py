@@ -14,7 +14,7 @@ from amvnet.simulation.sites.plot import Plot
 # Metres: length of a segment of a boundary, and width of the drive to a garage.
 SEGMENT = 2.5
 DRIVE_WIDTH = 3.0
-# Chance that a boundary is a hedge, and that one has a hedge before or behind a fence.
+# Chances that a boundary is a hedge, and that a fence has a hedge in front of or behind it.
 HEDGE = 0.62
 FENCE_AND_HEDGE = 0.14
 
@@ -24,7 +24,7 @@ class Boundary:
     """One kind of boundary: a fence, a hedge, or both, one behind the other.
 
     Attributes:
-        layers: each fence or hedge and how many metres it is off the line, in order.
+        layers: each fence or hedge, and its distance from the line of the boundary in metres.
         missing: share of the segments that are not there.
     """
 
@@ -68,16 +68,16 @@ def line_up(
         gap: x from and to of a drive that no segment closes off.
     """
     rng = plot.rng
-    way = np.array(end) - np.array(start)
-    length = float(np.linalg.norm(way))
+    line = np.array(end) - np.array(start)
+    length = float(np.linalg.norm(line))
     if length < 1:
         return
 
     count = max(1, round(length / SEGMENT))
     piece = length / count
-    yaw = np.arctan2(plot.side * way[1], way[0])
+    yaw = np.arctan2(plot.side * line[1], line[0])
     for index in range(count):
-        x, distance = np.array(start) + (index + 0.5) / count * way
+        x, distance = np.array(start) + (index + 0.5) / count * line
         closes_gap = gap is not None and gap[0] - piece / 2 < x < gap[1] + piece / 2
         if closes_gap or rng.random() < boundary.missing:
             continue

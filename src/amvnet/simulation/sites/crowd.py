@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from amvnet.simulation.bodies import vehicles
 from amvnet.simulation.bodies.vehicles.two_wheelers import fallen_bicycle
 from amvnet.simulation.chance import weighted_choice
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import part
+from amvnet.simulation.mesh import Maker, part
 from amvnet.simulation.sites.site import Site
 from amvnet.simulation.solids import box
 
@@ -25,28 +27,37 @@ OCCASIONS = {
 # Occasions per person that `Style.people` counts, and parked two-wheelers per such person.
 PEOPLE_FACTOR = 2.0
 TWO_WHEELER_FACTOR = 0.8
+# Metres: nobody is nearer to the end of a street.
+END_MARGIN = 2.0
 
 
 def add_people(site: Site) -> None:
-    """Add riders at the edges of the road, and people who walk, stand, meet, sit or cross."""
-    rng = site.rng
+    """Add riders, and people who walk, stand, meet, sit or cross the road."""
     ground = site.ground
     rate = PEOPLE_FACTOR * ground.style.people * ground.length / 100
 
+    for side, x in _random_places(site, rate):
+        _add_occasion(site, weighted_choice(rng, OCCASIONS), side, x)
+
+
+def _random_places(site: Site, rate: float) -> Iterator[tuple[int, float]]:
+    """Yield random sides and x along the street; on average `rate`, less those beyond its ends."""
+    rng = site.rng
     for _ in range(rng.poisson(rate)):
         side = int(rng.choice([-1, 1]))
-        x = rng.uniform(0, ground.length)
-        if ground.is_street(x, 2):
-            _add_occasion(site, weighted_choice(rng, OCCASIONS), side, x)
+        x = rng.uniform(0, site.ground.length)
+        if site.ground.is_street(x, END_MARGIN):
+            yield side, x
 
 
 def _add_occasion(site: Site, occasion: str, side: int, x: float) -> None:
+    """Add the people of one of `OCCASIONS` on a side of the street at x."""
     rng = site.rng
     ground = site.ground
     style = ground.style
     kerb = ground.kerb_t(side)
     front = ground.front(side)
-    # A place between the kerb and a little behind the front of the plots.
+    # From the kerb to a little behind the front of the plots.
     t = side * rng.uniform(kerb + 0.4, max(front, kerb + 0.8) + 1.0)
     turn = rng.uniform(0, 2 * np.pi)
 
@@ -74,9 +85,10 @@ def _add_occasion(site: Site, occasion: str, side: int, x: float) -> None:
         facing = -side * np.pi / 2
         seat = part([box((0.42, 1.7, 0.08), (-0.1, 0, 0.36))], Surface.WOOD, Label.OTHER_OBJECT)
         site.put(seat, x, bench_t, facing)
-        for place in (-0.5, 0.4)[: int(rng.integers(1, 3))]:
-            site.put(vehicles.sitter(rng), x + place, bench_t, facing, thing=True)
-    else:
+        sitters = int(rng.integers(1, 3))
+        for offset in (-0.5, 0.4)[:sitters]:
+            site.put(vehicles.sitter(rng), x + offset, bench_t, facing, thing=True)
+    else:  # stand by a car
         door_t = side * (style.road / 2 - 0.3 + rng.uniform(0.0, 0.8))
         site.put(vehicles.person(rng), x, door_t, turn, thing=True, margin=-np.inf)
 
@@ -87,14 +99,9 @@ def park_two_wheelers(site: Site) -> None:
     ground = site.ground
     rate = TWO_WHEELER_FACTOR * ground.style.people * ground.length / 100
 
-    for _ in range(rng.poisson(rate)):
-        side = int(rng.choice([-1, 1]))
-        x = rng.uniform(0, ground.length)
+    for side, x in _random_places(site, rate):
         front = ground.front(side)
         kerb = ground.kerb_t(side)
-        if not ground.is_street(x, 2):
-            continue
-
         make = vehicles.bicycle if rng.random() < 0.62 else vehicles.motorcycle
         way = rng.random()
         if way < 0.45:  # along a wall, a hedge or a fence
@@ -111,7 +118,7 @@ def park_two_wheelers(site: Site) -> None:
             put_rack(site, make, x, t, int(rng.integers(2, 8)))
 
 
-def put_rack(site: Site, make: vehicles.Maker, x: float, t: float, places: int) -> None:
+def put_rack(site: Site, make: Maker, x: float, t: float, places: int) -> None:
     """Put two-wheelers side by side at a rack, some of its places empty."""
     rng = site.rng
     pitch = rng.uniform(0.45, 0.8) if make is vehicles.bicycle else rng.uniform(0.8, 1.2)

@@ -59,7 +59,7 @@ def _plant_garden(plot: Plot, depth: float) -> None:
         bed = plants.flower_bed(rng, plot.width * rng.uniform(0.2, 0.5))
         plot.put(bed, plot.middle, plot.front + rng.uniform(0.8, 3), margin=plot.width * 0.3)
     if rng.random() < 0.2:
-        # Bushes or columns before the wall of the house.
+        # Bushes or narrow trees in front of the house.
         for x in np.arange(plot.x + plot.width * 0.3, plot.end - plot.width * 0.3, 1.4):
             bush = plants.bush(rng, 0.6) if rng.random() < 0.7 else trees.column(rng, 2.0)
             plot.put(bush, x, plot.front + depth - 0.5)

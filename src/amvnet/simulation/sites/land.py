@@ -14,8 +14,7 @@ from amvnet.simulation.sites.boundaries import draw_boundary, line_up
 from amvnet.simulation.sites.plot import Plot
 
 MEADOW_TILE = 5.0  # metres: side of a patch of uncut grass, which lies flat on the ground
-
-
+# Functions that fill a plot, and their shares.
 _Fillers = dict[Callable[[Plot], None], float]
 
 
@@ -274,7 +273,7 @@ def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> 
     """Plant undergrowth in a line along the street, its height changing slowly, with gaps.
 
     Args:
-        plot: where.
+        plot: the land.
         distance: metres from the middle line of the street.
         height: metres at the start; drawn if None.
     """

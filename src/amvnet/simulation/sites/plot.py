@@ -31,10 +31,12 @@ class Plot:
 
     @property
     def rng(self) -> np.random.Generator:
+        """The generator of the site, which draws everything."""
         return self.site.rng
 
     @property
     def style(self) -> Style:
+        """The numbers of the street."""
         return self.site.ground.style
 
     @property
@@ -77,7 +79,7 @@ class Plot:
     def put_as_is(
         self, mesh: Mesh, x: float, distance: float, yaw: float = 0.0, margin: float = 0.8
     ) -> None:
-        """Put a piece of something larger, without a brightness of its own; see `put`."""
+        """Put a piece of a larger body, which has one brightness; see `put`."""
         t = self.side * distance
         if not self.site.is_free(x, t, margin):
             return

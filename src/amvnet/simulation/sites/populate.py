@@ -15,7 +15,7 @@ from amvnet.simulation.bodies import (
 )
 from amvnet.simulation.mesh import Mesh
 from amvnet.simulation.sites.areas import add_areas
-from amvnet.simulation.sites.boundaries import draw_boundary
+from amvnet.simulation.sites.boundaries import SEGMENT, draw_boundary
 from amvnet.simulation.sites.crowd import add_people, park_two_wheelers
 from amvnet.simulation.sites.land import plant_thickets
 from amvnet.simulation.sites.plot import Plot
@@ -29,7 +29,8 @@ from amvnet.simulation.sites.traffic import (
     fill_side_roads,
     park_anywhere,
 )
-from amvnet.simulation.streets.plans import SideRoad
+from amvnet.simulation.streets.plans import Roundabout, SideRoad
+from amvnet.simulation.streets.styles import width_of
 
 # Roadside furniture per 100 m of street on each side.
 SIGNS = 3.0
@@ -40,6 +41,18 @@ SHELTERS = 0.15
 WORK_ZONES = 0.25
 # Metres between the trees, houses and copses of the second row, along the street.
 BACKGROUND_STEP = 14.0
+# Kinds of streets with houses behind the plots and along side roads.
+BUILT_UP = ("residential", "urban", "living", "avenue")
+# Share of the streets of a kind with a crash barrier along one side.
+GUARD_RAIL = {"motorway": 0.75, "fast": 0.6, "rural": 0.15}
+# Metres: distance between the segments of crash barriers, and by how much two of steel and two of
+# concrete overlap, so that no gap shows in a bend.
+BARRIER_STEP = 4.0
+RAIL_OVERLAP = 0.1
+CONCRETE_OVERLAP = 0.05
+# Metres between the barriers and between the cones of a work zone.
+WORK_BARRIER_STEP = 2.05
+CONE_STEP = 3.0
 
 
 def populate(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
@@ -85,7 +98,7 @@ def _fill_roadside(site: Site, side: int) -> None:
     has_wires = style.kind == "rural" or rng.random() < 0.15
     make_pole = furniture.utility_pole if has_wires else furniture.lamp
     for x in np.arange(rng.uniform(0, style.lamps), ground.length, style.lamps):
-        _put_beside(site, make_pole(rng), x, kerb_t if rng.random() < 0.7 else back_t, yaw)
+        _put_on_street(site, make_pole(rng), x, kerb_t if rng.random() < 0.7 else back_t, yaw)
 
     if np.isfinite(style.trees):
         for x in np.arange(rng.uniform(0, style.trees), ground.length, style.trees):
@@ -94,17 +107,17 @@ def _fill_roadside(site: Site, side: int) -> None:
     if np.isfinite(style.parking_period) and style.parking[int(side > 0)] and rng.random() < 0.6:
         _plant_parking_islands(site, side)
 
-    objects = (
+    roadside = (
         (furniture.sign, SIGNS, kerb_t),
         (furniture.post, POSTS, back_t),
         (clutter.clutter, CLUTTER, back_t),
         (clutter.shelter, SHELTERS, back_t),
     )
-    for make, per_100_m, t in objects:
+    for make, per_100_m, t in roadside:
         if make is clutter.shelter and style.kind == "motorway":
             continue
         for _ in range(rng.poisson(per_100_m * ground.length / 100)):
-            _put_beside(site, make(rng), rng.uniform(0, ground.length), t, yaw)
+            _put_on_street(site, make(rng), rng.uniform(0, ground.length), t, yaw)
 
     _put_guard_rail(site, side)
 
@@ -116,17 +129,18 @@ def _put_guard_rail(site: Site, side: int) -> None:
     style = ground.style
     yaw = along_road(side)
 
-    has_rail = {"motorway": 0.75, "fast": 0.6, "rural": 0.15}.get(style.kind, 0.0)
-    if rng.random() < has_rail:
-        t = side * (style.road / 2 + rng.uniform(0.5, 0.9))
-        if style.strips[int(side > 0)] and style.kind == "motorway":
-            t = side * (ground.front(side) - rng.uniform(0.3, 0.8))
-        for x in np.arange(0, ground.length, 4.0):
-            site.put(fence_shapes.guard_rail(4.1), x, t, yaw)
+    if rng.random() >= GUARD_RAIL.get(style.kind, 0.0):
+        return
+
+    t = side * (style.road / 2 + rng.uniform(0.5, 0.9))
+    if style.strips[int(side > 0)] and style.kind == "motorway":
+        t = side * (ground.front(side) - rng.uniform(0.3, 0.8))
+    for x in np.arange(0, ground.length, BARRIER_STEP):
+        site.put(fence_shapes.guard_rail(BARRIER_STEP + RAIL_OVERLAP), x, t, yaw)
 
 
-def _put_beside(site: Site, mesh: Mesh, x: float, t: float, yaw: float) -> None:
-    """Put a body beside the road, unless the street has ended there."""
+def _put_on_street(site: Site, mesh: Mesh, x: float, t: float, yaw: float) -> None:
+    """Put a body at x, t if the street passes x."""
     if site.ground.is_street(x):
         site.put(mesh, x, t, yaw)
 
@@ -141,11 +155,11 @@ def _plant_parking_islands(site: Site, side: int) -> None:
 
 
 def _fill_background(site: Site, side: int) -> None:
-    """Put a second row of trees and houses behind the plots, to close off the view."""
+    """Put a second row of trees and houses behind the plots, which closes off the view."""
     rng = site.rng
     ground = site.ground
     front = ground.front(side)
-    has_houses = ground.style.kind in ("residential", "urban", "living", "avenue")
+    has_houses = ground.style.kind in BUILT_UP
     # Some streets have a free view.
     density = rng.choice([1.0, 0.6, 0.2], p=[0.6, 0.25, 0.15])
 
@@ -199,11 +213,11 @@ def _close_ends(site: Site) -> None:
 
         is_wild = rng.random() < 0.33
         layer, _ = draw_boundary(rng).layers[0]
-        for t in np.arange(-reach, reach, 2.5):
+        for t in np.arange(-reach, reach, SEGMENT):
             if is_wild:
                 segment = plants.bush(rng, rng.uniform(0.8, 1.8))
             else:
-                segment = layer.segment(rng, 2.5)
+                segment = layer.segment(rng, SEGMENT)
             site.put(segment, x + outwards * rng.uniform(1.5, 2.0), t + 1.2, np.pi / 2)
 
 
@@ -214,16 +228,16 @@ def _line_side_road(site: Site, road: SideRoad, side: int) -> None:
     if ground.style.kind == "motorway":
         return
 
-    edge = road.width / 2 + sum(strip.width for strip in road.strips)
+    edge = road.width / 2 + width_of(road.strips)
     first = ground.front(road.side) + rng.uniform(1, 5)
     last = min(road.length, first + rng.uniform(6, 22))
 
     if rng.random() < 0.75:
         layer, _ = draw_boundary(rng).layers[0]
-        for along in np.arange(first, last, 2.5):
-            _put_along(site, road, layer.segment(rng, 2.5), along, side * (edge + 0.4))
+        for along in np.arange(first, last, SEGMENT):
+            _put_along(site, road, layer.segment(rng, SEGMENT), along, side * (edge + 0.4))
 
-    has_houses = ground.style.kind in ("residential", "urban", "living", "avenue")
+    has_houses = ground.style.kind in BUILT_UP
     for along in np.arange(first + 5, last + 10, rng.uniform(10, 20)):
         width = rng.uniform(7, 12)
         depth = rng.uniform(7, 11)
@@ -242,7 +256,8 @@ def _put_along(
     """Put a body next to a side road, unless the street or another road is within its reach."""
     ground = site.ground
     px, py, yaw = road.pose_at(along, across)
-    x, y = np.array([px]), np.array([py])
+    x = np.array([px])
+    y = np.array([py])
     _, t = ground.street_coordinates(x, y)
     is_clear = abs(t[0]) > ground.front(road.side) + reach
     if is_clear and ground.distance_from_crossings(x, y)[0] > reach:
@@ -277,27 +292,32 @@ def _fill_islands(site: Site) -> None:
             elif rng.random() < 0.4:
                 site.put(plants.hedge(rng, 4.0, rng.uniform(0.6, 1.4)), x, middle)
 
-    if ground.plan.roundabout:
-        _fill_roundabout(site)
+    if ground.plan.roundabout is not None:
+        _fill_roundabout(site, ground.plan.roundabout)
 
 
 def _put_barriers(site: Site, x: tuple[float, float], t: float, kind: str) -> None:
-    """Put a crash barrier along the middle of the road from one x to another."""
-    for place in np.arange(x[0], x[1], 4.0):
+    """Put a crash barrier along the middle of the road between two x.
+
+    Args:
+        site: the street.
+        x: from and to, along the street.
+        t: of the barrier.
+        kind: "rail" for steel on both sides, otherwise concrete.
+    """
+    rail = fence_shapes.guard_rail(BARRIER_STEP + RAIL_OVERLAP)
+    concrete = furniture.barrier(BARRIER_STEP + CONCRETE_OVERLAP)
+    for middle in np.arange(x[0], x[1], BARRIER_STEP):
         if kind == "rail":
-            site.put(fence_shapes.guard_rail(4.1), place, t + 0.3, margin=-np.inf)
-            site.put(fence_shapes.guard_rail(4.1), place, t - 0.3, np.pi, margin=-np.inf)
+            site.put(rail, middle, t + 0.3, margin=-np.inf)
+            site.put(rail, middle, t - 0.3, np.pi, margin=-np.inf)
         else:
-            site.put(furniture.barrier(4.05), place, t, margin=-np.inf)
+            site.put(concrete, middle, t, margin=-np.inf)
 
 
-def _fill_roundabout(site: Site) -> None:
-    """Plant the island of the roundabout."""
+def _fill_roundabout(site: Site, roundabout: Roundabout) -> None:
+    """Plant trees and bushes on the island of the roundabout."""
     rng = site.rng
-    roundabout = site.ground.plan.roundabout
-    if roundabout is None:
-        return
-
     reach = roundabout.island - 1.5
     for _ in range(rng.poisson(0.3 * max(reach, 0) ** 1.5)):
         angle = rng.uniform(0, 2 * np.pi)
@@ -306,6 +326,7 @@ def _fill_roundabout(site: Site) -> None:
             plant = trees.random_tree(rng, rng.uniform(3, 8))
         else:
             plant = plants.bush(rng, rng.uniform(0.3, 1.2))
+
         x = roundabout.x + radius * np.cos(angle)
         site.put_at(plant, x, roundabout.y + radius * np.sin(angle), 0.0)
 
@@ -322,7 +343,8 @@ def _add_work_zones(site: Site) -> None:
         has_barriers = rng.random() < 0.5
         length = rng.uniform(8, 25)
 
-        for x in np.arange(start, start + length, 2.05 if has_barriers else 3.0):
+        step = WORK_BARRIER_STEP if has_barriers else CONE_STEP
+        for x in np.arange(start, start + length, step):
             segment = furniture.barrier(2.0) if has_barriers else furniture.traffic_cone(rng)
             site.put(segment, x, edge)
 

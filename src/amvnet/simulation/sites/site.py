@@ -10,8 +10,8 @@ from amvnet.simulation.materials import MOVING, Label
 from amvnet.simulation.mesh import Mesh, place, with_instance, with_labels, with_random_tint
 from amvnet.simulation.streets.ground import Ground
 
-# Metres: half the longest body that may cover the sensor, the height up to which bodies are in its
-# way, and how near those that stand and those that move may come to it.
+# Metres: half the length of the longest body that may cover the sensor, the height up to which
+# bodies are in its way, and how near to it bodies that stand and bodies that move may be.
 LONGEST_BODY = 30.0
 OBSTACLE_HEIGHT = 2.2
 CLEARANCE = 2.1
@@ -58,7 +58,7 @@ class Site:
     Attributes:
         ground: the street.
         rng: draws everything.
-        course: (P, 2) x and y of the places where the sensor will be: no body covers them.
+        course: (P, 2) x and y of the sensor at each scan: no body covers them.
         fixed: bodies that stand still.
         movers: bodies that move.
         instances: number of instance ids in use.
@@ -109,7 +109,7 @@ class Site:
         self.put_at(mesh, px, py, heading + yaw, thing=thing)
 
     def put_at(self, mesh: Mesh, x: float, y: float, yaw: float, *, thing: bool = False) -> None:
-        """Put a body on the ground at x, y, unless it would cover a place of the sensor."""
+        """Put a body on the ground at x, y, unless it would cover the course of the sensor."""
         if self.covers_course(mesh, x, y, yaw):
             return
 
@@ -120,7 +120,7 @@ class Site:
         self.fixed.append(body)
 
     def covers_course(self, mesh: Mesh, x: float, y: float, yaw: float) -> bool:
-        """Return whether a body that is put at x, y would be at a place of the sensor."""
+        """Return whether a body that is put at x, y would cover the course of the sensor."""
         return covers(mesh, (x, y, yaw), self.course, CLEARANCE)
 
     def put_moving(self, mesh: Mesh, x: float, t: float, speed: float) -> None:
@@ -136,7 +136,7 @@ class Site:
 
 
 def _as_thing(mesh: Mesh, instance: int) -> Mesh:
-    """Return the mesh as one instance; what people lead, such as dogs, is none."""
+    """Return the mesh as one instance, without its parts that have no class, such as dogs."""
     thing = with_instance(mesh, instance)
     is_thing = mesh.label != Label.OTHER_OBJECT
     return replace(thing, instance=np.where(is_thing, thing.instance, 0).astype(np.uint16))

@@ -6,9 +6,8 @@ import numpy as np
 
 from amvnet.simulation.bodies import clutter, furniture, vehicles
 from amvnet.simulation.bodies.vehicles.cars import open_door
-from amvnet.simulation.bodies.vehicles.parts import moved
 from amvnet.simulation.chance import weighted_choice
-from amvnet.simulation.mesh import Mesh, join
+from amvnet.simulation.mesh import Mesh, join, place
 from amvnet.simulation.sites.site import Site
 from amvnet.simulation.streets.plans import SideRoad
 
@@ -35,7 +34,7 @@ MOTORWAY_VEHICLES = {
     vehicles.bus: 0.02,
     vehicles.motorcyclist: 0.01,
 }
-# Metres: least distance between two vehicles of one lane, bumper to bumper.
+# Metres: smallest distance between two vehicles of one lane, bumper to bumper.
 BUMPER_GAP = 2.0
 # Longest vehicle that parks at an angle to the street, metres.
 LONGEST_ANGLED = 5.8
@@ -60,6 +59,7 @@ def fill_parking_lane(site: Site, side: int) -> None:
 
 
 def _fill_parallel(site: Site, side: int) -> None:
+    """Put vehicles into a parking lane, one behind the other."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -80,7 +80,7 @@ def _fill_parallel(site: Site, side: int) -> None:
 
 
 def _fill_angled(site: Site, side: int, angle: float) -> None:
-    """Put vehicles on bays at an angle to the street."""
+    """Put vehicles into parking bays at an angle to the street."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -180,7 +180,7 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
         is_ego_lane = abs(lane - ego_t) < 1.5
         factor = 1.0 if is_ego_lane else rng.uniform(0.75, 1.35)
         speed = direction * ego_speed * factor
-        # Some lanes are full, as before a traffic light.
+        # Some lanes are full, as in front of a traffic light.
         is_queue = rng.random() < 0.06 and style.kind != "living"
         mean_gap = rng.uniform(1, 8) if is_queue else 90 / max(style.traffic, 0.05)
 
@@ -200,7 +200,7 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
 
 
 def fill_bus_stops(site: Site) -> None:
-    """Put a bus or a tram at a stop, and those who wait there."""
+    """Put a stop with a shelter and people, and perhaps a bus, along some streets."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -219,8 +219,9 @@ def fill_bus_stops(site: Site) -> None:
         site.put(vehicles.bus(rng), x, t, along_road(side), thing=True, margin=8.0)
     site.put(clutter.shelter(rng), x, side * (ground.kerb_t(side) + 2.4), facing)
     for _ in range(rng.poisson(2.5)):
-        place = x + rng.normal(scale=3.0)
-        site.put(vehicles.person(rng), place, stand_t, rng.uniform(0, 2 * np.pi), thing=True)
+        stand_x = x + rng.normal(scale=3.0)
+        person = vehicles.person(rng)
+        site.put(person, stand_x, stand_t, rng.uniform(0, 2 * np.pi), thing=True)
 
 
 def car_with_trailer(rng: np.random.Generator) -> list[Mesh]:
@@ -228,7 +229,7 @@ def car_with_trailer(rng: np.random.Generator) -> list[Mesh]:
     car = vehicles.car(rng)
     trailer = vehicles.trailer(rng)
     gap = float(trailer.triangles[..., 0].max()) - float(car.triangles[..., 0].min())
-    return [car, moved(trailer, x=-gap + 0.1)]
+    return [car, place(trailer, x=-gap + 0.1)]
 
 
 def along_road(side: int) -> float:

@@ -72,7 +72,7 @@ def _garage_row(plot: Plot) -> None:
 
 
 def _petrol_station(plot: Plot) -> None:
-    """Put pumps under a canopy before a shop."""
+    """Put pumps under a canopy in front of a shop."""
     rng = plot.rng
     front = plot.front
 

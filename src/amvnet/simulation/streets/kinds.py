@@ -19,7 +19,8 @@ class Kind:
     islands: float
     # Chance of a parking lane on each side.
     parking: float
-    # Chances of the arrangements of strips on each side; see `styles.SIDES`.
+    # Chances of the arrangements of strips on each side; their names are those in
+    # `_draw_strips` of `styles`.
     sides: dict[str, float]
     # Largest height of the banks.
     relief: float

@@ -48,7 +48,6 @@ class Planner:
 
         return Plan(
             style=self.style,
-            length=self.length,
             start=start,
             end=end,
             roundabout=roundabout,

@@ -146,7 +146,6 @@ class Plan:
 
     Attributes:
         style: the numbers of the street.
-        length: of the simulated land along x, from 0.
         start, end: x where the street begins and ends; infinite if it does so out of sight.
         roundabout: None if there is none.
         crossings: the side roads.
@@ -156,7 +155,6 @@ class Plan:
     """
 
     style: Style
-    length: float
     start: float
     end: float
     roundabout: Roundabout | None

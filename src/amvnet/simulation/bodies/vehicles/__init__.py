@@ -1,9 +1,5 @@
 """Meshes of vehicles and people; x is forward, and all stand on z = 0."""
 
-from collections.abc import Callable
-
-import numpy as np
-
 from amvnet.simulation.bodies.vehicles.buses import bus, tram
 from amvnet.simulation.bodies.vehicles.cars import car, van
 from amvnet.simulation.bodies.vehicles.machines import caravan, excavator, machine, trailer
@@ -15,13 +11,8 @@ from amvnet.simulation.bodies.vehicles.two_wheelers import (
     motorcycle,
     motorcyclist,
 )
-from amvnet.simulation.mesh import Mesh
-
-# Draws one vehicle or person.
-Maker = Callable[[np.random.Generator], Mesh]
 
 __all__ = [
-    "Maker",
     "bicycle",
     "bicyclist",
     "bus",

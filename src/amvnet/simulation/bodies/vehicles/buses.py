@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from amvnet.simulation.bodies.vehicles.parts import draw_paint, glass, lamps, moved, plates, wheels
+from amvnet.simulation.bodies.vehicles.parts import draw_paint, glass, lamps, plates, wheels
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh, join, part
+from amvnet.simulation.mesh import Mesh, join, part, place
 from amvnet.simulation.solids import box, copies
 
 
@@ -26,7 +26,7 @@ def bus(rng: np.random.Generator) -> Mesh:
     rear = _section(rng, 7.5, width, 3.0, (-0.1,))
     bellows = part([box((1.2, width * 0.9, 2.5), (-0.6, 0, 0.4))], Surface.RUBBER, Label.BUS)
     bend = rng.normal(scale=0.1)
-    return join([moved(front, x=4.75), bellows, moved(rear, x=-4.75, yaw=bend)])
+    return join([place(front, x=4.75), bellows, place(rear, x=-4.75, yaw=bend)])
 
 
 def tram(rng: np.random.Generator) -> Mesh:
@@ -38,7 +38,7 @@ def tram(rng: np.random.Generator) -> Mesh:
     pieces = []
     for index in range(sections):
         section = _section(rng, length, width, 3.4, ())
-        pieces.append(moved(section, x=(index - (sections - 1) / 2) * (length + 0.8)))
+        pieces.append(place(section, x=(index - (sections - 1) / 2) * (length + 0.8)))
     total = sections * (length + 0.8)
     bogie_x = np.linspace(-total / 2 + 2, total / 2 - 2, sections + 1)
     bogies = copies(box((2.2, 1.9, 0.5), (0, 0, 0.02)), x=bogie_x)

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amvnet.simulation.bodies.vehicles.parts import draw_paint, glass, lamps, plates, turned, wheels
+from amvnet.simulation.bodies.vehicles.parts import draw_paint, glass, lamps, plates, wheels
+from amvnet.simulation.chance import normalised, weighted_choice
 from amvnet.simulation.materials import Label, Surface
 from amvnet.simulation.mesh import Mesh, join, part
-from amvnet.simulation.solids import box, copies, prism, tube
+from amvnet.simulation.solids import box, copies, prism, tube, turned
 
 Range = tuple[float, float]
 
@@ -35,38 +36,94 @@ class CarType:
 
 CAR_TYPES = {
     "hatchback": CarType(
-        0.24, (3.6, 4.4), (1.62, 1.82), (1.38, 1.56), (0.60, 0.66), (0.19, 0.27), (0.0, 0.04),
-        (0.9, 1.7), (0.2, 0.8),
+        share=0.24,
+        length=(3.6, 4.4),
+        width=(1.62, 1.82),
+        height=(1.38, 1.56),
+        belt=(0.60, 0.66),
+        bonnet=(0.19, 0.27),
+        boot=(0.0, 0.04),
+        windscreen=(0.9, 1.7),
+        tail=(0.2, 0.8),
     ),
     "saloon": CarType(
-        0.17, (4.2, 5.1), (1.68, 1.92), (1.36, 1.50), (0.60, 0.66), (0.22, 0.29), (0.11, 0.19),
-        (1.1, 1.9), (0.8, 2.0),
+        share=0.17,
+        length=(4.2, 5.1),
+        width=(1.68, 1.92),
+        height=(1.36, 1.50),
+        belt=(0.60, 0.66),
+        bonnet=(0.22, 0.29),
+        boot=(0.11, 0.19),
+        windscreen=(1.1, 1.9),
+        tail=(0.8, 2.0),
     ),
     "estate": CarType(
-        0.15, (4.3, 5.0), (1.70, 1.90), (1.40, 1.55), (0.60, 0.66), (0.21, 0.28), (0.0, 0.03),
-        (1.0, 1.8), (0.2, 0.7),
+        share=0.15,
+        length=(4.3, 5.0),
+        width=(1.70, 1.90),
+        height=(1.40, 1.55),
+        belt=(0.60, 0.66),
+        bonnet=(0.21, 0.28),
+        boot=(0.0, 0.03),
+        windscreen=(1.0, 1.8),
+        tail=(0.2, 0.7),
     ),
     "sport utility": CarType(
-        0.13, (4.0, 5.0), (1.75, 2.00), (1.58, 1.90), (0.58, 0.66), (0.19, 0.27), (0.0, 0.03),
-        (0.6, 1.3), (0.1, 0.5),
+        share=0.13,
+        length=(4.0, 5.0),
+        width=(1.75, 2.00),
+        height=(1.58, 1.90),
+        belt=(0.58, 0.66),
+        bonnet=(0.19, 0.27),
+        boot=(0.0, 0.03),
+        windscreen=(0.6, 1.3),
+        tail=(0.1, 0.5),
     ),
     "people carrier": CarType(
-        0.11, (4.0, 5.0), (1.70, 1.95), (1.60, 1.98), (0.52, 0.62), (0.12, 0.20), (0.0, 0.02),
-        (0.8, 1.5), (0.05, 0.4),
+        share=0.11,
+        length=(4.0, 5.0),
+        width=(1.70, 1.95),
+        height=(1.60, 1.98),
+        belt=(0.52, 0.62),
+        bonnet=(0.12, 0.20),
+        boot=(0.0, 0.02),
+        windscreen=(0.8, 1.5),
+        tail=(0.05, 0.4),
     ),
     "city car": CarType(
-        0.08, (2.6, 3.6), (1.50, 1.70), (1.42, 1.60), (0.56, 0.64), (0.12, 0.20), (0.0, 0.03),
-        (0.7, 1.3), (0.1, 0.5),
+        share=0.08,
+        length=(2.6, 3.6),
+        width=(1.50, 1.70),
+        height=(1.42, 1.60),
+        belt=(0.56, 0.64),
+        bonnet=(0.12, 0.20),
+        boot=(0.0, 0.03),
+        windscreen=(0.7, 1.3),
+        tail=(0.1, 0.5),
     ),
     "coupe": CarType(
-        0.05, (3.9, 4.8), (1.68, 1.95), (1.20, 1.38), (0.62, 0.70), (0.25, 0.34), (0.05, 0.15),
-        (1.5, 2.2), (1.2, 2.6),
+        share=0.05,
+        length=(3.9, 4.8),
+        width=(1.68, 1.95),
+        height=(1.20, 1.38),
+        belt=(0.62, 0.70),
+        bonnet=(0.25, 0.34),
+        boot=(0.05, 0.15),
+        windscreen=(1.5, 2.2),
+        tail=(1.2, 2.6),
     ),
     "pickup": CarType(
-        0.02, (4.8, 5.5), (1.75, 2.00), (1.65, 1.95), (0.56, 0.62), (0.19, 0.25), (0.28, 0.36),
-        (0.7, 1.3), (0.05, 0.2),
+        share=0.02,
+        length=(4.8, 5.5),
+        width=(1.75, 2.00),
+        height=(1.65, 1.95),
+        belt=(0.56, 0.62),
+        bonnet=(0.19, 0.25),
+        boot=(0.28, 0.36),
+        windscreen=(0.7, 1.3),
+        tail=(0.05, 0.2),
     ),
-}  # fmt: skip
+}
 # Shares of vans and of convertibles among the other cars.
 VANS = 0.09
 CONVERTIBLES = 0.03
@@ -118,9 +175,8 @@ def car(rng: np.random.Generator) -> Mesh:
     if rng.random() < VANS:
         return van(rng)
 
-    shares = [kind.share for kind in CAR_TYPES.values()]
-    names = list(CAR_TYPES)
-    name = names[rng.choice(len(names), p=np.array(shares) / sum(shares))]
+    shares = {name: kind.share for name, kind in CAR_TYPES.items()}
+    name = weighted_choice(rng, normalised(shares))
     shape = _draw_shape(rng, CAR_TYPES[name])
     paint = draw_paint(rng, 0.45)
     is_open = name in ("coupe", "city car", "saloon") and rng.random() < CONVERTIBLES * 3

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from amvnet.simulation.bodies.vehicles.parts import draw_paint, glass, lamps, scaled, turned, wheels
+from amvnet.simulation.bodies.vehicles.parts import draw_paint, glass, lamps, wheels
 from amvnet.simulation.chance import weighted_choice
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh, join, part
-from amvnet.simulation.solids import box, copies, prism, tube
+from amvnet.simulation.mesh import Mesh, join, part, scaled
+from amvnet.simulation.solids import box, copies, prism, tube, turned
 
 _MACHINE = Label.CONSTRUCTION_VEHICLE
 

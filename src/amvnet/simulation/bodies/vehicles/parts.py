@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -78,29 +77,3 @@ def lamps(half: float, width: float, z: float, label: Label) -> Mesh:
     x = [[-(half - 0.01)], [half - 0.02]]
     four = copies(lamp, x=x, y=[-(width / 2 - 0.2), width / 2 - 0.2], z=z)
     return part([four], Surface.SIGN_FACE, label)
-
-
-def turned(solid: np.ndarray, yaw: float) -> np.ndarray:
-    """Return a solid, (T, 3, 3), turned about the z axis by radians."""
-    cos = np.cos(yaw)
-    sin = np.sin(yaw)
-    return solid @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-
-
-def scaled(mesh: Mesh, factor: float) -> Mesh:
-    """Return a mesh of another size."""
-    return replace(mesh, triangles=mesh.triangles * np.float32(factor))
-
-
-def moved(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Mesh:
-    """Return a mesh turned about the z axis by radians, then moved by metres."""
-    corners = turned(mesh.triangles, yaw) + np.array([x, y, z])
-    return replace(mesh, triangles=corners.astype(np.float32))
-
-
-def leaned(mesh: Mesh, roll: float) -> Mesh:
-    """Return a mesh that leans over to the left by radians."""
-    cos = np.cos(roll)
-    sin = np.sin(roll)
-    rotation = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
-    return replace(mesh, triangles=(mesh.triangles @ rotation.T).astype(np.float32))

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from amvnet.simulation.bodies.vehicles.parts import leaned, moved, scaled
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh, join, part
+from amvnet.simulation.mesh import Mesh, join, part, place, rolled, scaled
 from amvnet.simulation.solids import Vector, box, copies, hoop, tube
 
 # Metres: thigh, and shin with shoe, of a person who is 1.75 m tall.
@@ -167,7 +166,7 @@ def _things(rng: np.random.Generator, hip_z: float) -> list[Mesh]:
         seat = box((0.3, 0.5, 0.06), (0.55, 0, 0.55))
         return [part([frame, seat], Surface.METAL, Label.PERSON)]
     if choice < 0.34:
-        return [moved(_dog(rng), x=rng.uniform(-0.5, 1.2), y=rng.choice([-0.7, 0.7]))]
+        return [place(_dog(rng), x=rng.uniform(-0.5, 1.2), y=rng.choice([-0.7, 0.7]))]
     if choice < 0.36:  # a box
         return [part([box((0.4, 0.5, 0.35), (0.42, 0, hip_z + 0.1))], Surface.WOOD, Label.PERSON)]
 
@@ -210,7 +209,7 @@ def _wheelchair_user(rng: np.random.Generator) -> Mesh:
     chair = [box((0.45, 0.46, 0.06), (0.1, 0, 0.45)), box((0.05, 0.46, 0.5), (-0.14, 0, 0.48))]
     return join(
         [
-            moved(sitter(rng, 0.5), x=0.02),
+            place(sitter(rng, 0.5), x=0.02),
             part([*tyres, casters], Surface.RUBBER, Label.PERSON),
             part(chair, Surface.CLOTH, Label.PERSON),
         ]
@@ -229,7 +228,7 @@ def people_group(rng: np.random.Generator) -> list[Mesh]:
         yaw = rng.normal(scale=0.15) if walk_together else angle + np.pi + rng.normal(scale=0.5)
         x = spread * np.cos(angle)
         y = spread * np.sin(angle)
-        people.append(moved(person(rng), float(x), float(y), yaw=float(yaw)))
+        people.append(place(person(rng), float(x), float(y), yaw=float(yaw)))
     return people
 
 
@@ -262,4 +261,4 @@ def rider(
         z = seat[1] + 0.06 + np.sqrt(0.27 - lean**2)
         helmet = tube((x, 0, z + 0.06), (x + 0.02, 0, z + 0.36), 0.14, 0.11, sides=6)
         pieces.append(part([helmet], Surface.PLASTIC, label))
-    return leaned(join(pieces), float(rng.normal(scale=0.03)))
+    return rolled(join(pieces), float(rng.normal(scale=0.03)))

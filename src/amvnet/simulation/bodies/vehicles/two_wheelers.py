@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from amvnet.simulation.bodies.vehicles.parts import draw_paint, leaned, moved, scaled
+from amvnet.simulation.bodies.vehicles.parts import draw_paint
 from amvnet.simulation.bodies.vehicles.people import rider
 from amvnet.simulation.materials import Label, Surface
-from amvnet.simulation.mesh import Mesh, join, part
+from amvnet.simulation.mesh import Mesh, join, part, place, rolled, scaled
 from amvnet.simulation.solids import Vector, box, copies, hoop, tube
 
 # Largest angle in radians at which a parked two-wheeler leans over.
@@ -27,7 +27,7 @@ def bicycle(rng: np.random.Generator, label: Label = Label.BICYCLE) -> Mesh:
     pieces += _bicycle_load(rng, label, radius, wheelbase)
     mesh = join(pieces)
     if label == Label.BICYCLE:
-        return leaned(mesh, float(rng.uniform(-STAND_LEAN, STAND_LEAN)))
+        return rolled(mesh, float(rng.uniform(-STAND_LEAN, STAND_LEAN)))
 
     return mesh
 
@@ -106,9 +106,9 @@ def _bicycle_load(
 
 def fallen_bicycle(rng: np.random.Generator) -> Mesh:
     """Return a bicycle that lies on its side."""
-    mesh = leaned(bicycle(rng), float(np.pi / 2 - 0.1))
+    mesh = rolled(bicycle(rng), float(np.pi / 2 - 0.1))
     lowest = float(mesh.triangles[..., 2].min())
-    return moved(mesh, z=-lowest)
+    return place(mesh, z=-lowest)
 
 
 def motorcycle(rng: np.random.Generator, label: Label = Label.MOTORCYCLE) -> Mesh:
@@ -118,7 +118,7 @@ def motorcycle(rng: np.random.Generator, label: Label = Label.MOTORCYCLE) -> Mes
     if label == Label.MOTORCYCLE:
         if rng.random() < 0.1:
             mesh = _covered(rng)
-        return leaned(mesh, float(rng.uniform(-0.17, 0.17)))
+        return rolled(mesh, float(rng.uniform(-0.17, 0.17)))
 
     return mesh
 
@@ -164,7 +164,7 @@ def _motorbike(rng: np.random.Generator, label: Label) -> Mesh:
 
 
 def _scooter(rng: np.random.Generator, label: Label) -> Mesh:
-    """Return a scooter: small wheels, a shield before the legs and a closed tail."""
+    """Return a scooter: small wheels, a shield in front of the legs and a closed tail."""
     size = rng.uniform(0.9, 1.12)
     shield = box((0.1, 0.42, 0.6), (0.45, 0, 0.35), top=(0.8, 0.8), shift=-0.12)
     floor = box((0.5, 0.3, 0.12), (0.15, 0, 0.25))
@@ -192,7 +192,7 @@ def _scooter(rng: np.random.Generator, label: Label) -> Mesh:
 
 
 def _covered(rng: np.random.Generator) -> Mesh:
-    """Return a motorcycle under a cover, of which only the wheels can be seen."""
+    """Return a motorcycle under a cover; only its wheels can be seen."""
     length = rng.uniform(1.6, 2.2)
     cover = box(
         (length, rng.uniform(0.6, 0.85), rng.uniform(0.8, 1.0)), (0, 0, 0.15), top=(0.6, 0.5)
@@ -228,7 +228,7 @@ def bicyclist(rng: np.random.Generator) -> Mesh:
         tyres = [hoop(0.25, 0.05, (-1.7, y, 0.25)) for y in (-0.42, 0.42)]
         pieces.append(part([tub], Surface.CLOTH, Label.BICYCLIST))
         pieces.append(part(tyres, Surface.RUBBER, Label.BICYCLIST))
-    return leaned(join(pieces), float(rng.normal(scale=0.04)))
+    return rolled(join(pieces), float(rng.normal(scale=0.04)))
 
 
 def motorcyclist(rng: np.random.Generator) -> Mesh:
@@ -239,4 +239,4 @@ def motorcyclist(rng: np.random.Generator) -> Mesh:
     pieces.append(rider(rng, Label.MOTORCYCLIST, (-0.28, 0.8), grip, feet))
     if rng.random() < 0.12:
         pieces.append(rider(rng, Label.MOTORCYCLIST, (-0.62, 0.84), (-0.3, 1.1), feet))
-    return leaned(join(pieces), float(rng.normal(scale=0.05)))
+    return rolled(join(pieces), float(rng.normal(scale=0.05)))
