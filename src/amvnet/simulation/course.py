@@ -64,7 +64,7 @@ class Course:
     side_road: SideRoad | None = None
 
     def street_x(self, index: int) -> float:
-        """Return x along the street, of a scan, or that of the junction."""
+        """Return x along the street of a scan, or of the junction with the side road."""
         if self.side_road is not None:
             return self.side_road.street_x
         return self.start + index * self.spacing

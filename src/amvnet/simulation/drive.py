@@ -40,6 +40,7 @@ def drive_street(
     start_time = 0.0
     step = np.eye(4)
     step[0, 3] = drive.spacing
+
     for street, street_seed in enumerate(street_seeds):
         count = min(drive.scans_per_street, scans - street * drive.scans_per_street)
         rng = np.random.default_rng(street_seed)

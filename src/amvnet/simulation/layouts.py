@@ -255,6 +255,7 @@ def _add_scene(tables: dict[str, list[Row]], sequence: Row) -> None:
 
     sample_links = _links(samples)
     scan_links = _links([scan["token"] for scan in scans])
+
     for index, scan in enumerate(scans):
         token = scan["token"]
         time = scan["time"]

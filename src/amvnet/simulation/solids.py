@@ -137,6 +137,7 @@ def prism(
     next_right = np.roll(right, -1, axis=0)
     left_middle = np.broadcast_to(left.mean(axis=0), left.shape)
     right_middle = np.broadcast_to(right.mean(axis=0), right.shape)
+
     return np.concatenate(
         [
             _triangles(left, next_left, next_right),
@@ -164,6 +165,7 @@ def loft(rings: np.ndarray) -> np.ndarray:
 
     start = np.broadcast_to(rings[0].mean(axis=0), rings[0].shape)
     end = np.broadcast_to(rings[-1].mean(axis=0), rings[-1].shape)
+
     return np.concatenate(
         [
             _triangles(low, next_low, next_high),

@@ -41,7 +41,7 @@ class Sequence:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The settings that the bytes of the sequence depend on, besides its number."""
+        """The settings that, with its number, determine the bytes of the sequence."""
         return {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
 
     @property

@@ -88,6 +88,7 @@ def shed(rng: np.random.Generator) -> Mesh:
     door = planks(0, 0.9, 0, 1.8, -depth / 2 - 0.03)
 
     surface = Surface.WOOD if rng.random() < 0.6 else Surface.PLASTER
+
     return join(
         [
             part([walls, door], surface, Label.BUILDING),
@@ -111,6 +112,7 @@ def garages(rng: np.random.Generator, count: int) -> Mesh:
     ]
     gates = planks(middles, 2.6, -0.1, 2.1, -depth / 2 + rng.uniform(0.05, 0.4))
     surface = Surface.METAL if rng.random() < 0.5 else Surface.WOOD
+
     return join(
         [
             part(solids, Surface.PLASTER, Label.BUILDING, tint=rng.normal(scale=0.5)),
@@ -143,6 +145,7 @@ def hall(rng: np.random.Generator, width: float, depth: float, height: float) ->
     """Return an industrial hall: ribbed walls, a band of windows and gates."""
     pitch = rng.uniform(0.25, 1.0)
     rib = rng.choice([0.0, 0.04, 0.12])
+
     parts = []
     for yaw, length, distance in (
         (0.0, width, depth / 2),
@@ -186,6 +189,7 @@ def greenhouse(rng: np.random.Generator) -> Mesh:
     x = np.array([-half, half])
     frame = tube((0, 0, 0), (0, 0, height), 0.04, sides=4)
     posts = copies(frame, x=x[:, None], y=np.linspace(-length / 2, length / 2, 6))
+
     return join(
         [
             part([prism(profile, length)], Surface.WINDOW, Label.BUILDING),
@@ -203,6 +207,7 @@ def church(rng: np.random.Generator) -> Mesh:
     )
     tower = box((6, 6, 24 + FOOT), (0, -10, -FOOT))
     roof = box((11, 21, 7), (0, 2, height), top=(0.02, 1.0))
+
     return join(
         [
             part([nave, buttresses, tower], Surface.STONE, Label.BUILDING),

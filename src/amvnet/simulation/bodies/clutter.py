@@ -32,6 +32,7 @@ def bins(rng: np.random.Generator) -> Mesh:
         return _object([box(size, (0, 0, 0.1), top=(1.05, 1.2))], Surface.PLASTIC, rng)
 
     count = int(rng.choice([1, 2, 3, 5], p=[0.4, 0.3, 0.2, 0.1]))
+
     meshes = []
     for index in range(count):
         body = box((0.5, 0.6, rng.uniform(0.85, 1.0)), (0, 0, 0.05), top=(1.15, 1.2))
@@ -308,6 +309,7 @@ def shelter(rng: np.random.Generator) -> Mesh:
     pane = box((length, 0.03, 1.9), (0, 0.6, 0.3))
 
     surface = Surface.GLASS if rng.random() < 0.6 else Surface.WOOD
+
     return join(
         [
             part([posts, roof, seat], Surface.METAL, Label.OTHER_STRUCTURE),

@@ -53,6 +53,7 @@ def draw_facade(rng: np.random.Generator, height: float) -> Facade:
     """Draw the look of a house whose walls are `height` metres high."""
     surfaces = (Surface.PLASTER, Surface.BRICK, Surface.STONE, Surface.WOOD)
     is_tall = height > 7
+
     return Facade(
         surface=surfaces[rng.choice(4, p=[0.7, 0.18, 0.06, 0.06])],
         storey=float(rng.uniform(2.5, 3.4)),
@@ -86,6 +87,7 @@ def wall(rng: np.random.Generator, facade: Facade, width: float, height: float) 
 
     parts = []
     bottom = -FOOT
+
     for storey, sill in enumerate(sills):
         low = sill
         top = min(sill + facade.window[1], height)
@@ -136,6 +138,7 @@ def _storey(
 
     panes = planks(0, width - 0.05, sill - 0.1, top + 0.1, facade.recess)
     sills = planks(middles, opening + 0.1, sill - 0.05, sill, -0.06)
+
     return [
         walls,
         part([panes], Surface.WINDOW, Label.BUILDING),
@@ -162,6 +165,7 @@ def _balconies(rng: np.random.Generator, middles: np.ndarray, floor: float) -> l
     rails = np.concatenate([rail, copies(sides, x=[-1.3, 1.3])])
 
     surface = Surface.METAL if rng.random() < 0.4 else Surface.PLASTER
+
     return [
         part([copies(slab, x=middles)], Surface.PLASTER, Label.BUILDING),
         part([copies(rails, x=middles)], surface, Label.BUILDING, tint=rng.normal(scale=0.5)),

@@ -110,6 +110,7 @@ def draw_fence(rng: np.random.Generator, kinds: dict[str, float] | None = None) 
         surface = Surface.METAL
 
     is_neat = rng.random() < 0.6
+
     return Fence(
         kind=kind,
         height=float(rng.uniform(*_HEIGHTS.get(kind, _USUAL_HEIGHT))),

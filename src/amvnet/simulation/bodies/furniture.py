@@ -232,6 +232,7 @@ def gantry(rng: np.random.Generator, width: float) -> Mesh:
     )
     beams = copies(box((0.3, width, 0.3)), z=[height, height + 1.2])
     board = box((0.05, width * 0.3, 2.0), (-0.25, -width * 0.2, height))
+
     return join(
         [
             part([masts], Surface.METAL, Label.POLE),

@@ -46,6 +46,7 @@ def _stem(
     """Return the solids of a crooked stem, and the point where it ends."""
     lean = rng.normal(scale=slant, size=2)
     crook = radius * rng.uniform(0.1, 0.9)
+
     pieces = 3
 
     solids = []
@@ -91,6 +92,7 @@ def _cloud(
 ) -> Mesh:
     """Return one large airy crown, in which pulses end metres apart, perhaps down to the ground."""
     boughs = []
+
     for _ in range(int(rng.integers(3, 6))):
         x, y = np.array(fork[:2]) + rng.normal(scale=spread * 0.5, size=2)
         end = (float(x), float(y), height * rng.uniform(0.5, 0.9))
@@ -109,6 +111,7 @@ def _bare_boughs(
 ) -> Mesh:
     """Return boughs and branches without leaves, in a haze of twigs."""
     rods = []
+
     for _ in range(int(rng.integers(4, 8))):
         x, y = np.array(fork[:2]) + rng.normal(scale=spread * 0.6, size=2)
         bough = np.array([x, y, height * rng.uniform(0.4, 0.95)])

@@ -248,6 +248,7 @@ def trace(
     tint[bare] = ground.tint(x, y, label[bare])
 
     is_foliage = nearest.depth[hit] > 0
+
     return Hits(
         direction=rays.direction[hit],
         distance=distance,
@@ -274,6 +275,7 @@ def _enter_foliage(
     """
     index = np.flatnonzero(nearest.depth > 0)  # of the rays that are still on their way
     clumps = np.zeros(len(index), dtype=np.int32)  # that each ray is inside of: clumps overlap
+
     for _ in range(MOST_CROSSINGS):
         if not len(index):
             return
@@ -290,7 +292,7 @@ def _enter_foliage(
         stops = free_path < behind.distance
         nearest.distance[index[stops]] += free_path[stops]
 
-        # The other rays reach the next surface; those whose surface is foliage's continue.
+        # The other rays reach the next surface; they continue if it is that of foliage.
         rows = np.flatnonzero(~stops)
         index = index[rows]
         clumps = clumps[rows]

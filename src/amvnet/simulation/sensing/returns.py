@@ -85,6 +85,7 @@ def receive(
 
     lost_points, lost_rings = _lost_returns(sensor, rings, rng)
     lost_labels = np.zeros(len(lost_points), dtype=np.uint32)
+
     return (
         np.concatenate([points, lost_points]),
         np.concatenate([labels, lost_labels]),

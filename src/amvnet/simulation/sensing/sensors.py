@@ -6,6 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+# Standard deviations by which a device differs from its type, at most.
+MOST_DEVIATIONS = 2.5
+
 
 @dataclass(frozen=True)
 class LidarModel:
@@ -162,16 +165,17 @@ SENSORS: dict[str, LidarModel] = {"hdl64e": HDL64E, "hdl32e": HDL32E}
 def draw_device(sensor: LidarModel, rng: np.random.Generator) -> LidarModel:
     """Return one device of a type of LiDAR as it is mounted on one car.
 
-    No number is farther than two and a half standard deviations from that of the type. Devices of a
-    type whose spreads are 0 are equal to it.
+    No number differs from that of the type by more than `MOST_DEVIATIONS` standard deviations. If
+    all spreads of a type are 0, its devices are equal to it.
     """
 
     def draw() -> float:
-        return float(np.clip(rng.standard_normal(), -2.5, 2.5))
+        return float(np.clip(rng.standard_normal(), -MOST_DEVIATIONS, MOST_DEVIATIONS))
 
     offset = sensor.elevation_spread * draw()
-    own = sensor.laser_spread * np.clip(rng.standard_normal(len(sensor.elevations)), -2.5, 2.5)
-    elevations = np.array(sensor.elevations) + offset + own
+    deviations = rng.standard_normal(len(sensor.elevations))
+    deviations = np.clip(deviations, -MOST_DEVIATIONS, MOST_DEVIATIONS)
+    elevations = np.array(sensor.elevations) + offset + sensor.laser_spread * deviations
     # From the top down, as neighbours may have changed places.
     ordered = np.sort(elevations)[::-1]
 

@@ -96,6 +96,7 @@ def add_lot(site: Site, area: Area) -> None:
     angle = np.pi / 2 if rng.random() < 0.7 else rng.uniform(0.8, 1.3)
     pitch = rng.uniform(2.5, 3.1) / np.sin(angle)
     rows = [AISLE - ROW] if area.depth < AISLE + ROW + 2 else [AISLE - ROW, AISLE + ROW]
+
     for row in rows:
         for x in np.arange(area.start + 1.8, area.stop - 1.5, pitch):
             mesh = weighted_choice(rng, LOT_VEHICLES)(rng)
@@ -122,6 +123,7 @@ def add_yard(site: Site, area: Area) -> None:
 
     front = site.ground.front(area.side)
     heading = rng.choice([0.0, np.pi / 2]) + rng.normal(scale=0.3)
+
     for distance in np.arange(3.0, area.depth, 6.0):
         x = area.start + 4
         while x < area.stop - 4:
@@ -159,10 +161,12 @@ def add_square(site: Site, area: Area) -> None:
     area.label(site, weighted_choice(rng, chances))
 
     front = site.ground.front(area.side)
+
     for _ in range(rng.poisson(2)):
         t = area.side * (front + rng.uniform(2, area.depth))
         make = vehicles.bicycle if rng.random() < 0.75 else vehicles.motorcycle
         put_rack(site, make, rng.uniform(area.start, area.stop - 4), t, int(rng.integers(3, 9)))
+
     for _ in range(rng.poisson(2)):
         t = area.side * (front + rng.uniform(1, area.depth))
         tree = trees.random_tree(rng, rng.uniform(4, 9))

@@ -76,6 +76,7 @@ def line_up(
     count = max(1, round(length / SEGMENT))
     piece = length / count
     yaw = np.arctan2(plot.side * line[1], line[0])
+
     for index in range(count):
         x, distance = np.array(start) + (index + 0.5) / count * line
         closes_gap = gap is not None and gap[0] - piece / 2 < x < gap[1] + piece / 2

@@ -37,7 +37,7 @@ def add_people(site: Site) -> None:
     rate = PEOPLE_FACTOR * ground.style.people * ground.length / 100
 
     for side, x in _random_places(site, rate):
-        _add_occasion(site, weighted_choice(rng, OCCASIONS), side, x)
+        _add_occasion(site, weighted_choice(site.rng, OCCASIONS), side, x)
 
 
 def _random_places(site: Site, rate: float) -> Iterator[tuple[int, float]]:

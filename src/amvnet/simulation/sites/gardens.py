@@ -47,6 +47,7 @@ def _plant_garden(plot: Plot, depth: float) -> None:
     green = plot.style.green
 
     plant_bushes(plot, rng.poisson(4.0 * green), depth)
+
     for _ in range(rng.poisson(0.6 * green)):
         distance = plot.front + rng.uniform(0.6, depth + 1)
         tree = trees.random_tree(rng, rng.uniform(3, 9))
@@ -116,6 +117,7 @@ def fill_row(plot: Plot) -> None:
     height = rng.uniform(*style.storeys)
     is_flat = rng.random() < 0.4
     width = plot.width / houses
+
     for index in range(houses):
         house = buildings.building(rng, width, depth, height + rng.normal(scale=0.5), is_flat)
         x = plot.x + (index + 0.5) * width

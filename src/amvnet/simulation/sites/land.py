@@ -86,6 +86,7 @@ def _orchard(plot: Plot) -> None:
 
     pitch = rng.uniform(3, 6)
     has_vines = rng.random() < 0.4
+
     for row in front + 2 + np.arange(4) * pitch * 0.9:
         for x in np.arange(plot.x + 1, plot.end, pitch):
             if has_vines:
@@ -180,6 +181,7 @@ def _allotments(plot: Plot) -> None:
 
     boundary = draw_boundary(rng)
     line_up(plot, boundary, (plot.x, front + 0.5), (plot.end, front + 0.5))
+
     for x in np.arange(plot.x + 4, plot.end, 9.0):
         side = draw_boundary(rng)
         line_up(plot, side, (x + 4.5, front + 0.5), (x + 4.5, front + 14))
@@ -284,6 +286,7 @@ def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> 
 
     height = float(rng.uniform(1.2, 5.0)) if height is None else height
     highest = max(6.0, 1.3 * height)
+
     for x in np.arange(plot.x + 2, plot.end, 4.0):
         height = float(np.clip(height + rng.normal(scale=change), 0.8, highest))
         if rng.random() < filled:

@@ -26,6 +26,7 @@ def fill_plots(site: Site, side: int) -> None:
     rng = site.rng
 
     x = rng.uniform(0, 8)
+
     while x < site.ground.length:
         fill = fillers[rng.choice(len(fillers), p=site.ground.style.plots)]
         has_house = fill in (fill_house, fill_row)

@@ -65,6 +65,7 @@ def populate(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
     """
     ground = site.ground
     add_areas(site)
+
     for side in (-1, 1):
         fill_plots(site, side)
         fill_parking_lane(site, side)
@@ -113,6 +114,7 @@ def _fill_roadside(site: Site, side: int) -> None:
         (clutter.clutter, CLUTTER, back_t),
         (clutter.shelter, SHELTERS, back_t),
     )
+
     for make, per_100_m, t in roadside:
         if make is clutter.shelter and style.kind == "motorway":
             continue
@@ -238,6 +240,7 @@ def _line_side_road(site: Site, road: SideRoad, side: int) -> None:
             _put_along(site, road, layer.segment(rng, SEGMENT), along, side * (edge + 0.4))
 
     has_houses = ground.style.kind in BUILT_UP
+
     for along in np.arange(first + 5, last + 10, rng.uniform(10, 20)):
         width = rng.uniform(7, 12)
         depth = rng.uniform(7, 11)
@@ -319,6 +322,7 @@ def _fill_roundabout(site: Site, roundabout: Roundabout) -> None:
     """Plant trees and bushes on the island of the roundabout."""
     rng = site.rng
     reach = roundabout.island - 1.5
+
     for _ in range(rng.poisson(0.3 * max(reach, 0) ** 1.5)):
         angle = rng.uniform(0, 2 * np.pi)
         radius = reach * np.sqrt(rng.random())

@@ -66,6 +66,7 @@ def _fill_parallel(site: Site, side: int) -> None:
     width = style.parking[int(side > 0)]
 
     x = rng.uniform(0, 6)
+
     while x < ground.length:
         mesh = weighted_choice(rng, PARKED_VEHICLES)(rng)
         half = length_of(mesh) / 2 + rng.uniform(0.2, 1.0)
@@ -113,6 +114,7 @@ def park_anywhere(site: Site, side: int) -> None:
         return
 
     rate = 0.25 if style.kind in ("motorway", "rural") else 0.9 * min(style.parked, 0.7)
+
     for start in np.arange(0.0, ground.length, 100.0):
         x = start + rng.uniform(0, 30)
         for _ in range(rng.poisson(rate)):
@@ -218,6 +220,7 @@ def fill_bus_stops(site: Site) -> None:
         t = side * (style.road / 2 - (0.9 if not style.parking[int(side > 0)] else -0.8))
         site.put(vehicles.bus(rng), x, t, along_road(side), thing=True, margin=8.0)
     site.put(clutter.shelter(rng), x, side * (ground.kerb_t(side) + 2.4), facing)
+
     for _ in range(rng.poisson(2.5)):
         stand_x = x + rng.normal(scale=3.0)
         person = vehicles.person(rng)

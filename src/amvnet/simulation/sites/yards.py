@@ -34,6 +34,7 @@ def _car_park(plot: Plot) -> None:
     plot.pave((plot.x + 1, plot.end - 1), (front + 0.5, front + 20), Label.PARKING)
 
     chance = plot.style.parked + 0.2
+
     for row in (4.0, 14.5):
         for x in np.arange(plot.x + 3, plot.end - 3, 2.8):
             make = weighted_choice(rng, CAR_PARK_VEHICLES)
@@ -63,6 +64,7 @@ def _garage_row(plot: Plot) -> None:
     plot.pave((plot.x, plot.end), (front, distance), Label.PARKING)
     row = buildings.garages(rng, int(plot.width / 3.4))
     plot.put(row, plot.middle, distance + 3, plot.facing, margin=plot.width / 2)
+
     for _ in range(rng.poisson(1.5)):
         car = vehicles.car(rng)
         yaw = rng.uniform(0, 6)
@@ -101,6 +103,7 @@ def _industrial_yard(plot: Plot) -> None:
     for _ in range(rng.poisson(4)):
         thing = clutter.yard_clutter(rng) if rng.random() < 0.6 else clutter.clutter(rng)
         plot.put(thing, plot.random_x(), front + rng.uniform(1, 13), rng.uniform(0, 6))
+
     for _ in range(rng.poisson(1.5)):
         make = weighted_choice(rng, CAR_PARK_VEHICLES)
         yaw = rng.choice([-1, 1]) * np.pi / 2

@@ -32,6 +32,7 @@ class GroundBrightness:
                 wanted[label] = wanted[Label.ROAD] * rng.lognormal(0, 0.06)
             else:
                 wanted[label] = rng.lognormal(np.log(PAVEMENT), 0.2)
+
         for label, reflectivity in wanted.items():
             reflection = REFLECTIONS[GROUND_SURFACES[label]]
             ratio = np.log(reflectivity / reflection.reflectivity)

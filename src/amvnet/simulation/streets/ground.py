@@ -176,7 +176,7 @@ class Ground(MiddleLine):
         return z + self._relief.beyond(places.kerb - pavement, places.t, places.x, x, y)
 
     def _profiles(self, places: Places) -> list[tuple[tuple[Strip, ...], np.ndarray]]:
-        """Return the strips of each road next to the places where it is the nearest."""
+        """Return the strips of each road, and whether it is the nearest one of each place."""
         is_street = places.branch < 0
         profiles = [
             (self.style.strips[0], is_street & (places.t < 0)),
@@ -200,6 +200,7 @@ class Ground(MiddleLine):
         plots = np.flatnonzero(off >= 0)
         plot_x = places.x[plots]
         plot_t = places.t[plots]
+
         for patch in self.patches:
             inside = (plot_x > patch.x[0]) & (plot_x < patch.x[1])
             inside &= (plot_t > patch.t[0]) & (plot_t < patch.t[1])
@@ -270,5 +271,5 @@ class Ground(MiddleLine):
 
 
 def _ramp(distance: np.ndarray) -> np.ndarray:
-    """Return 0 before a kerb, 1 behind it, and a steep line over the kerb itself."""
+    """Return 0 on the road, 1 behind the kerb, and a steep line over the kerb itself."""
     return np.clip((distance + KERB_RAMP) / (2 * KERB_RAMP), 0, 1)

@@ -21,6 +21,7 @@ def is_painted(plan: Plan, places: Places) -> np.ndarray:
     if not style.median:
         painted |= (np.abs(t) < 0.07) & (places.x % 9 < 4)
     centres = sorted(abs(lane) for lane, _ in style.lanes)
+
     for inner, outer in pairwise(centres):
         if outer - inner > 1:
             line = (inner + outer) / 2
@@ -28,7 +29,7 @@ def is_painted(plan: Plan, places: Places) -> np.ndarray:
     for lane, _ in style.lanes:
         painted |= (np.abs(t - lane) < 0.09) & (places.x % 60 < 3.5)
 
-    # Within a junction there are none of these; stop lines lie before it.
+    # None of these are in a junction; stop lines are in front of it.
     painted &= places.crossing > 1
     painted |= (np.abs(places.crossing - 4.5) < 0.2) & (t < 0) & is_road
     is_stripe = (t % 1.0 < 0.5) & is_road

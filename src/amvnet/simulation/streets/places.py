@@ -55,6 +55,7 @@ def locate(line: MiddleLine, plan: Plan, x: np.ndarray, y: np.ndarray) -> Places
 
     crossing = np.full(np.shape(x), np.inf)
     branch = np.full(np.shape(x), -1)
+
     distances = []
     for index, side_road in enumerate(plan.crossings):
         distance = side_road.distance(x, y)
@@ -62,7 +63,7 @@ def locate(line: MiddleLine, plan: Plan, x: np.ndarray, y: np.ndarray) -> Places
         branch = np.where(distance < crossing, index, branch)
         crossing = np.minimum(crossing, distance)
 
-    # The parking lane ends before a side road, and where islands interrupt it.
+    # The parking lane ends short of a side road, and where islands interrupt it.
     parking = np.where(t < 0, style.parking[0], style.parking[1])
     kerb = road
     if parking.any():

@@ -96,6 +96,7 @@ class Planner:
         rng = self.rng
         crossings = []
         x = rng.uniform(10, 140 / self.style.junctions)
+
         while x < self.length - 20:
             sides = ((-1, 1), (-1,), (1,))[rng.choice(3, p=[0.35, 0.35, 0.3])]
             if start + 8 < x < end - 8:

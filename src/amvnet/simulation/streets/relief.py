@@ -56,6 +56,7 @@ class Relief:
         """
         off = np.clip(off, 0, FARTHEST_RISE)
         z = np.zeros(np.shape(off))
+
         for side, bank in enumerate(self._banks):
             # The two sides meet on the road, or behind its end.
             weight = np.clip(0.5 + (t if side else -t) / 4, 0, 1)

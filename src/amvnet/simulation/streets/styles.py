@@ -183,6 +183,7 @@ def _draw_lanes(
     half = median / 2 + count * width + margin
 
     is_one_way = median == 0 and rng.random() < kind.one_way
+
     lanes = []
     for index in range(count):
         t = median / 2 + (index + 0.5) * width

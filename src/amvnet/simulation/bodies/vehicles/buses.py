@@ -69,6 +69,7 @@ def _section(
     painted = [lower, upper, posts]
     if rng.random() < 0.6:
         painted.append(machinery)
+
     return join(
         [
             part(painted, draw_paint(rng, 0.75), Label.BUS),

@@ -219,6 +219,7 @@ def _draw_shape(rng: np.random.Generator, kind: CarType) -> CarShape:
 
     length = draw(kind.length)
     height = draw(kind.height)
+
     return CarShape(
         length=length,
         width=draw(kind.width),
@@ -332,32 +333,35 @@ def van(rng: np.random.Generator) -> Mesh:
     door = roof_front - 0.9
 
     lower = [
-        (-half, 0.3), (half - 0.1, 0.25), (half, 0.6), (half - 0.1, belt - 0.25), (front, belt),
+        (-half, 0.3),
+        (half - 0.1, 0.25),
+        (half, 0.6),
+        (half - 0.1, belt - 0.25),
+        (front, belt),
         (-half, belt),
-    ]  # fmt: skip
+    ]
     cab = [
         (door, belt + 0.01),
         (front, belt + 0.01),
         (roof_front, height - 0.08),
         (door, height - 0.08),
     ]
-    painted = [
-        prism(lower, width),
-        box((roof_front + half, width * 0.9, 0.09), ((roof_front - half) / 2, 0, height - 0.08)),
-        copies(
-            box((0.14, 0.22, 0.3)), x=front - 0.3, y=[-width / 2 - 0.1, width / 2 + 0.1], z=belt
-        ),
-    ]
+    roof = box((roof_front + half, width * 0.9, 0.09), ((roof_front - half) / 2, 0, height - 0.08))
+    mirror_y = [-width / 2 - 0.1, width / 2 + 0.1]
+    mirrors = copies(box((0.14, 0.22, 0.3)), x=front - 0.3, y=mirror_y, z=belt)
+    painted = [prism(lower, width), roof, mirrors]
 
+    # Behind the doors, a van has windows or metal.
     rest = box(
         (door + half, width * 0.97, height - belt - 0.08),
         ((door - half) / 2, 0, belt),
         top=(1, 0.92),
     )
+    seats = box((0.2, width * 0.8, 0.8), (door + 0.1, 0, belt - 0.1))
     has_windows = rng.random() < 0.4
     pieces = [
         glass([prism(cab, width * 0.95, width * 0.86)], Label.CAR, bool(rng.random() < 0.6)),
-        part([box((0.2, width * 0.8, 0.8), (door + 0.1, 0, belt - 0.1))], Surface.CLOTH, Label.CAR),
+        part([seats], Surface.CLOTH, Label.CAR),
     ]
     if has_windows:
         posts = np.linspace(-half + 0.1, door, 4)
@@ -367,6 +371,7 @@ def van(rng: np.random.Generator) -> Mesh:
         pieces.append(glass([rest], Label.CAR, bool(rng.random() < 0.4)))
     else:
         painted.append(rest)
+
     if rng.random() < 0.12:
         rack = box((length * 0.5, 0.35, 0.05), (-0.3, 0.2, height + 0.12))
         pieces.append(part([rack], Surface.METAL, Label.CAR))

@@ -66,6 +66,7 @@ def caravan(rng: np.random.Generator) -> Mesh:
     pane = box((rng.uniform(0.6, 1.2), width + 0.04, 0.55))
     panes = copies(pane, x=[-half * 0.55, half * 0.35], z=1.3)
     door = box((0.65, 0.05, 1.75), (0, -width / 2, floor + 0.1))
+
     return join(
         [
             part([prism(profile, width)], Surface.LIGHT_PAINT, Label.TRAILER),
@@ -88,6 +89,7 @@ def _boat_trailer(rng: np.random.Generator) -> Mesh:
     hull = prism(profile, width * 0.5, width)
     frame = copies(box((length, 0.08, 0.1), (0, 0, 0.4)), y=[-0.5, 0.5])
     surface = Surface.PLASTIC if rng.random() < 0.5 else Surface.LIGHT_PAINT
+
     return join(
         [
             part([hull], surface, Label.TRAILER),
@@ -139,6 +141,7 @@ def excavator(rng: np.random.Generator) -> Mesh:
     angle = rng.uniform(-np.pi, np.pi)
     painted = [turned(solid, angle) for solid in (body, engine, upper_arm, lower_arm, bucket)]
     scale = np.float32(size)
+
     return join(
         [
             part([tracks * scale], Surface.RUBBER, _MACHINE),
@@ -220,6 +223,7 @@ def _roller(rng: np.random.Generator) -> Mesh:
     body = box((2.2, width * 0.9, 0.7), (0, 0, 0.75))
     posts = copies(box((0.07, 0.07, 1.1)), x=[[-0.6], [0.5]], y=[-width * 0.4, width * 0.4], z=1.4)
     roof = box((1.6, width, 0.08), (0, 0, 2.5))
+
     return join(
         [
             part(drums, Surface.METAL, _MACHINE),

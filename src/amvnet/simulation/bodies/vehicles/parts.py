@@ -45,7 +45,7 @@ def wheels(
 
 
 def glass(solids: Sequence[np.ndarray], label: Label, clear: bool) -> Mesh:
-    """Return convex panes or cabins of glass; pulses pass clear glass, but not tinted one."""
+    """Return convex panes or cabins of glass; pulses pass through clear glass only."""
     if not clear:
         return part(solids, Surface.GLASS, label)
 
@@ -66,7 +66,7 @@ def facing_outwards(solid: np.ndarray) -> np.ndarray:
 
 
 def plates(half: float, z: float, label: Label) -> Mesh:
-    """Return bright number plates `half` metres before and behind the middle of a vehicle."""
+    """Return bright number plates `half` metres in front of and behind the middle of a vehicle."""
     both = copies(box((0.03, 0.5, 0.11)), x=[-(half + 0.01), half + 0.01], z=z)
     return part([both], Surface.PLATE, label)
 

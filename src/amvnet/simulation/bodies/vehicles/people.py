@@ -147,12 +147,11 @@ def _things(rng: np.random.Generator, hip_z: float) -> list[Mesh]:
         bed = box((0.75, 0.45, 0.35), (0.75, 0, 0.55), top=(1.1, 1.1))
         hood = tube((0.95, 0, 0.85), (1.15, 0, 1.1), 0.26, 0.1, sides=6)
         grip = tube((0.35, 0, 1.0), (0.6, 0, 0.6), 0.03, sides=4)
-        hoops = [
-            hoop(0.14, 0.05, (x, y, 0.14), sides=8) for x in (0.5, 1.05) for y in (-0.25, 0.25)
-        ]
+        tyre = hoop(0.14, 0.05, (0, 0, 0.14), sides=8)
+        tyres = copies(tyre, x=[[0.5], [1.05]], y=[-0.25, 0.25])
         return [
             part([bed, hood], Surface.CLOTH, Label.PERSON),
-            part([grip, *hoops], Surface.METAL, Label.PERSON),
+            part([grip, tyres], Surface.METAL, Label.PERSON),
         ]
     if choice < 0.20:  # an umbrella
         dome = tube((0.15, 0.1, hip_z + 0.85), (0.15, 0.1, hip_z + 1.15), 0.55, 0.04, sides=8)
@@ -204,13 +203,13 @@ def _crouching(rng: np.random.Generator) -> Mesh:
 
 
 def _wheelchair_user(rng: np.random.Generator) -> Mesh:
-    tyres = [hoop(0.31, 0.05, (0.0, y, 0.31)) for y in (-0.3, 0.3)]
+    tyres = copies(hoop(0.31, 0.05, (0, 0, 0.31)), y=[-0.3, 0.3])
     casters = copies(box((0.14, 0.05, 0.14)), x=0.5, y=[-0.25, 0.25])
     chair = [box((0.45, 0.46, 0.06), (0.1, 0, 0.45)), box((0.05, 0.46, 0.5), (-0.14, 0, 0.48))]
     return join(
         [
             place(sitter(rng, 0.5), x=0.02),
-            part([*tyres, casters], Surface.RUBBER, Label.PERSON),
+            part([tyres, casters], Surface.RUBBER, Label.PERSON),
             part(chair, Surface.CLOTH, Label.PERSON),
         ]
     )

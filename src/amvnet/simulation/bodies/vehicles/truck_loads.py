@@ -92,8 +92,10 @@ def flatbed(rng: np.random.Generator, load: Load) -> list[Mesh]:
         pieces.append(part(goods, surface, Label.TRUCK))
     if rng.random() < 0.25:
         elbow = (load.front - 1.2, 0.3, load.floor + 2.0)
-        crane = [tube((load.front - 0.3, 0, load.floor), elbow, 0.15, sides=5),
-                 tube(elbow, (load.front - 0.6, 0.2, load.floor + 0.6), 0.12, sides=5)]  # fmt: skip
+        crane = [
+            tube((load.front - 0.3, 0, load.floor), elbow, 0.15, sides=5),
+            tube(elbow, (load.front - 0.6, 0.2, load.floor + 0.6), 0.12, sides=5),
+        ]
         pieces.append(part(crane, Surface.LIGHT_PAINT, Label.TRUCK))
     return pieces
 
@@ -113,6 +115,7 @@ def tipper(rng: np.random.Generator, load: Load) -> list[Mesh]:
         (load.middle, 0, load.floor + height),
         top=(0.5, 0.3),
     )
+
     return [
         part([trough, ribs], draw_paint(rng, 0.6), Label.TRUCK),
         part([heap], Surface.GRAVEL, Label.TRUCK),
@@ -131,6 +134,7 @@ def tanker(rng: np.random.Generator, load: Load) -> list[Mesh]:
     )
     ladder = box((0.06, 0.4, 2 * radius), (load.rear + 0.1, 0, load.floor))
     saddle = box((load.length * 0.9, 0.9, 0.3), (load.middle, 0, load.floor - 0.15))
+
     return [
         part([tank], Surface.METAL if rng.random() < 0.4 else Surface.LIGHT_PAINT, Label.TRUCK),
         part([hatches, ladder, saddle], Surface.METAL, Label.TRUCK),
@@ -157,6 +161,7 @@ def mixer(rng: np.random.Generator, load: Load) -> list[Mesh]:
         ),
         box((load.length, 0.9, 0.2), (load.middle, 0, load.floor - 0.1)),
     ]
+
     return [
         part(drum, draw_paint(rng, 0.8), Label.TRUCK),
         part(frame, Surface.METAL, Label.TRUCK),
@@ -179,6 +184,7 @@ def refuse(rng: np.random.Generator, load: Load) -> list[Mesh]:
         x=np.arange(load.rear + 1.4, load.front, 1.1),
         z=load.floor,
     )
+
     return [
         part([prism(profile, load.width), ribs], draw_paint(rng, 0.85), Label.TRUCK),
         part([prism(tail, load.width * 0.96)], draw_paint(rng, 0.6), Label.TRUCK),
@@ -195,6 +201,7 @@ def fire_engine(rng: np.random.Generator, load: Load) -> list[Mesh]:
         box((load.length * 1.1, 0.08, 0.12), (load.middle, 0, top + 0.15)), y=[-0.3, 0.3]
     )
     rungs = copies(box((0.05, 0.6, 0.05)), x=np.arange(load.rear, load.front, 0.5), z=top + 0.15)
+
     return [
         part([body], draw_paint(rng, 0.7), Label.TRUCK),
         part([shutters, rails, rungs], Surface.METAL, Label.TRUCK),

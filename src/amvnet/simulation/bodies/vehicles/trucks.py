@@ -46,6 +46,7 @@ def truck(rng: np.random.Generator) -> Mesh:
         top=rng.uniform(2.3, 3.0) if is_light else rng.uniform(2.8, 3.9),
     )
     radius = 0.38 if is_light else rng.uniform(0.45, 0.53)
+
     return join(
         [
             cab(rng, half, cab_length, width * rng.uniform(0.92, 1.0), cab_height),
@@ -63,6 +64,7 @@ def cab(rng: np.random.Generator, nose: float, length: float, width: float, heig
     slant = rng.uniform(0.02, 0.3)
 
     bonnet = rng.uniform(0.3, 0.9) if rng.random() < 0.2 else 0.0
+    front = nose - bonnet
     lower = [
         (rear, floor),
         (nose, floor),
@@ -70,7 +72,8 @@ def cab(rng: np.random.Generator, nose: float, length: float, width: float, heig
         (nose - bonnet - 0.02, sill),
         (rear, sill),
     ]
-    front = nose - bonnet
+
+    # The upper part: a box of glass between a roof, a back and two posts on each side.
     window = box(
         (front - rear - 0.04, width * 0.96, height - sill - 0.3),
         ((front + rear) / 2, 0, sill + 0.01),
@@ -88,46 +91,32 @@ def cab(rng: np.random.Generator, nose: float, length: float, width: float, heig
         y=[-width * 0.46, width * 0.46],
         z=sill,
     )
+
     mirrors = copies(
         box((0.1, 0.22, 0.5)), x=front - 0.1, y=[-width / 2 - 0.18, width / 2 + 0.18], z=sill
     )
     bumper = box((0.12, width, 0.3), (nose, 0, floor - 0.08))
 
+    seats = box((0.3, width * 0.7, 0.9), (rear + 0.4, 0, sill - 0.4))
+    headlamps = copies(
+        box((0.04, 0.35, 0.18)), x=nose + 0.06, y=[-width * 0.38, width * 0.38], z=floor + 0.2
+    )
+
+    # A spoiler on the roof, and two warning lights.
     painted = [prism(lower, width), roof, back, posts]
     if rng.random() < 0.25:
-        spoiler_z = height - 0.05
-        painted.append(
-            box(
-                (0.9, width * 0.85, rng.uniform(0.3, 0.7)),
-                (rear + 0.5, 0, spoiler_z),
-                top=(0.3, 0.9),
-                shift=-0.2,
-            )
-        )
+        size = (0.9, width * 0.85, rng.uniform(0.3, 0.7))
+        painted.append(box(size, (rear + 0.5, 0, height - 0.05), top=(0.3, 0.9), shift=-0.2))
     if rng.random() < 0.15:
         painted.append(copies(box((0.2, 0.3, 0.14)), x=front - 0.6, y=[-0.5, 0.5], z=height))
+
     return join(
         [
             part(painted, draw_paint(rng, 0.7), Label.TRUCK),
             glass([window], Label.TRUCK, bool(rng.random() < 0.5)),
-            part(
-                [box((0.3, width * 0.7, 0.9), (rear + 0.4, 0, sill - 0.4))],
-                Surface.CLOTH,
-                Label.TRUCK,
-            ),
+            part([seats], Surface.CLOTH, Label.TRUCK),
             part([mirrors, bumper], Surface.PLASTIC, Label.TRUCK),
-            part(
-                [
-                    copies(
-                        box((0.04, 0.35, 0.18)),
-                        x=nose + 0.06,
-                        y=[-width * 0.38, width * 0.38],
-                        z=floor + 0.2,
-                    )
-                ],
-                Surface.SIGN_FACE,
-                Label.TRUCK,
-            ),
+            part([headlamps], Surface.SIGN_FACE, Label.TRUCK),
         ]
     )
 
@@ -177,6 +166,7 @@ def _semi_trailer(rng: np.random.Generator) -> Mesh:
     legs = copies(box((0.12, 0.12, 0.6)), x=half - 5.5, y=[-0.7, 0.7], z=0.45)
     unit = box((5.6, 0.9, 0.3), (half - 2.9, 0, 0.65))
     axles = [half - 1.4, half - 4.9, -half + 1.6, -half + 2.9, -half + 4.2]
+
     return join(
         [
             cab(rng, half, rng.uniform(1.9, 2.4), width * 0.98, rng.uniform(3.0, 3.8)),
@@ -209,6 +199,7 @@ def _camper(rng: np.random.Generator) -> Mesh:
         white.append(prism(alcove, width))
     panes = copies(box((0.9, width + 0.03, 0.5)), x=[-half * 0.5, half * 0.15], z=1.4)
     awning = box((length * 0.5, 0.12, 0.12), (-0.3, -width / 2, height - 0.3))
+
     return join(
         [
             part([*white, awning], Surface.LIGHT_PAINT, Label.TRUCK),

@@ -225,9 +225,9 @@ def bicyclist(rng: np.random.Generator) -> Mesh:
 
     if rng.random() < 0.06:
         tub = box((0.8, 0.75, 0.75), (-1.7, 0, 0.2), top=(0.6, 0.8))
-        tyres = [hoop(0.25, 0.05, (-1.7, y, 0.25)) for y in (-0.42, 0.42)]
+        tyres = copies(hoop(0.25, 0.05, (-1.7, 0, 0.25)), y=[-0.42, 0.42])
         pieces.append(part([tub], Surface.CLOTH, Label.BICYCLIST))
-        pieces.append(part(tyres, Surface.RUBBER, Label.BICYCLIST))
+        pieces.append(part([tyres], Surface.RUBBER, Label.BICYCLIST))
     return rolled(join(pieces), float(rng.normal(scale=0.04)))
 
 
