@@ -16,7 +16,7 @@ SMALLEST_MIXED_STEP = 0.3
 LARGEST_MIXED_STEP = 3.0
 # Spread of the size of the relief from place to place: standard deviation of its logarithm.
 RELIEF_SPREAD = 0.65
-# Metres: least and mean additional distance of a ghost, which a mirror shows behind itself.
+# Metres: smallest and mean distance by which a ghost, a mirrored body, lies behind the mirror.
 GHOST_NEAREST = 0.5
 GHOST_MEAN = 6.0
 # Degrees between neighbouring shots of one laser, at most.

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from amvnet.simulation.bodies import (
-    buildings,
-    plants,
-    trees,
-)
+from amvnet.simulation.bodies import buildings, plants, trees
 from amvnet.simulation.mesh import Mesh
 from amvnet.simulation.sites.boundaries import SEGMENT, draw_boundary
 from amvnet.simulation.sites.land import plant_thickets

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from amvnet.simulation.bodies import (
-    furniture,
-    vehicles,
-)
+from amvnet.simulation.bodies import furniture, vehicles
 from amvnet.simulation.sites.areas import add_areas
 from amvnet.simulation.sites.background import close_ends, fill_background, line_side_road
 from amvnet.simulation.sites.crowd import add_people, park_two_wheelers

@@ -4,18 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from amvnet.simulation.bodies import (
-    clutter,
-    fence_shapes,
-    furniture,
-    plants,
-    trees,
-)
+from amvnet.simulation.bodies import clutter, fence_shapes, furniture, plants, trees
 from amvnet.simulation.mesh import Mesh
 from amvnet.simulation.sites.site import Site
-from amvnet.simulation.sites.traffic import (
-    along_road,
-)
+from amvnet.simulation.sites.traffic import along_road
 from amvnet.simulation.streets.plans import Roundabout
 
 # Furniture per 100 m of street on each side.

@@ -11,9 +11,10 @@ from amvnet.simulation.materials import Label, Surface
 from amvnet.simulation.mesh import Mesh, join, part
 from amvnet.simulation.solids import box, copies, prism, tube, turned
 
-# Shares of vans and of convertibles among the other cars.
+# Shares of vans among all cars, and of convertibles among the types that may be open.
 VANS = 0.09
-CONVERTIBLES = 0.03
+CONVERTIBLES = 0.09
+OPEN_TYPES = ("coupe", "city car", "saloon")
 
 
 def car(rng: np.random.Generator) -> Mesh:
@@ -25,7 +26,7 @@ def car(rng: np.random.Generator) -> Mesh:
     name = weighted_choice(rng, normalised(shares))
     shape = draw_shape(rng, CAR_TYPES[name])
     paint = draw_paint(rng, 0.45)
-    is_open = name in ("coupe", "city car", "saloon") and rng.random() < CONVERTIBLES * 3
+    is_open = name in OPEN_TYPES and rng.random() < CONVERTIBLES
 
     painted = [_lower_body(rng, shape), *_mirrors(shape)]
     pieces = _seats(rng, shape)

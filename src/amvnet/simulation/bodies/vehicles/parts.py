@@ -10,7 +10,7 @@ from amvnet.simulation.materials import Label, Surface
 from amvnet.simulation.mesh import Mesh, part
 from amvnet.simulation.solids import box, copies, tube
 
-# Metres that a pulse travels behind clear glass, on average, before dirt or a reflection ends it.
+# Metres: mean distance that a pulse travels behind clear glass until dirt or a reflection ends it.
 CLEAR_GLASS = 4.0
 
 
