@@ -20,7 +20,7 @@ from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.inputs import adapter_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.simulation import simulate
-from amvnet.simulation.sensors import HDL64E, SENSORS, LidarModel
+from amvnet.simulation.sensing.sensors import HDL64E, SENSORS, LidarModel
 
 SEED = 78
 VLP32C = (

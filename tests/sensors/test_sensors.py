@@ -30,7 +30,7 @@ from amvnet.sensors.lidars import (
     rotation_from_degrees,
 )
 from amvnet.sensors.measure import ground_height, measure
-from amvnet.simulation.sensors import HDL32E, HDL64E
+from amvnet.simulation.sensing.sensors import HDL32E, HDL64E
 from amvnet.weights.file import save
 
 from fixtures.scan_writers import pcd_bytes, write_bag1

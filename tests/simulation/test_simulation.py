@@ -14,8 +14,8 @@ import pytest
 from amvnet.errors import InputError
 from amvnet.simulation import SENSORS, Drive, SimulatedScan, drive_street, simulate
 from amvnet.simulation.layouts import semantickitti_ids
-from amvnet.simulation.sensors import LidarModel, draw_device
-from amvnet.simulation.styles import KINDS
+from amvnet.simulation.sensing.sensors import LidarModel, draw_device
+from amvnet.simulation.streets.kinds import KINDS
 
 # Raw ids of SemanticKITTI.
 THING_IDS = {10, 11, 13, 15, 18, 20, 30, 31, 32}

@@ -10,6 +10,12 @@ import numpy as np
 Option = TypeVar("Option")
 
 
+def normalised(shares: Mapping[Option, float]) -> dict[Option, float]:
+    """Return shares that add up to 1 in the ratios of the given ones."""
+    total = sum(shares.values())
+    return {option: share / total for option, share in shares.items()}
+
+
 def weighted_choice(rng: np.random.Generator, chances: Mapping[Option, float]) -> Option:
     """Draw one of the keys, each with the chance that is its value; the chances add up to 1."""
     options = list(chances)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -68,16 +68,6 @@ class SimulatedScan:
     ring: np.ndarray
     pose: np.ndarray
     time: float
-
-
-class Layout(Protocol):
-    """How one sequence is written: scan by scan, then the files of the whole sequence."""
-
-    def write_scan(self, index: int, scan: SimulatedScan) -> None:
-        """Write one scan."""
-
-    def finish(self) -> Row:
-        """Write the files of the whole sequence, and return what `complete` needs of it."""
 
 
 @dataclass
@@ -255,6 +245,7 @@ def _add_scene(tables: dict[str, list[Row]], sequence: Row) -> None:
 
     sample_links = _links(samples)
     scan_links = _links([scan["token"] for scan in scans])
+
     for index, scan in enumerate(scans):
         token = scan["token"]
         time = scan["time"]

@@ -1,48 +1,14 @@
-"""Labelled triangle meshes, and the few solids that all bodies are built from."""
+"""Labelled triangle meshes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from amvnet.simulation.materials import Label, Surface
-
-Vector = tuple[float, float, float]
-
-# Corners of the unit box, whose lower face is centred on the origin.
-_BOX_CORNERS = np.array(
-    [
-        (-0.5, -0.5, 0.0),
-        (0.5, -0.5, 0.0),
-        (-0.5, 0.5, 0.0),
-        (0.5, 0.5, 0.0),
-        (-0.5, -0.5, 1.0),
-        (0.5, -0.5, 1.0),
-        (-0.5, 0.5, 1.0),
-        (0.5, 0.5, 1.0),
-    ]
-)
-# Counter-clockwise seen from outside.
-_BOX_FACES = np.array(
-    [
-        (0, 3, 1),
-        (0, 2, 3),
-        (4, 5, 7),
-        (4, 7, 6),
-        (0, 1, 5),
-        (0, 5, 4),
-        (2, 7, 3),
-        (2, 6, 7),
-        (0, 6, 2),
-        (0, 4, 6),
-        (1, 3, 7),
-        (1, 7, 5),
-    ]
-)
+from amvnet.simulation.solids import moved
 
 
 @dataclass(frozen=True)
@@ -70,6 +36,10 @@ class Mesh:
 
     def __len__(self) -> int:
         return len(self.triangles)
+
+
+# Draws one body.
+Maker = Callable[[np.random.Generator], Mesh]
 
 
 def part(
@@ -109,10 +79,23 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(**columns)
 
 
-def place(mesh: Mesh, x: float, y: float, z: float, yaw: float) -> Mesh:
-    """Return the mesh turned by `yaw` (radians) about its vertical axis, then moved."""
+def place(mesh: Mesh, x: float = 0, y: float = 0, z: float = 0, yaw: float = 0) -> Mesh:
+    """Return the mesh turned by `yaw` radians about the z axis, then moved by metres."""
     corners = moved(mesh.triangles, (x, y, z), yaw)
     return replace(mesh, triangles=corners.astype(np.float32))
+
+
+def scaled(mesh: Mesh, factor: float) -> Mesh:
+    """Return the mesh, its size multiplied by a factor."""
+    return replace(mesh, triangles=mesh.triangles * np.float32(factor))
+
+
+def rolled(mesh: Mesh, roll: float) -> Mesh:
+    """Return the mesh turned by `roll` radians about the x axis: it leans to the right."""
+    cos = np.cos(roll)
+    sin = np.sin(roll)
+    rotation = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    return replace(mesh, triangles=(mesh.triangles @ rotation.T).astype(np.float32))
 
 
 def with_instance(mesh: Mesh, instance: int) -> Mesh:
@@ -132,239 +115,3 @@ def with_labels(mesh: Mesh, labels: dict[Label, int]) -> Mesh:
     for old, new in labels.items():
         label[mesh.label == old] = new
     return replace(mesh, label=label)
-
-
-def box(
-    size: Vector, at: Vector = (0, 0, 0), top: tuple[float, float] = (1, 1), shift: float = 0
-) -> np.ndarray:
-    """Return the (12, 3, 3) triangles of a box.
-
-    Args:
-        size: edge lengths in metres.
-        at: centre of the lower face.
-        top: factors by which the upper face is narrower in x and y.
-        shift: metres by which the upper face is moved along x.
-    """
-    corners = _BOX_CORNERS * np.array(size)
-    corners[4:, :2] *= np.array(top)
-    corners[4:, 0] += shift
-    return (corners + np.array(at))[_BOX_FACES]
-
-
-def copies(
-    triangles: np.ndarray, x: ArrayLike = 0.0, y: ArrayLike = 0.0, z: ArrayLike = 0.0
-) -> np.ndarray:
-    """Return copies of (T, 3, 3) triangles, one moved by each of the offsets.
-
-    The offsets are broadcast against each other: `x=[0, 1], z=2` are two copies, both 2 m up.
-    """
-    offsets = np.stack(np.broadcast_arrays(x, y, z), axis=-1)
-    return (triangles + offsets[..., None, None, :]).reshape(-1, 3, 3)
-
-
-def tube(
-    start: Vector,
-    end: Vector,
-    radius: float,
-    end_radius: float | None = None,
-    sides: int = 8,
-    *,
-    closed: bool = True,
-) -> np.ndarray:
-    """Return the (4 sides, 3, 3) triangles of a round bar between two points.
-
-    Its radius is `radius`, or goes from `radius` at the start to `end_radius` at the end. Without
-    its two ends, if it is not closed, it has (2 sides, 3, 3) triangles.
-    """
-    if end_radius is None:
-        end_radius = radius
-
-    start_point = np.array(start, dtype=float)
-    end_point = np.array(end, dtype=float)
-    axis = (end_point - start_point) / np.linalg.norm(end_point - start_point)
-
-    # A circle about the axis, (sides, 3).
-    x, y, z = axis
-    across = np.array([0, z, -y]) if abs(x) < 0.9 else np.array([-z, 0, x])
-    across /= np.linalg.norm(across)
-    a, b, c = across
-    upward = np.array([y * c - z * b, z * a - x * c, x * b - y * a])  # axis x across
-    angle = np.arange(sides) * 2 * np.pi / sides
-    circle = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * upward
-
-    low = start_point + circle * radius
-    high = end_point + circle * end_radius
-    next_low = np.roll(low, -1, axis=0)
-    next_high = np.roll(high, -1, axis=0)
-    side = [_triangles(low, next_low, next_high), _triangles(low, next_high, high)]
-    if not closed:
-        return np.concatenate(side)
-
-    start_points = np.broadcast_to(start_point, low.shape)
-    end_points = np.broadcast_to(end_point, high.shape)
-    ends = [_triangles(start_points, next_low, low), _triangles(end_points, high, next_high)]
-    return np.concatenate(side + ends)
-
-
-def prism(
-    profile: Sequence[tuple[float, float]], width: float, top_width: float | None = None
-) -> np.ndarray:
-    """Return the (4 n, 3, 3) triangles of a side view drawn out across y.
-
-    Args:
-        profile: n corners (x, z) of the side view, which is convex or nearly so.
-        width: width in y.
-        top_width: width at the top, if it differs.
-    """
-    if top_width is None:
-        top_width = width
-
-    xz = np.array(profile, dtype=float)
-    rise = (xz[:, 1] - xz[:, 1].min()) / np.ptp(xz[:, 1])
-    half_width = 0.5 * (width + rise * (top_width - width))
-
-    left = np.column_stack([xz[:, 0], half_width, xz[:, 1]])
-    right = left * np.array([1, -1, 1])
-    next_left = np.roll(left, -1, axis=0)
-    next_right = np.roll(right, -1, axis=0)
-    left_middle = np.broadcast_to(left.mean(axis=0), left.shape)
-    right_middle = np.broadcast_to(right.mean(axis=0), right.shape)
-    return np.concatenate(
-        [
-            _triangles(left, next_left, next_right),
-            _triangles(left, next_right, right),
-            _triangles(left_middle, left, next_left),
-            _triangles(right_middle, right, next_right),
-        ]
-    )
-
-
-def loft(rings: np.ndarray) -> np.ndarray:
-    """Return the triangles of the closed body through rings of corners.
-
-    Args:
-        rings: (n, k, 3) corners; seen from the last ring, each runs counter-clockwise.
-
-    Returns:
-        (2 n k, 3, 3) triangles, counter-clockwise seen from outside.
-    """
-    following = np.roll(rings, -1, axis=1)
-    low = rings[:-1].reshape(-1, 3)
-    next_low = following[:-1].reshape(-1, 3)
-    high = rings[1:].reshape(-1, 3)
-    next_high = following[1:].reshape(-1, 3)
-
-    start = np.broadcast_to(rings[0].mean(axis=0), rings[0].shape)
-    end = np.broadcast_to(rings[-1].mean(axis=0), rings[-1].shape)
-    return np.concatenate(
-        [
-            _triangles(low, next_low, next_high),
-            _triangles(low, next_high, high),
-            _triangles(start, following[0], rings[0]),
-            _triangles(end, rings[-1], following[-1]),
-        ]
-    )
-
-
-def planks(
-    x: ArrayLike,
-    width: ArrayLike,
-    bottom: ArrayLike,
-    top: ArrayLike,
-    y: ArrayLike = 0.0,
-) -> np.ndarray:
-    """Return upright rectangles that face along y, as (2 n, 3, 3) triangles.
-
-    The arguments are in metres and are broadcast against each other: `x` is the middle of each
-    rectangle, `bottom` and `top` are the heights of its edges.
-    """
-    x, width, bottom, top, y = np.broadcast_arrays(x, width, bottom, top, y)
-    left = (x - width / 2).ravel()
-    right = (x + width / 2).ravel()
-    bottom = bottom.ravel()
-    top = top.ravel()
-    y = y.ravel()
-
-    a = np.stack([left, y, bottom], axis=1)
-    b = np.stack([right, y, bottom], axis=1)
-    c = np.stack([right, y, top], axis=1)
-    d = np.stack([left, y, top], axis=1)
-    return np.concatenate([_triangles(a, b, c), _triangles(a, c, d)])
-
-
-def moved(triangles: np.ndarray, at: Vector, yaw: float = 0.0) -> np.ndarray:
-    """Return (T, 3, 3) triangles turned by `yaw` (radians) about the vertical axis, then moved."""
-    cos = np.cos(yaw)
-    sin = np.sin(yaw)
-    rotation = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # transposed: corners are rows
-    return triangles @ rotation + np.array(at)
-
-
-def leaning(triangles: np.ndarray, x: float, y: float) -> np.ndarray:
-    """Return (T, 3, 3) triangles moved by x and y metres for each metre above the ground."""
-    offset = np.zeros_like(triangles)
-    offset[..., 0] = x * triangles[..., 2]
-    offset[..., 1] = y * triangles[..., 2]
-    return triangles + offset
-
-
-def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.ndarray:
-    """Return the (2 sides, 3, 3) triangles of a flat ring in the x-z plane, such as a wheel's rim.
-
-    `at` is its centre.
-    """
-    angle = np.arange(sides) * 2 * np.pi / sides
-    circle = np.column_stack([np.cos(angle), np.zeros(sides), np.sin(angle)])
-
-    outer = circle * radius
-    inner = circle * (radius - thickness)
-    next_outer = np.roll(outer, -1, axis=0)
-    next_inner = np.roll(inner, -1, axis=0)
-    ring = np.concatenate(
-        [_triangles(outer, next_outer, next_inner), _triangles(outer, next_inner, inner)]
-    )
-    return ring + np.array(at)
-
-
-def _triangles(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the (n, 3, 3) triangles between three lists of n corners."""
-    return np.stack([a, b, c], axis=1)
-
-
-@lru_cache(maxsize=4)
-def _sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners (V, 3) and the faces (T, 3) of a unit sphere."""
-    from trimesh.creation import icosphere
-
-    sphere = icosphere(subdivisions=subdivisions)
-    return np.asarray(sphere.vertices), np.asarray(sphere.faces)
-
-
-def hull(
-    rng: np.random.Generator,
-    centre: Vector,
-    radii: Vector,
-    taper: float = 0,
-    square: float = 1,
-    fine: bool = True,
-) -> np.ndarray:
-    """Return the (T, 3, 3) triangles of the bumpy, closed hull of a clump of leaves.
-
-    The corners are counter-clockwise seen from outside.
-
-    Args:
-        rng: draws the bumps.
-        centre: centre of the hull in metres.
-        radii: half axes of the hull in metres.
-        taper: share by which it is narrower at the top and wider at the bottom.
-        square: exponent of the shape; below 1 it is closer to a box.
-        fine: 320 triangles instead of 80.
-    """
-    corners, faces = _sphere(2 if fine else 1)
-
-    waves = np.sin(corners @ rng.normal(scale=3.0, size=(3, 3)) + rng.uniform(0, 6.3, size=3))
-    swell = 1 + 0.09 * waves.sum(axis=1) + rng.normal(scale=0.11, size=len(corners))
-
-    shape = np.sign(corners) * np.abs(corners) ** square * swell[:, None]
-    shape[:, :2] *= np.maximum(1 - taper * shape[:, 2:], 0.05)  # keep the tip from turning over
-    return (shape * np.array(radii) + np.array(centre))[faces]

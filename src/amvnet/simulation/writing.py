@@ -19,8 +19,8 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.simulation.drive import drive_street
 from amvnet.simulation.layouts import LAYOUTS, SimulatedScan
-from amvnet.simulation.lidar import require_embree
-from amvnet.simulation.sensors import SENSORS, LidarModel
+from amvnet.simulation.sensing.lidar import require_embree
+from amvnet.simulation.sensing.sensors import SENSORS, LidarModel
 
 Progress = Callable[[int, int], None]  # scans written, scans in all
 # Environment variables that set the number of threads of the numerical libraries.
@@ -41,7 +41,7 @@ class Sequence:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The settings that the bytes of the sequence depend on, besides its number."""
+        """The settings that, with its number, determine the bytes of the sequence."""
         return {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
 
     @property

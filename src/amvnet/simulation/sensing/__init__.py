@@ -1,0 +1,1 @@
+"""The simulated LiDARs: what their pulses hit, and what they measure."""
