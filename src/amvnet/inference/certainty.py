@@ -9,7 +9,7 @@ import numpy as np
 
 # A share of uncertain points is unusual beyond this part of the way from the usual share to 1. For
 # weights of simulated streets, real scans of the right sensor stay below. The same scans without
-# intensity, tilted, or with the origin on the ground are above (docs/log/certainty.md).
+# intensity, tilted, or with the origin on the ground are above (docs/log/real_scans.md).
 UNUSUAL = 0.5
 
 
