@@ -13,26 +13,47 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from amvnet import onnx_runner as onnx_runner
+    from amvnet import weights as weights
     from amvnet.errors import InputError
     from amvnet.inference.fusion import fuse
-    from amvnet.inference.segmenter import Segmentation, Segmenter
+    from amvnet.inference.read import read, read_all
+    from amvnet.inference.segmentation import Segmentation
+    from amvnet.inference.segmenter import Segmenter
     from amvnet.models.methods import MethodName, Precision
     from amvnet.scan import Scan
     from amvnet.simulation import simulate
+    from amvnet.weights.file import Weights
     from amvnet.weights.push import push
 
-__all__ = ["InputError", "Scan", "Segmentation", "Segmenter", "fuse", "load", "push", "simulate"]
+__all__ = [
+    "InputError",
+    "Scan",
+    "Segmentation",
+    "Segmenter",
+    "Weights",
+    "fuse",
+    "load",
+    "push",
+    "read",
+    "read_all",
+    "simulate",
+]
 __version__ = version("amvnet")
 
 _MODULES = {
     "InputError": "amvnet.errors",
     "Scan": "amvnet.scan",
-    "Segmentation": "amvnet.inference.segmenter",
+    "Segmentation": "amvnet.inference.segmentation",
     "Segmenter": "amvnet.inference.segmenter",
+    "Weights": "amvnet.weights.file",
     "fuse": "amvnet.inference.fusion",
     "push": "amvnet.weights.push",
+    "read": "amvnet.inference.read",
+    "read_all": "amvnet.inference.read",
     "simulate": "amvnet.simulation",
 }
+_SUBMODULES = ("onnx_runner", "weights")
 
 
 def load(
@@ -65,9 +86,16 @@ def load(
     return segmenter
 
 
-def __getattr__(name: str) -> Any:
-    if name == "weights":
-        return import_module("amvnet.weights")
-    if name not in _MODULES:
-        raise AttributeError(f"module 'amvnet' has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+# Hidden from type checkers, which would take any name for one of the package.
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        if name in _SUBMODULES:
+            return import_module(f"amvnet.{name}")
+        if name not in _MODULES:
+            raise AttributeError(f"module 'amvnet' has no attribute {name!r}")
+        return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, *_SUBMODULES, "__doc__", "__version__"])

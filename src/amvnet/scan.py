@@ -11,7 +11,7 @@ from amvnet.errors import InputError
 FARTHEST = 10_000.0  # metres: no LiDAR sees that far, and squares of much larger numbers overflow
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scan:
     """The points of one turn of a LiDAR, in the sensor's frame.
 
@@ -55,6 +55,15 @@ class Scan:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        title = f"Scan {self.name}" if self.name else "Scan"
+        parts = [f"{len(self):,} points"]
+        if self.labels is not None:
+            parts.append("labels")
+        if self.ring is not None:
+            parts.append("rings")
+        return f"<{title}: {', '.join(parts)}>"
 
     @property
     def valid(self) -> np.ndarray:

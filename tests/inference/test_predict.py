@@ -111,8 +111,8 @@ def test_only_broken_scans_are_one_line(world: Path, tmp_path: Path) -> None:
 
 def no_segmentation(scan: Scan) -> Segmentation:
     """Return labels and scores of 0."""
-    zeros = np.zeros(len(scan))
-    return Segmentation(labels=zeros, uncertain=zeros, scores=zeros)
+    n = len(scan)
+    return Segmentation(np.zeros(n, np.uint8), np.zeros(n, bool), np.zeros((n, 1), np.float32))
 
 
 def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> None:
@@ -197,7 +197,7 @@ def test_a_finished_run_is_not_taken_for_an_interrupted_one(
 ) -> None:
     succeed(predict(world, tmp_path, "--resume"))
     (tmp_path / "000005.label").write_bytes(b"other")
-    succeed(predict(world, tmp_path, "--resume"))
+    succeed(predict(world, tmp_path, "--resume --overwrite"))
     check_same(tmp_path, whole)
 
 

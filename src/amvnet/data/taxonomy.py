@@ -85,6 +85,11 @@ class Taxonomy:
         return len(self.classes)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """K + 1 names, indexed by train id; the first is "unlabelled"."""
+        return ("unlabelled", *self.classes)
+
+    @property
     def raw_ids(self) -> list[int]:
         """The numeric raw ids of `raw_to_train`, followed by those of `train_to_raw`."""
         return [raw for raw in (*self.raw_to_train, *self.train_to_raw) if isinstance(raw, int)]

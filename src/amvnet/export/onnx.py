@@ -132,6 +132,11 @@ def export(
     return measured
 
 
+def possible_files(out: Path) -> list[Path]:
+    """Return the paths of all files that `export` may write into a folder."""
+    return [out / f"{name}.onnx" for name in GRAPHS["amvnet"]] + [out / DESCRIPTION]
+
+
 def _write_all(
     segmenter: Segmenter, scans: Sequence[Scan], folder: Path, progress: Progress
 ) -> tuple[dict[str, Any], Exported]:

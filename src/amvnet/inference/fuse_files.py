@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.inference.certainty import UncertainCount
 from amvnet.inference.fusion import Fusion
 from amvnet.inference.inputs import InputScan, ScanOptions, open_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline
@@ -47,13 +47,7 @@ class FileFusion:
         self.fusion = fusion
         self.pair = pair
         self.classes = classes
-        self.points = 0
-        self.uncertain = 0
-
-    @property
-    def uncertain_share(self) -> float:
-        """The share of the points so far that are uncertain."""
-        return self.uncertain / max(self.points, 1)
+        self.counted = UncertainCount()
 
     def __call__(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
         results = []
@@ -61,9 +55,7 @@ class FileFusion:
             checked = check_scan(scan)
             f, g = self.pair.read(scan_input.scores_path, checked, self.classes)
             result = self.fusion(checked, f, g)
-
-            self.uncertain += int(result.uncertain.sum())
-            self.points += len(checked)
+            self.counted.add(result.labels, result.uncertain)
             results.append(result)
 
         return results
@@ -72,7 +64,7 @@ class FileFusion:
 def fuse_files(
     inputs: Sequence[str],
     pair: ScorePair,
-    out: Path,
+    output: OutputOptions,
     fusion: FusionOptions,
     options: ScanOptions = ScanOptions(),
     progress: Progress = no_progress,
@@ -82,7 +74,7 @@ def fuse_files(
     Args:
         inputs: as for `predict`.
         pair: the two models' scores.
-        out: the folder of predictions.
+        output: where the labels are written.
         fusion: the head, its threshold, and the classes.
         options: which scans of the inputs to fuse.
 
@@ -90,8 +82,8 @@ def fuse_files(
         The number of label files, and the share of the points that are uncertain.
 
     Raises:
-        InputError: before anything is written, if scores of a scan are missing; at the end, if all
-            are broken.
+        InputError: before anything is written, if scores of a scan are missing or a file of the
+            user would be replaced; at the end, if all are broken.
         SomeBroken: at the end, if the scores of some scans are broken.
     """
     head = fusion.head
@@ -106,6 +98,6 @@ def fuse_files(
         pair.b.find(scan.scores_path)
 
     segment = FileFusion(Fusion(head, fusion.tau), pair, opened.taxonomy.size)
-    pipeline = Pipeline(opened.scans, segment, OutputOptions(out), opened.taxonomy)
+    pipeline = Pipeline(opened.scans, segment, output, opened.taxonomy)
     written = pipeline.run({"fused": pair.to_dict()}, progress)
-    return written, segment.uncertain_share
+    return written, segment.counted.share

@@ -81,6 +81,13 @@ class InputScan(Protocol):
     def scores_path(self) -> Path:
         """The path of the `.npz` of its scores, relative to a folder of predictions."""
 
+    def labels_path(self, kind: str) -> Path:
+        """Return the path of the file of its labels, relative to a folder of predictions.
+
+        Args:
+            kind: the format for scan files; datasets have their own.
+        """
+
     @property
     def path(self) -> Path:
         """The file that the scan is read from."""
@@ -164,6 +171,9 @@ class DatasetScan:
     def scores_path(self) -> Path:
         return Path(self.record.prediction).with_suffix(".npz")
 
+    def labels_path(self, kind: str) -> Path:
+        return Path(self.record.prediction)
+
     @property
     def path(self) -> Path:
         return self.record.points_path
@@ -246,6 +256,9 @@ class FileScan:
     @property
     def scores_path(self) -> Path:
         return Path(f"{self.scan.name}.npz")
+
+    def labels_path(self, kind: str) -> Path:
+        return Path(f"{self.scan.name}.{kind}")
 
     @property
     def path(self) -> Path:

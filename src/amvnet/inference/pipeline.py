@@ -25,7 +25,9 @@ from amvnet.inference.journal import Journal
 from amvnet.inference.segmenter import Segmentation
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
+from amvnet.written import WrittenFiles
 
+UNCERTAIN_ENDING = ".uncertain.npy"
 AHEAD = 3  # scans that are read ahead of the computing, and that may wait to be written
 Result = Segmentation | InputError
 
@@ -40,6 +42,7 @@ class OutputOptions:
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.
         uncertain: also write (N,) bool, the uncertain points, as `.uncertain.npy`.
+        overwrite: replace files that this package did not write, too.
 
     Raises:
         InputError: if the format is unknown, or a library for it is missing.
@@ -49,9 +52,19 @@ class OutputOptions:
     kind: str = "label"
     scores: bool = False
     uncertain: bool = False
+    overwrite: bool = False
 
     def __post_init__(self) -> None:
         check_kind(self.kind)
+
+    def paths_of(self, scan: InputScan) -> list[Path]:
+        """Return the paths of a scan's files, relative to the folder."""
+        paths = [scan.labels_path(self.kind)]
+        if self.scores:
+            paths.append(scan.scores_path)
+        if self.uncertain:
+            paths.append(scan.scores_path.with_suffix(UNCERTAIN_ENDING))
+        return paths
 
 
 @dataclass(frozen=True)
@@ -183,7 +196,7 @@ class Pipeline:
 
         Raises:
             InputError: if two scans would have the same files, an output folder is that of a scan,
-                or all scans are broken.
+                a file of the user would be replaced, or all scans are broken.
             SomeBroken: at the end, if some of several scans are broken.
         """
         processes = self.execution.processes
@@ -191,7 +204,16 @@ class Pipeline:
         for scan in self.scans:
             _check_folder(scan, self.output)
 
+        paths = list(chain.from_iterable(map(self.output.paths_of, self.scans)))
+        written = WrittenFiles(self.output.folder)
+        if not self.output.overwrite:
+            written.check(paths)
+
         journal = Journal(self.output.folder, settings, self.execution.resume, processes)
+        if processes.first:
+            written.claim(paths)
+        processes.wait()  # so that no file is written before it is claimed
+
         share = processes.share(self.scans)
         remaining = [scan for scan in share if str(scan.scores_path) not in journal.done]
 
@@ -204,6 +226,8 @@ class Pipeline:
                 faults.append(fault)
         progress(len(remaining), len(remaining))
         journal.close()
+        if processes.first:
+            written.finish(paths)
 
         all_faults = list(chain.from_iterable(processes.gather(faults)))
         _raise_faults(all_faults, len(self.scans))
@@ -300,7 +324,7 @@ class Pipeline:
         if self.output.scores:
             write_scores(scores_path, result)
         if self.output.uncertain:
-            write_uncertain(scores_path.with_suffix(".uncertain.npy"), result.uncertain)
+            write_uncertain(scores_path.with_suffix(UNCERTAIN_ENDING), result.uncertain)
 
         has_two_networks = result.rv is not None and result.bev is not None
         segmented.scan.write_labels(

@@ -7,13 +7,21 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
-from amvnet.errors import InputError
+from amvnet.distributed import Processes
+from amvnet.errors import InputError, SomeBroken
+from amvnet.inference.certainty import UncertainCount, Verdict
 from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.segmenter import Segmentation, Segmenter
-from amvnet.progress import Progress, no_progress
+from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import ScanAdapter
+
+# What to try if the labels are doubtful.
+ADVICE = (
+    "check what was assumed, and try --height, --axes, --rotate or --intensity-scale, "
+    "weights of another sensor, or training for yours (docs/own_sensor.md)"
+)
 
 
 def predict(
@@ -24,6 +32,7 @@ def predict(
     execution: ExecutionOptions = ExecutionOptions(),
     adapter: ScanAdapter | None = None,
     progress: Progress = no_progress,
+    say: Say = say_nothing,
 ) -> int:
     """Segment datasets, scan files, bags and folders of them.
 
@@ -35,14 +44,15 @@ def predict(
         execution: how many scans at a time, and by which processes.
         adapter: adapts scan files to what the weights expect; None measures everything about the
             sensor and says nothing.
+        say: is told at the end how sure the labels are, if there are two networks.
 
     Returns:
         The number of label files of these scans, with those of the run that is resumed.
 
     Raises:
         InputError: before anything is written, if an input is missing, its folder is that of the
-            output, or the method has no uncertain points to write; at the end, if every scan is
-            broken.
+            output, a file of the user would be replaced, or the method has no uncertain points to
+            write; at the end, if every scan is broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
     if output.uncertain and segmenter.method in ("rv", "bev"):
@@ -57,7 +67,14 @@ def predict(
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
     segment = NetworkSegmentation(segmenter)
     pipeline = Pipeline(opened.scans, segment, output, segmenter.taxonomy, execution)
-    return pipeline.run(_settings(segmenter, output, adapter), progress)
+    try:
+        written = pipeline.run(_settings(segmenter, output, adapter), progress)
+    except SomeBroken:
+        _report(segment, execution.processes, say)
+        raise
+
+    _report(segment, execution.processes, say)
+    return written
 
 
 class NetworkSegmentation:
@@ -66,6 +83,7 @@ class NetworkSegmentation:
     def __init__(self, segmenter: Segmenter) -> None:
         self.segmenter = segmenter
         self.by_ring = segmenter.by_ring()
+        self.counted = UncertainCount()
 
     def __call__(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
         results: list[Segmentation] = []
@@ -75,7 +93,21 @@ class NetworkSegmentation:
             segmenter = self.by_ring if is_adapted else self.segmenter
             results += segmenter.many([scan for _, scan in group])
 
+        for result in results:
+            self.counted.add(result.labels, result.uncertain)
         return results
+
+
+def _report(segment: NetworkSegmentation, processes: Processes, say: Say) -> None:
+    """Say how sure the labels of all processes are, and what to try if they are doubtful."""
+    shares = processes.gather((segment.counted.points, segment.counted.uncertain))
+    points = sum(points for points, _ in shares)
+    uncertain = sum(uncertain for _, uncertain in shares)
+    if not points or segment.segmenter.method in ("rv", "bev"):
+        return
+
+    verdict = Verdict(uncertain / points, segment.segmenter.weights.usual_uncertain)
+    say(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else str(verdict))
 
 
 def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter) -> dict[str, Any]:

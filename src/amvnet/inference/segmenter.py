@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,8 @@ from torch import Tensor
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.segmentation import Origin, Segmentation
 from amvnet.memory import keep_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.layers import fold_batch_norms
@@ -25,28 +27,6 @@ from amvnet.scan import Scan
 from amvnet.weights.file import Weights, load
 
 MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
-
-
-@dataclass(frozen=True)
-class Segmentation:
-    """The result for the N points of a scan, in their order.
-
-    A point that is not valid (see `Scan.valid`) has id 0, is not uncertain, and has scores of 0.
-
-    Attributes:
-        labels: (N,) uint8 train ids 1..K; 0 for points that are not valid.
-        uncertain: (N,) bool, the points on which the two networks disagree; all False for a single
-            network.
-        scores: (N, K) float32; the label of a point is c + 1 for its largest column c. Rows of the
-            geometric mean (the ensemble, and AMVNet's certain points) do not sum to 1.
-        rv, bev: (N, K) float32 class probabilities by each network, or None if it did not run.
-    """
-
-    labels: np.ndarray
-    uncertain: np.ndarray
-    scores: np.ndarray
-    rv: np.ndarray | None = None
-    bev: np.ndarray | None = None
 
 
 class Segmenter:
@@ -106,14 +86,29 @@ class Segmenter:
         """The classes."""
         return self.weights.taxonomy
 
-    def __call__(self, points: np.ndarray | Scan) -> Segmentation:
-        """Segment one scan: (N, 4) x, y, z in metres and intensity in [0, 1], or a `Scan`.
+    def __repr__(self) -> str:
+        return f"<Segmenter {self.method} on {self.device}, {self.precision}: {self.weights!r}>"
+
+    def __call__(self, points: np.ndarray | Scan | Path | str) -> Segmentation:
+        """Segment one scan.
+
+        Args:
+            points: (N, 4) x, y, z in metres and intensity in [0, 1]; or a `Scan`; or the path of a
+                scan file, which is adapted to the weights as `amvnet predict` does.
 
         Raises:
-            InputError: if there is no valid point, or the model needs a ring index and there is
-                none.
+            InputError: if there is no valid point, the model needs a ring index and there is none,
+                or a file cannot be read or holds several scans.
         """
-        return self.many([points])[0]
+        if not isinstance(points, Path | str):
+            return self.many([points])[0]
+
+        scans, assumed = self._open(points)
+        if len(scans) > 1:
+            raise InputError(
+                f"{points}: expected one scan, found {len(scans)}; segment them with Segmenter.each"
+            )
+        return self._segment_input(scans[0], assumed)
 
     def many(self, scans: Sequence[np.ndarray | Scan]) -> list[Segmentation]:
         """Segment several scans in one pass of the networks, which suits a GPU.
@@ -127,8 +122,50 @@ class Segmenter:
 
         results = []
         for scan, points in zip(checked, batch.slices(), strict=True):
-            results.append(_segmentation(scan.valid, labels, scores, points))
+            result = _segmentation(scan.valid, labels, scores, points)
+            origin = Origin(scan, self.taxonomy, self.method, self.weights.usual_uncertain)
+            results.append(replace(result, origin=origin))
         return results
+
+    def each(self, path: Path | str, topic: str | None = None) -> Iterator[Segmentation]:
+        """Segment the scans of a file, a bag, a folder of these, or a dataset, one after the other.
+
+        Scans of files and bags are adapted to the weights as `amvnet predict` does; all of one
+        folder or bag alike.
+
+        Args:
+            path: as INPUT of `amvnet predict`.
+            topic: of bags; None means the only topic with PointCloud2 messages.
+
+        Returns:
+            An iterator that reads and segments one scan at a time.
+
+        Raises:
+            InputError: if there is no scan; by the iterator, if one cannot be read or segmented.
+        """
+        scans, assumed = self._open(path, topic)
+        return (self._segment_input(scan, assumed) for scan in scans)
+
+    def _open(
+        self, path: Path | str, topic: str | None = None
+    ) -> tuple[Sequence[InputScan], list[str]]:
+        """Return the scans of a path, and a list that receives what is assumed of them."""
+        assumed: list[str] = []
+        adapter = adapter_for(self.weights, say=assumed.append)
+        opened = open_inputs([str(path)], ScanOptions(topic=topic), self.taxonomy, adapter)
+        return opened.scans, assumed
+
+    def _segment_input(self, scan: InputScan, assumed: list[str]) -> Segmentation:
+        """Read and segment a scan of `_open`."""
+        loaded = scan.load(labels=True)
+        segmenter = self.by_ring() if scan.is_adapted else self
+        result = segmenter(loaded.scan)
+
+        assert result.origin is not None
+        origin = replace(
+            result.origin, path=scan.path, file_xyz=loaded.file_xyz, assumed="; ".join(assumed)
+        )
+        return replace(result, origin=origin)
 
     def by_ring(self) -> Segmenter:
         """Return a segmenter for scans whose `ring` is the row of each point, 0 the lowest.

@@ -21,12 +21,16 @@ def draw(
 ) -> list[Path]:
     """Draw each of the first clusters with its surroundings, and return the files (RANK.png)."""
     paths = []
-    for position, row in enumerate(ranking.clusters[:PICTURES], start=1):
-        path = folder / f"{position:02d}.png"
+    for row, path in zip(ranking.clusters, possible_files(folder), strict=False):
         _draw_cluster(row, ranking, dataset, segmenter, by=by, path=path)
         paths.append(path)
 
     return paths
+
+
+def possible_files(folder: Path) -> list[Path]:
+    """Return the paths of all files that `draw` may write into a folder."""
+    return [folder / f"{position:02d}.png" for position in range(1, PICTURES + 1)]
 
 
 def _draw_cluster(

@@ -309,10 +309,13 @@ def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
         The file of the scans, NAME-scans.csv.
     """
     _write(path, COLUMNS, _cluster_rows(ranking, taxonomy))
+    _write(scans_path(path), SCAN_COLUMNS, _scan_rows(ranking))
+    return scans_path(path)
 
-    scans_path = path.with_name(f"{path.stem}-scans{path.suffix}")
-    _write(scans_path, SCAN_COLUMNS, _scan_rows(ranking))
-    return scans_path
+
+def scans_path(path: Path) -> Path:
+    """Return the file of the scans, given that of the clusters."""
+    return path.with_name(f"{path.stem}-scans{path.suffix}")
 
 
 def _write(path: Path, columns: Sequence[str], rows: Iterator[list[Any]]) -> None:

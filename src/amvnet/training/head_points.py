@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -193,7 +193,8 @@ class PointGatherer:
         points = self._gather(jobs, folder, build_assertion(self.model.assertion), say)
         if len(points) < least:
             say("head: the networks agree everywhere; it learns from points drawn from all")
-            points = self._gather(jobs, folder, _everywhere, say)
+            everywhere = self._gather(jobs, folder, _everywhere, say)
+            points = replace(everywhere, uncertain_share=points.uncertain_share)
 
         if len(points) < least:
             raise InputError(

@@ -13,6 +13,7 @@ from amvnet.config.schema import HeadTraining
 from amvnet.models.point_head import PointHead
 from amvnet.training.head_points import HeadBatch, HeadPoints
 from amvnet.training.stages import Stage
+from amvnet.weights.file import UNCERTAIN
 
 
 class HeadStage(Stage):
@@ -74,7 +75,7 @@ class HeadStage(Stage):
         super().on_validation_epoch_end()
         assert self.val_points is not None
         self.log("train/uncertain", self.train_points.uncertain_share)
-        self.log("val/uncertain", self.val_points.uncertain_share)
+        self.log(UNCERTAIN, self.val_points.uncertain_share)
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.SGD(

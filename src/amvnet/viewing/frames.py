@@ -7,11 +7,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from amvnet.data.datasets.select import taxonomy_named
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.segmentation import Origin, Segmentation
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
 from amvnet.progress import Progress, no_progress
@@ -176,6 +178,26 @@ def choose_frames(
 
     indices = np.linspace(0, len(scans) - 1, min(count, len(scans))).round().astype(int)
     return Frames(opened.taxonomy, [scans[index] for index in indices], source)
+
+
+def frame_of(result: Segmentation, origin: Origin) -> Frame:
+    """Return the frame of a scan that was segmented: its labels, and those of each network."""
+    scan = origin.scan
+    rv = result.rv
+    bev = result.bev
+    labels = {}
+    for name, scores in (("rv", rv), ("bev", bev)):
+        if scores is not None:
+            labels[name] = expand_labels(torch.from_numpy(scores[scan.valid]), scan.valid)
+    labels[origin.method] = result.labels
+
+    frame = Frame(Path(scan.name).name or "scan", scan.points, scan.valid, scan.labels, labels)
+    if rv is None or bev is None:
+        return frame
+
+    similarity = cosine_similarity(torch.from_numpy(rv), torch.from_numpy(bev))
+    disagreement = (1 - similarity).clamp(0, 1).numpy() * scan.valid
+    return replace(frame, uncertain=result.uncertain, disagreement=disagreement)
 
 
 def _segmented(frame: Frame, scan: Scan, segmenter: Segmenter) -> Frame:

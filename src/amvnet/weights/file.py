@@ -33,12 +33,16 @@ SIZES = {
     "point_head": ("assertion", "point_head"),
 }
 PARTS = tuple(SIZES)
+UNCERTAIN = "val/uncertain"  # metric of the point head: the share of uncertain points
+# The share for weights without this metric: that of the paper on nuScenes, and of `sim-hdl64e` on
+# simulated streets.
+USUAL_UNCERTAIN = 0.2
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
 _FIELD_TYPES = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Weights:
     """The trained parts of an AMVNet, and everything needed to use them.
 
@@ -55,15 +59,33 @@ class Weights:
     model: ModelConfig
     taxonomy: Taxonomy
     sensor: str = ""
-    tensors: Mapping[str, Tensor] = field(default_factory=dict, repr=False)
+    tensors: Mapping[str, Tensor] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     metrics: Mapping[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        sensor = f" for {self.sensor}" if self.sensor else ""
+        parts = ", ".join(self.parts) or "no parts"
+        classes = f"{self.taxonomy.size} classes of {self.taxonomy.name}"
+        return f"<Weights{sensor}: {parts}; {classes}>"
 
     @property
     def parts(self) -> tuple[str, ...]:
         """The names of the parts that have parameters, in the order of `PARTS`."""
         present = {name.split(".", 1)[0] for name in self.tensors}
         return tuple(part for part in PARTS if part in present)
+
+    @property
+    def usual_uncertain(self) -> float:
+        """The share of uncertain points in the scans of the validation, in [0, 1].
+
+        `USUAL_UNCERTAIN` if the file does not say.
+        """
+        metrics = self.metrics.get("point_head")
+        share = metrics.get(UNCERTAIN) if isinstance(metrics, Mapping) else None
+        if isinstance(share, int | float) and 0 <= share <= 1:
+            return float(share)
+        return USUAL_UNCERTAIN
 
     def part(self, name: str) -> dict[str, Tensor]:
         """Return the parameters of one part, named as in the part's own module."""

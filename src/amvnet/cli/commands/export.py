@@ -7,7 +7,7 @@ from pathlib import Path
 from amvnet.cli.console import progress, say
 
 
-def export(weights: str, out: Path, int8: str | None = None) -> None:
+def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = False) -> None:
     """Write the networks and the head as ONNX, with a JSON that a program in C++ can follow.
 
     Args:
@@ -15,10 +15,13 @@ def export(weights: str, out: Path, int8: str | None = None) -> None:
         out: folder for the graphs and amvnet.json.
         int8: convert the convolutions to 8-bit integers, for CPUs, calibrated with these scans: a
             dataset, scan files or a folder of them as predict takes them, or the word simulated.
+        overwrite: replace files in the folder that amvnet did not write, too.
     """
     from amvnet.export.onnx import export as export_weights
+    from amvnet.export.onnx import possible_files
+    from amvnet.written import protecting
 
-    with progress("exporting") as step:
+    with protecting(possible_files(out), overwrite), progress("exporting") as step:
         exported = export_weights(weights, out, step, int8)
     largest = max(exported.differences.values())
     say(

@@ -24,6 +24,7 @@ def fuse(
     sequences: str | None = None,
     taxonomy: str | None = None,
     topic: str | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Fuse the scores of any two models: labels by the point head, or by the ensemble.
 
@@ -45,10 +46,12 @@ def fuse(
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the
             head's or the inputs'.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
+        overwrite: replace files in the folder that amvnet did not write, too.
     """
     from amvnet.data.datasets.select import taxonomy_named
     from amvnet.inference.fuse_files import FusionOptions, fuse_files
     from amvnet.inference.inputs import ScanOptions
+    from amvnet.inference.pipeline import OutputOptions
     from amvnet.weights.file import load
 
     pair = parse_scores(scores_a, scores_b, key_a, key_b, logits)
@@ -64,7 +67,7 @@ def fuse(
         written, uncertain = fuse_files(
             inputs,
             pair,
-            out,
+            OutputOptions(out, overwrite=overwrite),
             FusionOptions(weights, tau, classes),
             options=ScanOptions(parse_names(sequences), split, topic),
             progress=step,

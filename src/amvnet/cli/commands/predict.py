@@ -36,6 +36,7 @@ def predict(
     axes: str | None = None,
     rotate: str | None = None,
     offset: str | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Segment datasets, scans, bags, or folders of scans.
 
@@ -68,6 +69,7 @@ def predict(
             (y right).
         rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees.
         offset: of scan files, what to add to x,y,z after the rotation, in metres.
+        overwrite: replace files in the folder that amvnet did not write, too.
     """
     from amvnet.export.engines import use_engine
     from amvnet.inference.inputs import ScanOptions, adapter_for
@@ -94,10 +96,11 @@ def predict(
         written = predict_inputs(
             inputs,
             segmenter,
-            OutputOptions(out, format, scores, uncertain),
+            OutputOptions(out, format, scores, uncertain, overwrite),
             options=ScanOptions(parse_names(sequences), split, topic),
             execution=ExecutionOptions(batch, at_once, resume, processes),
             adapter=adapter_for(segmenter.weights, given_sensor, say),
             progress=step,
+            say=say,
         )
     say(f"{written} label files in {out}")

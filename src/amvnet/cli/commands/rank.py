@@ -18,6 +18,7 @@ def rank(
     sequences: str | None = None,
     pictures: Path | None = None,
     device: str = "cpu",
+    overwrite: bool = False,
 ) -> None:
     """Rank clusters of points, and scans, to look at next: to label them, or to check their labels.
 
@@ -31,31 +32,36 @@ def rank(
         sequences: sequences or scenes instead, separated by commas.
         pictures: folder for drawings of the first clusters from above.
         device: cpu, cuda, cuda:1, ...
+        overwrite: replace files that amvnet did not write, too.
     """
     from amvnet.data.datasets.base import choose_records
     from amvnet.data.datasets.open import open_with_classes
     from amvnet.files import make_folder
     from amvnet.inference.segmenter import Segmenter
     from amvnet.models.methods import widest_method
-    from amvnet.ranking.pictures import draw
+    from amvnet.ranking.pictures import draw, possible_files
     from amvnet.ranking.rank import rank as rank_records
-    from amvnet.ranking.rank import write_ranking
+    from amvnet.ranking.rank import scans_path, write_ranking
     from amvnet.weights.file import load
+    from amvnet.written import protecting
 
-    loaded = load(weights)
-    dataset = open_with_classes(data, loaded.taxonomy)
-    records = choose_records(dataset, parse_names(sequences), split)
-    segmenter = Segmenter(loaded, device, widest_method(loaded.parts), keep_memory=True)
-
-    # Before any scan is scored, so that no time is wasted if a folder cannot be made.
+    # Before any scan is scored, so that no time is wasted.
     make_folder(out.parent)
+    files = [out, scans_path(out)]
     if pictures is not None:
         make_folder(pictures)
+        files += possible_files(pictures)
 
-    with progress("scoring") as step:
-        ranking = rank_records(dataset, records, segmenter, by, step)
-    scans = write_ranking(ranking, dataset.taxonomy, out)
-    say(f"{len(ranking.clusters)} clusters in {out}, {len(records)} scans in {scans}")
-    if pictures is not None:
-        drawn = draw(ranking, dataset, segmenter, by, pictures)
-        say(f"{len(drawn)} pictures in {pictures}")
+    with protecting(files, overwrite):
+        loaded = load(weights)
+        dataset = open_with_classes(data, loaded.taxonomy)
+        records = choose_records(dataset, parse_names(sequences), split)
+        segmenter = Segmenter(loaded, device, widest_method(loaded.parts), keep_memory=True)
+
+        with progress("scoring") as step:
+            ranking = rank_records(dataset, records, segmenter, by, step)
+        scans = write_ranking(ranking, dataset.taxonomy, out)
+        say(f"{len(ranking.clusters)} clusters in {out}, {len(records)} scans in {scans}")
+        if pictures is not None:
+            drawn = draw(ranking, dataset, segmenter, by, pictures)
+            say(f"{len(drawn)} pictures in {pictures}")

@@ -22,6 +22,7 @@ def submit(
     use_radar: bool = False,
     use_map: bool = False,
     use_external: bool = False,
+    overwrite: bool = False,
 ) -> None:
     """Check and pack predictions for the benchmark's server, or check an archive of any tool.
 
@@ -37,9 +38,11 @@ def submit(
         use_radar: nuScenes: the method was given radar.
         use_map: nuScenes: the method was given the semantic map.
         use_external: nuScenes: the method was given data that are not of nuScenes.
+        overwrite: replace an archive that amvnet did not write, too.
     """
     from amvnet.submission import pack
     from amvnet.submission.rules import Sources, rules_for
+    from amvnet.written import protecting
 
     sources = Sources(use_camera, use_lidar, use_radar, use_map, use_external)
     rules = rules_for(open_data(data), split, parse_names(sequences))
@@ -52,7 +55,7 @@ def submit(
         with progress("checking") as step:
             submission = pack.check(rules, check, step)
     elif predictions is not None and out is not None and check is None:
-        with progress("packing") as step:
+        with protecting([out], overwrite), progress("packing") as step:
             submission = pack.write(rules, predictions, out, sources, step)
     else:
         raise InputError(

@@ -1,0 +1,74 @@
+"""How sure the labels of scans are, judged by how often the two networks disagree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from threading import Lock
+
+import numpy as np
+
+# A share of uncertain points is unusual beyond this part of the way from the usual share to 1. For
+# weights of simulated streets, real scans of the right sensor stay below. The same scans without
+# intensity, tilted, or with the origin on the ground are above (docs/log/real_scans.md).
+UNUSUAL = 0.5
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How sure the labels of some scans are; it prints as one line.
+
+    Attributes:
+        share: the share of the points that are uncertain, in [0, 1].
+        usual: this share in the scans that the weights were validated on.
+    """
+
+    share: float
+    usual: float
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether so many points are uncertain that the weights do not know such scans."""
+        return self.share > self.usual + UNUSUAL * (1 - self.usual)
+
+    def __str__(self) -> str:
+        shares = f"{self.share:.1%} of the points are uncertain (usual: {self.usual:.1%})"
+        return f"do not rely on these labels: {shares}" if self.is_doubtful else shares
+
+
+def uncertain_share(labels: np.ndarray, uncertain: np.ndarray) -> float:
+    """Return the share of a scan's valid points that are uncertain; 0 if there are none.
+
+    Args:
+        labels: (N,) train ids; 0 for points that are not valid.
+        uncertain: (N,) bool.
+    """
+    count = UncertainCount()
+    count.add(labels, uncertain)
+    return count.share
+
+
+class UncertainCount:
+    """Counts the uncertain points of scans; several threads may add to it."""
+
+    def __init__(self) -> None:
+        self.points = 0
+        self.uncertain = 0
+        self._lock = Lock()
+
+    def add(self, labels: np.ndarray, uncertain: np.ndarray) -> None:
+        """Add a scan.
+
+        Args:
+            labels: (N,) train ids; points with id 0 are not valid and do not count.
+            uncertain: (N,) bool.
+        """
+        points = int(np.count_nonzero(labels))
+        count = int(np.count_nonzero(uncertain))
+        with self._lock:
+            self.points += points
+            self.uncertain += count
+
+    @property
+    def share(self) -> float:
+        """The share of the points that are uncertain, in [0, 1]; 0 without points."""
+        return self.uncertain / max(self.points, 1)

@@ -1,0 +1,199 @@
+"""The result for one scan: labels, scores, uncertain points, and what to do with them."""
+
+from __future__ import annotations
+
+import tempfile
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from amvnet.data.label_files import KINDS, write_scan_labels
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import InputError
+from amvnet.inference.certainty import Verdict, uncertain_share
+from amvnet.scan import Scan
+
+NAMED = 3  # classes in the short description of a result
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The scan of a result, and what labelled it.
+
+    Attributes:
+        scan: as the networks saw it.
+        taxonomy: the classes.
+        method: the method of the labels.
+        usual_uncertain: the share of uncertain points that the weights had in their validation.
+        path: the file of the scan, or None if it was in memory.
+        file_xyz: (N, 3) the coordinates as they are in the file, or None if it was in memory.
+        assumed: what was assumed of the scan's sensor; empty if the scan was in memory.
+    """
+
+    scan: Scan
+    taxonomy: Taxonomy
+    method: str
+    usual_uncertain: float
+    path: Path | None = None
+    file_xyz: np.ndarray | None = None
+    assumed: str = ""
+
+
+@dataclass(frozen=True, repr=False)
+class Segmentation:
+    """The result for the N points of a scan, in their order.
+
+    A point that is not valid (see `Scan.valid`) has id 0, is not uncertain, and has scores of 0.
+
+    Attributes:
+        labels: (N,) uint8 train ids 1..K; 0 for points that are not valid.
+        uncertain: (N,) bool, the points on which the two networks disagree; all False for a single
+            network.
+        scores: (N, K) float32; the label of a point is c + 1 for its largest column c. Rows of the
+            geometric mean (the ensemble, and AMVNet's certain points) do not sum to 1.
+        rv, bev: (N, K) float32 class probabilities by each network, or None if it did not run.
+        origin: the scan and what labelled it; None for the late fusion alone.
+    """
+
+    labels: NDArray[np.uint8]
+    uncertain: NDArray[np.bool_]
+    scores: NDArray[np.float32]
+    rv: NDArray[np.float32] | None = None
+    bev: NDArray[np.float32] | None = None
+    origin: Origin | None = None
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def __repr__(self) -> str:
+        parts = [f"<Segmentation of {len(self):,} points"]
+        if self.origin is not None and len(self):
+            parts.append(f": {self._most_frequent()}")
+        if self.verdict is not None:
+            parts.append(f"; {self.verdict.share:.1%} uncertain")
+            if self.verdict.is_doubtful:
+                parts.append(", not to be relied on")
+
+        return "".join([*parts, ">"])
+
+    def _most_frequent(self) -> str:
+        """Return the most frequent classes and their shares, as text."""
+        counts = np.bincount(self.labels, minlength=len(self.class_names))
+        texts = []
+        for index in np.argsort(-counts, kind="stable")[:NAMED]:
+            if counts[index]:
+                texts.append(f"{counts[index] / len(self):.0%} {self.class_names[index]}")
+        return ", ".join(texts)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """K + 1 names of the classes, by id; the name of id 0 is "unlabelled"."""
+        return self._origin().taxonomy.names
+
+    @property
+    def colors(self) -> NDArray[np.uint8]:
+        """(K + 1, 3) RGB colours of the classes in 0..255, by id: `colors[labels]` is (N, 3)."""
+        return np.asarray(self._origin().taxonomy.colors, dtype=np.uint8)
+
+    @property
+    def raw_ids(self) -> NDArray[np.uint32]:
+        """(N,) the labels as the benchmark's files number them (10 is a car of SemanticKITTI)."""
+        raw: NDArray[np.uint32] = self._origin().taxonomy.to_raw(self.labels)
+        return raw
+
+    @property
+    def verdict(self) -> Verdict | None:
+        """How sure the labels are, compared with the scans that the weights were validated on.
+
+        None for a single network, and for the late fusion alone.
+        """
+        if self.origin is None or self.rv is None or self.bev is None:
+            return None
+        share = uncertain_share(self.labels, self.uncertain)
+        return Verdict(share, self.origin.usual_uncertain)
+
+    @property
+    def assumed(self) -> str:
+        """What was assumed of the sensor to adapt the scan of a file; else empty."""
+        return "" if self.origin is None else self.origin.assumed
+
+    def save(self, path: Path | str) -> Path:
+        """Write the labels, in the format of the path's ending; an existing file is replaced.
+
+        `.label` and `.npy` hold the raw ids; `.ply`, `.pcd` and `.las` the points too, coloured by
+        class, with the coordinates of the scan's file (`write_scan_labels` describes them).
+
+        Returns:
+            The path.
+
+        Raises:
+            InputError: if the ending is another one, the path is that of the scan itself, a library
+                for the format is missing, or the file cannot be written.
+        """
+        origin = self._origin()
+        path = Path(path)
+        kind = path.suffix.removeprefix(".")
+        if kind not in KINDS:
+            raise InputError(
+                f"{path}: expected a name that ends in .{', .'.join(KINDS)}, "
+                f"found {path.suffix or 'no ending'}; rename it"
+            )
+        if origin.path is not None and path.resolve() == origin.path.resolve():
+            raise InputError(f"{path}: expected another file than the scan's; rename it")
+
+        xyz = origin.scan.points[:, :3] if origin.file_xyz is None else origin.file_xyz
+        has_two_networks = self.rv is not None and self.bev is not None
+        return write_scan_labels(
+            path.with_suffix(""),
+            kind,
+            xyz,
+            self.labels,
+            origin.taxonomy,
+            uncertain=self.uncertain if has_two_networks else None,
+        )
+
+    def show(self, path: Path | str | None = None, open_browser: bool = True) -> Path:
+        """Write a self-contained HTML page that shows the scan in 3D, and open it.
+
+        It shows the labels, those of each network, uncertain points, and errors if the scan has
+        labels.
+
+        Args:
+            path: the file, NAME.html; by default in a temporary folder.
+            open_browser: whether to open the page in a browser.
+
+        Returns:
+            The path of the page.
+
+        Raises:
+            InputError: if the file cannot be written.
+        """
+        # Viewing is built on inference. Imported here, it closes no circle.
+        from amvnet.viewing.frames import frame_of
+        from amvnet.viewing.page import write_page
+
+        origin = self._origin()
+        title = origin.scan.name or "scan"
+        if path is None:
+            path = Path(tempfile.mkdtemp(prefix="amvnet-")) / "scan.html"
+
+        page = write_page(path, [frame_of(self, origin)], origin.taxonomy, Path(title).name)
+        if open_browser:
+            webbrowser.open(page.resolve().as_uri())
+        return page
+
+    def _origin(self) -> Origin:
+        """Return the origin.
+
+        Raises:
+            InputError: if there is none.
+        """
+        if self.origin is None:
+            raise InputError(
+                "expected the result of a Segmenter, which knows its classes and points, "
+                "found one of the late fusion alone; use its labels"
+            )
+        return self.origin

@@ -1,0 +1,121 @@
+"""A record of the files that commands wrote, so that a user's own files are not replaced."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from amvnet.errors import InputError
+from amvnet.files import atomic_write
+
+RECORD = ".amvnet-written.json"
+
+Stamp = tuple[int, int]  # a file's size in bytes, and when it changed last, in nanoseconds
+
+
+class WrittenFiles:
+    """The files in a folder that commands of this package wrote.
+
+    A record in the folder lists them with their stamps: a file that was changed since belongs to
+    the user. While a run is writing, its files are listed without stamps, so that a run that was
+    killed can be repeated.
+
+    Args:
+        folder: the folder; all paths are relative to it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._stamps = _read(folder / RECORD)
+
+    def check(self, paths: Iterable[Path]) -> None:
+        """Check that writing these files would replace no file of the user.
+
+        Raises:
+            InputError: if a file exists that is not listed, or was changed since.
+        """
+        foreign = [path for path in paths if self._is_foreign(path)]
+        if foreign:
+            more = f" (and {len(foreign) - 1} more)" if len(foreign) > 1 else ""
+            raise InputError(
+                f"{self.folder / foreign[0]}{more}: expected no file, or one as amvnet wrote it, "
+                "found another; change --out, or say --overwrite to replace it"
+            )
+
+    def _is_foreign(self, path: Path) -> bool:
+        stamp = _stamp_of(self.folder / path)
+        if stamp is None:
+            return False
+
+        name = path.as_posix()
+        return name not in self._stamps or self._stamps[name] not in (None, stamp)
+
+    def claim(self, paths: Iterable[Path]) -> None:
+        """List files before they are written."""
+        self._update({path.as_posix(): None for path in paths})
+
+    def finish(self, paths: Iterable[Path]) -> None:
+        """List files with their stamps after they are written; forget those that do not exist."""
+        self._update({path.as_posix(): _stamp_of(self.folder / path) for path in paths}, True)
+
+    def _update(self, stamps: dict[str, Stamp | None], is_finished: bool = False) -> None:
+        """Write the record with other stamps; entries of other runs stay."""
+        self._stamps = _read(self.folder / RECORD) | stamps
+        if is_finished:
+            for name, stamp in stamps.items():
+                if stamp is None:
+                    del self._stamps[name]
+
+        with atomic_write(self.folder / RECORD) as part:
+            part.write_text(json.dumps(self._stamps, indent=0))
+
+
+@contextmanager
+def protecting(paths: Sequence[Path], overwrite: bool = False) -> Iterator[None]:
+    """Check that a command's output files replace no file of the user, and list them at the end.
+
+    Args:
+        paths: the files that the block may write.
+        overwrite: whether to replace a user's files, too.
+
+    Raises:
+        InputError: before the block, if a user's file would be replaced.
+    """
+    names_by_folder: dict[Path, list[Path]] = {}
+    for path in paths:
+        names_by_folder.setdefault(path.parent, []).append(Path(path.name))
+
+    if not overwrite:
+        for folder, names in names_by_folder.items():
+            WrittenFiles(folder).check(names)
+    yield
+    for folder, names in names_by_folder.items():
+        WrittenFiles(folder).finish(names)
+
+
+def _read(path: Path) -> dict[str, Stamp | None]:
+    """Read the stamps by name; a record that is missing or broken lists nothing."""
+    try:
+        entries = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+
+    stamps: dict[str, Stamp | None] = {}
+    for name, stamp in entries.items() if isinstance(entries, dict) else ():
+        if stamp is None:
+            stamps[name] = None
+        elif isinstance(stamp, list) and len(stamp) == 2:
+            size, changed = stamp
+            stamps[name] = (size, changed)
+    return stamps
+
+
+def _stamp_of(path: Path) -> Stamp | None:
+    """Return the stamp of a file, or of the link to one; None if there is none."""
+    try:
+        status = path.lstat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns

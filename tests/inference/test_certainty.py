@@ -1,0 +1,152 @@
+"""A run says how sure its labels are, and warns if the weights do not know such scans."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amvnet import Segmenter
+from amvnet.inference.certainty import UncertainCount, Verdict, uncertain_share
+from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
+
+from fixtures.worlds import fresh_weights, make_streets, run_cli, street, without
+
+POINTS = street(5, 400)[0]
+
+
+def with_usual(share: Any) -> Weights:
+    """Return weights whose validation had a share of uncertain points."""
+    weights = fresh_weights()
+    return replace(weights, metrics={**weights.metrics, "point_head": {UNCERTAIN: share}})
+
+
+# ---- the share that is usual
+
+
+@pytest.mark.parametrize("share", [0, 0.0, 0.125, 1.0])
+def test_the_usual_share_is_that_of_the_validation(share: float, tmp_path: Path) -> None:
+    path = save(with_usual(share), tmp_path / "w.safetensors")
+    assert load(path).usual_uncertain == share
+
+
+@pytest.mark.parametrize("metrics", [{}, {"point_head": {}}, {"point_head": None}])
+def test_weights_that_do_not_say_have_a_default(metrics: dict[str, Any]) -> None:
+    weights = replace(fresh_weights(), metrics=metrics)
+    assert weights.usual_uncertain == USUAL_UNCERTAIN
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.1, float("nan"), "0.5", None, [0.5]])
+def test_a_share_that_is_none_is_not_believed(share: object) -> None:
+    assert with_usual(share).usual_uncertain == USUAL_UNCERTAIN
+
+
+# ---- the verdict
+
+
+@pytest.mark.parametrize("usual", [0.0, 0.05, 0.2, 0.45, 0.9])
+def test_the_usual_share_is_trusted_and_disagreement_everywhere_is_not(usual: float) -> None:
+    assert not Verdict(usual, usual).is_doubtful
+    assert Verdict(1.0, usual).is_doubtful
+    shares = np.linspace(0, 1, 101)
+    doubtful = [Verdict(share, usual).is_doubtful for share in shares]
+    assert doubtful == sorted(doubtful)  # once doubtful, always doubtful
+
+
+def test_the_verdict_is_a_line_with_both_shares() -> None:
+    assert str(Verdict(0.25, 0.2)) == "25.0% of the points are uncertain (usual: 20.0%)"
+    line = str(Verdict(0.93, 0.2))
+    assert line.startswith("do not rely on these labels: 93.0%")
+    assert "\n" not in line
+
+
+def test_a_result_has_the_share_of_its_valid_points() -> None:
+    points = np.concatenate([POINTS, np.full((100, 4), np.nan, np.float32)])
+    result = Segmenter(with_usual(0.1))(points)
+    assert result.verdict is not None
+    assert result.verdict.share == result.uncertain[: len(POINTS)].mean()
+    assert result.verdict.usual == 0.1
+
+
+@pytest.mark.parametrize("method", ["rv", "bev"])
+def test_one_network_has_no_verdict(method: Any) -> None:
+    assert Segmenter(fresh_weights(), method=method)(POINTS).verdict is None
+
+
+def test_a_count_of_scans_is_that_of_all_their_points() -> None:
+    count = UncertainCount()
+    rng = np.random.default_rng(0)
+    labels = rng.integers(0, 3, (5, 100))
+    uncertain = (rng.random((5, 100)) < 0.3) & (labels > 0)
+    for pair in zip(labels, uncertain, strict=True):
+        count.add(*pair)
+
+    assert count.share == uncertain_share(labels.ravel(), uncertain.ravel())
+    assert count.share == uncertain[labels > 0].mean()
+    assert UncertainCount().share == 0
+
+
+# ---- the command
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_streets(tmp_path_factory.mktemp("data"), ("00",))
+
+
+def said(data: Path, out: Path, weights: Weights, capsys: Any, *options: str) -> str:
+    """Segment a dataset; return what is printed."""
+    path = save(weights, out / "w.safetensors")
+    words = ("predict", data, "--weights", path, "--out", out / "labels", *options)
+    assert run_cli(*words) == (0, "")
+    return str(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("at_once", ["1", "2"])
+def test_predict_says_the_share_of_the_run(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], at_once: str
+) -> None:
+    weights = with_usual(1.0)
+    segmenter = Segmenter(weights)
+    uncertain = [segmenter(street(scan)[0]).uncertain for scan in range(2)]
+    verdict = Verdict(float(np.concatenate(uncertain).mean()), 1.0)
+
+    text = said(data, tmp_path, weights, capsys, "--at-once", at_once)
+    assert str(verdict) in text
+    assert "warning" not in text
+
+
+def test_predict_warns_and_says_what_to_try(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = with_usual(0.0)
+    everywhere = replace(weights.model.assertion, threshold=1.0)
+    weights = replace(weights, model=replace(weights.model, assertion=everywhere))
+
+    text = said(data, tmp_path, weights, capsys)
+    (warning,) = [line for line in text.splitlines() if line.startswith("warning: ")]
+    assert "100.0%" in warning
+    for word in ("--height", "--axes", "--intensity-scale", "weights of another sensor"):
+        assert word in warning
+
+
+def test_predict_warns_even_if_some_scans_are_broken(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    street(0)[0].tofile(tmp_path / "a.bin")
+    (tmp_path / "b.bin").write_bytes(b"123")
+    path = save(with_usual(0.5), tmp_path / "w.safetensors")
+    options = ("--weights", path, "--out", tmp_path / "labels")
+    code, _ = run_cli("predict", tmp_path / "a.bin", tmp_path / "b.bin", *options)
+    assert code == 3
+    assert "of the points are uncertain" in capsys.readouterr().out
+
+
+def test_predict_by_one_network_says_nothing_of_it(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    weights = without(fresh_weights(), "polar_net", "point_head")
+    assert "uncertain" not in said(data, tmp_path, weights, capsys, "--method", "rv")
