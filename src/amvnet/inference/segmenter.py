@@ -22,6 +22,7 @@ from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import check_intensity, trained_intensity
 from amvnet.weights.file import Weights, load
 
 MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
@@ -82,6 +83,9 @@ class Segmenter:
                 "expected an assertion that needs no labels, found loss; "
                 "train the head with another one"
             )
+        # Weights that were trained with other intensities take them, too.
+        trained = trained_intensity(self.weights.training, self.weights.sensor)
+        self._are_fractions = trained is None or trained.quantiles[-1] <= 1
         self.engine = "torch"
         self.device = _check_device(device)
         self.precision = precision
@@ -110,8 +114,8 @@ class Segmenter:
         """Segment one scan: (N, 4) x, y, z in metres and intensity in [0, 1], or a `Scan`.
 
         Raises:
-            InputError: if there is no valid point, or the model needs a ring index and there is
-                none.
+            InputError: if there is no valid point, more than a few intensities are out of range, or
+                the model needs a ring index and there is none.
         """
         return self.many([points])[0]
 
@@ -205,6 +209,8 @@ class Segmenter:
         return scores, uncertain
 
     def _batch(self, scans: Sequence[Scan]) -> PointBatch:
+        if self._are_fractions:
+            scans = [check_intensity(scan) for scan in scans]
         batch = PointBatch.of(scans)
         if _is_gpu(self.device):
             batch = batch.pin_memory()
