@@ -21,6 +21,7 @@ from amvnet.inference.inputs import adapter_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import MEASURED, ScanAdapter
+from amvnet.sensors.ground import ground_height
 from amvnet.sensors.lidars import (
     AXES,
     HEIGHTS,
@@ -29,7 +30,7 @@ from amvnet.sensors.lidars import (
     make_sensor,
     rotation_from_degrees,
 )
-from amvnet.sensors.measure import ground_height, measure
+from amvnet.sensors.measure import measure
 from amvnet.simulation.sensing.sensors import HDL32E, HDL64E
 from amvnet.weights.file import save
 
@@ -365,6 +366,7 @@ def test_a_sensor_is_described_by_name_file_and_options(tmp_path: Path) -> None:
         ("beams: 1.5", ["beams"]),
         ("colour: red", ["colour", "beams"]),
         ("height: -1", ["height", "-1"]),
+        ("unit: inch", ["unit", "mm"]),
         ("height: .nan", ["height"]),
         ("intensity_scale: 0", ["intensity_scale"]),
         ("fov_up: -20\nfov_down: 3", ["fov_down"]),
@@ -476,6 +478,7 @@ def test_options_override_what_is_measured(world: Path, tmp_path: Path) -> None:
         "{w}/robot.bin --sensor eye",
         "{w}/robot.bin --sensor {w}/none.yaml",
         "{w}/robot.bin --axes up",
+        "{w}/robot.bin --unit inch",
         "{w}/robot.bin --rotate 1,2",
         "{w}/robot.bin --offset=-1,x,2",
         "{w}/robot.bin --height=-1",
@@ -497,8 +500,8 @@ def test_scans_of_datasets_are_not_adapted(tmp_path: Path) -> None:
     data = make_streets(tmp_path / "data", ("00",), 1)
     path = data / "sequences/00/velodyne/000000.bin"
     points = np.fromfile(path, np.float32).reshape(-1, 4)
-    points[:, 2] += 1  # another height, another range of intensities, a point at the origin
-    points[:, 3] *= 255
+    points[:, 2] += 1  # another height, other intensities, a point at the origin
+    points[:, 3] *= 0.1
     points[3] = 0
     points.tofile(path)
 

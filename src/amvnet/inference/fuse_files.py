@@ -9,7 +9,7 @@ from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.inference.certainty import UncertainCount
 from amvnet.inference.fusion import Fusion
-from amvnet.inference.inputs import InputScan, ScanOptions, open_inputs
+from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.score_files import ScorePair
 from amvnet.inference.segmenter import Segmentation, check_scan
@@ -89,8 +89,7 @@ def fuse_files(
     head = fusion.head
     taxonomy = fusion.taxonomy if head is None else head.taxonomy
     # Scan files are adapted as for the networks that the head was trained with.
-    view = ModelConfig().range_view if head is None else head.model.range_view
-    adapter = ScanAdapter(view, "" if head is None else head.sensor)
+    adapter = ScanAdapter(ModelConfig().range_view) if head is None else adapter_for(head)
 
     opened = open_inputs(inputs, options, taxonomy, adapter)
     for scan in opened.scans:

@@ -20,6 +20,7 @@ from amvnet.errors import InputError
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import MEASURED, ScanAdapter
+from amvnet.sensors.intensity import trained_intensity
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights
 
@@ -199,7 +200,8 @@ def adapter_for(
         given: what is known of the sensor; the rest is measured.
         say: is told what was assumed of the sensor.
     """
-    return ScanAdapter(weights.model.range_view, weights.sensor, given, say)
+    intensity = trained_intensity(weights.training, weights.sensor)
+    return ScanAdapter(weights.model.range_view, weights.sensor, given, say, intensity)
 
 
 class FileReader:

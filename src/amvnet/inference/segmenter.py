@@ -24,6 +24,7 @@ from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import check_intensity, trained_intensity
 from amvnet.weights.file import Weights, load
 
 MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
@@ -62,6 +63,9 @@ class Segmenter:
                 "expected an assertion that needs no labels, found loss; "
                 "train the head with another one"
             )
+        # Weights that were trained with other intensities take them, too.
+        trained = trained_intensity(self.weights.training, self.weights.sensor)
+        self._are_fractions = trained is None or trained.quantiles[-1] <= 1
         self.engine = "torch"
         self.device = _check_device(device)
         self.precision = precision
@@ -97,8 +101,9 @@ class Segmenter:
                 scan file, which is adapted to the weights as `amvnet predict` does.
 
         Raises:
-            InputError: if there is no valid point, the model needs a ring index and there is none,
-                or a file cannot be read or holds several scans.
+            InputError: if there is no valid point, more than a few intensities are out of range, the
+                model needs a ring index and there is none, or a file cannot be read or holds several
+                scans.
         """
         if not isinstance(points, Path | str):
             return self.many([points])[0]
@@ -242,6 +247,8 @@ class Segmenter:
         return scores, uncertain
 
     def _batch(self, scans: Sequence[Scan]) -> PointBatch:
+        if self._are_fractions:
+            scans = [check_intensity(scan) for scan in scans]
         batch = PointBatch.of(scans)
         if _is_gpu(self.device):
             batch = batch.pin_memory()

@@ -1,4 +1,4 @@
-"""Adapt the scans of any sensor to some weights: intensity, height over the ground, rows."""
+"""Adapt the scans of any sensor to some weights: intensity, frame, height over the ground, rows."""
 
 from __future__ import annotations
 
@@ -11,23 +11,48 @@ from typing import Any
 import numpy as np
 
 from amvnet.config.schema import RangeViewConfig
-from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.cloud import Cloud, usual_scale
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
+from amvnet.sensors.frame import STEADY_TILT, Frame, find_frame, median_frame
+from amvnet.sensors.intensity import (
+    IntensityMap,
+    TrainedIntensity,
+    are_of_one_range,
+    intensity_map,
+    quantiles_of,
+    trained_intensity,
+)
 from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
-from amvnet.sensors.measure import SensorGeometry, elevations, measure
+from amvnet.sensors.measure import SensorGeometry, elevations, measure_lasers
 
 MEASURED = 5  # scans of a recording that are measured; later ones get the median of these
 STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
 SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
 LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
+HIGHEST = 4.5  # metres: no vehicle carries its sensor higher; the coordinates may be in feet
 OUTSIDE = 0.16  # share of points outside a field of view from which on it is too narrow
 SAME_ANGLE = 6.0  # degrees: fields of view are alike if both ends differ by less
 SAME_BEAMS = 1.4  # factor: numbers of lasers are alike if they differ by less
 KEYS = ("beams", "fov_up", "fov_down", "height")  # attributes of a SensorGeometry
+
+
+@dataclass(frozen=True)
+class _Measurement:
+    """What was measured of a scan, or of several as their median.
+
+    Attributes:
+        frame: of the coordinates.
+        lasers: of the sensor, without its height.
+        quantiles: of the intensities as they are in the file; None if there are none.
+    """
+
+    frame: Frame
+    lasers: SensorGeometry
+    quantiles: np.ndarray | None
 
 
 @dataclass
@@ -36,51 +61,42 @@ class _Recording:
 
     Attributes:
         measurements: of the first scans, at most `MEASURED`.
-        is_steady: whether the measured heights agree.
+        median: of these.
+        is_steady: whether the frames agree.
         is_learnt: whether `measurements` is complete; later scans add nothing to it.
-        is_reported: whether the user was told what was assumed.
+        reported: what the user was told of: usual scans (True), scans of another sensor (False).
     """
 
-    measurements: list[SensorGeometry] = field(default_factory=list)
+    measurements: list[_Measurement] = field(default_factory=list)
+    median: _Measurement | None = None
     is_steady: bool = True
     is_learnt: bool = False
-    is_reported: bool = False
+    reported: set[bool] = field(default_factory=set)
 
-    def measure(self, scan: Scan, valid: np.ndarray) -> SensorGeometry:
-        """Return the median of the first scans if their heights agree, else measure this scan.
-
-        Args:
-            valid: (N,) bool, `scan.valid`.
-        """
-        is_complete = self.is_learnt or len(self.measurements) == MEASURED
-        if self.is_steady and is_complete:
-            return _median(self.measurements)
-
-        ring = None if scan.ring is None else scan.ring[valid]
-        geometry = measure(scan.points[valid], ring)
-        if self.is_learnt:
-            return geometry
-
-        self.measurements = [*self.measurements, geometry][-MEASURED:]
-        heights = _known_values(self.measurements, "height")
-        if heights:
-            self.is_steady &= max(heights) - min(heights) < STEADY
-        return _median(self.measurements) if self.is_steady else geometry
+    def add(self, measurement: _Measurement) -> None:
+        """Add what was measured of one of the first scans."""
+        self.measurements.append(measurement)
+        self.median = _median(self.measurements)
+        self.is_steady = _are_steady([measured.frame for measured in self.measurements])
+        self.is_learnt |= len(self.measurements) == MEASURED
 
 
 class ScanAdapter:
     """Turns the contents of scan files into scans as some weights expect them.
 
-    Intensities are scaled to [0, 1], the axes are turned level, and the scan is moved up or down
-    until its sensor is as high over the ground as the one that the weights were trained for.
-    `ring` becomes the row of each point in the range image, 0 the lowest, for `Segmenter.by_ring`.
-    The row follows the elevation at which the sensor saw the point, before the move.
+    Intensities are brought to the distribution of the training, the axes are turned level, and the
+    scan is moved up or down until its sensor is as high over the ground as the one that the weights
+    were trained for. `ring` becomes the row of each point in the range image, 0 the lowest, for
+    `Segmenter.by_ring`. The row follows the elevation at which the sensor saw the point, before the
+    move.
 
     Args:
         view: the range view of the weights.
         trained_for: name of the sensor that the weights were trained for.
         sensor: what is known of the sensor of the scans; the rest is measured.
         say: is told once for each recording what was assumed.
+        intensity: the intensities that the weights were trained with; None means those of the
+            sensor that they were trained for, if they are known.
     """
 
     def __init__(
@@ -89,41 +105,44 @@ class ScanAdapter:
         trained_for: str = "",
         sensor: Sensor | None = None,
         say: Say = say_nothing,
+        intensity: TrainedIntensity | None = None,
     ) -> None:
         self.sensor = sensor or Sensor()
         self._view = view
         self._trained_sensor = SENSORS.get(trained_for)
         self._trained_height = HEIGHTS.get(trained_for)
+        self._trained_intensity = intensity or trained_intensity({}, trained_for)
         self._say = say
-        self._recordings: dict[tuple[str, float | None], _Recording] = {}
+        self._recordings: dict[str, _Recording] = {}
 
     def __call__(self, cloud: Cloud, source: str) -> Scan:
         """Return the scan as the weights expect it; its points keep their order and number.
 
         Args:
-            source: name of the bag or folder that the scan is from. Scans with the same source and
-                the same scale of intensity are assumed to come from one sensor.
+            source: name of the bag or folder that the scan is from. Scans of one source are assumed
+                to come from one sensor, as long as their intensities have the same range.
 
         Raises:
-            InputError: if no point is usable.
+            InputError: if no point is usable, or the unit of the coordinates is in doubt.
         """
-        scale = self._intensity_scale(cloud)
-        scan = _level(cloud, self.sensor).to_scan(scale)
+        recording = self._recordings.setdefault(source, _Recording())
+        is_usual, measurement = self._measurement(cloud, recording)
+        to_intensity = self._intensity_map(cloud, measurement.quantiles)
+        heights = self._heights(measurement.frame)
+        is_reported = is_usual in recording.reported
+        if recording.is_steady or not is_reported:
+            self._check_height(cloud, measurement.frame)
+
+        scan = _to_scan(cloud, measurement.frame.complete(self.sensor), to_intensity)
+        seen = _raise_points(scan, heights.to_seen)
+        moved = _raise_points(scan, heights.to_trained)
+
         valid = scan.valid
-
-        recording = self._recording(source, scale)
-        geometry = _override(recording.measure(scan, valid), self.sensor)
-        moved = _raise_points(scan, self._rise(geometry))
-
-        # Elevations are those that the sensor saw. If the origin is on the ground, they are right
-        # only after the move.
-        is_on_ground = geometry.height is not None and geometry.height < LOWEST
-        seen = moved if is_on_ground else scan
+        geometry = _override(measurement.lasers, self.sensor)
         view = self._row_view(seen.points[valid], geometry)
-
-        if not recording.is_reported:
-            recording.is_reported = True
-            self._say(self._report(cloud, scale, geometry))
+        if not is_reported:
+            recording.reported.add(is_usual)
+            self._say(self._report(cloud, measurement.frame, to_intensity, geometry))
         return dataclasses.replace(moved, ring=self._rows(seen, valid, view))
 
     def learn(self, source: str, first: Sequence[Callable[[], Cloud]]) -> None:
@@ -132,30 +151,92 @@ class ScanAdapter:
         Args:
             first: functions that read these scans; broken scans are left out.
         """
+        recording = self._recordings.setdefault(source, _Recording())
         for read in first:
-            with suppress(InputError):
-                cloud = read()
-                scale = self._intensity_scale(cloud)
-                scan = _level(cloud, self.sensor).to_scan(scale)
-                self._recording(source, scale).measure(scan, scan.valid)
+            if not recording.is_learnt:
+                with suppress(InputError):
+                    cloud = read()
+                    recording.add(self._measure(cloud, quantiles_of(cloud.intensity)))
+        recording.is_learnt |= recording.median is not None
 
-        for (name, _), recording in self._recordings.items():
-            if name == source:
-                recording.is_learnt = True
+    def _measurement(self, cloud: Cloud, recording: _Recording) -> tuple[bool, _Measurement]:
+        """Return the median of the first scans if this scan is like them, else measure it.
 
-    def _intensity_scale(self, cloud: Cloud) -> float | None:
-        return self.sensor.intensity_scale or cloud.intensity_scale()
+        Returns:
+            Whether the intensities have the range of the first scans, and the measurement.
+        """
+        quantiles = quantiles_of(cloud.intensity)
+        median = recording.median
+        is_usual = median is None or are_of_one_range(quantiles, median.quantiles)
+        if not is_usual:
+            return False, self._measure(cloud, quantiles)
 
-    def _recording(self, source: str, scale: float | None) -> _Recording:
-        return self._recordings.setdefault((source, scale), _Recording())
+        if median is None or not recording.is_learnt:
+            own = self._measure(cloud, quantiles)
+            recording.add(own)
+            median = recording.median
+            assert median is not None
+        elif not recording.is_steady:
+            own = self._measure(cloud, quantiles)
 
-    def _rise(self, geometry: SensorGeometry) -> float:
-        """Return how far to move a scan up, metres."""
-        if geometry.height is None or self._trained_height is None:
-            return 0.0
+        if recording.is_steady:
+            return True, median
+        return True, dataclasses.replace(own, quantiles=median.quantiles)
 
-        rise = geometry.height - self._trained_height
-        return 0.0 if abs(rise) < SAME_HEIGHT else rise
+    def _measure(self, cloud: Cloud, quantiles: np.ndarray | None) -> _Measurement:
+        """Measure one scan.
+
+        Raises:
+            InputError: if the unit of the coordinates is in doubt.
+        """
+        usable = np.isfinite(cloud.xyz).all(axis=1) & (cloud.xyz != 0).any(axis=1)
+        try:
+            frame = find_frame(cloud.xyz[usable], self.sensor)
+        except InputError as error:
+            raise InputError(f"{cloud.name}: {error}") from None
+
+        # All lasers are needed here, in the order of the file.
+        scan = _to_scan(cloud, frame.complete(self.sensor))
+        seen = _raise_points(scan, self._heights(frame).to_seen)
+        valid = scan.valid
+        ring = None if scan.ring is None else scan.ring[valid]
+        return _Measurement(frame, measure_lasers(seen.points[valid], ring), quantiles)
+
+    def _intensity_map(self, cloud: Cloud, quantiles: np.ndarray | None) -> IntensityMap:
+        given = self.sensor.intensity_scale
+        scale = given or cloud.full or 1.0
+        if given is None and cloud.full is None and quantiles is not None:
+            assert cloud.intensity is not None
+            scale = usual_scale(quantiles[-1], is_integer=cloud.intensity.dtype.kind in "iu")
+        return intensity_map(quantiles, scale, self._trained_intensity, is_given=given is not None)
+
+    def _heights(self, frame: Frame) -> _Moves:
+        """Return how far to move a scan up."""
+        trained = self._trained_height
+        given = self.sensor.height
+        ground = frame.height
+        is_on_ground = ground is not None and ground < LOWEST and (given is None or given >= LOWEST)
+        if is_on_ground and ground is not None:
+            # The sensor is not at the origin: it is as high as given, or as that of the training.
+            above = given if given is not None else trained
+            if above is None:
+                return _Moves(is_on_ground=True)
+            target = above if trained is None else trained
+            return _Moves(ground - above, ground - target, is_on_ground=True)
+
+        height = given if given is not None else ground
+        if height is None or trained is None or abs(height - trained) < SAME_HEIGHT:
+            return _Moves()
+        return _Moves(to_trained=height - trained)
+
+    def _check_height(self, cloud: Cloud, frame: Frame) -> None:
+        """Raise InputError if the ground is too far below the sensor for coordinates in metres."""
+        is_given = self.sensor.height is not None or self.sensor.unit is not None
+        if not is_given and frame.height is not None and frame.height > HIGHEST:
+            raise InputError(
+                f"{cloud.name}: expected a sensor at most {HIGHEST:g} m over the ground, found "
+                f"{frame.height:.1f}; give --unit ft if these are feet, else --height"
+            )
 
     def _row_view(self, points: np.ndarray, geometry: SensorGeometry) -> RangeViewConfig | None:
         """Return the range view that gives (P, 4) points their rows by elevation.
@@ -211,16 +292,17 @@ class ScanAdapter:
         all_rows[valid] = rows
         return all_rows
 
-    def _report(self, cloud: Cloud, scale: float | None, geometry: SensorGeometry) -> str:
+    def _report(
+        self, cloud: Cloud, frame: Frame, to_intensity: IntensityMap, geometry: SensorGeometry
+    ) -> str:
         """Return a line on what was assumed, and whether the weights have seen such a sensor."""
-        assumed = [
-            _describe_intensity(cloud, scale),
-            self._describe_height(geometry),
+        assumed = [cloud.note] if cloud.note else []
+        assumed += [
+            to_intensity.text,
+            *self._describe_frame(frame),
+            self._describe_height(frame),
             _describe_lasers(geometry),
         ]
-        if cloud.note:
-            assumed.insert(0, cloud.note)
-
         line = f"{cloud.name}: assumed {', '.join(assumed)}"
 
         trained = self._trained_sensor
@@ -232,14 +314,33 @@ class ScanAdapter:
             "and have seen no such sensor"
         )
 
-    def _describe_height(self, geometry: SensorGeometry) -> str:
-        if geometry.height is None:
-            return "no ground to measure the height by (give --height)"
+    def _describe_frame(self, frame: Frame) -> list[str]:
+        """Return what was guessed of the frame, each as a text with its option."""
+        texts = []
+        if self.sensor.unit is None and frame.unit != "m":
+            texts.append(f"--unit {frame.unit}")
+        if self.sensor.axes is None and frame.axes != "x-forward":
+            texts.append(f"--axes {frame.axes}")
+        if frame.pitch or frame.roll:
+            texts.append(
+                f"a tilt of {frame.tilt:.0f} degrees (levelled, --rotate "
+                f"0,{frame.pitch:.1f},{frame.roll:.1f})"
+            )
+        return texts
 
-        text = f"sensor {geometry.height:.2f} m over the ground"
-        rise = self._rise(geometry)
-        if rise:
-            text += f" (moved by {rise:+.2f} m to {self._trained_height:.2f} m)"
+    def _describe_height(self, frame: Frame) -> str:
+        given = self.sensor.height
+        if given is None and frame.height is None:
+            return "no ground to measure the height by (give --height; --axes if z is not up)"
+
+        moves = self._heights(frame)
+        if moves.is_on_ground:
+            text = f"the ground {-(frame.height or 0):+.2f} m from the origin"
+        else:
+            height = given if given is not None else frame.height
+            text = f"sensor {height:.2f} m over the ground"
+        if moves.to_trained:
+            text += f" (moved by {moves.to_trained:+.2f} m to {self._trained_height:.2f} m)"
         return text
 
     def _is_like(self, trained: Sensor, geometry: SensorGeometry) -> bool:
@@ -257,14 +358,31 @@ class ScanAdapter:
         )
 
 
-def _level(cloud: Cloud, sensor: Sensor) -> Cloud:
-    """Return the cloud in the package's axes; lost points, at the file's origin, stay lost."""
-    if sensor.level:
-        return cloud
+@dataclass(frozen=True)
+class _Moves:
+    """How far a scan is moved up, metres.
+
+    Attributes:
+        to_seen: so that the sensor is at the origin.
+        to_trained: so that the sensor of the training is.
+        is_on_ground: whether the file's origin is on the ground, or below.
+    """
+
+    to_seen: float = 0.0
+    to_trained: float = 0.0
+    is_on_ground: bool = False
+
+
+def _to_scan(cloud: Cloud, sensor: Sensor, to_intensity: IntensityMap | None = None) -> Scan:
+    """Return the scan in the package's axes; lost points, at the file's origin, stay lost."""
+    intensity = None
+    if to_intensity is not None:
+        intensity = to_intensity(cloud.intensity, len(cloud.xyz))
 
     xyz = sensor.to_level(cloud.xyz)
-    xyz[(cloud.xyz == 0).all(axis=1)] = np.nan
-    return dataclasses.replace(cloud, xyz=xyz)
+    if xyz is not cloud.xyz:
+        xyz[(cloud.xyz == 0).all(axis=1)] = np.nan
+    return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 
 
 def _raise_points(scan: Scan, rise: float) -> Scan:
@@ -297,23 +415,33 @@ def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) 
     return dataclasses.replace(view, rows="elevation", fov_up=top + half, fov_down=bottom - half)
 
 
-def _known_values(measurements: Sequence[SensorGeometry], key: str) -> list[float]:
-    """Return the values of one attribute, without those that are unknown."""
-    values = [getattr(geometry, key) for geometry in measurements]
-    return [value for value in values if value is not None]
+def _are_steady(frames: Sequence[Frame]) -> bool:
+    """Return whether the scans of a recording were recorded in one frame, at one height."""
+    if len({(frame.unit, frame.axes) for frame in frames}) > 1:
+        return False
+    heights = [frame.height for frame in frames if frame.height is not None]
+    if heights and max(heights) - min(heights) >= STEADY:
+        return False
+    turns = np.array([(frame.pitch, frame.roll) for frame in frames])
+    return bool((np.ptp(turns, axis=0) < STEADY_TILT).all())
 
 
-def _median(measurements: Sequence[SensorGeometry]) -> SensorGeometry:
-    """Return the median of each attribute."""
+def _median(measurements: Sequence[_Measurement]) -> _Measurement:
+    """Return the median of each value that is known."""
     medians: dict[str, Any] = {}
     for key in KEYS:
-        values = _known_values(measurements, key)
-        if values:
-            medians[key] = float(np.median(values))
-
+        values = [getattr(measured.lasers, key) for measured in measurements]
+        known = [value for value in values if value is not None]
+        if known:
+            medians[key] = float(np.median(known))
     if "beams" in medians:
         medians["beams"] = round(medians["beams"])
-    return SensorGeometry(**medians)
+
+    frame = median_frame([measured.frame for measured in measurements])
+    quantiles = [measured.quantiles for measured in measurements]
+    present = [values for values in quantiles if values is not None]
+    pooled = np.median(present, axis=0) if 2 * len(present) > len(quantiles) else None
+    return _Measurement(frame, SensorGeometry(**medians), pooled)
 
 
 def _override(measured: SensorGeometry, sensor: Sensor) -> SensorGeometry:
@@ -337,13 +465,6 @@ def _is_near(angle: float | None, trained_angle: float | None) -> bool:
     if angle is None or trained_angle is None:
         return True
     return abs(angle - trained_angle) <= SAME_ANGLE
-
-
-def _describe_intensity(cloud: Cloud, scale: float | None) -> str:
-    if cloud.intensity is None or scale is None:
-        return "no intensity"
-
-    return f"intensity 0 to {scale:g}"
 
 
 def _describe_lasers(sensor: Sensor | SensorGeometry) -> str:

@@ -23,7 +23,9 @@ AXES = {
     "y-forward": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),  # x right, y forward, z up: nuScenes
     "z-forward": ((0, 0, 1), (-1, 0, 0), (0, -1, 0)),  # x right, y down, z forward: cameras
     "z-down": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),  # x forward, y right, z down: aircraft
+    "y-up": ((0, 0, -1), (-1, 0, 0), (0, 1, 0)),  # x right, y up, z backward: computer graphics
 }
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # metres
 Triple = tuple[float, float, float]
 
 
@@ -37,10 +39,11 @@ class Sensor:
         fov_up, fov_down: ends of the field of view, degrees above the horizon.
         height: metres over the ground.
         intensity_scale: the largest possible intensity.
+        unit: of the coordinates, a name in `UNITS`.
         axes: which way the axes point, a name in `AXES`.
         rotate: yaw, pitch and roll in degrees, applied after `axes`: they turn the scan level, with
             +x forward.
-        offset: metres added to x, y and z after that.
+        offset: metres added to x, y and z after that, which brings the sensor to the origin.
 
     Raises:
         InputError: if a value is impossible.
@@ -52,9 +55,10 @@ class Sensor:
     fov_down: float | None = None
     height: float | None = None
     intensity_scale: float | None = None
-    axes: str = "x-forward"
-    rotate: Triple = (0.0, 0.0, 0.0)
-    offset: Triple = (0.0, 0.0, 0.0)
+    unit: str | None = None
+    axes: str | None = None
+    rotate: Triple | None = None
+    offset: Triple | None = None
 
     def __post_init__(self) -> None:
         top = 90 if self.fov_up is None else self.fov_up
@@ -66,7 +70,8 @@ class Sensor:
         self._check("fov_down", is_below, "degrees from -90 to 90, below fov_up")
         self._check("height", _is_within(self.height, 0, 100), "metres from 0 to 100")
         self._check("intensity_scale", scale is None or 0 < scale < math.inf, "a number above 0")
-        self._check("axes", self.axes in AXES, f"one of {', '.join(AXES)}")
+        self._check("unit", self.unit is None or self.unit in UNITS, f"one of {', '.join(UNITS)}")
+        self._check("axes", self.axes is None or self.axes in AXES, f"one of {', '.join(AXES)}")
         self._check("rotate", _are_finite(self.rotate), "yaw,pitch,roll in degrees")
         self._check("offset", _are_finite(self.offset), "x,y,z in metres")
 
@@ -78,23 +83,26 @@ class Sensor:
             )
 
     @property
-    def level(self) -> bool:
-        """Whether the scans already have the package's axes: x forward, y left, z up."""
-        return self == dataclasses.replace(
-            self, axes="x-forward", rotate=(0.0, 0.0, 0.0), offset=(0.0, 0.0, 0.0)
-        )
+    def turn(self) -> np.ndarray:
+        """The (3, 3) rotation from the file's axes to the package's: x forward, y left, z up."""
+        axes = np.array(AXES[self.axes or "x-forward"], dtype=np.float64)
+        return axes if self.rotate is None else rotation_from_degrees(*self.rotate) @ axes
 
     def to_level(self, xyz: np.ndarray) -> np.ndarray:
-        """Return the (N, 3) points of a file in the package's axes.
+        """Return the (N, 3) points of a file in metres and in the package's axes.
 
-        They are float64 if they had to be turned or moved.
+        What is not known of the frame is taken as in order. The points are float64 if they had to
+        be scaled, turned or moved.
         """
-        if self.level:
+        scale = UNITS[self.unit or "m"]
+        turn = self.turn
+        offset = np.array(self.offset or (0.0, 0.0, 0.0))
+        if scale == 1 and not offset.any() and np.array_equal(turn, np.eye(3)):
             return xyz
 
-        axes = np.array(AXES[self.axes], dtype=np.float64)
-        turn = rotation_from_degrees(*self.rotate) @ axes
-        return xyz.astype(np.float64) @ turn.T + np.array(self.offset)
+        # Numbers too large to be scaled or turned become infinite, which makes points invalid.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return xyz.astype(np.float64) * scale @ turn.T + offset
 
 
 def _is_within(value: float | None, low: float, high: float) -> bool:
@@ -102,8 +110,8 @@ def _is_within(value: float | None, low: float, high: float) -> bool:
     return value is None or low <= value <= high
 
 
-def _are_finite(values: Triple) -> bool:
-    return all(map(math.isfinite, values))
+def _are_finite(values: Triple | None) -> bool:
+    return values is None or all(map(math.isfinite, values))
 
 
 def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> np.ndarray:
@@ -222,7 +230,7 @@ def _convert(values: Mapping[Any, Any], are_options: bool = False) -> dict[str, 
 
 def _converter(key: str) -> Callable[[Any], Any]:
     """Return the function that converts values of an attribute."""
-    if key in ("name", "axes"):
+    if key in ("name", "unit", "axes"):
         return str
     if key == "beams":
         return _to_whole

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-MIN_DISTANCE = 1.0  # metres: nearer returns are from the vehicle itself
+from amvnet.sensors.ground import MIN_DISTANCE, ground_height
+
 MIN_POINTS = 100  # fewer say nothing about the sensor
 FOV_PERCENTILES = (0.5, 99.5)  # of the elevations: the ends of the field of view
 MIN_BEAMS = 4
@@ -27,18 +29,6 @@ MIN_PEAK_POINTS = 0.9  # share of the points that lie in peaks
 MAX_PEAK_WIDTH = 0.1  # share of the field of view that peaks cover; if it is more, they are blurred
 SECTORS = 12  # of the turn
 MIN_SECTOR_PEAKS = 0.75  # share of all peaks that a good sector must have
-
-# The ground plane
-CELL = 1.0  # metres: side of the cells whose lowest points are used
-GROUND_RADIUS = 20.0  # metres: farther points are not used
-HALF_WEIGHT = 8.0  # metres: a cell at this distance counts half as much as one at the sensor
-TRIES = 400  # planes through three low points each
-MIN_AREA = 1.0  # square metres: twice the area of the triangle between the three points
-PLANE_TOLERANCE = 0.1  # metres between the plane and the points of the ground
-MAX_SLOPE = 10.0  # degrees
-MIN_HEIGHT = -0.5  # metres of the sensor over the plane: a plane far above the sensor is a ceiling
-MIN_CELLS = 30
-MIN_AGREEMENT = 0.25  # weighted share of the cells that must lie in the plane
 
 
 @dataclass(frozen=True)
@@ -64,6 +54,15 @@ def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometr
         points: (N, 3 or more) finite x, y, z in the sensor's frame, in the order of the file.
         ring: (N,) indices of the lasers, or None if the file has none.
     """
+    lasers = measure_lasers(points, ring)
+    if lasers.fov_up is None:
+        return lasers
+    height = ground_height(points[:, :3].astype(np.float64))
+    return dataclasses.replace(lasers, height=height)
+
+
+def measure_lasers(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:
+    """Measure the lasers of a sensor as `measure` does, but not its height."""
     xyz = points[:, :3].astype(np.float64)
     is_distant = np.hypot(xyz[:, 0], xyz[:, 1]) > MIN_DISTANCE
     if is_distant.sum() < MIN_POINTS:
@@ -76,7 +75,7 @@ def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometr
         beams: int | None = len(np.unique(ring))
     else:
         beams = beams_by_order(xyz) or beams_by_peaks(distant)
-    return SensorGeometry(beams, float(up), float(down), ground_height(distant))
+    return SensorGeometry(beams, float(up), float(down))
 
 
 def elevations(xyz: np.ndarray) -> np.ndarray:
@@ -150,75 +149,3 @@ def _count_peaks(elevation: np.ndarray) -> tuple[int, float]:
     begins = np.diff(is_peak.astype(int), prepend=0) == 1
     width = is_peak.sum() * BIN / max(high - low, BIN)
     return int(begins.sum()), width
-
-
-def ground_height(xyz: np.ndarray) -> float | None:
-    """Return how many metres the origin is above the ground; None if no ground is found.
-
-    The ground is the plane through three low points that most low points agree with and few are
-    below, refined by least squares. Near points count more.
-
-    Args:
-        xyz: (N, 3) points in the sensor's frame.
-    """
-    low = _lowest_points(xyz)
-    if len(low) < MIN_CELLS:
-        return None
-
-    weight = 1 / (1 + np.hypot(low[:, 0], low[:, 1]) / HALF_WEIGHT)
-    plane = _best_plane(low, weight)
-    if plane is None:
-        return None
-
-    xy1 = _with_ones(low)
-    for _ in range(3):
-        is_ground = np.abs(low[:, 2] - xy1 @ plane) < PLANE_TOLERANCE
-        if is_ground.sum() < MIN_CELLS / 2:
-            return None
-        plane = np.linalg.lstsq(xy1[is_ground], low[is_ground, 2], rcond=None)[0]
-
-    height = -plane[2]
-    is_agreed = weight[is_ground].sum() > MIN_AGREEMENT * weight.sum()
-    return float(height) if is_agreed and height > MIN_HEIGHT else None
-
-
-def _lowest_points(xyz: np.ndarray) -> np.ndarray:
-    """Return the (M, 3) lowest points of the cells around the sensor."""
-    xyz = xyz[np.hypot(xyz[:, 0], xyz[:, 1]) < GROUND_RADIUS]
-    column, row = np.floor((xyz[:, :2] + GROUND_RADIUS) / CELL).astype(np.int64).T
-    cell = column * int(2 * GROUND_RADIUS / CELL + 1) + row
-
-    order = np.lexsort((xyz[:, 2], cell))
-    is_first = np.diff(cell[order], prepend=-1) > 0
-    return xyz[order][is_first]
-
-
-def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
-    """Return (a, b, c) of the plane z = a x + b y + c that most low points agree with.
-
-    None if every plane is too steep. The draws are seeded: the same points give the same plane.
-
-    Args:
-        low: (M, 3) low points.
-        weight: (M,) their weights.
-    """
-    rng = np.random.default_rng(0)
-    triples = low[rng.choice(len(low), (TRIES, 3), p=weight / weight.sum())]  # (tries, 3, 3)
-    corners = np.concatenate([triples[:, :, :2], np.ones((TRIES, 3, 1))], axis=2)
-    is_large = np.abs(np.linalg.det(corners)) > MIN_AREA
-    planes = np.linalg.solve(corners[is_large], triples[is_large][:, :, 2:])[:, :, 0]
-
-    slopes = np.hypot(planes[:, 0], planes[:, 1])
-    planes = planes[slopes < np.tan(np.radians(MAX_SLOPE))]
-    if not len(planes):
-        return None
-
-    above = low[:, 2] - planes @ _with_ones(low).T  # (planes, M) metres
-    agreeing = (np.abs(above) < PLANE_TOLERANCE) @ weight
-    below = (above < -3 * PLANE_TOLERANCE) @ weight
-    return planes[(agreeing - below).argmax()]
-
-
-def _with_ones(xyz: np.ndarray) -> np.ndarray:
-    """Return (M, 3) rows x, y, 1: times (a, b, c), they are the heights of a plane."""
-    return np.column_stack([xyz[:, :2], np.ones(len(xyz))])

@@ -19,7 +19,10 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import quantiles_of
 from amvnet.training.augment import augment, mix, mix_lasers, paste
+
+SAMPLED_SCANS = 20  # whose intensities are measured
 
 Key = tuple[int, int]  # epoch, index in the list of scans
 
@@ -259,6 +262,22 @@ def count_classes(
         with atomic_write(path) as part:
             np.savez(part, counts=totals, scans=scans, classes=classes)
     return totals
+
+
+def sample_intensities(dataset: Dataset, records: Sequence[ScanRecord]) -> list[float]:
+    """Return the quantiles of the intensities of some scans, as weights carry them.
+
+    They are those at `sensors.intensity.PROBABILITIES`, on average over a sample of the scans, and
+    empty if no scan has usable points.
+    """
+    indices = np.linspace(0, len(records) - 1, min(SAMPLED_SCANS, len(records))).astype(int)
+    found = []
+    for index in indices:
+        scan = dataset.read(records[index], labels=False)
+        quantiles = quantiles_of(scan.points[scan.valid, 3])
+        if quantiles is not None:
+            found.append(quantiles)
+    return np.mean(found, axis=0).round(4).tolist() if found else []
 
 
 def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:

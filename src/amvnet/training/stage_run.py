@@ -21,12 +21,13 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
+from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
 from amvnet.training.fit import FitOptions, Loaders, fit
 from amvnet.training.head_points import PointGatherer, make_head_loader
 from amvnet.training.head_scores import NetworkScores, ScoreSource, score_source, scorer_with_head
 from amvnet.training.head_stage import HeadStage
-from amvnet.training.loaders import ScanSet, count_classes, make_loader
+from amvnet.training.loaders import ScanSet, count_classes, make_loader, sample_intensities
 from amvnet.training.losses import class_weights
 from amvnet.training.run_plan import RunPlan
 from amvnet.training.run_record import SETTINGS, check_begun, sequence_names, stage_settings
@@ -141,7 +142,12 @@ class StageRun:
 
     def keep_weights(self) -> KeepWeights:
         """Return the callback that writes the trained part after each epoch."""
-        return KeepWeights(PartWriter(self, self.settings, time.time()), self.folder)
+        # Only the first process writes.
+        scans = self.plan.scans
+        is_first = self.plan.options.processes.first
+        intensities = sample_intensities(scans.dataset, scans.train) if is_first else []
+        writer = PartWriter(self, self.settings, intensities, time.time())
+        return KeepWeights(writer, self.folder)
 
     def pictures(self, score: Callable[[PointBatch], Tensor]) -> Pictures:
         """Return the callback that draws validation scans.
@@ -164,11 +170,13 @@ class PartWriter:
     Attributes:
         stage: the stage.
         settings: those of the stage, computed only once because that takes long.
+        intensities: quantiles of the intensities of the training scans.
         started: when the training was begun or resumed, by `time.time`.
     """
 
     stage: StageRun
     settings: dict[str, Any]
+    intensities: list[float]
     started: float
 
     def __call__(self, module: nn.Module, path: Path, metrics: dict[str, float]) -> None:
@@ -179,6 +187,7 @@ class PartWriter:
             "sequences": sequence_names(scans.train),
             "validated_on": sequence_names(scans.val),
             "scans": len(scans.train),
+            INTENSITIES: self.intensities,
         }
         if "scores" in self.settings:
             description["scores"] = self.settings["scores"]

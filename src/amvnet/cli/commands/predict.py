@@ -33,6 +33,7 @@ def predict(
     sensor: str | None = None,
     height: float | None = None,
     intensity_scale: float | None = None,
+    unit: str | None = None,
     axes: str | None = None,
     rotate: str | None = None,
     offset: str | None = None,
@@ -64,11 +65,14 @@ def predict(
             measured.
         height: of scan files, the sensor's height over the ground in metres; default: measured.
         intensity_scale: of scan files, the largest possible intensity; default: 1, 255 or 65535,
-            as the values suggest.
-        axes: of scan files, x-forward (y left), y-forward (x right), z-forward (y down) or z-down
-            (y right).
-        rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees.
-        offset: of scan files, what to add to x,y,z after the rotation, in metres.
+            as the values suggest, and spread as in the training of the weights.
+        unit: of scan files, m, cm, mm or ft; default: m, or mm if they are certainly that.
+        axes: of scan files, x-forward (y left), y-forward (x right), z-forward (y down), z-down
+            (y right) or y-up (x right); default: by the ground.
+        rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees; default:
+            by the ground.
+        offset: of scan files, what to add to x,y,z after the rotation, in metres, so that the
+            sensor is at the origin.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
     from amvnet.export.engines import use_engine
@@ -83,6 +87,7 @@ def predict(
         sensor,
         height=height,
         intensity_scale=intensity_scale,
+        unit=unit,
         axes=axes,
         rotate=rotate,
         offset=offset,

@@ -21,6 +21,7 @@ MOST_RINGS = 256  # a column with larger values does not hold ring indices
 # The largest intensities that sensors write: fractions, 8 bits, 16 bits.
 FLOAT_RANGES = (1.0, 255.0, 65535.0)
 INTEGER_RANGES = (255.0, 65535.0)  # integers are not fractions
+WILD_SHARE = 0.001  # of the intensities, which may be larger than the range of the others
 
 # Names of columns in lower case. If a file has several of them, the first in this order is used.
 COLUMN_NAMES = {
@@ -64,8 +65,8 @@ class Cloud:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.
 
         If the format does not define the largest possible intensity, the largest value in the scan
-        decides. Up to 1 (floats only) the divisor is 1, up to 255 it is 255, up to 65535 it is
-        65535, and beyond that it is the value itself.
+        decides, without the `WILD_SHARE` of outliers. Up to 1 (floats only) the divisor is 1, up to
+        255 it is 255, up to 65535 it is 65535, and beyond that it is the value itself.
         """
         if self.full is not None:
             return self.full
@@ -76,13 +77,8 @@ class Cloud:
         if not len(finite):
             return None
 
-        largest = float(finite.max())
-        is_integer = self.intensity.dtype.kind in "iu"
-        ranges = INTEGER_RANGES if is_integer else FLOAT_RANGES
-        for limit in ranges:
-            if largest <= limit:
-                return limit
-        return largest
+        largest = float(np.quantile(finite, 1 - WILD_SHARE, method="higher"))
+        return usual_scale(largest, is_integer=self.intensity.dtype.kind in "iu")
 
     def to_scan(self, scale: float | None = None) -> Scan:
         """Return the scan, with float32 coordinates and intensities clipped to [0, 1].
@@ -112,6 +108,15 @@ class Cloud:
         if not scan.valid.any():
             raise InputError(f"{self.name}: {_why_unusable(points[:, :3])}")
         return scan
+
+
+def usual_scale(largest: float, is_integer: bool) -> float:
+    """Return the largest intensity of a usual range that holds the largest one of a scan."""
+    ranges = INTEGER_RANGES if is_integer else FLOAT_RANGES
+    for limit in ranges:
+        if largest <= limit:
+            return limit
+    return largest
 
 
 def _why_unusable(xyz: np.ndarray) -> str:

@@ -1,0 +1,198 @@
+"""Measure what the usual changes of a scan cost: units, frames and intensities of other tools.
+
+    python benchmarks/changed_scans.py DATA [WEIGHTS] [--scans 10]
+
+DATA is a dataset in the layout of SemanticKITTI, such as semantickitti:PATH; the scans are spread
+evenly over its sequences. Each is changed and then labelled as `amvnet predict` labels a file of
+it: once without any option, once with the option that mends the change. Print the accuracy, and
+its share of the accuracy on the unchanged scans; a refused scan has its message instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.formats.cloud import Cloud
+from amvnet.errors import InputError
+from amvnet.inference.inputs import adapter_for
+from amvnet.inference.segmenter import Segmenter
+from amvnet.scan import Scan
+from amvnet.sensors.lidars import AXES, HEIGHTS, make_sensor, rotation_from_degrees
+
+HEIGHT = HEIGHTS["hdl64e"]  # metres of the sensor over the ground
+
+
+@dataclass(frozen=True)
+class Change:
+    """A way in which tools change a scan.
+
+    Attributes:
+        title: for the table.
+        apply: returns the changed cloud, given (N, 3) coordinates and (N,) intensities.
+        options: of `amvnet predict`, those that mend it, as attributes of a `Sensor`.
+    """
+
+    title: str
+    apply: Callable[[np.ndarray, np.ndarray], Cloud]
+    options: dict[str, Any]
+
+
+def turned(matrix: np.ndarray) -> Callable[[np.ndarray, np.ndarray], Cloud]:
+    """Return a change that multiplies the coordinates with a (3, 3) matrix."""
+    return lambda xyz, intensity: Cloud(xyz @ matrix.T, intensity)
+
+
+def tilted(pitch: float, roll: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
+    """Return a change that turns a scan by these degrees."""
+    return turned(rotation_from_degrees(0, pitch, roll))
+
+
+def with_outlier(xyz: np.ndarray, intensity: np.ndarray) -> Cloud:
+    """Set the intensity of one point to 300."""
+    changed = intensity.copy()
+    changed[len(changed) // 2] = 300
+    return Cloud(xyz, changed)
+
+
+def scaled(factor: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
+    """Return a change that multiplies the intensities."""
+    return lambda xyz, intensity: Cloud(xyz, intensity * np.float32(factor))
+
+
+def lifted(x: float, z: float) -> Callable[[np.ndarray, np.ndarray], Cloud]:
+    """Return a change that moves a scan, metres."""
+    return lambda xyz, intensity: Cloud(xyz + np.array([x, 0, z], xyz.dtype), intensity)
+
+
+CHANGES = (
+    Change("unchanged", Cloud, {}),
+    Change("no intensity", lambda xyz, intensity: Cloud(xyz), {}),
+    Change(
+        "constant intensity 0.15",
+        lambda xyz, intensity: Cloud(xyz, np.full_like(intensity, 0.15)),
+        {},
+    ),
+    Change("intensity x 0.01", scaled(0.01), {"intensity_scale": 0.01}),
+    Change("intensity x 255", scaled(255), {"intensity_scale": 255}),
+    Change(
+        "16-bit intensity, dark",
+        lambda xyz, intensity: Cloud(xyz, (6000 * intensity).astype(np.uint16)),
+        {"intensity_scale": 6000},
+    ),
+    Change("one intensity of 300", with_outlier, {"intensity_scale": 1}),
+    Change("origin on the ground", lifted(0, HEIGHT), {"offset": (0, 0, -HEIGHT)}),
+    Change("the same, 1 m behind", lifted(1, HEIGHT), {"offset": (-1, 0, -HEIGHT)}),
+    Change("8 degrees of pitch", tilted(8, 0), {"rotate": (0, -8, 0)}),
+    Change("8 degrees of roll", tilted(0, 8), {"rotate": (0, 0, -8)}),
+    Change("upside-down", turned(np.diag([1.0, -1.0, -1.0])), {"axes": "z-down"}),
+    Change("camera axes", turned(np.array(AXES["z-forward"]).T), {"axes": "z-forward"}),
+    Change("millimetres", lambda xyz, intensity: Cloud(1000 * xyz, intensity), {"unit": "mm"}),
+    Change("centimetres", lambda xyz, intensity: Cloud(100 * xyz, intensity), {"unit": "cm"}),
+    Change("feet", lambda xyz, intensity: Cloud(xyz / 0.3048, intensity), {"unit": "ft"}),
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a change comes to.
+
+    Attributes:
+        accuracies: share of the labelled points that are right, for each scan that was not refused.
+        refusal: the message of the last scan that was refused; empty if none was.
+        said: what was assumed of the last scan.
+    """
+
+    accuracies: list[float]
+    refusal: str = ""
+    said: str = ""
+
+
+def measure(
+    change: Change, options: dict[str, Any], scans: list[Scan], by_row: Segmenter
+) -> Outcome:
+    """Label changed scans, each as if it were alone in its folder."""
+    lines: list[str] = [""]
+    refusal = ""
+    accuracies = []
+    for scan in scans:
+        cloud = change.apply(scan.points[:, :3], scan.points[:, 3])
+        adapter = adapter_for(by_row.weights, make_sensor(**options), lines.append)
+        try:
+            labels = by_row(adapter(cloud, scan.name)).labels
+        except InputError as error:
+            refusal = str(error)
+            continue
+
+        assert scan.labels is not None
+        is_labelled = scan.labels > 0
+        accuracies.append(float(np.mean(labels[is_labelled] == scan.labels[is_labelled])))
+    return Outcome(accuracies, refusal, lines[-1])
+
+
+def cell(outcome: Outcome, unchanged: float) -> str:
+    """Return accuracy and its share of the accuracy on the unchanged scans, both in percent."""
+    text = ""
+    if outcome.accuracies:
+        accuracy = 100 * float(np.mean(outcome.accuracies))
+        text = f"{accuracy:.1f} ({100 * accuracy / unchanged:.0f} %)"
+    if outcome.refusal:
+        text += " refused"
+    return text.strip()
+
+
+def main() -> None:
+    """Print the table, and below it what was said about the last scan."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("data")
+    parser.add_argument("weights", nargs="?", default="sim-hdl64e")
+    parser.add_argument("--scans", type=int, default=10)
+    parser.add_argument("--only", default="")
+    options = parser.parse_args()
+
+    dataset = open_dataset(options.data)
+    records = dataset.records(dataset.sequences("all"))
+    indices = np.linspace(0, len(records) - 1, options.scans).round().astype(int)
+    scans = [dataset.read(records[index]) for index in indices]
+    by_row = Segmenter(options.weights).by_ring()
+
+    table = Table("change", "without options", "with", "accuracy with it")
+    remarks = []
+    unchanged = 0.0
+    for change in CHANGES:
+        if options.only and change.title not in ("unchanged", options.only):
+            continue
+        alone = measure(change, {}, scans, by_row)
+        unchanged = unchanged or 100 * float(np.mean(alone.accuracies))
+        row = [change.title, cell(alone, unchanged), "", ""]
+        if change.options:
+            row[2:] = [name_option(change.options)]
+            row.append(cell(measure(change, change.options, scans, by_row), unchanged))
+        table.add_row(*row)
+        remarks.append(f"{change.title}: {alone.refusal or alone.said}")
+        print(*row, sep=" | ", flush=True)
+
+    console = Console(width=150)
+    console.print(table)
+    for remark in remarks:
+        console.print(remark, soft_wrap=True)
+
+
+def name_option(options: dict[str, Any]) -> str:
+    """Return options as they are written on the command line."""
+    words = []
+    for key, value in options.items():
+        text = ",".join(f"{number:g}" for number in value) if isinstance(value, tuple) else value
+        words.append(f"--{key.replace('_', '-')}={text}")
+    return " ".join(words)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""Find the frame of a scan file: its unit, which axis points up, and how it is tilted."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import mode
+
+import numpy as np
+
+from amvnet.errors import InputError
+from amvnet.sensors.ground import Ground, find_ground
+from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
+
+# The unit, by the median distance of the points: 2 to 40 m in the scans of all sensors
+FARTHEST_MEDIAN = 200.0  # farther: not metres
+MIN_MILLIMETRES = 4000.0  # farther: millimetres; between the two, centimetres or millimetres
+AROUND = (
+    0.5  # near points (5 %) are nearer than this share of far ones (95 %), or the origin is off
+)
+
+UP_AXES = ("z-down", "z-forward", "y-up")  # are tried if no ground is found below
+SAME_TILT = 3.0  # degrees: real roads slope by up to 2.6 as seen from the cars of the datasets
+STEADY_TILT = 3.0  # degrees: if tilts in a recording differ by more, each scan gets its own
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What was found of the frame of a file, as far as the user did not describe it.
+
+    Attributes:
+        unit: of the coordinates, a name in `UNITS`.
+        axes: which way they point, a name in `AXES`.
+        pitch, roll: degrees that turn the scan level after that; 0 if it is level enough, or the
+            user described the rotation.
+        height: metres of the origin over the ground then; None if no ground was found.
+        tilt: degrees of the ground before, for messages.
+    """
+
+    unit: str = "m"
+    axes: str = "x-forward"
+    pitch: float = 0.0
+    roll: float = 0.0
+    height: float | None = None
+    tilt: float = 0.0
+
+    def complete(self, sensor: Sensor) -> Sensor:
+        """Return the sensor with everything about its frame known.
+
+        What the user described is done first: the rest turns the scan about the sensor.
+        """
+        if sensor.rotate is not None:
+            return dataclasses.replace(sensor, unit=self.unit)
+
+        complete = dataclasses.replace(
+            sensor, unit=self.unit, axes=self.axes, rotate=(0.0, self.pitch, self.roll)
+        )
+        if sensor.offset is None:
+            return complete
+        turn = complete.turn @ sensor.turn.T
+        x, y, z = turn @ np.array(sensor.offset)
+        return dataclasses.replace(complete, offset=(float(x), float(y), float(z)))
+
+
+def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
+    """Find the frame of a scan.
+
+    Args:
+        xyz: (N, 3) finite coordinates as in the file, without lost points.
+        sensor: what the user described; only the rest is guessed.
+
+    Raises:
+        InputError: if the unit is none of metres and millimetres, and the user did not give it.
+    """
+    unit = sensor.unit or _find_unit(xyz)
+    frame = Frame(unit, sensor.axes or "x-forward")
+    level = frame.complete(dataclasses.replace(sensor, unit=unit)).to_level(xyz)
+    level = level.astype(np.float64)
+    ground = find_ground(level)
+
+    is_described = sensor.axes is not None or sensor.rotate is not None
+    if ground is None and not is_described:
+        axes = _find_axes(level)
+        level = level @ np.array(AXES[axes], dtype=np.float64).T
+        frame = dataclasses.replace(frame, axes=axes)
+        ground = find_ground(level)
+
+    if ground is None:
+        return frame
+    if sensor.rotate is None and ground.is_sure and ground.tilt > SAME_TILT:
+        return _level(frame, level, ground)
+    return dataclasses.replace(frame, height=ground.height, tilt=ground.tilt)
+
+
+def _find_unit(xyz: np.ndarray) -> str:
+    """Tell metres from millimetres by the distances of (N, 3) points."""
+    if not len(xyz):
+        return "m"
+    near, median, far = np.quantile(
+        np.linalg.norm(xyz.astype(np.float64), axis=1), (0.05, 0.5, 0.95)
+    )
+
+    # Map coordinates are all far away; they are refused with another message.
+    if not median > FARTHEST_MEDIAN or near > AROUND * far:
+        return "m"
+    if median > MIN_MILLIMETRES:
+        return "mm"
+    raise InputError(
+        f"expected metres from the sensor, found half of the points farther than {median:.0f}; "
+        "give --unit cm or mm (or m, if they are metres)"
+    )
+
+
+def _find_axes(xyz: np.ndarray) -> str:
+    """Return the axes by which the (N, 3) points have a ground, if only one of `UP_AXES` does.
+
+    In a corridor, the walls on both sides look like it.
+    """
+    sure = []
+    for axes in UP_AXES:
+        ground = find_ground(xyz @ np.array(AXES[axes], dtype=np.float64).T)
+        if ground is not None and ground.is_sure:
+            sure.append(axes)
+    return sure[0] if len(sure) == 1 else "x-forward"
+
+
+def _level(frame: Frame, level: np.ndarray, ground: Ground) -> Frame:
+    """Return the frame with the rotation that levels a tilted scan.
+
+    The lowest points of the cells of a tilted scan are not those of the level one: the ground is
+    found a second time.
+    """
+    turn = rotation_from_degrees(0, *_levelling(ground.up))
+    again = find_ground(level @ turn.T) or ground
+    up = ground.up if again is ground else turn.T @ again.up
+    pitch, roll = _levelling(up)
+    return dataclasses.replace(frame, pitch=pitch, roll=roll, height=again.height, tilt=ground.tilt)
+
+
+def _levelling(up: np.ndarray) -> tuple[float, float]:
+    """Return pitch and roll in degrees of the rotation that turns a (3,) vector to +z."""
+    x, y, z = up
+    roll = np.degrees(np.arctan2(y, z))
+    pitch = -np.degrees(np.arctan2(x, np.hypot(y, z)))
+    return float(pitch), float(roll)
+
+
+def median_frame(frames: Sequence[Frame]) -> Frame:
+    """Return the frame of a recording, given those of its first scans."""
+    unit = mode(frame.unit for frame in frames)
+    axes = mode(frame.axes for frame in frames)
+    alike = [frame for frame in frames if (frame.unit, frame.axes) == (unit, axes)] or list(frames)
+    heights = [frame.height for frame in frames if frame.height is not None]
+    return Frame(
+        unit,
+        axes,
+        pitch=float(np.median([frame.pitch for frame in alike])),
+        roll=float(np.median([frame.roll for frame in alike])),
+        height=float(np.median(heights)) if heights else None,
+        tilt=float(np.median([frame.tilt for frame in alike])),
+    )

@@ -1,0 +1,235 @@
+"""Intensities as some weights know them: the range, the distribution, a filler if there are none.
+
+Sensors, drivers and tools write intensities as fractions, in 8 or 16 bits, calibrated or not. What
+a network needs is their distribution in its training, so that is what they are brought to. All
+decisions rest on quantiles: a few wild values change nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.formats.cloud import WILD_SHARE
+from amvnet.errors import InputError
+from amvnet.scan import Scan
+
+# The distribution of intensities is described by their quantiles at these probabilities. The ends
+# leave out a thousandth: outliers, and the few retroreflectors that decide the maximum of a scan.
+PROBABILITIES = (0.001, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999)
+COMPARED = (5, 7)  # of these: the median, and the quantile of the bright tenth
+ALIKE = 2.0  # factor: distributions are alike if these quantiles differ by less
+DARKEST = 0.004  # one step of 8 bits: below it, factors mean nothing
+CONSTANT = 0.01  # share of the median: if 98 % of the intensities differ by less, they say nothing
+OWN_RANGE = 8.0  # factor: a scan whose median or bright tenth differs by more is of another range
+BLIND_SHARE = 0.2  # networks that saw this share of their scans without intensity need none
+
+# Quantiles of the intensities in simulated training scans, for weights that do not carry theirs.
+QUANTILES = {
+    "hdl64e": (0.0, 0.0, 0.07, 0.133, 0.232, 0.311, 0.396, 0.492, 0.565, 0.755, 0.986),
+    "hdl32e": (0.0, 0.0, 0.005, 0.007, 0.011, 0.039, 0.066, 0.11, 0.17, 0.265, 0.792),
+}
+KEY = "intensity_quantiles"  # of a part's training record
+
+
+@dataclass(frozen=True)
+class TrainedIntensity:
+    """The intensities that some networks were trained with.
+
+    Attributes:
+        quantiles: of the intensities of the training scans in [0, 1], at `PROBABILITIES`.
+        is_optional: whether the networks learnt to do without intensities, as zeros.
+    """
+
+    quantiles: Sequence[float]
+    is_optional: bool = False
+
+    def filler(self, count: int) -> np.ndarray:
+        """Return (count,) float32 intensities for a scan that has none.
+
+        They are zeros for networks that learnt that these stand for no intensity. Others take any
+        constant for a material: they get seeded draws from the distribution of their training.
+        """
+        if self.is_optional:
+            return np.zeros(count, np.float32)
+        draws = np.random.default_rng(0).random(count)
+        return np.interp(draws, PROBABILITIES, self.quantiles).astype(np.float32)
+
+
+def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntensity | None:
+    """Return the intensities that weights were trained with; None if nothing tells them.
+
+    Args:
+        training: the training records of the weights by part.
+        sensor: name of the sensor that the weights were trained for.
+    """
+    quantiles = QUANTILES.get(sensor)
+    shares = []
+    for part in ("range_net", "polar_net"):
+        record = training.get(part)
+        if not isinstance(record, Mapping):
+            continue
+
+        carried = record.get(KEY)
+        if _are_quantiles(carried):
+            quantiles = carried
+        augment = record.get("augment")
+        share = augment.get("no_intensity") if isinstance(augment, Mapping) else None
+        shares.append(share if isinstance(share, (int, float)) else 0)
+
+    if quantiles is None:
+        return None
+    return TrainedIntensity(quantiles, is_optional=min(shares, default=0) >= BLIND_SHARE)
+
+
+def _are_quantiles(values: Any) -> bool:
+    """Return whether a value of a weights file can be quantiles at `PROBABILITIES`."""
+    if not isinstance(values, list) or len(values) != len(PROBABILITIES):
+        return False
+    numbers = np.array([value for value in values if isinstance(value, (int, float))], float)
+    if len(numbers) != len(values) or not np.isfinite(numbers).all():
+        return False
+    return bool((np.diff(numbers) >= 0).all())
+
+
+def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
+    """Return the quantiles of (N,) intensities at `PROBABILITIES`; None if there are none.
+
+    Intensities that are not finite are left out.
+    """
+    if intensity is None:
+        return None
+    finite = intensity[np.isfinite(intensity)]
+    return np.quantile(finite.astype(np.float64), PROBABILITIES) if len(finite) else None
+
+
+def is_constant(quantiles: np.ndarray) -> bool:
+    """Return whether nearly all intensities are the same, so that they say nothing."""
+    low, median, high = quantiles[1], quantiles[5], quantiles[9]
+    return bool(high - low <= CONSTANT * abs(median))
+
+
+def are_of_one_range(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    """Return whether the intensities of two scans, by their quantiles, can be scaled alike."""
+    if a is None or b is None:
+        return a is None and b is None
+    if is_constant(a) or is_constant(b):
+        return is_constant(a) and is_constant(b)
+    return _are_alike(a, b, OWN_RANGE, least=DARKEST * max(a[-1], b[-1]))
+
+
+def _are_alike(
+    a: np.ndarray | Sequence[float], b: np.ndarray | Sequence[float], factor: float, least: float
+) -> bool:
+    """Return whether compared quantiles differ by at most a factor, or are both below `least`."""
+    for index in COMPARED:
+        low, high = sorted((max(a[index], least), max(b[index], least)))
+        if high > factor * low:
+            return False
+    return True
+
+
+@dataclass(frozen=True)
+class IntensityMap:
+    """How the intensities of a source become those that some weights know.
+
+    Attributes:
+        text: says it to the user.
+        scale: the divisor of the intensities; None if they are matched or filled in.
+        matched: quantiles of the source, increasing, and what they become; None if they are not
+            matched.
+        trained: fills in missing intensities; None: they become zeros.
+    """
+
+    text: str
+    scale: float | None = None
+    matched: tuple[np.ndarray, np.ndarray] | None = None
+    trained: TrainedIntensity | None = None
+
+    def __call__(self, intensity: np.ndarray | None, count: int) -> np.ndarray:
+        """Return the (count,) intensities in [0, 1] of a scan; NaN stays NaN."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            if intensity is not None and self.scale is not None:
+                return np.clip(intensity / self.scale, 0, 1)
+            if intensity is not None and self.matched is not None:
+                mapped = np.interp(intensity, *self.matched)
+                return np.where(np.isfinite(intensity), mapped, np.nan)
+        return np.zeros(count) if self.trained is None else self.trained.filler(count)
+
+
+def intensity_map(
+    quantiles: np.ndarray | None,
+    scale: float,
+    trained: TrainedIntensity | None,
+    is_given: bool = False,
+) -> IntensityMap:
+    """Decide how to map the intensities of a source.
+
+    They are divided by their scale. If their distribution then differs from that of the training,
+    it is matched by its quantiles instead, unless the user gave the scale.
+
+    Args:
+        quantiles: of the raw intensities at `PROBABILITIES`; None if there are none.
+        scale: the largest possible intensity.
+        trained: the intensities of the training; None if unknown.
+        is_given: whether the user gave the scale.
+    """
+    if quantiles is None:
+        return IntensityMap(f"no intensity ({_describe_filler(trained)})", trained=trained)
+
+    linear = IntensityMap(f"intensity 0 to {scale:g}", scale)
+    if is_given:
+        return linear
+    if is_constant(quantiles):
+        text = f"intensity {quantiles[5]:g} everywhere, so none ({_describe_filler(trained)})"
+        return IntensityMap(text, trained=trained)
+    if trained is None or _are_alike(quantiles / scale, trained.quantiles, ALIKE, DARKEST):
+        return linear
+
+    # Equal quantiles of the source, such as many zeros, become the mean of those of the training.
+    found, index = np.unique(quantiles, return_inverse=True)
+    becomes = np.bincount(index, weights=trained.quantiles) / np.bincount(index)
+    text = (
+        f"intensity 0 to {scale:g}, spread as in the training: half of it was below "
+        f"{quantiles[5] / scale:.2g}, now {trained.quantiles[5]:.2g} "
+        f"(--intensity-scale {scale:g} keeps it)"
+    )
+    return IntensityMap(text, matched=(found, np.clip(becomes, 0, 1)))
+
+
+def _describe_filler(trained: TrainedIntensity | None) -> str:
+    if trained is None:
+        return "0 instead"
+    if trained.is_optional:
+        return "0 instead, as in a part of the training"
+    return "drawn at random as in the training; the labels will be much worse"
+
+
+def check_intensity(scan: Scan) -> Scan:
+    """Return a scan with intensities in [0, 1]; a few outliers are clipped.
+
+    Raises:
+        InputError: if more than `WILD_SHARE` of the intensities are out of range.
+    """
+    intensity = scan.points[:, 3]
+    if intensity.min() >= 0 and intensity.max() <= 1:  # false if one is NaN
+        return scan
+
+    valid = scan.valid
+    is_outside = valid & ((intensity < 0) | (intensity > 1))
+    if not is_outside.any():
+        return scan
+    if is_outside.sum() > max(WILD_SHARE * valid.sum(), 1):
+        low, high = intensity[valid].min(), intensity[valid].max()
+        raise InputError(
+            f"{scan.name or 'scan'}: expected intensities in [0, 1], found {low:g} to {high:g}; "
+            "divide them by the largest possible one, as amvnet predict does for scan files"
+        )
+
+    points = scan.points.copy()
+    points[is_outside, 3] = np.clip(intensity[is_outside], 0, 1)
+    return dataclasses.replace(scan, points=points)

@@ -1,0 +1,144 @@
+"""Scans in any usual frame reach the networks as the same scan in the sensor's own frame does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amvnet.data.formats.cloud import Cloud
+from amvnet.inference.inputs import adapter_for
+from amvnet.scan import Scan
+from amvnet.sensors.frame import find_frame
+from amvnet.sensors.ground import find_ground
+from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
+
+from fixtures.sensors import LASERS, place
+from fixtures.worlds import fails, fresh_weights
+
+UP = ["z-down", "z-forward", "y-up"]
+
+
+def scan_xyz(height: float = 1.73, seed: int = 0) -> np.ndarray:
+    points, _ = place(LASERS["os1-64"], height, seed=seed)
+    return points[:, :3].astype(np.float64)
+
+
+def in_axes(xyz: np.ndarray, axes: str) -> np.ndarray:
+    return xyz @ np.array(AXES[axes], float)
+
+
+def tilted(xyz: np.ndarray, pitch: float, roll: float) -> np.ndarray:
+    return xyz @ rotation_from_degrees(0, pitch, roll).T
+
+
+def adapt(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]:
+    """Return the adapted scan, and what was said."""
+    lines: list[str] = []
+    weights = replace(fresh_weights(), sensor="hdl64e")
+    intensity = np.linspace(0, 0.6, len(xyz))
+    scan = adapter_for(weights, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")
+    return scan, lines[0]
+
+
+def assert_alike(scan: Scan, expected: Scan, atol: float) -> None:
+    np.testing.assert_allclose(scan.points, expected.points, atol=atol)
+    assert scan.ring is not None
+    assert expected.ring is not None
+    assert np.abs(scan.ring - expected.ring).max() <= 1
+
+
+@pytest.mark.parametrize("axes", UP)
+@pytest.mark.parametrize("unit", [1, 1000])
+def test_axes_and_millimetres_are_recognised_and_said(axes: str, unit: float) -> None:
+    xyz = scan_xyz()
+    expected, usual = adapt(xyz)
+    scan, line = adapt(unit * in_axes(xyz, axes))
+    assert_alike(scan, expected, atol=1e-4)
+    assert f"--axes {axes}" in line
+    assert ("--unit mm" in line) == (unit == 1000)
+    assert "--" not in usual
+
+
+@pytest.mark.parametrize("tilt", [(8, 0), (-8, 0), (0, 8), (0, -8), (6, -12)])
+@pytest.mark.parametrize("axes", ["x-forward", "z-forward"])
+def test_a_tilted_scan_is_levelled(tilt: tuple[float, float], axes: str) -> None:
+    xyz = scan_xyz()
+    scan, line = adapt(in_axes(tilted(xyz, *tilt), axes))
+    ground = find_ground(scan.points[:, :3].astype(np.float64))
+    assert ground is not None
+    assert ground.tilt < 0.3
+    assert ground.height == pytest.approx(1.73, abs=0.1)
+    np.testing.assert_allclose(scan.points[:, 2], xyz[:, 2], atol=0.15)
+    assert "--rotate 0," in line
+
+
+@pytest.mark.parametrize("rise", [1.73, 1.5, 3.4])
+@pytest.mark.parametrize("options", [{}, {"height": 1.73}, {"offset": (0, 0, -1.73)}])
+def test_an_origin_on_the_ground_or_below_it_is_mended(
+    rise: float, options: dict[str, Any]
+) -> None:
+    xyz = scan_xyz()
+    expected, _ = adapt(xyz)
+    scan, _ = adapt(xyz + np.array([0, 0, rise]), Sensor(**options))
+    assert_alike(scan, expected, atol=0.16)  # a difference in height of 0.15 m is left alone
+
+
+@pytest.mark.parametrize("z", [-1.73, 0, 1.73])
+def test_no_offset_hurts(z: float) -> None:
+    xyz = scan_xyz()
+    expected, _ = adapt(xyz)
+    scan, _ = adapt(xyz + np.array([1, 0, 1.73]), Sensor(offset=(-1, 0, z)))
+    assert_alike(scan, expected, atol=0.05)
+
+
+def test_an_offset_is_in_the_axes_of_the_file_if_these_are_guessed() -> None:
+    xyz = scan_xyz()
+    expected, _ = adapt(xyz)
+    moved = in_axes(xyz, "z-forward") + np.array([0.4, -1.2, 0.3])
+    for sensor in (Sensor(offset=(-0.4, 1.2, -0.3)), Sensor(unit="m", offset=(-0.4, 1.2, -0.3))):
+        assert_alike(adapt(moved, sensor)[0], expected, atol=0.05)
+
+
+def test_what_the_user_describes_is_not_guessed() -> None:
+    xyz = tilted(scan_xyz(), 8, 0)
+    scan, _ = adapt(xyz, Sensor(rotate=(0, 0, 0), height=1.73))
+    np.testing.assert_allclose(scan.points[:, :3], xyz, atol=1e-5)
+
+    down = in_axes(scan_xyz(), "z-down")
+    scan, _ = adapt(down, Sensor(axes="x-forward", height=1.73))
+    np.testing.assert_allclose(scan.points[:, :3], down, atol=1e-5)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("cm", 100), ("ft", 1 / 0.3048)])
+def test_other_units_are_refused_with_the_option_that_mends_it(unit: str, factor: float) -> None:
+    xyz = scan_xyz()
+    fails(lambda: adapt(factor * xyz), "a:", "--unit", unit)
+    expected, _ = adapt(xyz)
+    assert_alike(adapt(factor * xyz, Sensor(unit=unit))[0], expected, atol=1e-4)
+
+
+def test_map_coordinates_are_not_taken_for_millimetres() -> None:
+    xyz = scan_xyz() + np.array([4500, 300, 0])
+    assert find_frame(xyz, Sensor()).unit == "m"
+
+
+def test_the_walls_of_a_corridor_are_not_taken_for_the_ground() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-20, 20, 20_000)
+    y = np.where(rng.random(20_000) < 0.5, 1.2, -1.2) + rng.normal(0, 0.01, 20_000)
+    walls = np.column_stack([x, y, rng.uniform(-0.2, 2, 20_000)])
+    frame = find_frame(walls, Sensor())
+    assert (frame.axes, frame.pitch, frame.roll) == ("x-forward", 0, 0)
+
+
+def test_scans_that_sway_are_levelled_one_by_one() -> None:
+    weights = replace(fresh_weights(), sensor="hdl64e")
+    adapter = adapter_for(weights)
+    for seed, pitch in enumerate((8, -8, 8, -8, 8, -8, 8)):
+        xyz = scan_xyz(seed=seed)
+        cloud = Cloud(tilted(xyz, pitch, 0), np.linspace(0, 0.6, len(xyz)), name="a")
+        scan = adapter(cloud, "a")
+        np.testing.assert_allclose(scan.points[:, 2], xyz[:, 2], atol=0.2)

@@ -1,0 +1,186 @@
+"""Intensities of any range reach the networks as those of their training did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.formats.cloud import Cloud
+from amvnet.inference.inputs import adapter_for
+from amvnet.inference.segmenter import Segmenter
+from amvnet.scan import Scan
+from amvnet.sensors.ground import ground_height
+from amvnet.sensors.intensity import KEY, PROBABILITIES, QUANTILES, trained_intensity
+from amvnet.sensors.lidars import Sensor
+from amvnet.training.loaders import sample_intensities
+from amvnet.weights.file import Weights
+
+from fixtures.sensors import LASERS, place
+from fixtures.worlds import fails, fresh_weights, make_streets
+
+TRAINED = np.array(QUANTILES["hdl64e"])
+
+
+def scan_points(height: float = 1.73, seed: int = 0) -> np.ndarray:
+    """Return a scan whose intensities are distributed nearly as in the training."""
+    points, _ = place(LASERS["os1-64"], height, seed=seed)
+    draws = np.random.default_rng(seed).random(len(points))
+    points[:, 3] = np.interp(draws, PROBABILITIES, TRAINED) ** 1.1
+    return points
+
+
+def weights_with(training: dict[str, Any]) -> Weights:
+    return replace(fresh_weights(), sensor="hdl64e", training=training)
+
+
+def adapt(
+    clouds: list[Cloud], sensor: Sensor | None = None, training: dict[str, Any] | None = None
+) -> tuple[list[Scan], list[str]]:
+    """Return the adapted scans of one source, and what was said."""
+    lines: list[str] = []
+    adapter = adapter_for(weights_with(training or {}), sensor, lines.append)
+    return [adapter(cloud, "a") for cloud in clouds], lines
+
+
+def quantile_gap(intensity: np.ndarray) -> float:
+    """Return by how much the quarters of intensities differ from those of the training."""
+    quarters = np.quantile(intensity, (0.25, 0.5, 0.75))
+    return float(np.abs(quarters - TRAINED[4:7]).max())
+
+
+def test_intensities_like_those_of_the_training_stay_as_they_are() -> None:
+    points = scan_points()
+    (scan,), _ = adapt([Cloud(points[:, :3], points[:, 3], name="a")])
+    np.testing.assert_array_equal(scan.points[:, 3], points[:, 3])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda values: values * np.float32(0.01),
+        lambda values: values * 255,
+        lambda values: (values * 255).astype(np.uint8),
+        lambda values: (values * 65535).astype(np.uint16),
+        lambda values: (values * 6000).astype(np.uint16),  # 16 bits, nearly all dark
+        lambda values: values * 1e9,
+    ],
+)
+def test_intensities_of_any_range_become_those_of_the_training(
+    change: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    points = scan_points()
+    (scan,), _ = adapt([Cloud(points[:, :3], change(points[:, 3]), name="a")])
+    intensity = scan.points[:, 3]
+    assert quantile_gap(intensity) < 0.05
+    assert 0 <= intensity.min() < intensity.max() <= 1
+    assert np.corrcoef(intensity, points[:, 3])[0, 1] > 0.99
+
+
+@pytest.mark.parametrize("scale", [1, 255])
+def test_one_wild_value_changes_nothing_else(scale: int) -> None:
+    points = scan_points()
+    intensity = scale * points[:, 3]
+    wild = intensity.copy()
+    wild[7] = 300 * scale
+
+    (expected,), _ = adapt([Cloud(points[:, :3], intensity, name="a")])
+    (scan,), _ = adapt([Cloud(points[:, :3], wild, name="a")])
+    is_other = np.arange(len(points)) != 7
+    np.testing.assert_array_equal(scan.points[is_other], expected.points[is_other])
+    assert scan.points[7, 3] == 1
+
+
+def test_a_scale_that_the_user_gives_is_all_that_is_done() -> None:
+    points = scan_points()
+    (scan,), lines = adapt(
+        [Cloud(points[:, :3], 40 * points[:, 3], name="a")], Sensor(intensity_scale=1000)
+    )
+    np.testing.assert_allclose(scan.points[:, 3], 0.04 * points[:, 3], rtol=1e-6)
+    assert "0 to 1000" in lines[0]
+
+
+@pytest.mark.parametrize("intensity", [None, 0.0, 0.15, 255, np.nan])
+@pytest.mark.parametrize("share", [0.1, 0.25])
+def test_missing_intensities_are_filled_in_as_the_weights_need_it(
+    intensity: float | None, share: float
+) -> None:
+    xyz = scan_points()[:, :3]
+    values = None if intensity is None else np.full(len(xyz), intensity)
+    record = {"augment": {"no_intensity": share}}
+    training = {"range_net": record, "polar_net": record}
+
+    (scan, again), lines = adapt([Cloud(xyz, values, name="a")] * 2, training=training)
+    assert scan.valid.all()
+    np.testing.assert_array_equal(scan.points, again.points)
+    if share >= 0.2:
+        assert (scan.points[:, 3] == 0).all()
+    else:
+        assert quantile_gap(scan.points[:, 3]) < 0.02
+        assert "much worse" in lines[0]
+
+
+def test_another_range_later_in_a_source_is_that_of_another_sensor() -> None:
+    first = []
+    for seed in range(3):
+        points = scan_points(seed=seed)
+        first.append(Cloud(points[:, :3], points[:, 3], name="a"))
+
+    lines: list[str] = []
+    adapter = adapter_for(weights_with({}), say=lines.append)
+    adapter.learn("a", [lambda cloud=cloud: cloud for cloud in first])
+    for height in (1.0, 2.5):
+        points = scan_points(height)
+        scan = adapter(Cloud(points[:, :3], 255 * points[:, 3], name="b"), "a")
+        np.testing.assert_allclose(scan.points[:, 3], points[:, 3], atol=1e-6)
+        assert ground_height(scan.points[:, :3].astype(float)) == pytest.approx(1.73, abs=0.05)
+
+    points = scan_points()
+    scan = adapter(Cloud(points[:, :3], points[:, 3], name="c"), "a")
+    np.testing.assert_array_equal(scan.points, points)
+    assert len(lines) == 2
+
+
+@pytest.mark.parametrize(
+    "record", [None, 3, {KEY: []}, {KEY: "x" * 11}, {KEY: [1.0] * 10 + [0.0]}, {"augment": 1}]
+)
+def test_weights_that_carry_no_quantiles_have_those_of_their_sensor(record: Any) -> None:
+    trained = trained_intensity({"range_net": record}, "hdl64e")
+    assert trained is not None
+    assert not trained.is_optional
+    np.testing.assert_array_equal(trained.quantiles, TRAINED)
+    assert trained_intensity({"range_net": record}, "homemade") is None
+
+
+def test_training_measures_the_intensities_that_weights_carry(tmp_path: Path) -> None:
+    data = SemanticKitti(make_streets(tmp_path, ("00", "01"), 2))
+    records = data.records(("00", "01"))
+    quantiles = sample_intensities(data, records)
+
+    each = [np.quantile(data.read(record).points[:, 3], PROBABILITIES) for record in records]
+    np.testing.assert_allclose(quantiles, np.mean(each, axis=0), atol=1e-4)
+    trained = trained_intensity({"polar_net": {KEY: quantiles}}, "")
+    assert trained is not None
+    assert trained.quantiles == quantiles
+
+
+def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> None:
+    points = scan_points()
+    segmenter = Segmenter(weights_with({}))
+    wrong = points * np.array([1, 1, 1, 255], np.float32)
+    fails(lambda: segmenter(wrong), "[0, 1]", "divide")
+
+    wild = points.copy()
+    wild[7, 3] = 300
+    clipped = points.copy()
+    clipped[7, 3] = 1
+    np.testing.assert_array_equal(segmenter(wild).labels, segmenter(clipped).labels)
+    assert wild[7, 3] == 300
+
+    raw = {"range_net": {KEY: np.linspace(0, 255, 11).tolist()}}
+    assert len(Segmenter(weights_with(raw))(wrong).labels) == len(points)
