@@ -153,7 +153,7 @@ class PlainCloud:
         header_type = types[HEADER_TYPE]
         sequence = {"seq": 0} if _has_sequence(header_type) else {}
 
-        fields = []
+        fields: list[Any] = []
         for field in self.fields:
             fields.append(types[FIELD_TYPE](**vars(field)))
 
@@ -216,7 +216,7 @@ def pack_rgb(colors: np.ndarray) -> np.ndarray:
 def _encode(origin: Origin, columns: Mapping[str, np.ndarray], is_dense: bool) -> PlainCloud:
     """Return the message of (N,) little-endian columns."""
     numbers = {kind: number for number, kind in TYPES.items()}
-    fields = []
+    fields: list[PointField] = []
     layout = {}
     for name, values in columns.items():
         offset = ALIGNMENT * len(fields)  # no column is wider
