@@ -1,0 +1,1 @@
+"""A ROS 2 node that gives every point of a LiDAR scan its class, by AMVNet."""

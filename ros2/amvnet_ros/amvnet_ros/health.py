@@ -1,0 +1,143 @@
+"""What the node tells about itself once a second: how many clouds, how fast, how sure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from statistics import median
+from threading import Lock
+
+UNSURE = 0.9  # share of uncertain points; on scans that weights know it is 0.2 to 0.6
+
+
+class Level(Enum):
+    """Levels of a DiagnosticStatus, by name."""
+
+    OK = "OK"
+    WARN = "WARN"
+    ERROR = "ERROR"
+
+
+@dataclass(frozen=True)
+class Report:
+    """A DiagnosticStatus: level, message, and values by name."""
+
+    level: Level
+    message: str
+    values: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A cloud that was labelled.
+
+    Attributes:
+        seconds: from its arrival to its labels.
+        age: seconds from its stamp to its labels.
+        points: how many it has.
+        uncertain: the share of points on which the networks disagree; None for a single network.
+    """
+
+    seconds: float
+    age: float
+    points: int
+    uncertain: float | None
+
+
+@dataclass
+class _Period:
+    """What happened since the last report."""
+
+    labelled: list[Labelled] = field(default_factory=list)
+    received: int = 0
+    dropped: int = 0
+    refusal: str = ""
+
+
+class Health:
+    """Counts what happens to the clouds; any thread may call it."""
+
+    def __init__(self) -> None:
+        self._lock = Lock()
+        self._period = _Period()
+        self._received = 0
+        self._dropped = 0
+        self._refused = 0
+
+    def receive(self, drops: bool) -> None:
+        """Count a cloud that arrived.
+
+        Args:
+            drops: whether an older one is dropped for it.
+        """
+        with self._lock:
+            self._period.received += 1
+            self._period.dropped += drops
+            self._received += 1
+            self._dropped += drops
+
+    def label(self, labelled: Labelled) -> None:
+        """Count a cloud that was labelled."""
+        with self._lock:
+            self._period.labelled.append(labelled)
+
+    def refuse(self, reason: str) -> None:
+        """Count a cloud that could not be labelled."""
+        with self._lock:
+            self._period.refusal = reason
+            self._refused += 1
+
+    def report(self, seconds: float) -> Report:
+        """Return what happened since the last report, and begin a new period.
+
+        Args:
+            seconds: since the last report.
+        """
+        with self._lock:
+            period = self._period
+            self._period = _Period()
+            values = {
+                "clouds received": str(self._received),
+                "clouds dropped (late)": str(self._dropped),
+                "clouds refused": str(self._refused),
+            }
+        values |= _describe(period, seconds)
+        return Report(*_judge(period), values)
+
+
+def _describe(period: _Period, seconds: float) -> dict[str, str]:
+    """Return the values of a period; those of its clouds are medians, or maxima if so named."""
+    labelled = period.labelled
+    rate = len(labelled) / seconds if seconds > 0 else 0.0
+    values = {"clouds labelled per second": f"{rate:.2f}"}
+    if not labelled:
+        return values
+
+    latencies = [1000 * cloud.seconds for cloud in labelled]
+    ages = [1000 * cloud.age for cloud in labelled]
+    values["latency (ms)"] = f"{median(latencies):.0f}"
+    values["latency, maximum (ms)"] = f"{max(latencies):.0f}"
+    values["stamp to labels (ms)"] = f"{median(ages):.0f}"
+    values["points"] = f"{median(cloud.points for cloud in labelled):.0f}"
+    uncertain = _uncertain(period)
+    if uncertain is not None:
+        values["uncertain points (%)"] = f"{100 * uncertain:.1f}"
+    return values
+
+
+def _judge(period: _Period) -> tuple[Level, str]:
+    if period.refusal:
+        return Level.ERROR, period.refusal
+    if not period.received and not period.labelled:
+        return Level.WARN, "no clouds: check the topic, and its QoS"
+
+    uncertain = _uncertain(period)
+    if uncertain is not None and uncertain > UNSURE:
+        share = f"{100 * uncertain:.0f} % of the points are uncertain"
+        return Level.WARN, f"{share}: check sensor, height, axes and intensity_scale"
+    return Level.OK, "labelling"
+
+
+def _uncertain(period: _Period) -> float | None:
+    shares = [cloud.uncertain for cloud in period.labelled if cloud.uncertain is not None]
+    return median(shares) if shares else None

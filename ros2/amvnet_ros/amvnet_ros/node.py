@@ -1,0 +1,225 @@
+"""The node: subscribes to scans, publishes labels, a coloured cloud and diagnostics."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import traceback
+from array import array
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header, String
+
+from amvnet.data.formats.pointcloud2 import (
+    CLOUD_TYPE,
+    FIELD_TYPE,
+    HEADER_TYPE,
+    NANOSECONDS,
+    TIME_TYPE,
+    PlainCloud,
+)
+from amvnet.errors import InputError
+from amvnet_ros.health import Health, Labelled
+from amvnet_ros.newest import NewestOnly
+from amvnet_ros.segmentation import CloudSegmenter, Settings
+
+# Exit codes, as those of the command line.
+DONE = 0
+FAILED = 1
+WRONG_INPUT = 2
+
+TYPES = {CLOUD_TYPE: PointCloud2, FIELD_TYPE: PointField, HEADER_TYPE: Header, TIME_TYPE: Time}
+REPORT_PERIOD = 1.0  # seconds
+REFUSAL_PERIOD = 5.0  # seconds between lines of the log about broken clouds
+
+
+@dataclass(frozen=True)
+class _Arrival:
+    """A message, and when it arrived (seconds of `time.monotonic`)."""
+
+    message: Any
+    time: float
+
+
+class SegmentNode(Node):
+    """Labels the newest scan whenever the one before is done.
+
+    Raises:
+        InputError: if a parameter is wrong.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("amvnet")
+        self.exit_code = DONE
+        self._health = Health()
+        self._report_time = time.monotonic()
+
+        settings = self._declare_settings()
+        topic = self.resolve_topic_name("points")
+        self._segment = CloudSegmenter(settings, topic, self.get_logger().info)
+        self._hardware = settings.device
+
+        self._labels = self._create_cloud_publisher("~/labels")
+        self._cloud = self._create_cloud_publisher("~/cloud")
+        self._classes = self.create_publisher(String, "~/classes", latched_profile())
+        self._classes.publish(String(data=self._segment.classes()))
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+
+        self._worker = NewestOnly(self._label, self._fail)
+        self.create_subscription(
+            PointCloud2,
+            "points",
+            self._receive,
+            newest_cloud_profile(),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+        self.create_timer(REPORT_PERIOD, self._report)
+        self.get_logger().info(f"{settings.weights} on {settings.device} waits for {topic}")
+
+    def close(self) -> None:
+        """End the thread that labels."""
+        self._worker.close()
+
+    def _declare_settings(self) -> Settings:
+        values = {}
+        for parameter in fields(Settings):
+            descriptor = ParameterDescriptor(
+                description=parameter.metadata["description"], read_only=True
+            )
+            declared = self.declare_parameter(parameter.name, parameter.default, descriptor)
+            values[parameter.name] = declared.value
+        return Settings(**values)
+
+    def _create_cloud_publisher(self, topic: str) -> Any:
+        options = QoSOverridingOptions.with_default_policies()
+        return self.create_publisher(
+            PointCloud2, topic, newest_cloud_profile(), qos_overriding_options=options
+        )
+
+    def _receive(self, message: Any) -> None:
+        drops = self._worker.put(_Arrival(message, time.monotonic()))
+        self._health.receive(drops)
+
+    def _label(self, arrival: _Arrival) -> None:
+        """Label a message and publish the result; called in the worker's thread."""
+        try:
+            labelled = self._segment(arrival.message)
+        except InputError as error:
+            self._health.refuse(str(error))
+            self.get_logger().error(str(error), throttle_duration_sec=REFUSAL_PERIOD)
+            return
+
+        # Encoding takes time, too.
+        if self._labels.get_subscription_count():
+            self._labels.publish(to_ros(labelled.labels_message()))
+        if self._cloud.get_subscription_count():
+            self._cloud.publish(to_ros(labelled.cloud_message()))
+
+        age = self.get_clock().now().nanoseconds - labelled.origin.stamp
+        self._health.label(
+            Labelled(
+                seconds=time.monotonic() - arrival.time,
+                age=age / NANOSECONDS,
+                points=len(labelled.raw),
+                uncertain=labelled.uncertain_share,
+            )
+        )
+
+    def _fail(self, error: Exception) -> None:
+        """End the node: an error that is not the message's would come again."""
+        if not self.context.ok():  # stopped while it labelled: there is nobody to publish to
+            return
+        self.exit_code = FAILED
+        self.get_logger().fatal("".join(traceback.format_exception(error)))
+        rclpy.try_shutdown()
+
+    def _report(self) -> None:
+        now = time.monotonic()
+        report = self._health.report(now - self._report_time)
+        self._report_time = now
+
+        values = []
+        for key, value in report.values.items():
+            values.append(KeyValue(key=key, value=value))
+        status = DiagnosticStatus(
+            level=getattr(DiagnosticStatus, report.level.value),
+            name=f"{self.get_name()}: segmentation",
+            message=report.message,
+            hardware_id=self._hardware,
+            values=values,
+        )
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id="")
+        self._diagnostics.publish(DiagnosticArray(header=header, status=[status]))
+
+
+def newest_cloud_profile() -> QoSProfile:
+    """Return the profile for sensor data, but with only the newest cloud.
+
+    A new one for each topic: rclpy writes what the user overrides for a topic into its profile.
+    """
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=1,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+
+
+def latched_profile() -> QoSProfile:
+    """Return a profile with which late subscribers get the last message, too."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=1,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL,
+    )
+
+
+def to_ros(cloud: PlainCloud) -> Any:
+    """Return the PointCloud2 of rclpy."""
+    return cloud.to_message(TYPES, lambda data: array("B", data.tobytes()))
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the node until it is told to stop; return the exit code.
+
+    0 after the shutdown, 2 if a parameter is wrong (one line on stderr), 1 after any other error.
+    """
+    # A robot runs other programs, too: without this, torch's threads would wait for each other by
+    # spinning. Before torch is imported, because OpenMP reads it once.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+    rclpy.init(args=args)
+    try:
+        node = SegmentNode()
+    except (InputError, ParameterException) as error:
+        print(f"amvnet_ros: {error}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return WRONG_INPUT
+
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        node.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return node.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

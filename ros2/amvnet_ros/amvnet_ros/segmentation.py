@@ -1,0 +1,154 @@
+"""From a PointCloud2 to the labels of its points, without ROS."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.formats.cloud import reading
+from amvnet.data.formats.pointcloud2 import Origin, PlainCloud, encode_labels, read_message
+
+
+def _parameter(default: Any, description: str) -> Any:
+    return field(default=default, metadata={"description": description})
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The parameters of the node. ROS has no None: what is to be measured is empty or out of range.
+
+    Their meaning is that of the options of `amvnet predict`.
+    """
+
+    weights: str = _parameter("sim-hdl64e", "a name, a path, or hf-hub:OWNER/NAME")
+    method: str = _parameter("amvnet", "amvnet, rv, bev, ensemble, arithmetic or maximum")
+    device: str = _parameter("cpu", "cpu, cuda, cuda:1, ...")
+    engine: str = _parameter("auto", "auto, torch, compile or onnx")
+    precision: str = _parameter("float32", "float32, bfloat16, or on a GPU float16")
+    threads: int = _parameter(0, "of the processor; 0: as many as it has cores")
+    sensor: str = _parameter("", "a name such as os1-64, or a YAML file; empty: measured")
+    height: float = _parameter(-1.0, "metres over the ground; negative: measured")
+    intensity_scale: float = _parameter(0.0, "the largest possible intensity; 0: measured")
+    axes: str = _parameter("", "x-forward, y-forward, z-forward or z-down; empty: x-forward")
+    rotate: str = _parameter("", "yaw,pitch,roll in degrees that level the scan")
+    offset: str = _parameter("", "x,y,z in metres, added after the rotation")
+
+    def sensor_options(self) -> dict[str, Any]:
+        """Return the arguments of `make_sensor`; None stands for a value to be measured."""
+        return {
+            "sensor": self.sensor or None,
+            "height": self.height if self.height >= 0 else None,
+            "intensity_scale": self.intensity_scale or None,
+            "axes": self.axes or None,
+            "rotate": self.rotate or None,
+            "offset": self.offset or None,
+        }
+
+
+@dataclass(frozen=True)
+class LabelledCloud:
+    """The N points of a message with their labels, in their order.
+
+    Attributes:
+        origin: of the message.
+        xyz: (N, 3) coordinates as in the message, metres.
+        raw: (N,) raw ids; 0 for lost points.
+        colors: (N, 3) uint8 RGB of the classes.
+        uncertain: (N,) bool; None for a single network.
+        uncertain_share: of the points that are not lost; None for a single network.
+    """
+
+    origin: Origin
+    xyz: np.ndarray
+    raw: np.ndarray
+    colors: np.ndarray
+    uncertain: np.ndarray | None
+    uncertain_share: float | None
+
+    def labels_message(self) -> PlainCloud:
+        """Return a message with label and uncertain only, point by point as in the scan's."""
+        return encode_labels(self.origin, self.raw, self.uncertain)
+
+    def cloud_message(self) -> PlainCloud:
+        """Return a message with x, y, z, rgb, label and uncertain."""
+        return encode_labels(self.origin, self.raw, self.uncertain, self.xyz, self.colors)
+
+
+class CloudSegmenter:
+    """Labels messages of one sensor.
+
+    The sensor is measured in the first messages, as `amvnet predict` measures it in the first scans
+    of a folder.
+
+    Args:
+        settings: the parameters of the node.
+        topic: where the messages come from, for what is said.
+        say: is told once what was assumed of the sensor.
+
+    Raises:
+        InputError: if a parameter is wrong.
+    """
+
+    def __init__(self, settings: Settings, topic: str, say: Callable[[str], None]) -> None:
+        # Late, so that the node can set the environment before torch reads it.
+        import torch
+
+        import amvnet
+        from amvnet.inference.inputs import adapter_for
+        from amvnet.models.methods import METHODS
+        from amvnet.sensors.lidars import make_sensor
+
+        sensor = make_sensor(**settings.sensor_options())
+        if settings.threads > 0:
+            torch.set_num_threads(settings.threads)
+
+        segmenter = amvnet.load(
+            settings.weights,
+            device=settings.device,
+            method=settings.method,  # type: ignore[arg-type]  # checked there
+            precision=settings.precision,  # type: ignore[arg-type]
+            engine=settings.engine,
+            keep_memory=True,
+        )
+        self.taxonomy = segmenter.taxonomy
+        self._topic = topic
+        self._adapt = adapter_for(segmenter.weights, sensor, say)
+        self._segment = segmenter.by_ring()
+        self._has_two_networks = len(METHODS[segmenter.method].parts) > 1
+        self._colors = np.asarray(self.taxonomy.colors, np.uint8)
+
+    def __call__(self, message: Any) -> LabelledCloud:
+        """Label the points of a message.
+
+        Raises:
+            InputError: if the message is broken, or none of its points is usable.
+        """
+        with reading(self._topic, "a PointCloud2 message", "check the driver"):
+            cloud = read_message(message, self._topic)
+            origin = Origin.of(message)
+
+        scan = self._adapt(cloud, self._topic)
+        result = self._segment(scan)
+        uncertain = result.uncertain if self._has_two_networks else None
+        share = None if uncertain is None else float(uncertain[scan.valid].mean())
+        return LabelledCloud(
+            origin=origin,
+            xyz=cloud.xyz,
+            raw=self.taxonomy.to_raw(result.labels),
+            colors=self._colors[result.labels],
+            uncertain=uncertain,
+            uncertain_share=share,
+        )
+
+    def classes(self) -> str:
+        """Return the classes as JSON: id as in the field label, name, color (RGB)."""
+        taxonomy = self.taxonomy
+        names = ("unlabelled", *taxonomy.classes)
+        entries = []
+        for raw, name, color in zip(taxonomy.train_to_raw, names, taxonomy.colors, strict=True):
+            entries.append({"id": raw, "name": name, "color": list(color)})
+        return json.dumps(entries)

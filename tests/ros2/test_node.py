@@ -1,0 +1,296 @@
+"""The node labels messages as `amvnet predict` labels the same scans in a bag."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from array import array
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from threading import Event
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin
+
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.inference.segmenter import Segmenter
+from amvnet.weights.file import save
+
+from fixtures.ros import STORE, FakeNode, install, over_the_wire
+from fixtures.scan_writers import cloud_message, write_bag2
+from fixtures.worlds import fresh_weights, street, succeed
+
+WAIT = 60.0  # seconds: much more than needed, on a busy machine too
+RECORD = np.dtype(
+    {
+        "names": ["x", "y", "z", "rgb", "label", "uncertain"],
+        "formats": ["<f4", "<f4", "<f4", "<u4", "<u4", "u1"],
+        "offsets": [0, 4, 8, 12, 16, 20],
+        "itemsize": 24,
+    }
+)
+
+
+def scan(seed: int) -> np.ndarray:
+    points, _ = street(seed)
+    points[:, 3] = np.clip(points[:, 3], 0, 1)
+    return points
+
+
+def ros_message(points: np.ndarray, **changes: Any) -> Any:
+    """Return a message as rclpy gives it, with an array of bytes."""
+    message = cloud_message(STORE, points, **changes)
+    message.data = array("B", message.data.tobytes())
+    return message
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    save(fresh_weights(), path)
+    return path
+
+
+@pytest.fixture
+def start(monkeypatch: pytest.MonkeyPatch, weights: Path) -> Iterator[Callable[..., Any]]:
+    """Return a function that starts a node with some parameters."""
+    nodes = []
+
+    def start_node(**parameters: Any) -> Any:
+        module = install(monkeypatch, **{"weights": str(weights), **parameters})
+        nodes.append(module.SegmentNode())
+        return nodes[-1]
+
+    yield start_node
+    for node in nodes:
+        node.close()
+
+
+def send(node: Any, message: Any) -> None:
+    """Hand a message to the node, and wait until it is done with it."""
+    is_done = Event()
+    label = node._worker._work
+
+    def work(arrival: Any) -> None:
+        label(arrival)
+        is_done.set()
+
+    node._worker._work = work
+    receive, _ = node.callbacks["points"]
+    receive(message)
+    assert is_done.wait(WAIT)
+    node._worker._work = label
+
+
+def report(node: Any) -> Any:
+    """Let the node report, and return the DiagnosticStatus."""
+    (timer,) = node.timers
+    timer()
+    (status,) = node.publishers["/diagnostics"].messages[-1].status
+    return status
+
+
+@pytest.mark.parametrize("padded", [False, True])
+def test_labels_are_those_of_predict_on_a_bag(
+    start: Callable[..., Any], weights: Path, tmp_path: Path, padded: bool
+) -> None:
+    scans = [scan(0), scan(1)]
+    bag = write_bag2(tmp_path / "bag", {"/points": scans}, StoragePlugin.MCAP, padded=padded)
+    options = "--format npy --uncertain --height 1.7 --engine torch"
+    succeed(f"predict {bag} --weights {weights} --out {tmp_path / 'out'} {options}")
+
+    node = start(height=1.7, engine="torch")
+    for number, points in enumerate(scans):
+        send(node, ros_message(points, padded=padded))
+        cloud = over_the_wire(node.publishers["~/cloud"].messages[-1])
+        records = np.frombuffer(cloud.data, RECORD)
+
+        stem = tmp_path / "out/bag" / f"{number:06d}"
+        raw = np.load(f"{stem}.npy")
+        np.testing.assert_array_equal(records["label"], raw)
+        np.testing.assert_array_equal(records["uncertain"], np.load(f"{stem}.uncertain.npy"))
+        for axis, name in enumerate("xyz"):
+            np.testing.assert_array_equal(records[name], points[:, axis])
+
+        colors = np.array(SEMANTICKITTI.colors)[SEMANTICKITTI.to_train(raw)]
+        bits = colors[:, 0] << 16 | colors[:, 1] << 8 | colors[:, 2]
+        np.testing.assert_array_equal(records["rgb"], bits)
+    assert len(set(raw)) > 1
+
+
+def test_messages_keep_the_header_and_the_rows_of_the_scan(start: Callable[..., Any]) -> None:
+    node = start()
+    message = ros_message(scan(0), padded=True)
+    send(node, message)
+    for topic, names in (
+        ("~/labels", ["label", "uncertain"]),
+        ("~/cloud", ["x", "y", "z", "rgb", "label", "uncertain"]),
+    ):
+        published = over_the_wire(node.publishers[topic].messages[-1])
+        assert published.header == message.header
+        assert (published.height, published.width) == (message.height, message.width)
+        assert [field.name for field in published.fields] == names
+
+
+def test_nothing_is_encoded_that_nobody_subscribes_to(start: Callable[..., Any]) -> None:
+    node = start()
+    node.publishers["~/cloud"].subscriptions = 0
+    send(node, ros_message(scan(0)))
+    assert not node.publishers["~/cloud"].messages
+    assert len(node.publishers["~/labels"].messages) == 1
+
+
+def test_a_single_network_has_no_uncertain_points(start: Callable[..., Any]) -> None:
+    node = start(method="rv")
+    send(node, ros_message(scan(0)))
+    published = over_the_wire(node.publishers["~/labels"].messages[-1])
+    assert [field.name for field in published.fields] == ["label"]
+    assert "uncertain points (%)" not in {value.key for value in report(node).values}
+
+
+def test_a_broken_message_is_reported_and_the_next_one_labelled(start: Callable[..., Any]) -> None:
+    node = start()
+    send(node, ros_message(scan(0), width=10**6))
+    send(node, ros_message(scan(0), fields=[]))
+    message = ros_message(scan(0))
+    message.fields[0].datatype = 99
+    send(node, message)
+
+    status = report(node)
+    assert status.level == status.ERROR
+    assert "/points: expected" in status.message
+    lines = [text for level, text in node.logger.lines if level == "error"]
+    assert len(lines) == 3
+    assert not any("\n" in line for line in lines)
+
+    send(node, ros_message(scan(0)))
+    assert len(node.publishers["~/labels"].messages) == 1
+    assert report(node).level != status.ERROR
+
+
+def test_the_diagnostics_tell_latency_and_counts(start: Callable[..., Any]) -> None:
+    node = start()
+    assert report(node).level == 1  # no clouds
+
+    send(node, ros_message(scan(0)))  # its stamp is 1 s 2 ns, and the clock says 2.5 s
+    status = report(node)
+    values = {value.key: value.value for value in status.values}
+    assert status.hardware_id == "cpu"
+    assert values["clouds received"] == "1"
+    assert values["stamp to labels (ms)"] == "1500"
+    assert float(values["latency (ms)"]) > 0
+
+
+def test_the_classes_are_published_once_for_late_subscribers(start: Callable[..., Any]) -> None:
+    publisher = start().publishers["~/classes"]
+    (message,) = publisher.messages
+    classes = json.loads(message.data)
+    assert publisher.qos.durability == "latched"
+    assert [entry["id"] for entry in classes] == list(SEMANTICKITTI.train_to_raw)
+    assert [entry["name"] for entry in classes[1:]] == list(SEMANTICKITTI.classes)
+    assert [tuple(entry["color"]) for entry in classes] == list(SEMANTICKITTI.colors)
+
+
+def test_clouds_have_the_quality_of_service_of_sensor_data(start: Callable[..., Any]) -> None:
+    node = start()
+    _, qos = node.callbacks["points"]
+    for profile in (qos, node.publishers["~/labels"].qos, node.publishers["~/cloud"].qos):
+        assert profile.reliability == "best_effort"
+        assert profile.history == "keep_last"
+        assert profile.depth == 1
+
+
+def test_what_is_overridden_for_a_topic_does_not_change_the_others(
+    start: Callable[..., Any],
+) -> None:
+    node = start()
+    node.publishers["~/cloud"].qos.reliability = "reliable"  # as rclpy does
+    _, qos = node.callbacks["points"]
+    assert qos.reliability == node.publishers["~/labels"].qos.reliability == "best_effort"
+
+
+def test_an_error_of_the_program_ends_the_node_with_its_traceback(
+    start: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("of the test")
+
+    node = start()
+    monkeypatch.setattr(Segmenter, "many", fail)
+    receive, _ = node.callbacks["points"]
+    receive(ros_message(scan(0)))
+    node._worker._thread.join(WAIT)
+
+    assert node.exit_code == 1
+    ((_, text),) = [line for line in node.logger.lines if line[0] == "fatal"]
+    assert "ZeroDivisionError: of the test" in text
+
+
+@pytest.mark.parametrize(
+    ("parameters", "words"),
+    [
+        ({"weights": "nowhere"}, "nowhere"),
+        ({"axes": "sideways"}, "sideways"),
+        ({"rotate": "1,2"}, "rotate"),
+        ({"sensor": "nothing.yaml"}, "nothing.yaml"),
+        ({"engine": "steam"}, "steam"),
+        ({"method": "magic"}, "magic"),
+        ({"device": "abacus"}, "abacus"),
+        ({"height": "high"}, "height"),
+    ],
+)
+def test_a_wrong_parameter_is_one_line_and_exit_code_2(
+    parameters: dict[str, Any],
+    words: str,
+    weights: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("OMP_WAIT_POLICY", "active")  # undoes what `main` sets
+    module = install(monkeypatch, **{"weights": str(weights), **parameters})
+    assert module.main([]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert words in error
+
+
+def test_the_sensor_is_described_as_for_predict(start: Callable[..., Any]) -> None:
+    node = start(sensor="vlp16", height=0.9, axes="y-forward", intensity_scale=255.0)
+    sensor = node._segment._adapt.sensor
+    assert (sensor.name, sensor.beams) == ("vlp16", 16)
+    assert (sensor.height, sensor.axes, sensor.intensity_scale) == (0.9, "y-forward", 255.0)
+
+    assert start()._segment._adapt.sensor.height is None
+    assert start(height=0.0)._segment._adapt.sensor.height == 0
+
+
+def test_what_is_assumed_of_the_sensor_is_logged_once(start: Callable[..., Any]) -> None:
+    node = start()
+    for seed in range(3):
+        send(node, ros_message(scan(seed)))
+    lines = [text for level, text in node.logger.lines if "assumed" in text]
+    assert len(lines) == 1
+    assert lines[0].startswith("/points: assumed")
+
+
+def test_importing_the_node_does_not_import_torch() -> None:
+    """Then `main` can still set the environment that OpenMP reads."""
+    code = (
+        "import sys, pytest; from fixtures.ros import install\n"
+        "monkeypatch = pytest.MonkeyPatch(); install(monkeypatch)\n"
+        "assert 'torch' not in sys.modules"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+
+def test_the_stand_in_refuses_parameters_of_another_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, threads=1.5)
+    descriptor = SimpleNamespace(description="threads", read_only=True)
+    with pytest.raises(sys.modules["rclpy.exceptions"].ParameterException):
+        FakeNode("test").declare_parameter("threads", 0, descriptor)
