@@ -101,9 +101,9 @@ class Segmenter:
                 scan file, which is adapted to the weights as `amvnet predict` does.
 
         Raises:
-            InputError: if there is no valid point, more than a few intensities are out of range, the
-                model needs a ring index and there is none, or a file cannot be read or holds several
-                scans.
+            InputError: if there is no valid point, more than a few intensities are out of range,
+                the model needs a ring index and there is none, or a file cannot be read or holds
+                several scans.
         """
         if not isinstance(points, Path | str):
             return self.many([points])[0]
