@@ -20,13 +20,13 @@ bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN
 	$(BIN)/amvnet bench --recipe semantickitti $(SCAN)
 
 lint: .venv/installed
-	$(BIN)/ruff check src ros2 tests benchmarks docs
-	$(BIN)/ruff format --check src ros2 tests benchmarks
+	$(BIN)/ruff check src ros2 docker tests benchmarks docs
+	$(BIN)/ruff format --check src ros2 docker tests benchmarks
 	$(BIN)/mypy
 
 format: .venv/installed
-	$(BIN)/ruff check --fix src ros2 tests benchmarks docs
-	$(BIN)/ruff format src ros2 tests benchmarks
+	$(BIN)/ruff check --fix src ros2 docker tests benchmarks docs
+	$(BIN)/ruff format src ros2 docker tests benchmarks
 
 # torch first and by itself: pinned, so that no other build is drawn in.
 .venv/installed: pyproject.toml constraints.txt
