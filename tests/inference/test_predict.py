@@ -25,6 +25,7 @@ from amvnet.inference.predict import NetworkSegmentation
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
 from amvnet.weights.file import save
+from amvnet.written import WrittenFiles
 
 from fixtures.counted_scans import Counter, counted_scans
 from fixtures.worlds import files, fresh_weights, refusal, run_cli, street, succeed
@@ -247,6 +248,7 @@ def test_what_a_killed_run_left_half_written_is_taken_away(
         part.write_bytes(b"whole")
     part.write_bytes(b"half")  # under the name that a file has until it is whole
     Journal(tmp_path, settings_of(world)).add("000000.npz")
+    WrittenFiles(tmp_path).claim([Path("000000.label")])
 
     succeed(predict(world, tmp_path))
     assert files(tmp_path) == files(whole) | {".notes.part"}

@@ -266,7 +266,8 @@ class Pipeline:
                             yield outcome.scan, outcome.fault
                             continue
                         writing.append((outcome.scan, writer.submit(self._write, outcome)))
-                        while len(writing) > AHEAD:
+                        # Those that are written are yielded at once, so that the journal has them.
+                        while writing and (len(writing) > AHEAD or writing[0][1].done()):
                             yield _wait(*writing.popleft())
                 while writing:
                     yield _wait(*writing.popleft())
