@@ -30,6 +30,8 @@ def predict(
     batch: int = 1,
     at_once: int | None = None,
     topic: str | None = None,
+    columns: str | None = None,
+    dtype: str | None = None,
     sensor: str | None = None,
     height: float | None = None,
     intensity_scale: float | None = None,
@@ -40,7 +42,7 @@ def predict(
     """Segment datasets, scans, bags, or folders of scans.
 
     Args:
-        inputs: datasets, scan files, bags, or folders of these.
+        inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
         weights: a weights file, or the name of a built-in one.
         out: folder for the labels.
         method: the whole of AMVNet, or a part of it.
@@ -58,7 +60,11 @@ def predict(
         batch: scans that go through the networks at a time; more than one suits a GPU.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
-        topic: of bags, the topic of the scans; default: the only one with PointCloud2.
+        topic: of bags, the topic of the scans; default: the only one with scans.
+        columns: of .bin, .npy and text files, what their columns hold, in order: x,y,z,intensity,
+            ring, and any other name for a column to leave out; default: as the values suggest.
+        dtype: of .bin files, the type of the numbers: float32, float64, ..., or one for each of the
+            columns, separated by commas; default: as the values suggest.
         sensor: of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default:
             measured.
         height: of scan files, the sensor's height over the ground in metres; default: measured.
@@ -69,6 +75,7 @@ def predict(
         rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees.
         offset: of scan files, what to add to x,y,z after the rotation, in metres.
     """
+    from amvnet.data.formats.rows import parse_layout
     from amvnet.export.engines import use_engine
     from amvnet.inference.inputs import ScanOptions, adapter_for
     from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
@@ -95,7 +102,7 @@ def predict(
             inputs,
             segmenter,
             OutputOptions(out, format, scores, uncertain),
-            options=ScanOptions(parse_names(sequences), split, topic),
+            options=ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
             execution=ExecutionOptions(batch, at_once, resume, processes),
             adapter=adapter_for(segmenter.weights, given_sensor, say),
             progress=step,
