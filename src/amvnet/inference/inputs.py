@@ -11,6 +11,7 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
 from amvnet.data.datasets.open import open_if_dataset
+from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import NamedScan, ending_of, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
@@ -223,12 +224,17 @@ class FileReader:
         """
         if self.adapter is None:
             cloud = scan.read()
-            return LoadedScan(cloud.to_scan(), cloud.xyz)
+            return LoadedScan(cloud.to_scan(), _file_xyz(cloud))
 
         to_measure = self._first.pop(scan.source, [])
         self.adapter.learn(scan.source, [first.read for first in to_measure])
         cloud = scan.read()
-        return LoadedScan(self.adapter(cloud, scan.source), cloud.xyz)
+        return LoadedScan(self.adapter(cloud, scan.source), _file_xyz(cloud))
+
+
+def _file_xyz(cloud: Cloud) -> np.ndarray:
+    """Return the (N, 3) coordinates as they are in the file."""
+    return cloud.xyz if cloud.file_xyz is None else cloud.file_xyz
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from amvnet.data.formats.arrow import read_feather
 from amvnet.data.formats.bags import METADATA, Bag
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.e57 import E57
 from amvnet.data.formats.las import read_las
 from amvnet.data.formats.numpy_files import read_npy, read_npz
+from amvnet.data.formats.packets import Capture
 from amvnet.data.formats.pcd import read_pcd
 from amvnet.data.formats.ply import read_ply
 from amvnet.data.formats.raw import NUSCENES_ENDING, columns_of, read_raw
@@ -80,6 +83,20 @@ FORMATS = (
         open=Bag,
         extra="formats",
     ),
+    Format(
+        (".feather",),
+        "a table with named columns; of Argoverse 2, moved to the LiDARs by the log's calibration",
+        read=read_feather,
+        extra="datasets",
+    ),
+    Format((".e57",), "every scan, in the frame of the instrument", open=E57, extra="e57"),
+    Format(
+        (".pcap", ".pcapng"),
+        "the packets of a Velodyne, a scan per turn; of other sensors, an error with the command "
+        "that converts it",
+        open=Capture,
+        extra="packets",
+    ),
 )
 
 # Kinds of files that are known, but not read: what they are, and what to do.
@@ -88,6 +105,10 @@ UNREADABLE = {
         "Waymo's records",
         "they need TensorFlow; convert them to KITTI's .bin, for example with OpenPCDet or "
         "MMDetection3D",
+    ),
+    ".parquet": (
+        "Parquet, as of Waymo's version 2",
+        "convert it to KITTI's .bin, for example with OpenPCDet or MMDetection3D",
     ),
     ".lvx": ("a recording of Livox Viewer", "convert it to a bag with Livox's lvx_to_rosbag"),
     ".lvx2": ("a recording of Livox Viewer", "convert it to .pcd or .las in Livox Viewer"),
@@ -130,6 +151,14 @@ BEGINNINGS = {
     b"#ROSBAG": ".bag",
     b"\x89MCAP0\r\n": ".mcap",
     b"SQLite format 3\x00": ".db3",
+    b"ARROW1": ".feather",
+    b"FEA1": ".feather",
+    b"ASTM-E57": ".e57",
+    b"\xd4\xc3\xb2\xa1": ".pcap",
+    b"\xa1\xb2\xc3\xd4": ".pcap",
+    b"\x4d\x3c\xb2\xa1": ".pcap",
+    b"\xa1\xb2\x3c\x4d": ".pcap",
+    b"\x0a\x0d\x0d\x0a": ".pcapng",
 }
 HEAD = 4096  # bytes in which the beginning must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
