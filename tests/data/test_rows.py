@@ -145,6 +145,7 @@ HEADERS = {
     "units": "x [m],y [m],z [m],intensity,laser_id\n",
     "VeloView": "Points:0,Points:1,Points:2,intensity,laser_id\n",
     "ParaView": '"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","intensity","laser_id"\n',
+    "ouster-cli": "# X1 (m), Y1 (m), Z1 (m), REFLECTIVITY (%), CHANNEL\n",
     "comment": "# written by a tool\n# x,y,z,intensity,ring\n",
     "slashes": "//X,Y,Z,Intensity,ring\n",
     "byte order mark": "\ufeffx,y,z,intensity,ring\n",

@@ -184,6 +184,23 @@ class NamedScan:
     read: Callable[[], Cloud]
 
 
+def formats_table() -> str:
+    """Return the table of docs/own_scans.md, in Markdown: kinds of files, and what happens."""
+    lines = ["| Files | What is read | Needs |", "|---|---|---|"]
+    for kind in FORMATS:
+        extra = f"`[{kind.extra}]`" if kind.extra else ""
+        lines.append(f"| {_listing(kind.endings)} | {kind.content} | {extra} |")
+
+    lines += ["", "| Files that are not read | What to do |", "|---|---|"]
+    for ending, (content, advice) in UNREADABLE.items():
+        lines.append(f"| `{ending}`, {content} | {advice} |")
+    return "\n".join(lines) + "\n"
+
+
+def _listing(endings: tuple[str, ...]) -> str:
+    return ", ".join(f"`{ending}`" for ending in endings)
+
+
 def find_scans(path: Path | str) -> list[Path]:
     """Return the scan files and bags that a text names, sorted by name.
 

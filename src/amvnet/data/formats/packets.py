@@ -21,7 +21,8 @@ LEAST = 16  # bytes of a packet's header in a capture
 
 # What other sensors send, by what turns a capture of it into files that are read.
 CONVERTERS = {
-    "Ouster": "run ouster-cli source FILE.pcap save FILE.pcd (of ouster-sdk) and read the .pcd",
+    "Ouster": "pip install ouster-sdk, run ouster-cli source FILE.pcap save FILE.csv, and give the "
+    "folder of the .csv",
     "Hesai": "export it as .pcd in PandarView 2, or as a bag with hesai_ros_driver",
     "Livox": "convert it to a bag with livox_ros_driver2",
     "RoboSense": "convert it to a bag with rslidar_sdk (msg_source 3)",

@@ -30,6 +30,7 @@ SEPARATORS: tuple[tuple[str | None, str], ...] = (
 )
 # Names of coordinates that other programs write, such as "Points:0" in ParaView and VeloView.
 POINTS = re.compile(r"points?(?:_m_xyz)?[:_](\d)")
+FIRST_RETURN = re.compile(r"([xyz])1")  # "X1 (m)" by ouster-cli
 UNITS = re.compile(r"\s*[\[(].*$")  # as in "x [m]"
 ADVICE = "write a line x y z intensity per point"
 
@@ -148,6 +149,9 @@ def _uncomment(line: str) -> str:
 def _clean_name(name: str) -> str:
     """Return the name of a column without quotes and units; "x" for "Points:0"."""
     bare = UNITS.sub("", name.strip().strip("\"'").strip()).lower()
+    first = FIRST_RETURN.fullmatch(bare)
+    if first:
+        return first[1]
     match = POINTS.fullmatch(bare)
     return "xyz"[int(match[1])] if match and int(match[1]) < 3 else bare
 
