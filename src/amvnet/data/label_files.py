@@ -14,6 +14,7 @@ from amvnet.data.formats.cloud import reading, split_records
 from amvnet.data.formats.las import check_header, require_laspy
 from amvnet.data.formats.pcd import read_fields
 from amvnet.data.formats.ply import read_vertices
+from amvnet.data.formats.pointcloud2 import pack_rgb
 from amvnet.data.scan_files import check_count, read_labels, write_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -197,10 +198,7 @@ def _write_ply(path: Path, points: LabelledPoints) -> None:
 def _write_pcd(path: Path, points: LabelledPoints) -> None:
     columns = _coordinates(points.xyz)
 
-    # PCL stores the three bytes of a colour as the bits of a float.
-    red, green, blue = points.colors.astype(np.uint32).T
-    columns["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
-
+    columns["rgb"] = pack_rgb(points.colors)
     columns["label"] = points.raw
     table = _to_records(columns | _uncertain_column(points.uncertain))
 
