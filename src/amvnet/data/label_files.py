@@ -137,9 +137,20 @@ def write_scan_labels(
         if kind == "npy":
             np.save(part, raw)
         else:
-            colors = np.asarray(taxonomy.colors, dtype=np.uint8)[ids]
-            POINT_WRITERS[kind](part, LabelledPoints(xyz, raw, colors, uncertain))
+            POINT_WRITERS[kind](part, label_points(xyz, ids, taxonomy, uncertain))
     return path
+
+
+def label_points(
+    xyz: np.ndarray, ids: np.ndarray, taxonomy: Taxonomy, uncertain: np.ndarray | None
+) -> LabelledPoints:
+    """Return the points with the raw ids and colours of (N,) train ids.
+
+    Raises:
+        InputError: if an id is outside 0..K.
+    """
+    raw = taxonomy.to_raw(ids)
+    return LabelledPoints(xyz, raw, np.asarray(taxonomy.colors, dtype=np.uint8)[ids], uncertain)
 
 
 def read_scan_labels(path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:

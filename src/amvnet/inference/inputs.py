@@ -9,13 +9,14 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
+from amvnet.data import label_bags
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
 from amvnet.data.datasets.open import open_if_dataset
-from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.cloud import Cloud, Message
 from amvnet.data.formats.detect import NamedScan, ending_of, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.label_files import KINDS, read_scan_labels, write_scan_labels
+from amvnet.data.label_files import KINDS, label_points, read_scan_labels, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.progress import Say, say_nothing
@@ -62,7 +63,7 @@ class LabelFormat:
     """How labels of scan files are written.
 
     Attributes:
-        kind: one of `label_files.KINDS`.
+        kind: one of `label_files.KINDS` or `label_bags.KINDS`.
         taxonomy: turns train ids into the raw ids that are written.
     """
 
@@ -208,6 +209,7 @@ class FileReader:
 
     def __init__(self, adapter: ScanAdapter | PlainAdapter | None) -> None:
         self.adapter = adapter
+        self.messages: dict[str, Message] = {}  # of scans in bags, by name, until they are written
         self._first: dict[str, list[NamedScan]] = {}
 
     def add(self, scan: NamedScan) -> None:
@@ -223,13 +225,19 @@ class FileReader:
             InputError: if it cannot be read, or no point is usable.
         """
         if self.adapter is None:
-            cloud = scan.read()
+            cloud = self._read(scan)
             return LoadedScan(cloud.to_scan(), _file_xyz(cloud))
 
         to_measure = self._first.pop(scan.source, [])
         self.adapter.learn(scan.source, [first.read for first in to_measure])
-        cloud = scan.read()
+        cloud = self._read(scan)
         return LoadedScan(self.adapter(cloud, scan.source), _file_xyz(cloud))
+
+    def _read(self, scan: NamedScan) -> Cloud:
+        cloud = scan.read()
+        if cloud.message is not None:
+            self.messages[scan.name] = cloud.message
+        return cloud
 
 
 def _file_xyz(cloud: Cloud) -> np.ndarray:
@@ -278,6 +286,11 @@ class FileScan:
         self, out: Path, form: LabelFormat, labels: Labels, file_xyz: np.ndarray | None
     ) -> Path:
         assert file_xyz is not None
+        message = self.reader.messages.pop(self.scan.name, None)
+        if form.kind in label_bags.KINDS:
+            assert message is not None  # predict checks that the scan is from a bag
+            points = label_points(file_xyz, labels.ids, form.taxonomy, labels.uncertain)
+            return label_bags.write_part(out, self.scan.name, form.kind, message, points)
         return write_scan_labels(
             out / self.scan.name,
             form.kind,

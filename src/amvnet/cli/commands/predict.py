@@ -10,7 +10,7 @@ from amvnet.cli.options import Split, join_processes, parse_names
 from amvnet.models.methods import MethodName, Precision
 
 EngineName = Literal["auto", "torch", "compile", "onnx"]
-FormatName = Literal["label", "npy", "ply", "pcd", "las"]
+FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
 
 
 def predict(
@@ -50,8 +50,8 @@ def predict(
         sequences: of datasets, these sequences or scenes instead, separated by commas.
         scores: also write the probabilities of both networks.
         resume: continue an interrupted run into the folder.
-        format: of scan files' labels: raw ids alone (label, npy), or coloured points (ply, pcd,
-            las).
+        format: of scan files' labels: raw ids alone (label, npy), coloured points (ply, pcd, las),
+            or, of bags, a bag of coloured points with the stamps of the scans (bag, mcap).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         device: cpu, cuda, cuda:1, ...
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or

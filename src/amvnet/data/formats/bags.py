@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from amvnet.data.formats.cloud import Cloud, reading
+from amvnet.data.formats.cloud import Cloud, Message, reading
 from amvnet.data.formats.livox import TYPES as LIVOX
-from amvnet.data.formats.livox import read_custom_message
-from amvnet.data.formats.pointcloud2 import read_message
+from amvnet.data.formats.livox import read_custom_message, read_header
+from amvnet.data.formats.pointcloud2 import Origin, read_message
 from amvnet.errors import InputError
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -103,11 +104,12 @@ class Bag:
             is_ros1 = self._ending == ".bag"
             deserialise = _deserialiser(is_ros1)
             connections = _connections(reader, self.topic)
-            for connection, _, data in reader.messages(connections=connections):
+            for connection, time, data in reader.messages(connections=connections):
                 if connection.msgtype == CLOUD:
-                    yield partial(_read_cloud_message, deserialise, data)
+                    read = partial(_read_pointcloud2, deserialise)
                 else:
-                    yield partial(read_custom_message, data, is_ros1)
+                    read = partial(_read_livox, is_ros1)
+                yield partial(read, data, self.topic, time)
 
 
 @contextmanager
@@ -145,8 +147,19 @@ def _deserialiser(is_ros1: bool) -> Callable[[bytes, str], Any]:
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
 
 
-def _read_cloud_message(deserialise: Callable[[bytes, str], Any], data: bytes, name: str) -> Cloud:
-    return read_message(deserialise(data, CLOUD), name)
+def _read_pointcloud2(
+    deserialise: Callable[[bytes, str], Any], data: bytes, topic: str, time: int, name: str
+) -> Cloud:
+    values = deserialise(data, CLOUD)
+    origin = Origin.of(values)
+    message = Message(topic, time, origin.stamp, origin.frame_id, origin.height)
+    return replace(read_message(values, name), message=message)
+
+
+def _read_livox(is_ros1: bool, data: bytes, topic: str, time: int, name: str) -> Cloud:
+    stamp, frame = read_header(data, is_ros1)
+    cloud = read_custom_message(data, is_ros1, name)
+    return replace(cloud, message=Message(topic, time, stamp, frame))
 
 
 def _connections(reader: Any, topic: str) -> list[Any]:

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 
 from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, split_records
+from amvnet.data.formats.pointcloud2 import NANOSECONDS
 from amvnet.errors import InputError
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
@@ -49,6 +50,14 @@ def read_custom_message(data: bytes, is_ros1: bool, name: str) -> Cloud:
     records = np.ndarray((count,), POINT, data, start, (stride,)) if count else np.empty(0, POINT)
     cloud = make_cloud(split_records(records), name)
     return Cloud(cloud.xyz, cloud.intensity, None, name, FULL_INTENSITY)
+
+
+def read_header(data: bytes, is_ros1: bool) -> tuple[int, str]:
+    """Return the stamp of a serialised CustomMsg, in nanoseconds, and the name of its frame."""
+    position = 4 if is_ros1 else ENCAPSULATION
+    seconds, nanoseconds, length = struct.unpack_from("<III", data, position)
+    frame = data[position + 12 : position + 12 + length].rstrip(b"\0")
+    return seconds * NANOSECONDS + nanoseconds, frame.decode("utf-8", "replace")
 
 
 def _find_points(data: bytes, origin: int, is_ros1: bool) -> tuple[int, int]:
