@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from importlib import metadata
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from amvnet.cli.main import main
+from amvnet.data.formats.detect import formats_table
 from amvnet.sensors.lidars import SENSORS
 
 from fixtures.scan_writers import write_bag1, write_pcd
@@ -55,6 +56,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         points.tofile(folder / name / "000000.bin")
         points.tofile(folder / name / "000001.bin")
 
+    rows = np.column_stack([points, np.arange(len(points)) % 16, np.zeros(len(points))])
+    rows.astype(np.float32).tofile(folder / "rows.bin")
     write_pcd(folder / "cloud.pcd", points * np.array([1, 1, 1, 255], np.float32), "binary")
     write_bag1(folder / "drive.bag", {"/lidar/top": [points], "/lidar/side": [points]})
     (folder / "robot.yaml").write_text(blocks("own_sensor.md", "yaml")[0])
@@ -68,7 +71,8 @@ def test_every_command_runs(
     words = shlex.split(command)
     if words[0] == "pip":
         (extra,) = re.findall(r"\[(\w+)\]", command)
-        assert extra in (metadata.metadata("amvnet").get_all("Provides-Extra") or [])
+        project = tomllib.loads((DOCS.parent / "pyproject.toml").read_text(encoding="utf-8"))
+        assert extra in project["project"]["optional-dependencies"]
         return
 
     assert words[0] == "amvnet"
@@ -110,6 +114,11 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
     # The measured height differs by some millimetres.
     heights = r"\d\.\d\d m over the ground \(moved by -\d\.\d\d m"
     assert re.sub(heights, "", printed) == re.sub(heights, "", " ".join(documented))
+
+
+def test_the_table_of_formats_is_that_of_the_code() -> None:
+    table = formats_table()
+    assert table in read_page("own_scans.md"), f"replace the table by this one:\n{table}"
 
 
 def test_the_names_of_sensors_are_those_that_are_known() -> None:

@@ -7,16 +7,18 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import laspy
 import numpy as np
 import plyfile
 import pytest
 from pypcd4 import PointCloud
+from rosbags.highlevel import AnyReader
 
 from amvnet.cli.commands import predict as verbs
-from amvnet.data.formats.detect import read_cloud
+from amvnet.data import label_bags
+from amvnet.data.formats.detect import list_scans, read_cloud
 from amvnet.data.label_files import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
@@ -115,7 +117,8 @@ def check_coordinates(kind: str, xyz: np.ndarray | None, expected: np.ndarray) -
 
 
 def test_every_kind_has_a_reader_here_and_is_offered_by_the_command_line() -> None:
-    assert set(READERS) == set(KINDS) == set(get_args(verbs.FormatName))
+    assert set(READERS) == set(KINDS)
+    assert {*KINDS, *label_bags.KINDS} == set(get_args(verbs.FormatName))
 
 
 @pytest.mark.parametrize("with_uncertain", [True, False])
@@ -369,3 +372,57 @@ def test_uncertain_points_next_to_scans_are_not_scans(world: Path, tmp_path: Pat
 def test_an_unknown_format_gives_an_error_of_one_line(world: Path, tmp_path: Path) -> None:
     message = failure(world, tmp_path, world / "scans/a.bin", "--format", "xyz")
     assert "ply" in message
+
+
+# --- bags ---
+
+
+@pytest.mark.parametrize("kind", label_bags.KINDS)
+def test_labels_of_a_bag_become_a_bag_with_its_stamps(
+    kind: str, world: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    bag = write_bag1(tmp_path / "drive.bag", {"/top": [some_points(60, seed) for seed in (1, 2)]})
+    options = ("--weights", world / "w.safetensors", "--out", out)
+    assert run_cli("predict", bag, *options, "--format", kind) == (0, "")
+    assert {name for name in files(out) if not name.startswith(".")} == {f"drive.{kind}"}
+    assert not list(out.glob(".drive*"))
+
+    assert run_cli("predict", bag, *options[:2], "--out", tmp_path / "ids")[0] == 0
+    scans = list(zip(list_scans(bag), list_scans(out / f"drive.{kind}"), strict=True))
+    assert len(scans) == 2
+    for index, (scan, labelled) in enumerate(scans):
+        first = scan.read()
+        second = labelled.read()
+        np.testing.assert_array_equal(second.xyz, first.xyz)
+        assert first.message is not None
+        assert second.message == replace(first.message, topic="/top/labels")
+
+        raw = np.fromfile(tmp_path / f"ids/drive/{index:06d}.label", np.uint32)
+        np.testing.assert_array_equal(labels_in(out / f"drive.{kind}", index), raw)
+
+
+def labels_in(path: Path, index: int) -> np.ndarray:
+    """Return the field `label` of a message of a bag."""
+    with AnyReader([path]) as reader:
+        messages = [
+            reader.deserialize(data, connection.msgtype)
+            for connection, _, data in reader.messages()
+        ]
+    message: Any = messages[index]
+    (offset,) = [field.offset for field in message.fields if field.name == "label"]
+    rows = message.data.reshape(-1, message.point_step)
+    return np.ascontiguousarray(rows[:, offset : offset + 4]).view("<u4").ravel()
+
+
+def test_only_bags_become_bags_and_none_is_overwritten(world: Path, tmp_path: Path) -> None:
+    bag = write_bag1(tmp_path / "drive.bag", {"/top": [some_points()]})
+    content = bag.read_bytes()
+    options = ("--weights", world / "w.safetensors", "--format", "bag", "--out")
+    code, message = run_cli("predict", bag, *options, tmp_path)
+    assert (code, message.count("\n")) == (2, 1)
+    assert bag.read_bytes() == content
+
+    code, message = run_cli("predict", world / "scans", *options, tmp_path / "out")
+    assert (code, message.count("\n")) == (2, 1)
+    assert "--format bag" in message

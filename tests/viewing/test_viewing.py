@@ -27,6 +27,7 @@ from amvnet.viewing.frames import RIGHT, WRONG, Frame
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page
+from fixtures.scan_writers import write_bag1
 from fixtures.worlds import (
     GOLDEN,
     commands_of,
@@ -307,6 +308,45 @@ def test_labels_are_read_with_the_classes_that_are_named(world: Path, tmp_path: 
     assert page.about["classes"][1:] == list(NUSCENES.classes)
     _, planes = page.scan(0)
     assert planes["labels"].tolist() == ids.tolist()
+
+
+@pytest.mark.parametrize("kind", ["npy", "ply", "pcd", "las"])
+def test_labels_of_every_format_of_predict_are_shown(
+    world: Path, tmp_path: Path, kind: str
+) -> None:
+    scan = world / "lone.bin"
+    weights = ("--weights", world / "w.safetensors", "--out", tmp_path / "labels")
+    assert run_cli("predict", scan, *weights, "--format", kind)[0] == 0
+
+    _, expected = view_page(tmp_path, scan, *weights[:2]).scan(0)
+    for labels in (tmp_path / "labels", tmp_path / f"labels/lone.{kind}"):
+        _, planes = view_page(tmp_path, scan, "--labels", labels).scan(0)
+        np.testing.assert_array_equal(planes["labels"], expected["amvnet"])
+
+
+def test_scans_are_read_as_predict_reads_them(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    points = np.fromfile(world / "lone.bin", np.float32).reshape(-1, 4)
+    expected, _ = view_page(tmp_path, world / "lone.bin").scan(0)
+    camera = np.column_stack([-points[:, 1], -points[:, 2], points[:, 0], points[:, 3]])
+    write_bag1(tmp_path / "a.bag", {"/camera": [camera], "/empty": [camera[:1]]})
+    capsys.readouterr()
+
+    options = ("--topic", "/camera", "--axes", "z-forward")
+    positions, _ = view_page(tmp_path, tmp_path / "a.bag", *options).scan(0)
+    np.testing.assert_allclose(positions, expected, atol=0.01)
+    assert "assumed intensity 0 to 1, axes z-forward" in capsys.readouterr().out
+
+    points[:, [2, 3, 0, 1]].astype(np.float64).tofile(tmp_path / "a.bin")
+    options = ("--columns", "z,intensity,x,y", "--dtype", "float64")
+    positions, _ = view_page(tmp_path, tmp_path / "a.bin", *options).scan(0)
+    np.testing.assert_allclose(positions, expected, atol=0.01)
+
+    options = ("--weights", str(world / "w.safetensors"), "--height", "1.5")
+    capsys.readouterr()
+    view_page(tmp_path, world / "lone.bin", *options)
+    assert "sensor 1.50 m over the ground" in capsys.readouterr().out
 
 
 def test_one_network_alone_has_no_doubts(world: Path, tmp_path: Path) -> None:

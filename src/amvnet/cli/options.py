@@ -15,7 +15,10 @@ if TYPE_CHECKING:
     from amvnet.distributed import Processes
     from amvnet.inference.score_files import ScorePair, Which
 
-Split = Literal["train", "val", "test", "all"]
+# Those from the fifth on are nuScenes' own.
+Split = Literal[
+    "train", "val", "test", "all", "mini_train", "mini_val", "train_detect", "train_track"
+]
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 SHOWN = 20  # names of sequences in a line

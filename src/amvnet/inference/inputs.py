@@ -9,12 +9,14 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
+from amvnet.data import label_bags
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
 from amvnet.data.datasets.open import open_if_dataset
+from amvnet.data.formats.cloud import Cloud, Message
 from amvnet.data.formats.detect import NamedScan, ending_of, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
-from amvnet.data.label_files import write_scan_labels
-from amvnet.data.scan_files import read_labels
+from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.label_files import KINDS, label_points, read_scan_labels, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.progress import Say, say_nothing
@@ -22,6 +24,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.adapt import MEASURED, ScanAdapter
 from amvnet.sensors.intensity import trained_intensity
 from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.plain import PlainAdapter
 from amvnet.weights.file import Weights
 
 
@@ -32,12 +35,14 @@ class ScanOptions:
     Attributes:
         sequences: of datasets, these sequences or scenes; None means those of `split`.
         split: of datasets, the official split.
-        topic: of bags; None means the only topic with PointCloud2 messages.
+        topic: of bags; None means the only topic with scans.
+        layout: of rows of numbers without names, what they hold.
     """
 
     sequences: Sequence[str] | None = None
     split: str = "all"
     topic: str | None = None
+    layout: RowLayout = UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -59,7 +64,7 @@ class LabelFormat:
     """How labels of scan files are written.
 
     Attributes:
-        kind: one of `label_files.KINDS`.
+        kind: one of `label_files.KINDS` or `label_bags.KINDS`.
         taxonomy: turns train ids into the raw ids that are written.
     """
 
@@ -214,8 +219,9 @@ class FileReader:
         adapter: adapts the scans; None reads them as they are.
     """
 
-    def __init__(self, adapter: ScanAdapter | None) -> None:
+    def __init__(self, adapter: ScanAdapter | PlainAdapter | None) -> None:
         self.adapter = adapter
+        self.messages: dict[str, Message] = {}  # of scans in bags, by name, until they are written
         self._first: dict[str, list[NamedScan]] = {}
 
     def add(self, scan: NamedScan) -> None:
@@ -231,13 +237,24 @@ class FileReader:
             InputError: if it cannot be read, or no point is usable.
         """
         if self.adapter is None:
-            cloud = scan.read()
-            return LoadedScan(cloud.to_scan(), cloud.xyz)
+            cloud = self._read(scan)
+            return LoadedScan(cloud.to_scan(), _file_xyz(cloud))
 
         to_measure = self._first.pop(scan.source, [])
         self.adapter.learn(scan.source, [first.read for first in to_measure])
+        cloud = self._read(scan)
+        return LoadedScan(self.adapter(cloud, scan.source), _file_xyz(cloud))
+
+    def _read(self, scan: NamedScan) -> Cloud:
         cloud = scan.read()
-        return LoadedScan(self.adapter(cloud, scan.source), cloud.xyz)
+        if cloud.message is not None:
+            self.messages[scan.name] = cloud.message
+        return cloud
+
+
+def _file_xyz(cloud: Cloud) -> np.ndarray:
+    """Return the (N, 3) coordinates as they are in the file."""
+    return cloud.xyz if cloud.file_xyz is None else cloud.file_xyz
 
 
 @dataclass(frozen=True)
@@ -268,19 +285,27 @@ class FileScan:
 
     @property
     def is_adapted(self) -> bool:
-        return self.reader.adapter is not None
+        return isinstance(self.reader.adapter, ScanAdapter)
 
     def load(self, labels: bool = False) -> LoadedScan:
         return self.reader.read(self.scan)
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-        label_path = path / f"{self.scan.name}.label" if path.is_dir() else path
-        return read_labels(label_path, np.uint32, count, taxonomy.to_train)
+        if path.is_dir():
+            stem = path / self.scan.name
+            paths = [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]
+            path = next(filter(Path.is_file, paths), paths[0])
+        return read_scan_labels(path, count, taxonomy)
 
     def write_labels(
         self, out: Path, form: LabelFormat, labels: Labels, file_xyz: np.ndarray | None
     ) -> Path:
         assert file_xyz is not None
+        message = self.reader.messages.pop(self.scan.name, None)
+        if form.kind in label_bags.KINDS:
+            assert message is not None  # predict checks that the scan is from a bag
+            points = label_points(file_xyz, labels.ids, form.taxonomy, labels.uncertain)
+            return label_bags.write_part(out, self.scan.name, form.kind, message, points)
         return write_scan_labels(
             out / self.scan.name,
             form.kind,
@@ -312,12 +337,13 @@ def open_inputs(
     inputs: Sequence[str],
     options: ScanOptions,
     taxonomy: Taxonomy | None = None,
-    adapter: ScanAdapter | None = None,
+    adapter: ScanAdapter | PlainAdapter | None = None,
 ) -> Inputs:
     """List the scans of all inputs.
 
     Args:
-        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
+        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, a folder of these, or
+            a pattern as `find_scans` takes it.
         options: which scans of the inputs to use.
         taxonomy: the classes, of weights or as the user names them. If None, they are those of the
             datasets; scan files have nuScenes' if they end in `.pcd.bin`, else SemanticKITTI's.
@@ -336,7 +362,7 @@ def open_inputs(
                 scans.append(DatasetScan(dataset, record))
             taxonomies.append(dataset.taxonomy)
         else:
-            files = list(list_scans(text, options.topic))
+            files = list(list_scans(text, options.topic, options.layout))
             for scan in files:
                 reader.add(scan)
                 scans.append(FileScan(scan, reader))

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from amvnet.data.formats.detect import READERS
+from amvnet.data.label_bags import KINDS as BAG_KINDS
 from amvnet.data.label_files import check_kind, write_uncertain
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
@@ -38,7 +39,8 @@ class OutputOptions:
 
     Attributes:
         folder: the folder of predictions.
-        kind: the format of scan files' labels, one of `label_files.KINDS`; datasets have their own.
+        kind: the format of scan files' labels, one of `label_files.KINDS` or `label_bags.KINDS`;
+            datasets have their own.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.
         uncertain: also write (N,) bool, the uncertain points, as `.uncertain.npy`.
@@ -55,7 +57,8 @@ class OutputOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        check_kind(self.kind)
+        if self.kind not in BAG_KINDS:
+            check_kind(self.kind)
 
     def paths_of(self, scan: InputScan) -> list[Path]:
         """Return the paths of a scan's files, relative to the folder."""

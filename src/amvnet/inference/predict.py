@@ -7,10 +7,14 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
+from amvnet.data import label_bags
+from amvnet.data.formats.bags import Bag
+from amvnet.data.formats.detect import BY_ENDING_OR_FOLDER, ending_of
+from amvnet.data.formats.rows import UNKNOWN
 from amvnet.distributed import Processes
 from amvnet.errors import InputError, SomeBroken
 from amvnet.inference.certainty import UncertainCount, Verdict
-from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.inputs import FileScan, InputScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.progress import Progress, Say, no_progress, say_nothing
@@ -64,17 +68,49 @@ def predict(
     adapter = adapter or adapter_for(segmenter.weights)
     opened = open_inputs(inputs, options, segmenter.taxonomy, adapter)
 
+    is_bag = output.kind in label_bags.KINDS
+    if is_bag:
+        _check_bags(opened.scans, output)
+
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
     segment = NetworkSegmentation(segmenter)
     pipeline = Pipeline(opened.scans, segment, output, segmenter.taxonomy, execution)
+    settings = _settings(segmenter, output, adapter)
+    if options.layout != UNKNOWN:
+        settings["layout"] = repr(options.layout)
+
+    faults: SomeBroken | None = None
     try:
-        written = pipeline.run(_settings(segmenter, output, adapter), progress)
-    except SomeBroken:
-        _report(segment, execution.processes, say)
-        raise
+        written = pipeline.run(settings, progress)
+    except SomeBroken as error:  # the others are written
+        faults = error
+    if is_bag and execution.processes.first:
+        names = [scan.name for scan in opened.scans if isinstance(scan, FileScan)]
+        label_bags.join_parts(output.folder, names, output.kind)
 
     _report(segment, execution.processes, say)
+    if faults is not None:
+        raise faults
     return written
+
+
+def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
+    """Raise InputError if labels cannot become bags: scans are in other files, or in these bags."""
+    label_bags.check_rosbags()
+    for scan in scans:
+        if not isinstance(scan, FileScan):
+            continue
+        if BY_ENDING_OR_FOLDER[ending_of(scan.path)].open is not Bag:
+            raise InputError(
+                f"{scan.path}: expected a bag for --format {output.kind}, found another file; "
+                "choose another format, such as ply"
+            )
+        path = label_bags.bag_path(output.folder, scan.name, output.kind)
+        if path.resolve() == scan.path.resolve():
+            raise InputError(
+                f"{scan.path}: expected another folder for the labels, found the bag's own; "
+                "change --out"
+            )
 
 
 class NetworkSegmentation:

@@ -16,8 +16,11 @@ from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_in
 from amvnet.inference.segmentation import Origin, Segmentation
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
-from amvnet.progress import Progress, no_progress
+from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
+from amvnet.sensors.adapt import ScanAdapter
+from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.plain import PlainAdapter
 
 # Colours for a dark background, RGB in 0..255. The official colour of points without a class is
 # black, which would hide them.
@@ -144,15 +147,19 @@ def choose_frames(
     inputs: Sequence[str],
     count: int,
     source: LabelSource,
-    sequences: Sequence[str] | None = None,
+    options: ScanOptions = ScanOptions(),
+    sensor: Sensor | None = None,
+    say: Say = say_nothing,
 ) -> Frames:
     """Choose up to `count` scans of the inputs, evenly spaced, to look at.
 
     Args:
-        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
+        inputs: as of `open_inputs`.
         count: the largest number of scans.
         source: where their labels come from, if anywhere.
-        sequences: of datasets, the sequences or scenes to choose from; None means all.
+        options: which scans of the inputs to choose from.
+        sensor: what is known of the sensor of scan files; the rest is measured for the weights.
+        say: is told what was assumed of the sensor.
 
     Raises:
         InputError: if an input or the labels are missing, one label file is named for several
@@ -166,9 +173,10 @@ def choose_frames(
             f"{labels_path}: expected a file or a folder of labels, found none; check the path"
         )
 
-    adapter = None if source.segmenter is None else adapter_for(source.segmenter.weights)
-    taxonomy = source.named_taxonomy()
-    opened = open_inputs(inputs, ScanOptions(sequences), taxonomy, adapter)
+    adapter: ScanAdapter | PlainAdapter = PlainAdapter(sensor, say)
+    if source.segmenter is not None:
+        adapter = adapter_for(source.segmenter.weights, sensor, say)
+    opened = open_inputs(inputs, options, source.named_taxonomy(), adapter)
     scans = opened.scans
     if labels_path is not None and labels_path.is_file() and len(scans) > 1:
         raise InputError(

@@ -24,6 +24,8 @@ def fuse(
     sequences: str | None = None,
     taxonomy: str | None = None,
     topic: str | None = None,
+    columns: str | None = None,
+    dtype: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Fuse the scores of any two models: labels by the point head, or by the ensemble.
@@ -45,10 +47,13 @@ def fuse(
         sequences: of datasets, these sequences or scenes instead, separated by commas.
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the
             head's or the inputs'.
-        topic: of bags, the topic of the scans; default: the only one with PointCloud2.
+        topic: of bags, the topic of the scans; default: the only one with scans.
+        columns: of .bin, .npy and text files, what their columns hold, as of predict.
+        dtype: of .bin files, the type of the numbers, as of predict.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
     from amvnet.data.datasets.select import taxonomy_named
+    from amvnet.data.formats.rows import parse_layout
     from amvnet.inference.fuse_files import FusionOptions, fuse_files
     from amvnet.inference.inputs import ScanOptions
     from amvnet.inference.pipeline import OutputOptions
@@ -69,7 +74,7 @@ def fuse(
             pair,
             OutputOptions(out, overwrite=overwrite),
             FusionOptions(weights, tau, classes),
-            options=ScanOptions(parse_names(sequences), split, topic),
+            options=ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
             progress=step,
         )
     say(f"{written} label files in {out}; the two models disagree on {uncertain:.1%} of the points")

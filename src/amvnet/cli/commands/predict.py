@@ -10,7 +10,7 @@ from amvnet.cli.options import Split, join_processes, parse_names
 from amvnet.models.methods import MethodName, Precision
 
 EngineName = Literal["auto", "torch", "compile", "onnx"]
-FormatName = Literal["label", "npy", "ply", "pcd", "las"]
+FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
 
 
 def predict(
@@ -30,6 +30,8 @@ def predict(
     batch: int = 1,
     at_once: int | None = None,
     topic: str | None = None,
+    columns: str | None = None,
+    dtype: str | None = None,
     sensor: str | None = None,
     height: float | None = None,
     intensity_scale: float | None = None,
@@ -42,7 +44,7 @@ def predict(
     """Segment datasets, scans, bags, or folders of scans.
 
     Args:
-        inputs: datasets, scan files, bags, or folders of these.
+        inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
         weights: a weights file, or the name of a built-in one.
         out: folder for the labels.
         method: the whole of AMVNet, or a part of it.
@@ -50,8 +52,8 @@ def predict(
         sequences: of datasets, these sequences or scenes instead, separated by commas.
         scores: also write the probabilities of both networks.
         resume: continue an interrupted run into the folder.
-        format: of scan files' labels: raw ids alone (label, npy), or coloured points (ply, pcd,
-            las).
+        format: of scan files' labels: raw ids alone (label, npy), coloured points (ply, pcd, las),
+            or, of bags, a bag of coloured points with the stamps of the scans (bag, mcap).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         device: cpu, cuda, cuda:1, ...
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
@@ -60,7 +62,11 @@ def predict(
         batch: scans that go through the networks at a time; more than one suits a GPU.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
-        topic: of bags, the topic of the scans; default: the only one with PointCloud2.
+        topic: of bags, the topic of the scans; default: the only one with scans.
+        columns: of .bin, .npy and text files, what their columns hold, in order: x,y,z,intensity,
+            ring, and any other name for a column to leave out; default: as the values suggest.
+        dtype: of .bin files, the type of the numbers: float32, float64, ..., or one for each of the
+            columns, separated by commas; default: as the values suggest.
         sensor: of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default:
             measured.
         height: of scan files, the sensor's height over the ground in metres; default: measured.
@@ -75,6 +81,7 @@ def predict(
             sensor is at the origin.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
+    from amvnet.data.formats.rows import parse_layout
     from amvnet.export.engines import use_engine
     from amvnet.inference.inputs import ScanOptions, adapter_for
     from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
@@ -102,7 +109,7 @@ def predict(
             inputs,
             segmenter,
             OutputOptions(out, format, scores, uncertain, overwrite),
-            options=ScanOptions(parse_names(sequences), split, topic),
+            options=ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
             execution=ExecutionOptions(batch, at_once, resume, processes),
             adapter=adapter_for(segmenter.weights, given_sensor, say),
             progress=step,

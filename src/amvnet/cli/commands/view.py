@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import parse_names
+from amvnet.cli.options import Split, parse_names
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,33 +21,68 @@ def view(
     html: Path | None = None,
     save: Path | None = None,
     scans: int = 5,
+    split: Split = "all",
     sequences: str | None = None,
     taxonomy: str | None = None,
     device: str = "cpu",
+    topic: str | None = None,
+    columns: str | None = None,
+    dtype: str | None = None,
+    sensor: str | None = None,
+    height: float | None = None,
+    intensity_scale: float | None = None,
+    axes: str | None = None,
+    rotate: str | None = None,
+    offset: str | None = None,
 ) -> None:
     """Look at scans, labels, uncertain points and errors in 3D: in Rerun, or in a browser.
 
     Args:
-        inputs: datasets, scan files, or folders of scans.
-        labels: a folder of labels as predict writes them, or the label file of one scan.
+        inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
+        labels: a folder of labels as predict writes them, in any of its formats, or the label file
+            of one scan.
         weights: instead, a weights file, or the name of a built-in one: the labels of every method
             are shown.
         html: write a page for a browser instead of opening a window.
         save: write a recording of Rerun instead of opening a window.
         scans: at most this many, evenly spaced.
-        sequences: of datasets, which sequences or scenes, separated by commas; default: all.
+        split: of datasets, the official split.
+        sequences: of datasets, these sequences or scenes instead, separated by commas.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
         device: cpu, cuda, cuda:1, ...
+        topic: of bags, the topic of the scans; default: the only one with scans.
+        columns: of .bin, .npy and text files, what their columns hold, as of predict.
+        dtype: of .bin files, the type of the numbers, as of predict.
+        sensor: of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default:
+            measured.
+        height: of scan files, the sensor's height over the ground in metres; default: measured.
+        intensity_scale: of scan files, the largest possible intensity; default: as the values
+            suggest.
+        axes: of scan files, x-forward (y left), y-forward (x right), z-forward (y down) or z-down
+            (y right).
+        rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees.
+        offset: of scan files, what to add to x,y,z after the rotation, in metres.
     """
+    from amvnet.data.formats.rows import parse_layout
     from amvnet.files import make_folder
+    from amvnet.inference.inputs import ScanOptions
     from amvnet.inference.segmenter import Segmenter
     from amvnet.models.methods import widest_method
+    from amvnet.sensors.lidars import make_sensor
     from amvnet.viewing.frames import LabelSource, choose_frames
     from amvnet.viewing.rerun_log import check_rerun, check_window
     from amvnet.weights.file import load
 
     if labels is not None and weights is not None:
         raise InputError("expected --labels or --weights, found both; give one of them")
+    given_sensor = make_sensor(
+        sensor,
+        height=height,
+        intensity_scale=intensity_scale,
+        axes=axes,
+        rotate=rotate,
+        offset=offset,
+    )
     if save is not None:
         check_rerun()
     elif html is None:
@@ -62,7 +97,8 @@ def view(
         loaded = load(weights)
         segmenter = Segmenter(loaded, device, widest_method(loaded.parts), keep_memory=True)
     source = LabelSource(segmenter, labels, taxonomy)
-    frames = choose_frames(inputs, scans, source, parse_names(sequences))
+    options = ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype))
+    frames = choose_frames(inputs, scans, source, options, given_sensor, say)
     _show(frames, _title(inputs, weights), html, save)
 
 

@@ -36,7 +36,7 @@ def _scene_names(numbers: str) -> frozenset[str]:
     return frozenset(names)
 
 
-SPLITS = ("train", "val", "test", "all")
+SPLITS = ("train", "val", "test", "all", "mini_train", "mini_val", "train_detect", "train_track")
 # The official splits. A scene in none of these belongs to "train".
 MINI_TRAIN = _scene_names("61 553 655 757 796 1077 1094 1100")
 MINI_VAL = _scene_names("103 916")
@@ -44,6 +44,12 @@ VAL = _scene_names(
     "3 12-18 35-36 38-39 92-110 221 268-278 329-332 344-346 519-524 552-565 625-627 629-630 "
     "632-638 770-771 775 777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 "
     "1059-1073"
+)
+# "train" in two halves, for networks that learn from the output of others: "train_detect" has
+# those of its scenes that are listed here, "train_track" the others.
+TRAIN_DETECT = _scene_names(
+    "1-2 41-76 161-176 190-214 254-324 347-375 382 420-439 457-480 566-583 665-689 739-769 868-991 "
+    "1011-1025 1074-1105"
 )
 
 
@@ -92,7 +98,7 @@ class NuScenes:
         return any(root.glob("v1.0-*/sample_data.json"))
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the scenes of "train", "val", "test" or "all" that are on disk."""
+        """Return the scenes of a split that are on disk, a name in `SPLITS`."""
         scenes = self.scenes(split)
         folder = self.root / "samples" / CHANNEL
         file_names = set(os.listdir(folder)) if folder.is_dir() else set()
@@ -108,7 +114,8 @@ class NuScenes:
             raise InputError(
                 f"{folder}: expected scans of {split} scenes "
                 f"({len(scenes)} in the tables of {self.version}), found none; "
-                f"name the scenes to use, such as {', '.join(examples)}"
+                "give --split all, or name the scenes to use, such as "
+                f"--sequences {','.join(examples)}"
             )
 
         return tuple(present)
@@ -117,7 +124,8 @@ class NuScenes:
         """Return the scenes of a split that the tables list, on disk or not.
 
         Args:
-            split: "train", "val", "test" or "all".
+            split: a name in `SPLITS`. In the mini version, "train" and "val" mean "mini_train" and
+                "mini_val".
 
         Raises:
             InputError: if the split is unknown.
@@ -130,7 +138,7 @@ class NuScenes:
 
         scenes = []
         for scene in sorted(self._records_by_scene):
-            if split in ("all", self._split(scene).removeprefix("mini_")):
+            if self._is_in(scene, split):
                 scenes.append(scene)
         return tuple(scenes)
 
@@ -318,6 +326,20 @@ class NuScenes:
             labels_path=labels_path,
             prediction=f"lidarseg/{self._split(scene)}/{token}_lidarseg.bin",
         )
+
+    def _is_in(self, scene: str, split: str) -> bool:
+        """Return whether a scene belongs to a split."""
+        if split == "mini_val":
+            return scene in MINI_VAL
+        if split == "mini_train":
+            return scene in MINI_TRAIN
+
+        own = self._split(scene).removeprefix("mini_")
+        if split == "train_detect":
+            return own == "train" and scene in TRAIN_DETECT
+        if split == "train_track":
+            return own == "train" and scene not in TRAIN_DETECT
+        return split in ("all", own)
 
     def _split(self, scene: str) -> str:
         """Return the official split of a scene in this version: "train", "mini_val", ..."""

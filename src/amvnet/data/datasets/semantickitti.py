@@ -64,7 +64,7 @@ class SemanticKitti:
             raise InputError(
                 f"{self.root}: expected a sequence of the {split} split "
                 f"({', '.join(splits[split])}), found {', '.join(present)}; "
-                "name the sequences to use"
+                f"give --split all, or name the sequences to use, such as --sequences {present[0]}"
             )
 
         return sequences

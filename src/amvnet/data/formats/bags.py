@@ -1,25 +1,46 @@
-"""Scans in ROS bags (ROS 1, ROS 2, mcap), by rosbags: the PointCloud2 messages of one topic."""
+"""Scans in ROS bags (ROS 1, ROS 2, mcap), by rosbags: the messages of one topic."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from amvnet.data.formats.cloud import Cloud, reading
-from amvnet.data.formats.pointcloud2 import read_message
+from amvnet.data.formats.cloud import Cloud, Message, reading
+from amvnet.data.formats.livox import TYPES as LIVOX
+from amvnet.data.formats.livox import read_custom_message, read_header
+from amvnet.data.formats.pointcloud2 import Origin, read_message
 from amvnet.errors import InputError
 
-TYPE = "sensor_msgs/msg/PointCloud2"
+CLOUD = "sensor_msgs/msg/PointCloud2"
+TYPES = (CLOUD, *LIVOX)
+KINDS = "PointCloud2 or Livox CustomMsg"
+
+# Messages with the packets of a sensor, by the beginning of their type, and what turns them into
+# PointCloud2 while the bag is played.
+PACKETS = {
+    "velodyne_msgs/": "velodyne_pointcloud (ros2 launch velodyne_pointcloud "
+    "velodyne_transform_node-VLP16-launch.py)",
+    "ouster_ros/": "ouster_ros (ros2 launch ouster_ros replay.launch.xml bag_file:=BAG)",
+    "ouster_sensor_msgs/": "ouster_ros (ros2 launch ouster_ros replay.launch.xml bag_file:=BAG)",
+    "hesai_ros_driver/": "hesai_ros_driver with source_type 3",
+    "pandar_msgs/": "pandar_pointcloud (roslaunch pandar_pointcloud transform.launch)",
+    "rslidar_msg": "rslidar_sdk with msg_source 2",
+    "robosense": "rslidar_sdk with msg_source 2",
+    "nebula_msgs/": "nebula_ros with launch_hw:=false",
+}
+LISTED = 10  # topics in a message
+
 METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
 MIN_MESSAGE = 16  # bytes of a bag for each message, compressed ones too
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
-Decode = Callable[[], Any]  # deserialises one message
+Decode = Callable[[str], Cloud]  # reads one message, given its name
 
 
 class Bag:
@@ -28,7 +49,7 @@ class Bag:
     Args:
         path: the file, or the folder of a ROS 2 bag.
         ending: the storage format: `.bag`, `.mcap`, `.db3`, or empty for a folder.
-        topic: the topic of the scans; None for the only one with PointCloud2.
+        topic: the topic of the scans; None for the only one with PointCloud2 or Livox CustomMsg.
 
     Raises:
         InputError: if the bag cannot be read, or has no such topic, or more than one.
@@ -40,7 +61,8 @@ class Bag:
 
         with reading(path, EXPECTED, ADVICE), _open_reader(path, ending) as reader:
             counts = _count_messages(reader)
-            self.topic = _choose_topic(counts, topic, path)
+            others = _describe_others(reader)
+            self.topic = _choose_topic(counts, topic, path, others)
         self._count = counts[self.topic]
 
         if not 0 < self._count <= _size(path) // MIN_MESSAGE:
@@ -67,21 +89,27 @@ class Bag:
             self._messages = self._read_messages()
 
         name = f"{self.path} ({self.topic}, {index})"
-        with reading(name, "a PointCloud2 message", ADVICE):
+        with reading(name, "a message with a cloud", ADVICE):
             for decode in self._messages:
                 self._next += 1
                 if self._next > index:
                     if self._next == self._count:
                         self._messages = iter(())  # closes the bag
-                    return read_message(decode(), name)
+                    return decode(name)
         raise InputError(f"{name}: expected {self._count} scans, found {self._next}; {ADVICE}")
 
     def _read_messages(self) -> Iterator[Decode]:
         with _open_reader(self.path, self._ending) as reader:
-            deserialise = _deserialiser(self._ending)
+            # A ROS 2 bag serialises in the same way in every storage format.
+            is_ros1 = self._ending == ".bag"
+            deserialise = _deserialiser(is_ros1)
             connections = _connections(reader, self.topic)
-            for _, _, data in reader.messages(connections=connections):
-                yield partial(deserialise, data, TYPE)
+            for connection, time, data in reader.messages(connections=connections):
+                if connection.msgtype == CLOUD:
+                    read = partial(_read_pointcloud2, deserialise)
+                else:
+                    read = partial(_read_livox, is_ros1)
+                yield partial(read, data, self.topic, time)
 
 
 @contextmanager
@@ -110,52 +138,88 @@ def _open_reader(path: Path, ending: str) -> Iterator[Any]:
         yield stack.enter_context(reader)
 
 
-def _deserialiser(ending: str) -> Callable[[bytes, str], Any]:
+def _deserialiser(is_ros1: bool) -> Callable[[bytes, str], Any]:
     """Return the function that turns the bytes of a message and its type's name into a message."""
     from rosbags.typesys import Stores, get_typestore
 
-    if ending == ".bag":
+    if is_ros1:
         return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
 
 
+def _read_pointcloud2(
+    deserialise: Callable[[bytes, str], Any], data: bytes, topic: str, time: int, name: str
+) -> Cloud:
+    values = deserialise(data, CLOUD)
+    origin = Origin.of(values)
+    message = Message(topic, time, origin.stamp, origin.frame_id, origin.height)
+    return replace(read_message(values, name), message=message)
+
+
+def _read_livox(is_ros1: bool, data: bytes, topic: str, time: int, name: str) -> Cloud:
+    stamp, frame = read_header(data, is_ros1)
+    cloud = read_custom_message(data, is_ros1, name)
+    return replace(cloud, message=Message(topic, time, stamp, frame))
+
+
 def _connections(reader: Any, topic: str) -> list[Any]:
-    return [c for c in reader.connections if c.topic == topic and c.msgtype == TYPE]
+    return [c for c in reader.connections if c.topic == topic and c.msgtype in TYPES]
 
 
 def _count_messages(reader: Any) -> dict[str, int]:
-    """Return the number of messages of each topic with PointCloud2."""
+    """Return the number of messages of each topic with scans."""
     counts: dict[str, int] = {}
     for connection in reader.connections:
-        if connection.msgtype == TYPE:
+        if connection.msgtype in TYPES:
             counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
     return counts
 
 
-def _choose_topic(counts: dict[str, int], topic: str | None, path: Path) -> str:
+def _describe_others(reader: Any) -> str:
+    """Return what is in a bag without scans, and what turns packets into scans."""
+    topics = []
+    advice = "give a bag with scans"
+    for connection in reader.connections:
+        if connection.msgtype in TYPES:
+            continue
+        topics.append(f"{connection.topic} ({connection.msgtype}, {connection.msgcount})")
+        for beginning, driver in PACKETS.items():
+            if connection.msgtype.startswith(beginning):
+                advice = (
+                    f"{connection.topic} has the packets of a sensor: play the bag with {driver} "
+                    "running, and record the PointCloud2 topic that it publishes"
+                )
+
+    listing = ", ".join(topics[:LISTED]) or "no topic"
+    if len(topics) > LISTED:
+        listing += f" and {len(topics) - LISTED} more"
+    return f"found {listing}; {advice}"
+
+
+def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, others: str) -> str:
     """Return the topic to read: the requested one, or the only one.
+
+    Args:
+        counts: the number of scans of each topic.
+        others: what else is in the bag, and what to do if it has no scans.
 
     Raises:
         InputError: if it is missing, or there are several and none is requested.
     """
     listing = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
 
+    if not counts:
+        expected = "a topic" if topic is None else topic
+        raise InputError(f"{path}: expected {expected} with {KINDS}, {others}")
     if topic is not None:
         if topic in counts:
             return topic
         raise InputError(
-            f"{path}: expected PointCloud2 under {topic}, found {listing or 'none'}; "
-            "give another --topic"
-        )
-
-    if not counts:
-        raise InputError(
-            f"{path}: expected a topic with PointCloud2, found none; "
-            "convert the driver's packets first"
+            f"{path}: expected {KINDS} under {topic}, found {listing}; give another --topic"
         )
     if len(counts) > 1:
         raise InputError(
-            f"{path}: expected one topic with PointCloud2, found {listing}; choose one with --topic"
+            f"{path}: expected one topic with {KINDS}, found {listing}; choose one with --topic"
         )
     return next(iter(counts))
 

@@ -42,6 +42,25 @@ COLUMN_NAMES = {
 
 
 @dataclass(frozen=True)
+class Message:
+    """The ROS message that a cloud is from.
+
+    Attributes:
+        topic: its topic.
+        time: when it was recorded, nanoseconds.
+        stamp: when the points were measured, nanoseconds.
+        frame_id: name of the frame of the coordinates.
+        height: number of rows of an organised cloud, else 1.
+    """
+
+    topic: str
+    time: int
+    stamp: int
+    frame_id: str
+    height: int = 1
+
+
+@dataclass(frozen=True)
 class Cloud:
     """The points of one scan file, in the file's own units and frame.
 
@@ -52,6 +71,8 @@ class Cloud:
         name: where the scan comes from, for messages.
         full: the largest possible intensity, or None if the format does not define it.
         note: what the reader had to assume about the file; empty if nothing.
+        file_xyz: (N, 3) the coordinates as they are in the file; None if `xyz` are these.
+        message: of a bag, where the cloud is from.
     """
 
     xyz: np.ndarray
@@ -60,6 +81,8 @@ class Cloud:
     name: str = ""
     full: float | None = None
     note: str = ""
+    file_xyz: np.ndarray | None = None
+    message: Message | None = None
 
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.

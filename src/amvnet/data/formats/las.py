@@ -36,8 +36,8 @@ def read_las(path: Path) -> Cloud:
         InputError: if the file is not LAS or LAZ, is truncated, or laspy is missing.
     """
     with reading(path, "a LAS or LAZ file", ADVICE):
-        count, is_compressed = _check_header(path)
-        _require_laspy(path)
+        count, is_compressed = check_header(path)
+        require_laspy(path)
         records = _read_in_process(path, count) if is_compressed else read_records(path)
 
     if len(records) < count:
@@ -48,7 +48,7 @@ def read_las(path: Path) -> Cloud:
     return make_cloud(split_records(records), str(path))
 
 
-def _check_header(path: Path) -> tuple[int, bool]:
+def check_header(path: Path) -> tuple[int, bool]:
     """Return the number of points that the header claims, and whether they are compressed.
 
     Raises:
@@ -78,7 +78,7 @@ def _check_header(path: Path) -> tuple[int, bool]:
     return check_point_count(count, path, min_size), is_compressed
 
 
-def _require_laspy(path: Path) -> None:
+def require_laspy(path: Path) -> None:
     try:
         import laspy  # noqa: F401
         import lazrs  # noqa: F401

@@ -21,6 +21,7 @@ from amvnet.data.formats.cloud import (
     ring_indices,
 )
 from amvnet.data.formats.raw import ring_column
+from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, named_cloud
 from amvnet.errors import InputError
 
 COLUMNS = ("x", "y", "z", "intensity")
@@ -29,17 +30,20 @@ RANGE_TOLERANCE = 0.05  # metres by which a column of distances may differ from 
 ADVICE = "save it again with np.save"
 
 
-def read_npy(path: Path) -> Cloud:
+def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read one array.
+
+    Args:
+        layout: what its columns hold; the types are in the file.
 
     Raises:
         InputError: if it is not an array of numbers, has an unsuitable shape or is truncated.
     """
     with reading(path, "a plain NumPy array", ADVICE), path.open("rb") as file:
-        return _to_cloud(_load(file, path.stat().st_size, path), path)
+        return _to_cloud(_load(file, path.stat().st_size, path), path, layout)
 
 
-def read_npz(path: Path) -> Cloud:
+def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read the only array of an archive, or the one named `points`, `xyz`, `scan` or `arr_0`.
 
     Raises:
@@ -49,7 +53,8 @@ def read_npz(path: Path) -> Cloud:
     with reading(path, "a NumPy archive", advice), zipfile.ZipFile(path) as archive:
         member = archive.getinfo(_choose_member(archive.namelist(), path))
         with archive.open(member) as file:
-            return _to_cloud(_load(cast(BinaryIO, file), member.file_size, path), path)
+            array = _load(cast(BinaryIO, file), member.file_size, path)
+            return _to_cloud(array, path, layout)
 
 
 def _choose_member(names: list[str], path: Path) -> str:
@@ -99,7 +104,7 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
     return flat.reshape(shape, order="F" if fortran_order else "C")
 
 
-def _to_cloud(array: np.ndarray, path: Path) -> Cloud:
+def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
     if array.dtype.names is not None:
         return _from_named_columns(array, array.dtype.names, path)
     if array.ndim not in (2, 3) or array.shape[-1] < 3:
@@ -109,6 +114,8 @@ def _to_cloud(array: np.ndarray, path: Path) -> Cloud:
         )
 
     table = array.reshape(-1, array.shape[-1])
+    if layout.columns:
+        return named_cloud(list(table.T), layout.columns, str(path), describe(layout.columns))
     columns = dict(zip(COLUMNS, table.T, strict=False))
     cloud = make_cloud(columns, str(path))
 

@@ -7,7 +7,9 @@ single spaces separate the numbers.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -94,16 +96,31 @@ def read_pcd(path: Path) -> Cloud:
     Raises:
         InputError: if the file is not PCD, is truncated, or has no x, y, z.
     """
+    return make_cloud(read_fields(path, partial(require_columns, path=path)), str(path))
+
+
+def read_fields(path: Path, choose: Callable[[Sequence[str]], dict[str, int]]) -> Arrays:
+    """Read some fields of the points.
+
+    Args:
+        choose: returns the index of each field to read, given the names of all.
+
+    Returns:
+        The (N,) values of each field, by the keys of `choose`.
+
+    Raises:
+        InputError: as `read_pcd`.
+    """
     with reading(path, "a PCD file", ADVICE), path.open("rb") as file:
         header = _read_header(file, path)
 
         columns = {}
         names = [column.name for column in header.columns]
-        for key, index in require_columns(names, path).items():
+        for key, index in choose(names).items():
             columns[key] = header.columns[index]
 
         read_points = READERS[header.encoding]
-        return make_cloud(read_points(file, header, columns, path), str(path))
+        return read_points(file, header, columns, path)
 
 
 def _read_header(file: BinaryIO, path: Path) -> Header:
@@ -120,7 +137,7 @@ def _read_header(file: BinaryIO, path: Path) -> Header:
                 f"{path}: expected the header of a PCD file, found no line DATA; {ADVICE}"
             )
 
-        words = line.decode("ascii").split()
+        words = line.decode("latin-1").split()  # comments may be in any encoding
         if words and not words[0].startswith("#"):
             entries[words[0].upper()] = words[1:]
 

@@ -5,7 +5,9 @@ We do not use plyfile: it allocates whatever a header claims, and is under the G
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -91,6 +93,21 @@ def read_ply(path: Path) -> Cloud:
     Raises:
         InputError: if the file is not PLY, is truncated, or has no vertices with x, y, z.
     """
+    return make_cloud(read_vertices(path, partial(require_columns, path=path)), str(path))
+
+
+def read_vertices(path: Path, choose: Callable[[Sequence[str]], dict[str, int]]) -> Arrays:
+    """Read some properties of the vertices.
+
+    Args:
+        choose: returns the index of each property to read, given the names of all.
+
+    Returns:
+        The (N,) values of each property, by the keys of `choose`.
+
+    Raises:
+        InputError: as `read_ply`.
+    """
     with reading(path, "a PLY file", ADVICE), path.open("rb") as file:
         encoding, elements = _read_header(file, path)
         vertex_index = [element.name for element in elements].index("vertex")
@@ -101,9 +118,9 @@ def read_ply(path: Path) -> Cloud:
                 f"{path}: expected vertices without lists, found a list; write the points alone"
             )
 
-        columns = require_columns(layout.vertex.properties, path)
-        read_vertices = _read_ascii if encoding == "ascii" else _read_binary
-        return make_cloud(read_vertices(file, layout, columns, path), str(path))
+        columns = choose(layout.vertex.properties)
+        read_columns = _read_ascii if encoding == "ascii" else _read_binary
+        return read_columns(file, layout, columns, path)
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:

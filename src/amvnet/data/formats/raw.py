@@ -1,4 +1,4 @@
-"""Scan files that are only rows of float32: four columns as in KITTI, or five as in nuScenes."""
+"""Scan files that are only rows of numbers, such as those of KITTI and nuScenes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,18 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from amvnet.data.formats.cloud import MAX_POINTS, MOST_RINGS, Cloud, check_point_count
+from amvnet.data.formats.rows import (
+    ADVICE,
+    COUNTS,
+    DTYPES,
+    ENOUGH,
+    UNKNOWN,
+    RowLayout,
+    guess_columns,
+    guess_dtype,
+    guess_rows,
+    named_cloud,
+)
 from amvnet.errors import InputError
 
 KITTI_COLUMNS = 4  # x, y, z, intensity
@@ -19,17 +31,30 @@ NEAR = 500.0  # metres: coordinates of usual scans are smaller
 SAMPLE_VALUES = 100_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # whole rows of either layout
 
 
-def read_raw(path: Path) -> Cloud:
-    """Read rows of 4 or 5 float32. The values tell how many columns there are, or else the name.
+def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
+    """Read rows of 3 to 6 float32 or float64, or as the user says.
+
+    The values tell the columns and their type. If they do not, it is nuScenes' five columns if the
+    name ends in `.pcd.bin`, else KITTI's four.
+
+    Args:
+        layout: what the user says.
 
     Raises:
-        InputError: if the file is not a whole number of rows, or the fifth column is not a ring.
+        InputError: if the file is not a whole number of rows, the values fit no layout, or the
+            fifth of nuScenes' columns is not a ring.
     """
+    if layout != UNKNOWN:
+        return _read_rows(path, _complete(path, layout))
+
     columns = columns_of(path)
     if columns is None:
-        columns = NUSCENES_COLUMNS if _has_nuscenes_name(path) else KITTI_COLUMNS
+        guess = guess_rows(path)
+        if guess is not None:
+            return _read_rows(path, guess)
+        columns = _usual_columns(path)
 
-    check_point_count(count_rows(path, np.float32, columns), path)
+    check_point_count(count_rows(path, np.float32, columns, ADVICE), path)
     table = read_table(path, np.float32, columns)
     if columns == KITTI_COLUMNS:
         return Cloud(table[:, :3], table[:, 3], name=str(path))
@@ -37,6 +62,50 @@ def read_raw(path: Path) -> Cloud:
     ring = ring_column(table[:, 4], path)
     full = FULL_INTENSITY if _has_nuscenes_name(path) else None
     return Cloud(table[:, :3], table[:, 3], ring, str(path), full)
+
+
+def _usual_columns(path: Path) -> int:
+    """Return the number of columns of a file whose values do not tell.
+
+    Raises:
+        InputError: if there are so many values that they would tell.
+    """
+    if path.stat().st_size >= ENOUGH:
+        raise InputError(
+            f"{path}: expected rows of {COUNTS[0]} to {COUNTS[-1]} {' or '.join(DTYPES)}, "
+            f"found values that fit none; {ADVICE}"
+        )
+    return NUSCENES_COLUMNS if _has_nuscenes_name(path) else KITTI_COLUMNS
+
+
+def _complete(path: Path, layout: RowLayout) -> RowLayout:
+    """Return a layout with what the user did not say taken from the values.
+
+    Raises:
+        InputError: if the values do not tell the columns.
+    """
+    dtypes = layout.dtypes or (guess_dtype(path) or DTYPES[0],)
+    columns = layout.columns or guess_columns(path, dtypes[0])
+    if columns is None:
+        raise InputError(
+            f"{path}: expected rows of {dtypes[0]}, found values that fit none; {ADVICE}"
+        )
+    return RowLayout(columns, dtypes)
+
+
+def _read_rows(path: Path, layout: RowLayout) -> Cloud:
+    record = layout.record
+    size = path.stat().st_size
+    if size % record.itemsize:
+        raise InputError(
+            f"{path}: expected {layout.describe()}, found {size} bytes, which is no multiple of "
+            f"{record.itemsize}; {ADVICE}, or copy the file again"
+        )
+
+    check_point_count(size // record.itemsize, path)
+    records = np.fromfile(path, dtype=record)
+    columns = [records[name] for name in record.names or ()]
+    return named_cloud(columns, layout.columns, str(path), layout.describe())
 
 
 def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
@@ -52,8 +121,11 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
     return np.fromfile(path, dtype=dtype, count=count * columns).reshape(count, columns)
 
 
-def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
+def count_rows(path: Path, dtype: DTypeLike, columns: int, advice: str = "copy it again") -> int:
     """Return the number of rows of such a file from its size alone.
+
+    Args:
+        advice: what to do if it is not a whole number of rows.
 
     Raises:
         InputError: as `read_table`.
@@ -68,7 +140,7 @@ def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
     if size % row_size:
         raise InputError(
             f"{path}: expected a whole number of rows of {row_size} bytes, found {size} bytes; "
-            "the file is truncated or has another format, copy it again"
+            f"the file is truncated or has another format, {advice}"
         )
     return size // row_size
 

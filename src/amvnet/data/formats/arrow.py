@@ -1,0 +1,116 @@
+"""Scans in Feather files (Arrow), such as those of Argoverse 2, by pyarrow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.formats.cloud import (
+    Cloud,
+    check_point_count,
+    make_cloud,
+    reading,
+    require_columns,
+)
+from amvnet.errors import InputError
+
+EXPECTED = "a Feather file"
+ADVICE = "copy it again, or write the table with pyarrow.feather.write_feather"
+
+# Argoverse 2: `LOG/sensors/lidar/TIME.feather` and `LOG/calibration/egovehicle_SE3_sensor.feather`.
+# Both of its LiDARs are on the roof, one upon the other, and the points of both are in one file.
+CALIBRATION = "calibration/egovehicle_SE3_sensor.feather"
+LIDARS = ("up_lidar", "down_lidar")
+POSITION = ("tx_m", "ty_m", "tz_m")
+
+
+def read_feather(path: Path) -> Cloud:
+    """Read the columns of a table by their names.
+
+    The points of Argoverse 2 are in the frame of the vehicle, whose origin is on its rear axle. If
+    the calibration of the log is there, they are moved to the LiDARs.
+
+    Raises:
+        InputError: if the file is not Feather, is truncated, has no x, y, z, or pyarrow is missing.
+    """
+    table = _read_columns(path, None)
+    cloud = make_cloud(table, str(path))
+    calibration = path.absolute().parents[min(2, len(path.absolute().parents) - 1)] / CALIBRATION
+    if not calibration.is_file():
+        return cloud
+
+    position = _lidar_position(calibration)
+    moved = (cloud.xyz - position).astype(cloud.xyz.dtype)
+    place = ", ".join(f"{value:.2f}" for value in position)
+    note = f"Argoverse 2, moved from the vehicle's origin to the LiDARs at {place}"
+    return Cloud(moved, cloud.intensity, cloud.ring, cloud.name, None, note, cloud.xyz)
+
+
+def _lidar_position(path: Path) -> np.ndarray:
+    """Return the (3,) mean position of the LiDARs in the frame of the vehicle, metres.
+
+    Raises:
+        InputError: if the calibration is broken or names no LiDAR.
+    """
+    table = _read_columns(path, ("sensor_name", *POSITION))
+    is_lidar = np.isin(table["sensor_name"].astype(str), LIDARS)
+    if not is_lidar.any():
+        raise InputError(
+            f"{path}: expected the sensors {', '.join(LIDARS)}, found none; copy the file again"
+        )
+    return np.stack([table[name][is_lidar].mean() for name in POSITION])
+
+
+def _read_columns(path: Path, names: tuple[str, ...] | None) -> dict[str, np.ndarray]:
+    """Return columns of a table, (N,) each.
+
+    Args:
+        names: of the columns; None for those of a scan, by the keys of `COLUMN_NAMES`.
+    """
+    require_pyarrow(path)
+    with reading(path, EXPECTED, ADVICE):
+        import pyarrow
+
+        with pyarrow.OSFile(str(path)) as file:
+            try:
+                reader = pyarrow.ipc.open_file(file)
+            except pyarrow.ArrowInvalid:
+                raise InputError(f"{path}: expected {EXPECTED} of version 2; {ADVICE}") from None
+            all_names = reader.schema.names
+            columns = _choose(all_names, names, path)
+            options = pyarrow.ipc.IpcReadOptions(included_fields=sorted(set(columns.values())))
+            reader = pyarrow.ipc.open_file(file, options=options)
+
+            batches: list[Any] = []
+            count = 0
+            for index in range(reader.num_record_batches):
+                batches.append(reader.get_batch(index))
+                count = check_point_count(count + len(batches[-1]), path)
+
+        arrays = {}
+        for key, index in columns.items():
+            values = []
+            for batch in batches:
+                values.append(batch.column(all_names[index]).to_numpy(zero_copy_only=False))
+            arrays[key] = np.concatenate(values) if values else np.empty(0, np.float32)
+        return arrays
+
+
+def _choose(all_names: list[str], names: tuple[str, ...] | None, path: Path) -> dict[str, int]:
+    """Return the indices of columns, given the names of all."""
+    if names is None:
+        return require_columns(all_names, path)
+    return {name: all_names.index(name) for name in names}
+
+
+def require_pyarrow(path: Path) -> None:
+    """Raise an InputError unless pyarrow is there."""
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        raise InputError(
+            f"{path}: expected the package pyarrow to read it, found none; "
+            'run pip install "amvnet[datasets]"'
+        ) from None

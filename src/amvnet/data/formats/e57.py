@@ -1,0 +1,93 @@
+"""Scans of surveying instruments in E57 files, by pye57."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.formats.cloud import Cloud, check_point_count, reading
+from amvnet.errors import InputError
+
+CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+INVALID = ("cartesianInvalidState", "sphericalInvalidState")  # not 0: a lost point
+EXPECTED = "an E57 file"
+ADVICE = "write the file again"
+
+
+class E57:
+    """The scans of an E57 file, each in the frame of the instrument at its place.
+
+    Args:
+        path: the file.
+        ending: not used.
+        topic: not used.
+
+    Raises:
+        InputError: if the file is broken or has no scan, or pye57 is missing.
+    """
+
+    def __init__(self, path: Path, ending: str = ".e57", topic: str | None = None) -> None:
+        self.path = path
+        with reading(path, EXPECTED, ADVICE):
+            file = _open(path)
+            self._count = int(file.scan_count)
+            file.close()
+        if not self._count:
+            raise InputError(f"{path}: expected scans, found none; {ADVICE}")
+
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self, index: int) -> Cloud:
+        """Read the scan at this index, from 0. Points that were not measured become NaN.
+
+        Raises:
+            InputError: if it is broken, or has no coordinates.
+        """
+        name = f"{self.path} ({index})"
+        with reading(name, "a scan of an E57 file", ADVICE):
+            file = _open(self.path)
+            try:
+                # Each number takes a bit at least, in a constant column nothing: only a scan of
+                # equal points is smaller.
+                check_point_count(int(file.get_header(index).point_count), name)
+                fields = file.read_scan_raw(index, ignore_unsupported_fields=True)
+            finally:
+                file.close()
+            return Cloud(_coordinates(fields, name), fields.get("intensity"), None, name)
+
+
+def _open(path: Path) -> Any:
+    try:
+        import pye57
+    except ImportError:
+        raise InputError(
+            f"{path}: expected the package pye57 to read it, found none; "
+            'run pip install "amvnet[e57]"'
+        ) from None
+    return pye57.E57(str(path))
+
+
+def _coordinates(fields: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """Return (N, 3) coordinates, NaN where nothing was measured."""
+    if set(CARTESIAN) <= set(fields):
+        xyz = np.column_stack([fields[key] for key in CARTESIAN])
+    elif set(SPHERICAL) <= set(fields):
+        distance, azimuth, elevation = (fields[key] for key in SPHERICAL)
+        level = distance * np.cos(elevation)
+        height = distance * np.sin(elevation)
+        xyz = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), height])
+    else:
+        raise InputError(
+            f"{name}: expected Cartesian or spherical coordinates, "
+            f"found {', '.join(fields)[:200]!a}; {ADVICE}"
+        )
+
+    xyz = xyz.astype(np.float64)
+    for key in INVALID:
+        if key in fields:
+            xyz[fields[key] != 0] = np.nan
+    return xyz

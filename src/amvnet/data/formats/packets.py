@@ -1,0 +1,146 @@
+"""Scans in packet captures (.pcap): those of Velodyne, by velodyne-decoder."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, reading, split_records
+from amvnet.errors import InputError
+
+EXPECTED = "a capture of Velodyne's packets"
+ADVICE = "capture it again"
+FULL_INTENSITY = 255.0
+
+PACKET_BYTES = 1206  # of Velodyne's data packets
+HEAD = 1 << 20  # bytes of a capture that are looked at
+LEAST = 16  # bytes of a packet's header in a capture
+
+# What other sensors send, by what turns a capture of it into files that are read.
+CONVERTERS = {
+    "Ouster": "pip install ouster-sdk, run ouster-cli source FILE.pcap save FILE.csv, and give the "
+    "folder of the .csv",
+    "Hesai": "export it as .pcd in PandarView 2, or as a bag with hesai_ros_driver",
+    "Livox": "convert it to a bag with livox_ros_driver2",
+    "RoboSense": "convert it to a bag with rslidar_sdk (msg_source 3)",
+}
+
+
+class Capture:
+    """The scans in a capture of a Velodyne's packets, a turn of the sensor each.
+
+    Lost returns are not in the packets, so not in the scans either. The model is told by the
+    packets.
+
+    Args:
+        path: the file.
+        ending: not used.
+        topic: not used.
+
+    Raises:
+        InputError: if the packets are another sensor's or broken, or velodyne-decoder is missing.
+    """
+
+    def __init__(self, path: Path, ending: str = ".pcap", topic: str | None = None) -> None:
+        self.path = path
+        maker = _maker_of(path)
+        if maker != "Velodyne":
+            advice = CONVERTERS.get(maker, "convert its packets with the sensor's own software")
+            raise InputError(
+                f"{path}: expected {EXPECTED}, found {maker or 'unknown'} packets; {advice}"
+            )
+
+        with reading(path, EXPECTED, ADVICE):
+            self._count = sum(1 for _ in self._decode())
+        if not self._count:
+            raise InputError(f"{path}: expected scans, found none in its packets; {ADVICE}")
+        self._next = 0
+        self._scans: Iterator[Any] = iter(())
+
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self, index: int) -> Cloud:
+        """Read the scan at this index, from 0. In order is fastest.
+
+        Raises:
+            InputError: if the packets are broken.
+        """
+        if index != self._next or self._next == 0:
+            self._next = 0
+            self._scans = self._decode()
+
+        name = f"{self.path} ({index})"
+        with reading(name, EXPECTED, ADVICE):
+            for records in self._scans:
+                self._next += 1
+                if self._next > index:
+                    check_point_count(len(records), name)
+                    cloud = make_cloud(split_records(records), name)
+                    return Cloud(cloud.xyz, cloud.intensity, cloud.ring, name, FULL_INTENSITY)
+        raise InputError(f"{name}: expected {self._count} scans, found {self._next}; {ADVICE}")
+
+    def _decode(self) -> Iterator[Any]:
+        """Yield the records of each scan."""
+        try:
+            import velodyne_decoder
+        except ImportError:
+            raise InputError(
+                f"{self.path}: expected the package velodyne-decoder to read it, found none; "
+                'run pip install "amvnet[packets]"'
+            ) from None
+        for _, records in velodyne_decoder.read_pcap(str(self.path), as_pcl_structs=True):
+            yield records
+
+
+def _maker_of(path: Path) -> str:
+    """Return the maker of the sensor whose packets are most frequent; empty if unknown."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+
+    makers = Counter(map(_maker_of_packet, _packets(head)))
+    del makers[""]
+    return makers.most_common(1)[0][0] if makers else ""
+
+
+def _packets(head: bytes) -> Iterator[bytes]:
+    """Yield the packets of a capture, from the link layer on; those of pcapng too."""
+    if head.startswith(b"\x0a\x0d\x0d\x0a"):
+        position = 0
+        while position + 28 <= len(head):
+            kind, length = struct.unpack_from("<II", head, position)
+            if kind == 6:  # an enhanced packet block
+                yield head[position + 28 : position + length]
+            position += max(length, 12)
+        return
+
+    order = ">" if head[:1] == b"\xa1" else "<"
+    position = 24
+    while position + LEAST <= len(head):
+        (length,) = struct.unpack_from(f"{order}I", head, position + 8)
+        yield head[position + LEAST : position + LEAST + length]
+        position += LEAST + length
+
+
+def _maker_of_packet(packet: bytes) -> str:
+    """Return the maker of the sensor that sent an Ethernet packet by UDP; empty if unknown."""
+    ip = packet.find(b"\x08\x00\x45")
+    if ip < 0 or len(packet) < ip + 30:
+        return ""
+    (port,) = struct.unpack_from(">H", packet, ip + 24)
+    data = packet[ip + 30 :]
+
+    if data[:2] == b"\xee\xff":
+        return "Hesai"
+    if data[:2] == b"\xff\xee" and len(data) >= PACKET_BYTES:
+        return "Velodyne"
+    if data[:4] == b"\x55\xaa\x05\x0a" or data[:2] == b"\x55\xaa":
+        return "RoboSense"
+    if 56000 <= port <= 57999:
+        return "Livox"
+    if port in (7502, 7503) or len(data) in (3392, 6464, 8448, 12608, 16640, 24832, 33024):
+        return "Ouster"
+    return ""

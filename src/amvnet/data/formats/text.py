@@ -1,0 +1,190 @@
+"""Scans in text files: a line of numbers per point, with or without the names of the columns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from amvnet.data.formats.cloud import MAX_POINTS, Cloud, check_point_count, find_columns, reading
+from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
+from amvnet.errors import InputError
+
+HEAD = 65_536  # bytes in which the columns must be found
+MOST_COLUMNS = 200
+CHECKED = 20  # lines that must be alike
+USED = 7  # columns without names that are looked at
+COMMENTS = ("#", "//", "%")
+# Separators of the values, and decimal marks, in the order in which they are tried; None is any
+# white space.
+SEPARATORS: tuple[tuple[str | None, str], ...] = (
+    (";", "."),
+    (";", ","),
+    (",", "."),
+    (None, "."),
+    (None, ","),
+)
+# Names of coordinates that other programs write, such as "Points:0" in ParaView and VeloView.
+POINTS = re.compile(r"points?(?:_m_xyz)?[:_](\d)")
+FIRST_RETURN = re.compile(r"([xyz])1")  # "X1 (m)" by ouster-cli
+UNITS = re.compile(r"\s*[\[(].*$")  # as in "x [m]"
+ADVICE = "write a line x y z intensity per point"
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """How the lines of a text file are to be read.
+
+    Attributes:
+        separator: between the values of a line; None for any white space.
+        decimal: the decimal mark, "." or ",".
+        skipped: lines before the first point.
+        count: the number of columns.
+        names: those of the columns; empty if there are none.
+    """
+
+    separator: str | None
+    decimal: str
+    skipped: int
+    count: int
+    names: tuple[str, ...] = ()
+
+
+def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
+    """Read a point of each line.
+
+    Columns are found by their names, if a line before the points has them; else they are x, y, z,
+    intensity and, if the values are whole numbers, the ring. Values are separated by white space,
+    commas or semicolons, also with decimal commas.
+
+    Args:
+        layout: what the user says; of it, the columns count.
+
+    Raises:
+        InputError: if there are no lines of three numbers or more, or a later line is another.
+    """
+    with reading(path, "lines of numbers", ADVICE):
+        table = find_table(path)
+        if table is None:
+            raise InputError(
+                f"{path}: expected lines of numbers x y z ..., found other text; {ADVICE}"
+            )
+
+        names = layout.columns or table.names
+        if names:
+            indices = sorted(find_columns(names).values())
+            if max(indices) >= table.count:
+                raise InputError(
+                    f"{path}: expected {len(names)} columns ({','.join(names)}), "
+                    f"found {table.count}; correct --columns"
+                )
+            values = _read_values(path, table, indices)
+            return named_cloud(list(values.T), [names[index] for index in indices], str(path))
+
+        values = _read_values(path, table, range(min(table.count, USED)))
+        names = name_columns(values)
+        more = "_" * (table.count - len(names))
+        note = describe([*names, *more]) if table.count > 4 else ""
+        return named_cloud(list(values.T), names, str(path), note)
+
+
+def find_table(path: Path) -> TextTable | None:
+    """Return how the lines of a file are to be read; None if it is no text with points."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    lines = _decode(head)
+    if len(head) == HEAD:
+        lines = lines[:-1]  # the last line may be cut
+
+    for separator, decimal in SEPARATORS:
+        table = _match(lines, separator, decimal)
+        if table is not None:
+            return table
+    return None
+
+
+def _decode(head: bytes) -> list[str]:
+    """Return the lines of the beginning of a file; none if it is no text."""
+    if re.search(rb"[\x00-\x08\x0e-\x1f]", head):
+        return []
+    return head.decode("latin-1").removeprefix("\xef\xbb\xbf").split("\n")
+
+
+def _match(lines: list[str], separator: str | None, decimal: str) -> TextTable | None:
+    """Return the table that starts after some lines, if it has these separators."""
+    names: tuple[str, ...] = ()
+    for skipped, line in enumerate(lines):
+        values = _split(line, separator)
+        if _are_numbers(values, names, decimal):
+            alike = filter(str.strip, islice(lines, skipped, skipped + CHECKED))
+            for other in alike:
+                row = _split(other, separator)
+                if len(row) != len(values) or not _are_numbers(row, names, decimal):
+                    return None
+            is_named = len(names) == len(values)
+            return TextTable(separator, decimal, skipped, len(values), names if is_named else ())
+
+        candidates = tuple(map(_clean_name, _split(_uncomment(line), separator)))
+        if {"x", "y", "z"} <= set(find_columns(candidates)):
+            names = candidates
+    return None
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    return line.strip().split(separator, MOST_COLUMNS)
+
+
+def _uncomment(line: str) -> str:
+    """Return a line without the mark of a comment."""
+    stripped = line.strip()
+    for mark in COMMENTS:
+        stripped = stripped.removeprefix(mark)
+    return stripped
+
+
+def _clean_name(name: str) -> str:
+    """Return the name of a column without quotes and units; "x" for "Points:0"."""
+    bare = UNITS.sub("", name.strip().strip("\"'").strip()).lower()
+    first = FIRST_RETURN.fullmatch(bare)
+    if first:
+        return first[1]
+    match = POINTS.fullmatch(bare)
+    return "xyz"[int(match[1])] if match and int(match[1]) < 3 else bare
+
+
+def _are_numbers(values: list[str], names: tuple[str, ...], decimal: str) -> bool:
+    """Return whether the values of a line are numbers: those of the named columns, or else all."""
+    if len(values) < 3:
+        return False
+    if len(names) == len(values):
+        values = [values[index] for index in find_columns(names).values()]
+
+    try:
+        for value in values:
+            float(value.strip().strip('"').replace(decimal, "."))
+    except ValueError:
+        return False
+    return True
+
+
+def _read_values(path: Path, table: TextTable, indices: range | list[int]) -> np.ndarray:
+    """Return some columns of all points, (N, columns) float64."""
+    with path.open(encoding="latin-1") as file:
+        lines: Iterator[str] = islice(file, table.skipped, None)
+        if table.decimal == ",":
+            lines = (line.replace(",", ".") for line in lines)
+        values = np.loadtxt(
+            lines,
+            delimiter=table.separator,
+            usecols=list(indices),
+            max_rows=MAX_POINTS + 1,
+            comments="#",
+            quotechar='"',
+            ndmin=2,
+        )
+    check_point_count(len(values), path)
+    return values

@@ -1,0 +1,142 @@
+"""Write the labels of a bag's scans as a bag: PointCloud2 messages with the stamps of the scans.
+
+Each scan is written as a part of its own, so that an interrupted run can go on; the parts become
+the bag at the end.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from amvnet.data.formats.cloud import Message
+from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, Origin, encode_labels
+from amvnet.data.label_files import LabelledPoints
+from amvnet.errors import InputError
+from amvnet.files import atomic_write, make_folder
+
+Kind = Literal["bag", "mcap"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+SUFFIX = "/labels"  # after the topic of the scans
+
+
+def check_rosbags() -> None:
+    """Raise an InputError unless rosbags is there."""
+    try:
+        import rosbags  # noqa: F401
+    except ImportError:
+        raise InputError(
+            "expected the package rosbags to write bags, found none; "
+            'run pip install "amvnet[formats]"'
+        ) from None
+
+
+def bag_path(folder: Path, name: str, kind: str) -> Path:
+    """Return the path of the bag with the labels of a scan.
+
+    Args:
+        folder: the folder of predictions.
+        name: of the scan, such as `drive/000012`.
+    """
+    bag = (folder / name).parent
+    return bag.with_name(f"{bag.name}.{kind}")
+
+
+def write_part(
+    folder: Path, name: str, kind: str, message: Message, points: LabelledPoints
+) -> Path:
+    """Write the labels of one scan as a part of the bag, and return its path.
+
+    Args:
+        folder: the folder of predictions.
+        name: of the scan, such as `drive/000012`.
+        kind: the bag, one of `KINDS`.
+        message: the scan's own message.
+        points: the points and their labels.
+    """
+    origin = Origin(message.stamp, message.frame_id, message.height)
+    cloud = encode_labels(origin, points.raw, points.uncertain, points.xyz, points.colors)
+    store = _types(kind)
+    values = cloud.to_message(store.types)
+    serialise = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
+    data = np.frombuffer(serialise(values, CLOUD_TYPE), np.uint8)
+
+    path = _parts(bag_path(folder, name, kind)) / f"{Path(name).name}.npz"
+    with atomic_write(path) as part:
+        np.savez(part, time=message.time, topic=message.topic + SUFFIX, data=data)
+    return path
+
+
+def join_parts(folder: Path, names: Sequence[str], kind: str) -> list[Path]:
+    """Join the parts of each bag, in order of time, and return the paths of the bags.
+
+    The parts are removed if none is missing, so that a later run can add what is.
+
+    Args:
+        folder: the folder of predictions.
+        names: of all scans.
+        kind: one of `KINDS`.
+    """
+    counts: dict[Path, int] = {}
+    for name in names:
+        path = bag_path(folder, name, kind)
+        counts[path] = counts.get(path, 0) + 1
+
+    written = []
+    for path, count in counts.items():
+        parts = sorted(_parts(path).glob("[0-9]*.npz"))
+        if parts:
+            _write_bag(path, parts, kind)
+            written.append(path)
+        if len(parts) == count:
+            shutil.rmtree(_parts(path))
+    return written
+
+
+def _parts(bag: Path) -> Path:
+    """Return the folder of the parts of a bag."""
+    return bag.with_name(f".{bag.name}.parts")
+
+
+def _types(kind: str) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
+
+
+def _write_bag(path: Path, parts: Sequence[Path], kind: str) -> None:
+    """Write a bag of the parts; it appears whole or not at all."""
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import StoragePlugin
+    from rosbags.rosbag2 import Writer as Writer2
+
+    make_folder(path.parent)
+    with TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
+        bag = Path(temporary) / "labels.bag"
+        if kind == "bag":
+            _write_messages(Writer1(bag), parts, kind)
+        else:
+            _write_messages(Writer2(bag, version=9, storage_plugin=StoragePlugin.MCAP), parts, kind)
+            (bag,) = bag.glob("*.mcap")
+        os.replace(bag, path)
+
+
+def _write_messages(writer: Any, parts: Sequence[Path], kind: str) -> None:
+    connections: dict[str, Any] = {}
+    with writer:
+        for part in parts:
+            with np.load(part, allow_pickle=False) as arrays:
+                topic = str(arrays["topic"])
+                time = int(arrays["time"])
+                data = arrays["data"].tobytes()
+            if topic not in connections:
+                connections[topic] = writer.add_connection(
+                    topic, CLOUD_TYPE, typestore=_types(kind)
+                )
+            writer.write(connections[topic], time, data)

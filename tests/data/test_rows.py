@@ -1,0 +1,249 @@
+"""Rows of numbers without names are recognised by their values, or read as the user says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amvnet.data.formats.detect import find_scans, list_scans, read_cloud
+from amvnet.data.formats.rows import RowLayout, parse_layout
+from amvnet.data.formats.text import find_table
+
+from fixtures.sensors import LASERS, place
+from fixtures.worlds import fails
+
+TIME = 1.6e9  # seconds, of the first point
+
+
+@pytest.fixture(scope="module")
+def table() -> np.ndarray:
+    """(N, 6) x, y, z, intensity, ring and time of a scan."""
+    points, ring = place(LASERS["vlp16"], 0.9)
+    time = TIME + np.linspace(0, 0.1, len(points))
+    return np.column_stack([points, ring, time])
+
+
+def row_bytes(table: np.ndarray, dtype: str) -> bytes:
+    return table.astype(dtype).tobytes()
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("order", ["as recorded", "shuffled"])
+@pytest.mark.parametrize("columns", ["xyz", "xyzi", "xyzir", "xyzit", "xyzirt", "xyzrgb"])
+def test_columns_and_type_are_told_by_the_values(
+    table: np.ndarray, tmp_path: Path, columns: str, order: str, dtype: str
+) -> None:
+    rng = np.random.default_rng(0)
+    if order == "shuffled":
+        table = rng.permutation(table)
+    rows = table[:, ["xyzirt".index(name) for name in columns.replace("rgb", "")]]
+    if columns == "xyzrgb":
+        rows = np.column_stack([rows, rng.integers(0, 256, (len(rows), 3))])
+
+    path = tmp_path / "a.bin"
+    path.write_bytes(row_bytes(rows, dtype))
+    cloud = read_cloud(path)
+
+    np.testing.assert_array_equal(cloud.xyz, rows[:, :3].astype(dtype))
+    has_intensity = columns[3:4] == "i"
+    assert (cloud.intensity is not None) == has_intensity
+    if cloud.intensity is not None:
+        np.testing.assert_array_equal(cloud.intensity, rows[:, 3].astype(dtype))
+    assert (cloud.ring is not None) == ("ir" in columns)
+    if columns not in ("xyzi", "xyzir") or dtype == "float64":
+        assert f"rows of {rows.shape[1]} {dtype}" in cloud.note
+
+
+def test_negative_intensities_and_lost_points_do_not_hide_the_columns(
+    table: np.ndarray, tmp_path: Path
+) -> None:
+    rows = table[:, :4].copy()
+    rows[:, 3] -= rows[:, 3].mean()
+    rows[::7, :3] = np.nan
+    (tmp_path / "a.bin").write_bytes(row_bytes(rows, "float32"))
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.bin").xyz, rows[:, :3].astype("f4"))
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5, 6])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_truncated_file_is_not_read_with_other_columns(
+    table: np.ndarray, tmp_path: Path, columns: int, dtype: str
+) -> None:
+    content = row_bytes(table[:, :columns], dtype)
+    path = tmp_path / "a.bin"
+    size = np.dtype(dtype).itemsize
+    for removed in range(1, columns):
+        path.write_bytes(content[: len(content) - removed * size])
+        fails(lambda: read_cloud(path), path, "--columns", "--dtype")
+
+
+def test_values_that_fit_nothing_are_refused_and_both_options_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(np.random.default_rng(0).bytes(60_000))
+    fails(lambda: read_cloud(path), path, "--columns x,y,z,intensity,ring", "--dtype float32")
+
+
+def test_the_user_s_columns_count(table: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "a.bin"
+    path.write_bytes(row_bytes(table[:, [5, 4, 2, 1, 0, 3]], "float64"))
+
+    for dtype in (None, "float64"):
+        cloud = read_cloud(path, parse_layout("time,ring,z,y,x,intensity", dtype))
+        np.testing.assert_array_equal(cloud.xyz, table[:, :3])
+        np.testing.assert_array_equal(cloud.intensity, table[:, 3])
+        np.testing.assert_array_equal(cloud.ring, table[:, 4])
+    fails(lambda: read_cloud(path, parse_layout("x,y,z", "float16,float32")), "--columns")
+
+
+def test_each_column_can_have_its_own_type(table: np.ndarray, tmp_path: Path) -> None:
+    fields = [("x", "f4"), ("y", "f4"), ("z", "f4"), ("i", "u1"), ("ring", "u2"), ("time", "f8")]
+    records = np.zeros(len(table), fields)
+    for (name, _), values in zip(fields, table.T, strict=True):
+        records[name] = np.round(values * 255) if name == "i" else values
+    path = tmp_path / "a.bin"
+    records.tofile(path)
+
+    layout = parse_layout("x,y,z,i,ring,_", "float32,float32,float32,uint8,uint16,float64")
+    (scan,) = list_scans(path, layout=layout)
+    cloud = scan.read()
+    np.testing.assert_array_equal(cloud.xyz, table[:, :3].astype("f4"))
+    np.testing.assert_array_equal(cloud.intensity, records["i"])
+    np.testing.assert_array_equal(cloud.ring, records["ring"])
+    assert cloud.intensity_scale() == 255
+
+
+def test_columns_of_arrays_can_be_named(table: np.ndarray, tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", table[:, [2, 1, 0, 3]])
+    cloud = read_cloud(tmp_path / "a.npy", RowLayout(("z", "y", "x", "intensity")))
+    np.testing.assert_array_equal(cloud.xyz, table[:, :3])
+    fails(lambda: read_cloud(tmp_path / "a.npy", RowLayout(tuple("xyzabc"))), "--columns")
+
+
+@pytest.mark.parametrize(
+    ("columns", "dtype", "word"),
+    [
+        ("x,y,intensity", None, "--columns"),
+        ("x,x,y,z", None, "--columns"),
+        ("", None, "--columns"),
+        (None, "float33", "--dtype"),
+        (None, "complex64", "--dtype"),
+        (None, "object", "--dtype"),
+        ("x,y,z", "float32,float32", "--dtype"),
+    ],
+)
+def test_impossible_options_are_refused(columns: str | None, dtype: str | None, word: str) -> None:
+    fails(lambda: parse_layout(columns, dtype), word)
+
+
+# --- text ---
+
+HEADERS = {
+    "names": "x,y,z,intensity,ring\n",
+    "quotes": '"X","Y","Z","Intensity","ring"\n',
+    "units": "x [m],y [m],z [m],intensity,laser_id\n",
+    "VeloView": "Points:0,Points:1,Points:2,intensity,laser_id\n",
+    "ParaView": '"Points_m_XYZ:0","Points_m_XYZ:1","Points_m_XYZ:2","intensity","laser_id"\n',
+    "ouster-cli": "# X1 (m), Y1 (m), Z1 (m), REFLECTIVITY (%), CHANNEL\n",
+    "comment": "# written by a tool\n# x,y,z,intensity,ring\n",
+    "slashes": "//X,Y,Z,Intensity,ring\n",
+    "byte order mark": "\ufeffx,y,z,intensity,ring\n",
+    "none": "",
+    "number of points": "5760\n",
+}
+
+
+def text_of(table: np.ndarray, separator: str = ",", decimal: str = ".") -> str:
+    lines = []
+    for row in table:
+        numbers = [f"{value:.3f}" for value in row[:4]] + [f"{value:.0f}" for value in row[4:5]]
+        lines.append(separator.join(numbers).replace(".", decimal))
+    return "\n".join(lines) + "\n"
+
+
+def check_text(path: Path, table: np.ndarray) -> None:
+    cloud = read_cloud(path)
+    np.testing.assert_allclose(cloud.xyz, table[:, :3], atol=0.0006)
+    assert cloud.intensity is not None
+    np.testing.assert_allclose(cloud.intensity, table[:, 3], atol=0.0006)
+    np.testing.assert_array_equal(cloud.ring, table[:, 4])
+
+
+@pytest.mark.parametrize("header", HEADERS)
+def test_text_is_read_with_any_header(table: np.ndarray, tmp_path: Path, header: str) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(HEADERS[header] + text_of(table), encoding="utf-8")
+    check_text(path, table)
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a.txt", "a.csv", "a.asc", "a.pts", "a", "a.dat"])
+@pytest.mark.parametrize(
+    ("separator", "decimal"), [(" ", "."), ("\t", "."), ("; ", "."), (";", ","), ("  ", ",")]
+)
+def test_text_is_read_with_any_separator_and_name(
+    table: np.ndarray, tmp_path: Path, name: str, separator: str, decimal: str
+) -> None:
+    path = tmp_path / name
+    path.write_text(text_of(table[:400], separator, decimal).replace("\n", "\r\n"))
+    check_text(path, table[:400])
+
+
+def test_columns_of_text_can_have_any_order_and_words_among_them(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text("label,z,y,x\ncar,3,2,1\nroad,6,5,4\n")
+    assert read_cloud(path).xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_text_of_other_things_is_refused(tmp_path: Path) -> None:
+    texts = ["hello\n", "1 2\n3 4\n", "x,y,z\n", "P0: 1 2 3\n", "1 2 3\n4 5\n"]
+    for text in texts:
+        path = tmp_path / "a.txt"
+        path.write_text(text)
+        fails(lambda path=path: read_cloud(path), path)  # type: ignore[misc]
+        assert find_table(path) is None
+
+
+def test_text_files_of_a_folder_are_scans_only_if_nothing_else_is(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("read me")
+    (tmp_path / "a.csv").write_text("1,2,3\n")
+    (tmp_path / "b.xyz").write_text("1 2 3\n")
+    assert find_scans(tmp_path) == [tmp_path / "a.csv", tmp_path / "b.xyz"]
+
+    (tmp_path / "c.bin").touch()
+    assert find_scans(tmp_path) == [tmp_path / "c.bin"]
+
+
+# --- which files ---
+
+
+def test_patterns_name_scans(tmp_path: Path) -> None:
+    for name in ("a/1.bin", "a/2.bin", "a/1.label", "b/1.bin", "b/.2.bin"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(np.ones((2, 4), np.float32).tobytes())
+
+    def names(pattern: str) -> list[str]:
+        return [scan.name for scan in list_scans(tmp_path / pattern)]
+
+    assert names("a/*") == ["1", "2"]
+    assert names("?/1.bin") == ["a/1", "b/1"]
+    assert names("*") == ["a/1", "a/2", "b/1"]
+    assert names("**/*.bin") == ["a/1", "a/2", "b/1"]
+    fails(lambda: names("a/*.pcd"), "*.pcd")
+    # A folder without scans names the one below that has some.
+    fails(lambda: names(""), tmp_path / "a")
+
+
+def test_drives_of_kitti_raw_are_found(tmp_path: Path) -> None:
+    for drive in ("0001", "0005"):
+        data = tmp_path / f"2011_09_26/2011_09_26_drive_{drive}_sync/velodyne_points/data"
+        data.mkdir(parents=True)
+        (data.parent / "timestamps.txt").write_text("2011-09-26 13:02:25.594360375\n")
+        (data / "0000000000.bin").write_bytes(np.ones((2, 4), np.float32).tobytes())
+
+    drive = "2011_09_26_drive_0001_sync"
+    assert [scan.name for scan in list_scans(tmp_path / "2011_09_26" / drive)] == ["0000000000"]
+    expected = [f"2011_09_26_drive_{number}_sync/0000000000" for number in ("0001", "0005")]
+    for folder in (tmp_path, tmp_path / "2011_09_26"):
+        assert [scan.name for scan in list_scans(folder)] == expected
