@@ -28,6 +28,7 @@ from amvnet.cli.commands.view import view
 from amvnet.cli.console import say
 from amvnet.cli.parser import Command, make_parser
 from amvnet.errors import InputError, SomeBroken
+from amvnet.threads import wait_passively
 
 # Exit codes.
 DONE = 0
@@ -89,6 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         1 for a full disk or an interruption.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    wait_passively()
     if not arguments or arguments[0] in ("-h", "--help"):
         say(USAGE)
         return DONE if arguments else WRONG_INPUT

@@ -22,6 +22,7 @@ from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
+from amvnet.threads import BusyMachine, survive_forks
 from amvnet.weights.file import Weights, load
 
 MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
@@ -88,6 +89,8 @@ class Segmenter:
         check_precision(precision, device)
         if keep_memory and device == "cpu":
             keep_freed_memory()
+        survive_forks()
+        self._machine = BusyMachine()
 
         self.model: AMVNet = self.weights.build().to(device)
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -122,8 +125,10 @@ class Segmenter:
             InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
         checked = [check_scan(points) for points in scans]
-        batch = self._batch(checked)
-        labels, scores = _fetch(self._scores(batch))
+        uses_team = self.device == "cpu" and self.engine != "onnx"
+        with self._machine.watch(uses_team):
+            batch = self._batch(checked)
+            labels, scores = _fetch(self._scores(batch))
 
         results = []
         for scan, points in zip(checked, batch.slices(), strict=True):
