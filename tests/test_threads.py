@@ -49,9 +49,7 @@ cli.main(["info"])
 """
 
 
-def run_python(
-    code: str, *arguments: str, environment: Mapping[str, str] | None = None
-) -> str:
+def run_python(code: str, *arguments: str, environment: Mapping[str, str] | None = None) -> str:
     """Run code in a process whose environment says nothing else about waiting threads."""
     inherited = {key: value for key, value in os.environ.items() if key not in WAITING}
     process = subprocess.run(

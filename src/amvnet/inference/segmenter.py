@@ -84,6 +84,7 @@ class Segmenter:
                 "train the head with another one"
             )
         self.engine = "torch"
+        self._at_once: int | None = None
         self.device = _check_device(device)
         self.precision = precision
         check_precision(precision, device)
@@ -99,10 +100,21 @@ class Segmenter:
 
     @property
     def at_once(self) -> int:
-        """The best number of scans to segment at a time, each with its share of the threads."""
+        """Scans to segment at the same time, each with its share of torch's threads.
+
+        If it was not set, it is the best number for the device and the engine.
+        """
+        if self._at_once is not None:
+            return self._at_once
         if self.device != "cpu" or self.engine != "torch":
             return 1
         return min(torch.get_num_threads(), MOST_AT_ONCE)
+
+    @at_once.setter
+    def at_once(self, count: int) -> None:
+        if count < 1:
+            raise InputError(f"expected one scan or more at a time, found {count}; set --at-once")
+        self._at_once = count
 
     @property
     def taxonomy(self) -> Taxonomy:

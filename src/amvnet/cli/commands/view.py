@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import parse_names
+from amvnet.cli.options import make_segmenter, parse_names
 from amvnet.errors import InputError
+from amvnet.models.methods import EngineName, Precision
 
 if TYPE_CHECKING:
     from amvnet.viewing.frames import Frame, Frames
@@ -24,6 +25,9 @@ def view(
     sequences: str | None = None,
     taxonomy: str | None = None,
     device: str = "cpu",
+    engine: EngineName = "auto",
+    precision: Precision = "float32",
+    at_once: int | None = None,
 ) -> None:
     """Look at scans, labels, uncertain points and errors in 3D: in Rerun, or in a browser.
 
@@ -38,10 +42,13 @@ def view(
         sequences: of datasets, which sequences or scenes, separated by commas; default: all.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
         device: cpu, cuda, cuda:1, ...
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
+            auto, the fastest here.
+        precision: of the networks; float16 on a GPU only.
+        at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
+            most 4.
     """
     from amvnet.files import make_folder
-    from amvnet.inference.segmenter import Segmenter
-    from amvnet.models.methods import widest_method
     from amvnet.viewing.frames import LabelSource, choose_frames
     from amvnet.viewing.rerun_log import check_rerun, check_window
     from amvnet.weights.file import load
@@ -59,8 +66,7 @@ def view(
 
     segmenter = None
     if weights is not None:
-        loaded = load(weights)
-        segmenter = Segmenter(loaded, device, widest_method(loaded.parts), keep_memory=True)
+        segmenter = make_segmenter(load(weights), device, engine, precision, at_once)
     source = LabelSource(segmenter, labels, taxonomy)
     frames = choose_frames(inputs, scans, source, parse_names(sequences))
     _show(frames, _title(inputs, weights), html, save)
