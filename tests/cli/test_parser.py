@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -90,11 +92,10 @@ def test_values_of_the_command_line_replace_those_of_the_recipe() -> None:
     assert recipe.training.bev == Recipe().training.bev
 
 
-def test_an_empty_recipe_is_refused(tmp_path: object) -> None:
-    path = f"{tmp_path}/empty.yaml"
+def test_an_empty_recipe_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "empty.yaml"
     for text in ("", "# nothing yet\n", "{}\n"):
-        with open(path, "w") as file:
-            file.write(text)
+        path.write_text(text)
         assert "found an empty file" in refusal(f"train {path} --data x --out o")
 
 
@@ -109,3 +110,23 @@ def test_an_error_of_the_disk_without_a_reason_says_what_is_known(
     assert code == 1
     assert "None" not in line
     assert "1000 requested and 0 written" in line
+
+
+@pytest.mark.parametrize("verb", ["predict", "view", "fuse"])
+def test_other_formats_are_refused_before_torch_is_imported(verb: str, tmp_path: Path) -> None:
+    picture = tmp_path / "scan.jpg"
+    picture.write_bytes(b"\xff\xd8\xff\xe0 a photograph")
+    words = {
+        "predict": ["--weights", "sim-hdl64e", "--out", str(tmp_path / "out")],
+        "view": ["--weights", "sim-hdl64e", "--html", str(tmp_path / "page.html")],
+        "fuse": ["--scores-a", ".", "--scores-b", ".", "--out", str(tmp_path / "out")],
+    }[verb]
+    code = (
+        "import sys; from amvnet.cli.main import main; code = main(sys.argv[1:]); "
+        "print(code, 'torch' in sys.modules)"
+    )
+    process = subprocess.run(
+        [sys.executable, "-c", code, verb, str(picture), *words], capture_output=True, text=True
+    )
+    assert process.stdout == "2 False\n"
+    assert "found another format" in process.stderr

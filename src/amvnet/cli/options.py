@@ -41,6 +41,19 @@ def open_data(data: str, taxonomy: Path | None = None) -> Dataset:
     return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
 
 
+def refuse_other_formats(inputs: Sequence[str]) -> None:
+    """Check that input files have a known format, before torch is imported.
+
+    Raises:
+        InputError: if one has not.
+    """
+    from amvnet.data.formats.detect import ending_of
+
+    for text in inputs:
+        if Path(text).is_file():
+            ending_of(Path(text))
+
+
 def make_segmenter(
     weights: Weights,
     device: str,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, parse_names, parse_scores
+from amvnet.cli.options import Split, parse_names, parse_scores, refuse_other_formats
 from amvnet.errors import InputError
 
 
@@ -46,6 +46,7 @@ def fuse(
             head's or the inputs'.
         topic: of bags, the topic of the scans; default: the only one with PointCloud2.
     """
+    refuse_other_formats(inputs)
     from amvnet.data.datasets.select import taxonomy_named
     from amvnet.inference.fuse_files import FusionOptions, fuse_files
     from amvnet.inference.inputs import ScanOptions

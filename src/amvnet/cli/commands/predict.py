@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, join_processes, make_segmenter, parse_names
+from amvnet.cli.options import (
+    Split,
+    join_processes,
+    make_segmenter,
+    parse_names,
+    refuse_other_formats,
+)
 from amvnet.models.methods import EngineName, MethodName, Precision
 
 FormatName = Literal["label", "npy", "ply", "pcd", "las"]
@@ -68,6 +74,7 @@ def predict(
         rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees.
         offset: of scan files, what to add to x,y,z after the rotation, in metres.
     """
+    refuse_other_formats(inputs)
     from amvnet.inference.inputs import ScanOptions, adapter_for
     from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
     from amvnet.inference.predict import predict as predict_inputs

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import make_segmenter, parse_names
+from amvnet.cli.options import make_segmenter, parse_names, refuse_other_formats
 from amvnet.errors import InputError
 from amvnet.models.methods import EngineName, Precision
 
@@ -48,6 +48,7 @@ def view(
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
     """
+    refuse_other_formats(inputs)
     from amvnet.files import make_folder
     from amvnet.viewing.frames import LabelSource, choose_frames
     from amvnet.viewing.rerun_log import check_rerun, check_window
