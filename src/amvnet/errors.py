@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import difflib
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 
@@ -12,6 +13,21 @@ class InputError(ValueError):
     The message is one line that says what was expected, what was found and what to do. The
     command line prints it to stderr and exits with code 2; from Python it is a `ValueError`.
     """
+
+
+def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") -> str:
+    """Return the end of an error message: the most similar name, or else what to do.
+
+    Args:
+        word: what the user wrote.
+        known: the names that are possible.
+        advice: what to do if none is similar.
+    """
+    names = {name.lower(): name for name in known}
+    similar = difflib.get_close_matches(word.lower(), names, n=1)
+    if not similar:
+        return f"; {advice}"
+    return f"; did you mean {names[similar[0]]}?"
 
 
 class SomeBroken(Exception):

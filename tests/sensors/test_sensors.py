@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from amvnet.errors import InputError
 from amvnet.inference.inputs import adapter_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import MEASURED, ScanAdapter
+from amvnet.sensors.adapt import MEASURED, ScanAdapter, _raise_points
 from amvnet.sensors.ground import ground_height
 from amvnet.sensors.lidars import (
     AXES,
@@ -512,3 +513,15 @@ def test_scans_of_datasets_are_not_adapted(tmp_path: Path) -> None:
     expected = Segmenter(str(weights))(points).labels
     np.testing.assert_array_equal(labels, SEMANTICKITTI.to_raw(expected))
     assert labels[3] != 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_bytes_as_points_give_no_warning(seed: int) -> None:
+    # Signalling NaN, infinity and numbers close to the largest are among them.
+    data = np.random.default_rng(seed).bytes(16 * 5000)
+    points = np.frombuffer(data, np.float32).reshape(-1, 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        raised = _raise_points(Scan(points), 0.5)
+    finite = np.isfinite(points[:, 2]) & (np.abs(points[:, 2]) < 1e30)
+    assert np.allclose(raised.points[finite, 2], points[finite, 2] + np.float32(0.5))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import socket
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,10 +28,13 @@ class Hub:
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        self.constants = SimpleNamespace(ENDPOINT=root.as_uri())
         self.calls: list[dict[str, object]] = []
 
-    def hf_hub_download(self, repo_id: str, filename: str, revision: str | None = None) -> str:
-        self.calls.append({"repo_id": repo_id, "revision": revision})
+    def hf_hub_download(
+        self, repo_id: str, filename: str, revision: str | None = None, **options: object
+    ) -> str:
+        self.calls.append({"repo_id": repo_id, "revision": revision, **options})
         path = self.root / repo_id / filename
         if not path.is_file():
             raise FileNotFoundError(f"\n404 Client Error.\n\nEntry Not Found for {repo_id}.")
@@ -71,6 +75,14 @@ def test_a_revision_can_be_named(hub: Hub) -> None:
     amvnet.push(fresh_weights(), NAME)
     load(f"{NAME}@v2")
     assert hub.calls[-1] == {"repo_id": "somebody/streets", "revision": "v2"}
+
+
+def test_a_hub_that_cannot_be_reached_is_not_asked_again_and_again(hub: Hub) -> None:
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))  # refuses connections, as it does not listen
+        hub.constants.ENDPOINT = f"http://127.0.0.1:{server.getsockname()[1]}"
+        fails(lambda: load(NAME), "cannot be reached", "name a file")
+    assert hub.calls[-1]["local_files_only"] is True
 
 
 def test_the_verbs_take_names_of_the_hub(

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 from rich import progress as rich_progress
 from rich.console import Console
 
 from amvnet.progress import Progress
+
+LEAST_SECONDS = 5  # between two lines about progress
+MOST_SECONDS = 60
 
 console = Console(highlight=False)
 
@@ -30,9 +35,9 @@ def on_terminal() -> bool:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield what shows progress: a bar on a terminal, elsewhere a line for each tenth."""
+    """Yield what shows progress: a bar on a terminal, elsewhere lines with the pace."""
     if not on_terminal():
-        yield lambda done, total: _say_each_tenth(title, done, total)
+        yield ProgressLines(title)
         return
 
     columns = (
@@ -46,6 +51,36 @@ def progress(title: str) -> Iterator[Progress]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def _say_each_tenth(title: str, done: int, total: int) -> None:
-    if done and done * 10 // total != (done - 1) * 10 // total:
-        say(f"{title}: {done} of {total}")
+class ProgressLines:
+    """Says in lines what is done, how fast, and how long the rest takes.
+
+    A line is due for each tenth, and once a minute; in between are at least some seconds.
+
+    Args:
+        title: the beginning of each line.
+    """
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self.start = time.monotonic()
+        self.last = self.start
+        self.tenths = 0
+
+    def __call__(self, done: int, total: int) -> None:
+        now = time.monotonic()
+        tenths = 10 * done // max(total, 1)
+        since_last = now - self.last
+        is_due = tenths > self.tenths or since_last >= MOST_SECONDS
+        if not done or not is_due or since_last < LEAST_SECONDS:
+            return
+
+        self.last = now
+        self.tenths = tenths
+        say(f"{self.title}: {done} of {total}, {self._pace(done, total, now - self.start)}")
+
+    def _pace(self, done: int, total: int, elapsed: float) -> str:
+        """Return the rate and the time left: "2.1 a second, 0:01:16 left"."""
+        rate = done / elapsed
+        pace = f"{rate:.3g} a second" if rate >= 1 else f"{1 / rate:.3g} s each"
+        left = timedelta(seconds=round((total - done) / rate))
+        return f"{pace}, {left} left"

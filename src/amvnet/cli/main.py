@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import sys
 import warnings
@@ -26,8 +25,9 @@ from amvnet.cli.commands.submit import submit
 from amvnet.cli.commands.train import train
 from amvnet.cli.commands.view import view
 from amvnet.cli.console import say
-from amvnet.cli.parser import Command, make_parser
-from amvnet.errors import InputError, SomeBroken
+from amvnet.cli.parser import Command, join_negative_values, make_parser
+from amvnet.errors import InputError, SomeBroken, did_you_mean
+from amvnet.threads import wait_passively
 
 # Exit codes.
 DONE = 0
@@ -89,6 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         1 for a full disk or an interruption.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    wait_passively()
     if not arguments or arguments[0] in ("-h", "--help"):
         say(USAGE)
         return DONE if arguments else WRONG_INPUT
@@ -107,7 +108,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         _complain(str(error))
         return SOME_BROKEN
     except OSError as error:  # a full disk, for example; earlier files are still whole
-        _complain(f"{error.filename or 'the disk'}: {error.strerror}; fix this and run it again")
+        # Some libraries raise an error without its parts.
+        _complain(
+            f"{error.filename or 'the disk'}: {error.strerror or error}; fix this and run it again"
+        )
         return FAILED
     except KeyboardInterrupt:
         _complain("interrupted")
@@ -128,7 +132,8 @@ def run(verb: str, arguments: Sequence[str]) -> None:
     """
     if verb not in VERBS:
         raise InputError(
-            f"expected a verb of {', '.join(VERBS)}, found {verb!r}; see amvnet --help"
+            f"expected a verb of amvnet, found {verb!r}"
+            + did_you_mean(verb, VERBS, "see amvnet --help")
         )
     if verb not in SHARED and _has_several_processes():
         raise InputError(
@@ -137,34 +142,27 @@ def run(verb: str, arguments: Sequence[str]) -> None:
         )
 
     _suppress_library_warnings()
+    arguments = join_negative_values(arguments)
     if VERBS[verb].takes_recipe:
         values = _parse_with_recipe(verb, arguments)
     else:
-        values = vars(make_parser(verb, VERBS[verb]).parse_args(list(arguments)))
+        values = vars(make_parser(verb, VERBS[verb]).parse_args(arguments))
     VERBS[verb].run(**values)
 
 
 def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
-    """Parse the arguments twice: to find the recipe, and with its values as the defaults."""
+    """Parse the arguments of a verb with a recipe, and set the values of their options in it."""
+    from amvnet.cli.recipe_options import with_options
     from amvnet.config.recipes import load_recipe
     from amvnet.config.schema import Recipe
 
-    command = VERBS[verb]
-    # A parser that is asked for help prints it and exits, so the recipe must be known before.
+    # The help shows the values of the recipe that is named first, else the paper's.
     asks_for_help = "-h" in arguments or "--help" in arguments
-    if not asks_for_help:
-        parsed = make_parser(verb, command, Recipe()).parse_args(list(arguments))
-        recipe = load_recipe(parsed.recipe)
-    elif arguments[0].startswith("-"):
-        recipe = Recipe()
-    else:
-        recipe = load_recipe(arguments[0])
+    names_recipe = bool(arguments) and not arguments[0].startswith("-")
+    shown = load_recipe(arguments[0]) if asks_for_help and names_recipe else Recipe()
 
-    parser = make_parser(verb, command, recipe)
-    values = vars(parser.instantiate(parser.parse_args(list(arguments))))
-    values["recipe"] = dataclasses.replace(
-        recipe, model=values.pop("model"), training=values.pop("training")
-    )
+    values = vars(make_parser(verb, VERBS[verb], shown).parse_args(list(arguments)))
+    values["recipe"] = with_options(load_recipe(values["recipe"]), values)
     return values
 
 

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import silence
 from amvnet.errors import InputError
-from amvnet.models.methods import METHODS
+from amvnet.models.methods import METHODS, EngineName, MethodName, Precision, widest_method
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.distributed import Processes
     from amvnet.inference.score_files import ScorePair, Which
+    from amvnet.inference.segmenter import Segmenter
+    from amvnet.weights.file import Weights
 
 # Those from the fifth on are nuScenes' own.
 Split = Literal[
@@ -40,6 +42,51 @@ def open_data(data: str, taxonomy: Path | None = None) -> Dataset:
     from amvnet.data.taxonomy import taxonomy_from_yaml
 
     return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
+
+
+def refuse_other_formats(inputs: Sequence[str]) -> None:
+    """Check that input files have a known format, before torch is imported.
+
+    Raises:
+        InputError: if one has not.
+    """
+    from amvnet.data.formats.detect import ending_of
+
+    for text in inputs:
+        if Path(text).is_file():
+            ending_of(Path(text))
+
+
+def make_segmenter(
+    weights: Weights,
+    device: str,
+    engine: EngineName,
+    precision: Precision,
+    at_once: int | None,
+    method: MethodName | None = None,
+) -> Segmenter:
+    """Return the segmenter of a verb.
+
+    Args:
+        weights: trained weights.
+        device: as for --device.
+        engine: as for --engine.
+        precision: as for --precision.
+        at_once: as for --at-once; None means the best number.
+        method: by which it labels scans; by default the widest that the weights have parts for.
+
+    Raises:
+        InputError: if one of the options does not fit the weights or this machine.
+    """
+    from amvnet.export.engines import use_engine
+    from amvnet.inference.segmenter import Segmenter
+
+    chosen = method or widest_method(weights.parts)
+    segmenter = Segmenter(weights, device, chosen, precision=precision, keep_memory=True)
+    if at_once is not None:
+        segmenter.at_once = at_once
+    use_engine(segmenter, engine)
+    return segmenter
 
 
 def describe_records(records: Sequence[ScanRecord]) -> str:

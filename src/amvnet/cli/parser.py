@@ -2,19 +2,40 @@
 
 from __future__ import annotations
 
+import argparse
 import inspect
+import re
 from argparse import BooleanOptionalAction
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 import docstring_parser
-from jsonargparse import ArgumentParser, set_parsing_settings
+from jsonargparse import ArgumentParser
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from amvnet.config.schema import Recipe
+
+# The groups of a verb's options in its help; the others come before them.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "which scans": (
+        "split",
+        "sequences",
+        "train_sequences",
+        "val_sequences",
+        "with_val",
+        "topic",
+        "scans",
+    ),
+    "scan files": ("sensor", "height", "intensity_scale", "axes", "rotate", "offset"),
+    "scores of two other models": ("scores_a", "scores_b", "key_a", "key_b", "logits"),
+    "how it is computed": ("device", "engine", "precision", "batch", "at_once"),
+}
+# What a value of a type is called.
+TYPE_WORDS = {int: "a whole number", float: "a number"}
+NEGATIVE = re.compile(r"-\.?\d")  # the beginning of a value that argparse takes for an option
 
 
 @dataclass(frozen=True)
@@ -36,18 +57,92 @@ class Command:
         return "recipe" in self.positional
 
 
+class HelpFormatter(argparse.HelpFormatter):
+    """Writes help texts without types, and a default unless the text has one."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=30)
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text = action.help or ""
+        has_no_default = action.default in (None, False, argparse.SUPPRESS, inspect.Parameter.empty)
+        if action.required or has_no_default or "default:" in text or not action.option_strings:
+            return text
+        return f"{text} (default: %(default)s)"
+
+
 class Parser(ArgumentParser):
     """A parser that raises an InputError of one line instead of printing its usage."""
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, formatter_class=HelpFormatter, **kwargs)
+        self.kinds: dict[str, Any] = {}  # types of the options' values, by flag
+
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         line = " ".join(message.split()) or str(ex)
-        raise InputError(f"{line}; see {self.prog} --help")
+        raise InputError(f"{self._in_words(line)}; see {self.prog} --help")
+
+    def _in_words(self, line: str) -> str:
+        """Return what a message of jsonargparse or argparse says, in the words of this project."""
+        unknown = re.match(r"unrecognized arguments: (.*)", line, re.IGNORECASE)
+        if unknown is not None:
+            return self._unknown_words(unknown[1])
+
+        missing = re.match(r"the following arguments are required: (.*)", line)
+        if missing is not None:
+            names = missing[1].split(", ")
+            flags = [flag_of(name) if flag_of(name) in self.kinds else name for name in names]
+            return f"expected {', '.join(flags)}, found none; add what is missing"
+
+        wrong = re.match(r'Parser key "([\w.-]+)"', line)
+        values = re.findall(r"(?:Got|Given) value: (\S+)", line)
+        if wrong is None or not values or flag_of(wrong[1]) not in self.kinds:
+            return line
+        flag = flag_of(wrong[1])
+        kind = self.kinds[flag]
+        return f"{flag}: expected {expected_words(kind)}, found {values[-1]!r}" + did_you_mean(
+            values[-1], literals(kind)
+        )
+
+    def _unknown_words(self, words: str) -> str:
+        word = words.split()[0]
+        if not word.startswith("-"):
+            return f"expected nothing more, found {words}; leave it out"
+        flag = word.split("=")[0]
+        flags = [known for known in self.kinds if known.startswith("--")]
+        return f"expected an option of {self.prog}, found {flag}{did_you_mean(flag, flags)}"
+
+
+def flag_of(name: str) -> str:
+    """Return the option of a parameter, with dashes instead of underscores."""
+    return "--" + name.replace("_", "-")
+
+
+def literals(kind: Any) -> tuple[str, ...]:
+    """Return the values of a Literal, also of an optional one; none of any other type."""
+    if get_origin(kind) is Literal:
+        return get_args(kind)
+    for part in get_args(kind):
+        if get_origin(part) is Literal:
+            return get_args(part)
+    return ()
+
+
+def expected_words(kind: Any) -> str:
+    """Return what a value of a type is called: "a number", or the values to choose from."""
+    choices = literals(kind)
+    if choices:
+        return f"one of {', '.join(choices)}"
+    for part in (kind, *get_args(kind)):
+        if part in TYPE_WORDS:
+            return TYPE_WORDS[part]
+    return "another value"
 
 
 def make_parser(verb: str, command: Command, recipe: Recipe | None = None) -> Parser:
     """Return the parser of a verb; the values of a recipe, if any, become options too."""
     docs = docstring_parser.parse(command.run.__doc__ or "")
-    help_texts = {param.arg_name: param.description for param in docs.params}
+    help_texts = {param.arg_name: param.description or "" for param in docs.params}
     metavars = [str(options["metavar"]) for options in command.positional.values()]
     parser = Parser(
         prog=f"amvnet {verb}",
@@ -58,35 +153,72 @@ def make_parser(verb: str, command: Command, recipe: Recipe | None = None) -> Pa
 
     for name, options in command.positional.items():
         parser.add_argument(name, help=help_texts.get(name), **options)
-    # Show the documentation of a recipe's values in the help.
-    set_parsing_settings(docstring_parse_attribute_docstrings=True)
+
     hints = get_type_hints(command.run)
-    for name, parameter in inspect.signature(command.run).parameters.items():
-        if name not in command.positional:
-            _add_option(parser, parameter, hints[name], help_texts.get(name))
+    parameters = dict(inspect.signature(command.run).parameters)
+    grouped = {name: title for title, names in GROUPS.items() for name in names}
+    groups: dict[str, Any] = {}
+    for name, parameter in sorted(parameters.items(), key=lambda item: item[0] in grouped):
+        if name in command.positional:
+            continue
+        title = grouped.get(name)
+        if title is None:
+            target: Any = parser
+        else:
+            target = groups.setdefault(title, None) or parser.add_argument_group(title)
+            groups[title] = target
+        _add_option(target, parameter, hints[name], help_texts.get(name, ""))
+        parser.kinds[flag_of(name)] = hints[name]
+
     if recipe is not None:
-        _add_recipe(parser, recipe)
+        from amvnet.cli.recipe_options import add_recipe
+
+        parser.kinds.update(add_recipe(parser, recipe))
     return parser
 
 
-def _add_option(
-    parser: Parser, parameter: inspect.Parameter, kind: Any, help_text: str | None
-) -> None:
-    """Add one parameter of a verb's function as an option, with dashes instead of underscores."""
-    flag = "--" + parameter.name.replace("_", "-")
+def _add_option(target: Any, parameter: inspect.Parameter, kind: Any, help_text: str) -> None:
+    """Add one parameter of a verb's function as an option.
+
+    Args:
+        target: the parser, or a group of it.
+    """
+    flag = flag_of(parameter.name)
     default = parameter.default
+    text = help_text.replace("%", "%%")
     if kind is bool:
         action = BooleanOptionalAction if default else "store_true"
-        parser.add_argument(flag, action=action, default=default, help=help_text)
-    elif default is inspect.Parameter.empty:
-        parser.add_argument(flag, type=kind, required=True, help=help_text)
+        target.add_argument(flag, action=action, default=default, help=text)
+        return
+
+    metavar = metavar_of(parameter.name, kind)
+    if default is inspect.Parameter.empty:
+        target.add_argument(
+            flag, type=kind, required=True, help=f"{text} (required)", metavar=metavar
+        )
     else:
-        parser.add_argument(flag, type=kind, default=default, help=help_text)
+        target.add_argument(flag, type=kind, default=default, help=text, metavar=metavar)
 
 
-def _add_recipe(parser: Parser, recipe: Recipe) -> None:
-    """Add every value of a recipe as an option, with dots: --training.rv.epochs 40."""
-    from amvnet.config.schema import ModelConfig, TrainingConfig
+def metavar_of(name: str, kind: Any) -> str:
+    """Return what stands for an option's value in the help: its choices, or its name."""
+    choices = literals(kind)
+    if choices:
+        return "{" + ",".join(choices) + "}"
+    return name.upper().replace("_", "-")
 
-    parser.add_argument("--model", type=ModelConfig, default=recipe.model)
-    parser.add_argument("--training", type=TrainingConfig, default=recipe.training)
+
+def join_negative_values(arguments: Sequence[str]) -> list[str]:
+    """Join options and values such as -1,0,0, which argparse takes for an option.
+
+    Returns:
+        The arguments, with `--offset -1,0,0` as `--offset=-1,0,0`.
+    """
+    joined: list[str] = []
+    for word in arguments:
+        follows_option = bool(joined) and joined[-1].startswith("--") and "=" not in joined[-1]
+        if follows_option and NEGATIVE.match(word):
+            joined[-1] += f"={word}"
+        else:
+            joined.append(word)
+    return joined

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, did_you_mean
 
 T = TypeVar("T")
 
@@ -45,6 +45,14 @@ def from_dict(cls: type[T], tree: Any, where: str = "configuration") -> T:
     return _replace(cls(), tree, where)
 
 
+def replace_values(config: T, tree: Mapping[str, Any], where: str) -> T:
+    """Return a copy of a dataclass with the values of nested dictionaries in place of its own.
+
+    The arguments and exceptions are those of `from_dict`.
+    """
+    return _replace(config, tree, where)
+
+
 def to_dict(config: Any) -> dict[str, Any]:
     """Return a dataclass as nested dictionaries, with lists in place of tuples."""
     tree: dict[str, Any] = {}
@@ -67,7 +75,8 @@ def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
     for key, value in tree.items():
         if key not in field_types:
             raise InputError(
-                f"{where}: expected one of {', '.join(field_types)}, found {key!r}; correct the key"
+                f"{where}: expected one of {', '.join(field_types)}, found {key!r}"
+                + did_you_mean(str(key), field_types, "correct the key")
             )
 
         changes[key] = _convert(getattr(default, key), value, field_types[key], f"{where}: {key}")
@@ -105,7 +114,8 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
     if choices:
         if value not in choices:
             raise InputError(
-                f"{where}: expected one of {', '.join(choices)}, found {value!r}; correct the value"
+                f"{where}: expected one of {', '.join(choices)}, found {value!r}"
+                + did_you_mean(str(value), choices, "correct the value")
             )
 
         return value

@@ -10,7 +10,7 @@ import yaml
 
 from amvnet.config.nested import from_dict, merge_trees
 from amvnet.config.schema import Recipe
-from amvnet.errors import InputError
+from amvnet.errors import InputError, did_you_mean
 
 # The folder of the built-in recipes.
 _FOLDER = resources.files("amvnet.config") / "recipes"
@@ -51,13 +51,19 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
         )
 
     try:
-        tree = yaml.safe_load(_read_text(name_or_path)) or {}
+        tree = yaml.safe_load(_read_text(name_or_path))
     except yaml.YAMLError as error:
         reason = str(error).splitlines()[0]
         raise InputError(
             f"{name_or_path}: expected YAML, found {reason}; correct the file"
         ) from None
 
+    # An empty file, perhaps of an interrupted download, would train at the paper's sizes.
+    if tree is None or tree == {}:
+        raise InputError(
+            f"{name_or_path}: expected a recipe, found an empty file; write at least the line "
+            "base: semantickitti-compact"
+        )
     if not isinstance(tree, dict):
         kind = type(tree).__name__
         raise InputError(
@@ -83,8 +89,12 @@ def _read_text(name_or_path: str) -> str:
 
     if not Path(name_or_path).is_file():
         raise InputError(
-            f"expected a recipe's name or a YAML file, found {name_or_path!r}; "
-            f"the built-in ones are {', '.join(recipe_names())}"
+            f"expected a recipe's name or a YAML file, found {name_or_path!r}"
+            + did_you_mean(
+                name_or_path,
+                recipe_names(),
+                advice=f"the built-in ones are {', '.join(recipe_names())}",
+            )
         )
 
     try:

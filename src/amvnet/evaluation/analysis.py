@@ -12,7 +12,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation, metrics
-from amvnet.evaluation.scoring import read_labelled
+from amvnet.evaluation.scoring import stream_labelled
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
 from amvnet.models.amvnet import merge
 from amvnet.models.assertions import Disagreement, cosine_similarity
@@ -105,14 +105,37 @@ def analyze(
         ensemble=np.zeros((BINS, size, size), dtype=np.int64),
         head=np.zeros((SWEPT, size, size), dtype=np.int64),
     )
-    for _, scan in read_labelled(dataset, records, progress):
-        _add(analysis, check_scan(scan), segmenter)
+
+    def label(record: ScanRecord, scan: Scan) -> LabelledScan:
+        return _label(check_scan(scan), segmenter)
+
+    for labelled in stream_labelled(dataset, records, label, segmenter.at_once, progress):
+        _count(analysis, labelled)
     return analysis
 
 
+@dataclass(frozen=True)
+class LabelledScan:
+    """A scan with N points and its labels.
+
+    Attributes:
+        scan: with ground truth.
+        ids: (N,) train ids by method.
+        head: (N,) train ids by the head, wherever a swept tau would ask it.
+        uncertain: (N,) bool, the uncertain points.
+        bins: (N,) bins of the cosine similarity of the two networks.
+    """
+
+    scan: Scan
+    ids: dict[str, np.ndarray]
+    head: np.ndarray
+    uncertain: np.ndarray
+    bins: np.ndarray
+
+
 @torch.inference_mode()
-def _add(analysis: Analysis, scan: Scan, segmenter: Segmenter) -> None:
-    """Count one scan."""
+def _label(scan: Scan, segmenter: Segmenter) -> LabelledScan:
+    """Label a scan by every method, and by the head for every point that a tau would ask."""
     # The steps of the method; the head settles every point that some tau makes uncertain.
     model = segmenter.model
     batch = PointBatch.of([scan]).to(segmenter.device)
@@ -132,18 +155,25 @@ def _add(analysis: Analysis, scan: Scan, segmenter: Segmenter) -> None:
     scores["amvnet"] = merge(f, g, uncertain, h[uncertain[asked]])
     ids = {name: expand_labels(values, scan.valid) for name, values in scores.items()}
     head = expand_labels(merge(f, g, asked, h), scan.valid)
-    truth = scan.labels
-    assert truth is not None
-    analysis.evaluation.add(scan.points, truth, ids, expand_to_scan(uncertain, scan.valid))
 
     # Points that no network has seen count as agreed on, with id 0, whatever tau is.
     bins = np.where(scan.valid, expand_to_scan(bin_of_valid, scan.valid), BINS - 1)
+    return LabelledScan(scan, ids, head, expand_to_scan(uncertain, scan.valid), bins)
+
+
+def _count(analysis: Analysis, labelled: LabelledScan) -> None:
+    """Count the points of one scan."""
+    bins = labelled.bins
+    truth = labelled.scan.labels
+    assert truth is not None
+    analysis.evaluation.add(labelled.scan.points, truth, labelled.ids, labelled.uncertain)
+
     size = len(analysis.ensemble[0])
     analysis.points += np.bincount(bins, minlength=BINS)
-    ensemble_cells = _cells(bins, truth, ids["ensemble"], size)
+    ensemble_cells = _cells(bins, truth, labelled.ids["ensemble"], size)
     analysis.ensemble += _confusions(ensemble_cells, BINS, size)
     swept = bins < SWEPT
-    head_cells = _cells(bins[swept], truth[swept], head[swept], size)
+    head_cells = _cells(bins[swept], truth[swept], labelled.head[swept], size)
     analysis.head += _confusions(head_cells, SWEPT, size)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,10 +16,13 @@ from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import TopView, draw_scan
+from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.models.methods import PAPER_METHODS
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
+
+Result = TypeVar("Result")
 
 PICTURES = 4  # scans that are drawn, evenly spaced
 
@@ -36,13 +41,23 @@ class MethodLabels:
     uncertain: np.ndarray | None = None
 
 
-LabelScan = Callable[[ScanRecord, Scan], MethodLabels]
+@dataclass(frozen=True)
+class Labeller:
+    """Labels scans.
+
+    Attributes:
+        label: labels a scan by one or several methods.
+        at_once: scans that it labels at the same time, each in a thread.
+    """
+
+    label: Callable[[ScanRecord, Scan], MethodLabels]
+    at_once: int = 1
 
 
 def evaluate(
     dataset: Dataset,
     records: Sequence[ScanRecord],
-    label: LabelScan,
+    labeller: Labeller,
     pictures: Path | None = None,
     progress: Progress = no_progress,
     processes: Processes = ALONE,
@@ -52,7 +67,7 @@ def evaluate(
     Args:
         dataset: the dataset that has the scans.
         records: the scans.
-        label: the function that labels a scan.
+        labeller: labels the scans.
         pictures: folder for pictures of a few of the scans from above; None draws none.
         progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans; each returns the evaluation of all scans.
@@ -64,9 +79,13 @@ def evaluate(
     indices = np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int)
     pictured = {records[index].name for index in indices}
 
-    for record, scan in read_labelled(dataset, processes.share(records), progress):
+    def label(record: ScanRecord, scan: Scan) -> tuple[ScanRecord, Scan, MethodLabels]:
+        return record, scan, labeller.label(record, scan)
+
+    share = processes.share(records)
+    labelled = stream_labelled(dataset, share, label, labeller.at_once, progress)
+    for record, scan, labels in labelled:
         assert scan.labels is not None
-        labels = label(record, scan)
         evaluation.add(scan.points, scan.labels, labels.ids, labels.uncertain)
         if pictures is not None and record.name in pictured:
             view = TopView(
@@ -82,29 +101,41 @@ def evaluate(
     return sum(processes.gather(evaluation), Evaluation(dataset.taxonomy))
 
 
-def read_labelled(
-    dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
-) -> Iterator[tuple[ScanRecord, Scan]]:
-    """Yield the records and their scans, each of which must have ground truth.
+def stream_labelled(
+    dataset: Dataset,
+    records: Sequence[ScanRecord],
+    compute: Callable[[ScanRecord, Scan], Result],
+    at_once: int,
+    progress: Progress,
+) -> Iterator[Result]:
+    """Read scans, each of which must have ground truth, and compute on several at the same time.
+
+    Yields:
+        The result of each scan, in order.
 
     Raises:
-        InputError: at the first scan that has none.
+        InputError: at the first scan that has no ground truth.
     """
-    for done, record in enumerate(records):
-        progress(done, len(records))
+
+    def read(record: ScanRecord) -> Scan:
         scan = dataset.read(record)
         if scan.labels is None:
             raise InputError(
                 f"{scan.name}: expected labels to compare with, found none; name labelled sequences"
             )
-        yield record, scan
-    progress(len(records), len(records))
+        return scan
+
+    progress(0, len(records))
+    with closing(stream_scans(records, read, compute, at_once)) as results:
+        for done, result in enumerate(results, start=1):
+            yield result
+            progress(done, len(records))
 
 
 def label_by_weights(
     dataset: Dataset, segmenter: Segmenter, methods: Sequence[str] = PAPER_METHODS
-) -> LabelScan:
-    """Return a function that labels a scan by several methods.
+) -> Labeller:
+    """Return what labels scans by several methods.
 
     Args:
         dataset: the dataset that has the scans.
@@ -119,11 +150,11 @@ def label_by_weights(
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
         return MethodLabels(*segmenter.labels_by_method(check_scan(scan), methods))
 
-    return label
+    return Labeller(label, segmenter.at_once)
 
 
-def label_from_files(dataset: Dataset, folder: Path) -> LabelScan:
-    """Return a function that reads the labels of a scan from a folder of predictions.
+def label_from_files(dataset: Dataset, folder: Path) -> Labeller:
+    """Return what reads the labels of scans from a folder of predictions.
 
     Raises:
         InputError: if there is no such folder.
@@ -134,4 +165,4 @@ def label_from_files(dataset: Dataset, folder: Path) -> LabelScan:
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
         return MethodLabels({"predictions": dataset.read_prediction(record, folder)})
 
-    return label
+    return Labeller(label)

@@ -164,8 +164,15 @@ class OnnxGraph(nn.Module):
             str(path), options, providers=["CPUExecutionProvider"]
         )
         self.input = self.session.get_inputs()[0].name
+        self.process = os.getpid()
 
     def forward(self, x: Tensor) -> Tensor:
+        # The runtime's threads are not part of a forked process, which would wait for them forever.
+        if os.getpid() != self.process:
+            raise InputError(
+                "expected the process that loaded the engine onnx, found one forked from it; "
+                "load the weights in the forked process, or use the engine torch"
+            )
         if len(x) != 1:
             raise InputError(
                 f"expected one scan at a time for the engine onnx, found {len(x)}; use torch"

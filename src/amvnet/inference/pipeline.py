@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import torch
 
 from amvnet.data.formats.detect import READERS
 from amvnet.data.label_bags import KINDS as BAG_KINDS
@@ -23,13 +22,13 @@ from amvnet.errors import InputError, SomeBroken
 from amvnet.files import atomic_write
 from amvnet.inference.inputs import InputScan, LabelFormat, Labels, LoadedScan
 from amvnet.inference.journal import Journal
+from amvnet.inference.scan_stream import AHEAD, stream_groups
 from amvnet.inference.segmenter import Segmentation
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.written import WrittenFiles
 
 UNCERTAIN_ENDING = ".uncertain.npy"
-AHEAD = 3  # scans that are read ahead of the computing, and that may wait to be written
 Result = Segmentation | InputError
 
 
@@ -243,41 +242,26 @@ class Pipeline:
             Each scan and None when its files are written, in order; or a scan that is broken and a
             line that says why, which may come before its turn.
         """
-        batch = self.execution.batch
-        at_once = self.execution.at_once or 1
-        with (
-            ThreadPoolExecutor(1) as reader,
-            computing_threads(at_once) as computer,
-            ThreadPoolExecutor(1) as writer,
-        ):
-            # Reading, computing and writing go on at the same time, each on other scans.
-            loads = ((scan, reader.submit(scan.load)) for scan in scans)
-            reading = deque(islice(loads, max(AHEAD, batch * at_once)))
-            computing = deque[Future[list[Segmented | Broken]]]()
-            writing = deque[tuple[InputScan, Future[None]]]()
-            # One more group than threads, so that no thread has to wait for the next.
-            most_groups = at_once + 1 if at_once > 1 else 1
-            try:
-                while reading or computing:
-                    while reading and len(computing) < most_groups:
-                        group = [reading.popleft() for _ in range(min(batch, len(reading)))]
-                        reading.extend(islice(loads, len(group)))
-                        computing.append(computer.submit(self._segment_group, group))
-
-                    for outcome in computing.popleft().result():
-                        if isinstance(outcome, Broken):
-                            yield outcome.scan, outcome.fault
-                            continue
-                        writing.append((outcome.scan, writer.submit(self._write, outcome)))
-                        # Those that are written are yielded at once, so that the journal has them.
-                        while writing and (len(writing) > AHEAD or writing[0][1].done()):
-                            yield _wait(*writing.popleft())
-                while writing:
+        groups = stream_groups(
+            scans,
+            load=lambda scan: scan.load(),
+            compute=self._segment_group,
+            batch=self.execution.batch,
+            at_once=self.execution.at_once or 1,
+        )
+        writing = deque[tuple[InputScan, Future[None]]]()
+        # Reading, computing and writing go on at the same time, each on other scans.
+        with closing(groups), ThreadPoolExecutor(1) as writer:
+            for outcome in chain.from_iterable(groups):
+                if isinstance(outcome, Broken):
+                    yield outcome.scan, outcome.fault
+                    continue
+                writing.append((outcome.scan, writer.submit(self._write, outcome)))
+                # Those that are written are yielded at once, so that the journal has them.
+                while writing and (len(writing) > AHEAD or writing[0][1].done()):
                     yield _wait(*writing.popleft())
-            finally:
-                # After an error, what has been submitted is not needed any more.
-                for pool in (reader, computer):
-                    pool.shutdown(wait=False, cancel_futures=True)
+            while writing:
+                yield _wait(*writing.popleft())
 
     def _segment_group(
         self, group: Sequence[tuple[InputScan, Future[LoadedScan]]]
@@ -337,39 +321,6 @@ class Pipeline:
             Labels(result.labels, result.uncertain if has_two_networks else None),
             segmented.file_xyz,
         )
-
-
-class CallingThread(Executor):
-    """Computes in the thread that submits, with all of torch's threads.
-
-    A second thread would start its own team of OpenMP threads, which would halve the speed of both.
-    """
-
-    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(function(*args, **kwargs))
-        except BaseException as error:
-            future.set_exception(error)
-        return future
-
-
-@contextmanager
-def computing_threads(at_once: int) -> Iterator[Executor]:
-    """Yield an executor of `at_once` jobs at a time, each with a share of torch's threads."""
-    if at_once == 1:
-        yield CallingThread()
-        return
-
-    threads = torch.get_num_threads()
-    share = max(threads // at_once, 1)
-    try:
-        with ThreadPoolExecutor(
-            at_once, initializer=torch.set_num_threads, initargs=(share,)
-        ) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)  # the pool's threads changed it for the whole process
 
 
 def _wait(scan: InputScan, writing: Future[None]) -> tuple[InputScan, None]:

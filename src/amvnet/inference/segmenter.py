@@ -25,6 +25,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import check_intensity, trained_intensity
+from amvnet.threads import BusyMachine, survive_forks
 from amvnet.weights.file import Weights, load
 
 MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
@@ -67,11 +68,14 @@ class Segmenter:
         trained = trained_intensity(self.weights.training, self.weights.sensor)
         self._are_fractions = trained is None or trained.quantiles[-1] <= 1
         self.engine = "torch"
+        self._at_once: int | None = None
         self.device = _check_device(device)
         self.precision = precision
         check_precision(precision, device)
         if keep_memory and device == "cpu":
             keep_freed_memory()
+        survive_forks()
+        self._machine = BusyMachine()
 
         self.model: AMVNet = self.weights.build().to(device)
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -80,10 +84,21 @@ class Segmenter:
 
     @property
     def at_once(self) -> int:
-        """The best number of scans to segment at a time, each with its share of the threads."""
+        """Scans to segment at the same time, each with its share of torch's threads.
+
+        If it was not set, it is the best number for the device and the engine.
+        """
+        if self._at_once is not None:
+            return self._at_once
         if self.device != "cpu" or self.engine != "torch":
             return 1
         return min(torch.get_num_threads(), MOST_AT_ONCE)
+
+    @at_once.setter
+    def at_once(self, count: int) -> None:
+        if count < 1:
+            raise InputError(f"expected one scan or more at a time, found {count}; set --at-once")
+        self._at_once = count
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -122,8 +137,10 @@ class Segmenter:
             InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
         checked = [check_scan(points) for points in scans]
-        batch = self._batch(checked)
-        labels, scores = _fetch(self._scores(batch))
+        uses_team = self.device == "cpu" and self.engine != "onnx"
+        with self._machine.watch(uses_team):
+            batch = self._batch(checked)
+            labels, scores = _fetch(self._scores(batch))
 
         results = []
         for scan, points in zip(checked, batch.slices(), strict=True):

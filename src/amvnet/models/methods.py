@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 Precision = Literal["float32", "bfloat16", "float16"]  # of the two networks
+EngineName = Literal["auto", "torch", "compile", "onnx"]  # what runs the two networks
 Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]  # f, g: (P, K) -> (P, K)
 
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)

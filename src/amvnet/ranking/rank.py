@@ -19,6 +19,7 @@ from amvnet.data.datasets.open import check_classes
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
+from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
 from amvnet.progress import Progress, no_progress
@@ -108,7 +109,7 @@ def rank(
 ) -> Ranking:
     """Rank the doubtful clusters of some scans.
 
-    One scan is in memory at a time, and 35 bytes for each cluster.
+    A few scans are in memory at a time, and 35 bytes for each cluster.
 
     Args:
         dataset: the dataset that has the scans.
@@ -117,7 +118,7 @@ def rank(
         by: `disagreement` finds points to label next: the two views disagree on them; labels are
             not needed. `labels` finds points that may be labelled wrongly: both views contradict
             their labels.
-        progress: called before each scan and at the end, with the number of scans done and in
+        progress: called at the start and after each scan, with the number of scans done and in
             all.
 
     Raises:
@@ -131,17 +132,20 @@ def rank(
     rows_by_scan = [np.zeros(0, dtype=ROW)]  # so that there may be no scans
     mean_doubts = np.zeros(len(records))
     sizes = np.zeros(len(records), dtype=np.int64)
-    for index, record in enumerate(records):
-        progress(index, len(records))
 
-        doubts = find_doubts(check_scan(dataset.read(record)), segmenter, by)
+    def rank_scan(record: ScanRecord, scan: Scan) -> tuple[np.ndarray, float, int]:
+        doubts = find_doubts(check_scan(scan), segmenter, by)
         rows, _ = find_clusters(doubts)
+        return rows, doubts.doubt.mean(), len(doubts.doubt)
+
+    progress(0, len(records))
+    ranked = stream_scans(records, dataset.read, rank_scan, segmenter.at_once)
+    for index, (rows, mean_doubt, size) in enumerate(ranked):
         rows["scan"] = index
         rows_by_scan.append(rows)
-
-        mean_doubts[index] = doubts.doubt.mean()
-        sizes[index] = len(doubts.doubt)
-    progress(len(records), len(records))
+        mean_doubts[index] = mean_doubt
+        sizes[index] = size
+        progress(index + 1, len(records))
 
     clusters = np.concatenate(rows_by_scan)
     if by == "labels":

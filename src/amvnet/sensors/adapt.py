@@ -391,7 +391,8 @@ def _raise_points(scan: Scan, rise: float) -> Scan:
         return scan
 
     offset = np.array([0, 0, rise, 0], np.float32)
-    return dataclasses.replace(scan, points=scan.points + offset)
+    with np.errstate(invalid="ignore"):  # points that are not valid may be any NaN
+        return dataclasses.replace(scan, points=scan.points + offset)
 
 
 def _field_of_view(sensor: Sensor | SensorGeometry) -> tuple[float, float] | None:

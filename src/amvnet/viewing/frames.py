@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import torch
 from amvnet.data.datasets.select import taxonomy_named
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.inputs import InputScan, LoadedScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Origin, Segmentation
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
 from amvnet.models.assertions import cosine_similarity
@@ -121,13 +123,18 @@ class Frames:
         Raises:
             InputError: if a file is broken or missing.
         """
-        for done, scan in enumerate(self.scans):
-            progress(done, len(self))
-            yield self._frame(scan)
-        progress(len(self), len(self))
+        segmenter = self.source.segmenter
+        at_once = 1 if segmenter is None else segmenter.at_once
 
-    def _frame(self, scan_input: InputScan) -> Frame:
-        scan = check_scan(scan_input.load(labels=True).scan)
+        progress(0, len(self))
+        frames = stream_scans(self.scans, _load_with_labels, self._frame, at_once)
+        with closing(frames):
+            for done, frame in enumerate(frames, start=1):
+                yield frame
+                progress(done, len(self))
+
+    def _frame(self, scan_input: InputScan, loaded: LoadedScan) -> Frame:
+        scan = check_scan(loaded.scan)
         frame = Frame(scan_input.title, scan.points, scan.valid, scan.labels)
 
         path = self.source.path
@@ -141,6 +148,10 @@ class Frames:
                 segmenter = segmenter.by_ring()
             frame = _segmented(frame, scan, segmenter)
         return frame
+
+
+def _load_with_labels(scan: InputScan) -> LoadedScan:
+    return scan.load(labels=True)
 
 
 def choose_frames(

@@ -20,7 +20,7 @@ from torch import Tensor
 from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, did_you_mean
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
@@ -312,8 +312,10 @@ def _find(name_or_path: str) -> Path:
 
     if not path.is_file():
         names = ", ".join(built_in()) or "none"
+        advice = f"check the path (built in: {names})"
         raise InputError(
-            f"expected a weights file, found no {name_or_path}; check the path (built in: {names})"
+            f"expected a weights file, found no {name_or_path}"
+            + did_you_mean(name_or_path, built_in(), advice)
         )
 
     return path

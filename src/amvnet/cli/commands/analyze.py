@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, parse_names, parse_numbers
+from amvnet.cli.options import Split, make_segmenter, parse_names, parse_numbers
 from amvnet.errors import InputError
+from amvnet.models.methods import EngineName, Precision
 
 
 def analyze(
@@ -19,6 +20,9 @@ def analyze(
     recipe: str | None = None,
     train_sequences: str | None = None,
     device: str = "cpu",
+    engine: EngineName = "auto",
+    precision: Precision = "float32",
+    at_once: int | None = None,
 ) -> None:
     """Draw the paper's figures: agreement, mIoU by distance, sweeps, tables by class and by method.
 
@@ -34,6 +38,11 @@ def analyze(
         train_sequences: sequences or scenes, separated by commas, that these heads learn from;
             default: the official split.
         device: cpu, cuda, cuda:1, ...
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
+            auto, the fastest here.
+        precision: of the networks; float16 on a GPU only.
+        at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
+            most 4.
     """
     from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.base import choose_records
@@ -42,7 +51,6 @@ def analyze(
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
-    from amvnet.inference.segmenter import Segmenter
     from amvnet.training.fit import quiet_lightning
     from amvnet.training.studies import NeighbourStudy
     from amvnet.weights.file import load
@@ -53,7 +61,7 @@ def analyze(
         )
     loaded = load(weights)
     dataset = open_with_classes(data, loaded.taxonomy)
-    segmenter = Segmenter(loaded, device, keep_memory=True)
+    segmenter = make_segmenter(loaded, device, engine, precision, at_once, method="amvnet")
     records = choose_records(dataset, parse_names(sequences), split)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.

@@ -7,9 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import console, progress
-from amvnet.cli.options import Split, join_processes, open_data, parse_methods, parse_names
+from amvnet.cli.options import (
+    Split,
+    join_processes,
+    make_segmenter,
+    open_data,
+    parse_methods,
+    parse_names,
+)
 from amvnet.errors import InputError
-from amvnet.models.methods import Precision
+from amvnet.models.methods import EngineName, Precision
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
@@ -27,7 +34,9 @@ def evaluate(
     pictures: Path | None = None,
     taxonomy: Path | None = None,
     device: str = "cpu",
+    engine: EngineName = "auto",
     precision: Precision = "float32",
+    at_once: int | None = None,
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
 
@@ -43,15 +52,17 @@ def evaluate(
         pictures: folder for drawings of some scans from above.
         taxonomy: a semantic-kitti.yaml with other classes.
         device: cpu, cuda, cuda:1, ...
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
+            auto, the fastest here.
         precision: of the networks; float16 on a GPU only.
+        at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
+            most 4.
     """
     from amvnet.data.datasets.base import choose_records
     from amvnet.data.datasets.open import open_with_classes
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
-    from amvnet.inference.segmenter import Segmenter
-    from amvnet.models.methods import widest_method
     from amvnet.weights.file import load
 
     processes = join_processes()
@@ -63,15 +74,12 @@ def evaluate(
         else:
             dataset = open_data(data, taxonomy)
         records = choose_records(dataset, names, split)
-        method = widest_method(loaded.parts)
-        segmenter = Segmenter(
-            loaded, processes.device(device), method, precision=precision, keep_memory=True
-        )
-        label = label_by_weights(dataset, segmenter, parse_methods(methods))
+        segmenter = make_segmenter(loaded, processes.device(device), engine, precision, at_once)
+        labeller = label_by_weights(dataset, segmenter, parse_methods(methods))
     elif predictions is not None and weights is None:
         dataset = open_data(data, taxonomy)
         records = choose_records(dataset, names, split)
-        label = label_from_files(dataset, predictions)
+        labeller = label_from_files(dataset, predictions)
     else:
         raise InputError(
             "expected either --weights or --predictions, found both or neither; give one of them"
@@ -83,7 +91,7 @@ def evaluate(
             make_folder(path.parent)
     with progress("scoring") as step:
         evaluation = evaluate_records(
-            dataset, records, label, pictures, progress=step, processes=processes
+            dataset, records, labeller, pictures, progress=step, processes=processes
         )
     if processes.first:
         show_evaluation(evaluation, data, dataset.taxonomy, json)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, parse_names, parse_scores
+from amvnet.cli.options import Split, parse_names, parse_scores, refuse_other_formats
 from amvnet.errors import InputError
 
 
@@ -52,6 +52,7 @@ def fuse(
         dtype: of .bin files, the type of the numbers, as of predict.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
+    refuse_other_formats(inputs)
     from amvnet.data.datasets.select import taxonomy_named
     from amvnet.data.formats.rows import parse_layout
     from amvnet.inference.fuse_files import FusionOptions, fuse_files

@@ -6,10 +6,15 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, join_processes, parse_names
-from amvnet.models.methods import MethodName, Precision
+from amvnet.cli.options import (
+    Split,
+    join_processes,
+    make_segmenter,
+    parse_names,
+    refuse_other_formats,
+)
+from amvnet.models.methods import EngineName, MethodName, Precision
 
-EngineName = Literal["auto", "torch", "compile", "onnx"]
 FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
 
 
@@ -81,13 +86,13 @@ def predict(
             sensor is at the origin.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
+    refuse_other_formats(inputs)
     from amvnet.data.formats.rows import parse_layout
-    from amvnet.export.engines import use_engine
     from amvnet.inference.inputs import ScanOptions, adapter_for
     from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
     from amvnet.inference.predict import predict as predict_inputs
-    from amvnet.inference.segmenter import Segmenter
     from amvnet.sensors.lidars import make_sensor
+    from amvnet.weights.file import load
 
     processes = join_processes()
     given_sensor = make_sensor(
@@ -99,10 +104,9 @@ def predict(
         rotate=rotate,
         offset=offset,
     )
-    segmenter = Segmenter(
-        weights, processes.device(device), method, precision=precision, keep_memory=True
+    segmenter = make_segmenter(
+        load(weights), processes.device(device), engine, precision, at_once, method=method
     )
-    use_engine(segmenter, engine)
 
     with progress("segmenting") as step:
         written = predict_inputs(

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, parse_names
+from amvnet.cli.options import Split, make_segmenter, parse_names
+from amvnet.models.methods import EngineName, Precision
 
 
 def rank(
@@ -18,6 +19,9 @@ def rank(
     sequences: str | None = None,
     pictures: Path | None = None,
     device: str = "cpu",
+    engine: EngineName = "auto",
+    precision: Precision = "float32",
+    at_once: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Rank clusters of points, and scans, to look at next: to label them, or to check their labels.
@@ -32,13 +36,16 @@ def rank(
         sequences: sequences or scenes instead, separated by commas.
         pictures: folder for drawings of the first clusters from above.
         device: cpu, cuda, cuda:1, ...
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
+            auto, the fastest here.
+        precision: of the networks; float16 on a GPU only.
+        at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
+            most 4.
         overwrite: replace files that amvnet did not write, too.
     """
     from amvnet.data.datasets.base import choose_records
     from amvnet.data.datasets.open import open_with_classes
     from amvnet.files import make_folder
-    from amvnet.inference.segmenter import Segmenter
-    from amvnet.models.methods import widest_method
     from amvnet.ranking.pictures import draw, possible_files
     from amvnet.ranking.rank import rank as rank_records
     from amvnet.ranking.rank import scans_path, write_ranking
@@ -56,7 +63,7 @@ def rank(
         loaded = load(weights)
         dataset = open_with_classes(data, loaded.taxonomy)
         records = choose_records(dataset, parse_names(sequences), split)
-        segmenter = Segmenter(loaded, device, widest_method(loaded.parts), keep_memory=True)
+        segmenter = make_segmenter(loaded, device, engine, precision, at_once)
 
         with progress("scoring") as step:
             ranking = rank_records(dataset, records, segmenter, by, step)

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, parse_names
+from amvnet.cli.options import Split, make_segmenter, parse_names, refuse_other_formats
 from amvnet.errors import InputError
+from amvnet.models.methods import EngineName, Precision
 
 if TYPE_CHECKING:
     from amvnet.viewing.frames import Frame, Frames
@@ -34,6 +35,9 @@ def view(
     axes: str | None = None,
     rotate: str | None = None,
     offset: str | None = None,
+    engine: EngineName = "auto",
+    precision: Precision = "float32",
+    at_once: int | None = None,
 ) -> None:
     """Look at scans, labels, uncertain points and errors in 3D: in Rerun, or in a browser.
 
@@ -62,12 +66,16 @@ def view(
             (y right).
         rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees.
         offset: of scan files, what to add to x,y,z after the rotation, in metres.
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
+            auto, the fastest here.
+        precision: of the networks; float16 on a GPU only.
+        at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
+            most 4.
     """
+    refuse_other_formats(inputs)
     from amvnet.data.formats.rows import parse_layout
     from amvnet.files import make_folder
     from amvnet.inference.inputs import ScanOptions
-    from amvnet.inference.segmenter import Segmenter
-    from amvnet.models.methods import widest_method
     from amvnet.sensors.lidars import make_sensor
     from amvnet.viewing.frames import LabelSource, choose_frames
     from amvnet.viewing.rerun_log import check_rerun, check_window
@@ -94,8 +102,7 @@ def view(
 
     segmenter = None
     if weights is not None:
-        loaded = load(weights)
-        segmenter = Segmenter(loaded, device, widest_method(loaded.parts), keep_memory=True)
+        segmenter = make_segmenter(load(weights), device, engine, precision, at_once)
     source = LabelSource(segmenter, labels, taxonomy)
     options = ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype))
     frames = choose_frames(inputs, scans, source, options, given_sensor, say)

@@ -3,6 +3,10 @@
 
 const FIELD = Math.tan((25 * Math.PI) / 180);  // half the height of the field of view at a distance of 1
 const NEAREST = 0.5, FARTHEST = 1500;
+const LOWEST = 0.03;  // radians: a drag does not take the camera under the ground
+// A drag over the window's height turns by half a circle, and tilts by a quarter: from FIRST, a third of the height
+// brings the camera down to the ground.
+const TURN = Math.PI, TILT = Math.PI / 2;
 const FIRST = { azimuth: 3.6, elevation: 0.55, distance: 46, target: [4, 0, -1] };
 const ABOVE = { azimuth: Math.PI, elevation: Math.PI / 2, distance: 95, target: [0, 0, 0] };
 const STREET = { azimuth: Math.PI, elevation: 0.2, distance: 14, target: [6, 0, -0.5] };
@@ -20,7 +24,7 @@ class Camera {
 
   clamp() {
     this.azimuth = ((this.azimuth % (2 * Math.PI)) + 2 * Math.PI) % (2 * Math.PI);
-    this.elevation = Math.min(Math.max(this.elevation, -Math.PI / 2), Math.PI / 2);
+    this.elevation = Math.min(Math.max(this.elevation, LOWEST), Math.PI / 2);
     this.distance = Math.min(Math.max(this.distance, NEAREST), FARTHEST);
     this.target = this.target.map((value) => Math.min(Math.max(value, -FARTHEST), FARTHEST));
   }
@@ -59,9 +63,10 @@ class Camera {
     return out;
   }
 
+  /** Turn around the target; dx and dy are fractions of the window's height. */
   turn(dx, dy) {
-    this.azimuth -= 0.006 * dx;
-    this.elevation += 0.006 * dy;
+    this.azimuth -= TURN * dx;
+    this.elevation += TILT * dy;
     this.clamp();
   }
 

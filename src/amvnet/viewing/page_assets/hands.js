@@ -32,7 +32,7 @@ class Hands {
     this.travelled += Math.hypot(dx, dy);
     if (this.down.size > 1) this.pinch(event.pointerId, before, now);
     else if (event.shiftKey || event.buttons & 6) this.camera.move(dx / this.height, dy / this.height);
-    else if (this.travelled > STILL) this.camera.turn(dx, dy);
+    else if (this.travelled > STILL) this.camera.turn(dx / this.height, dy / this.height);
     this.down.set(event.pointerId, now);
     this.on.camera();
   }

@@ -4,6 +4,7 @@
 const look = new Look(), camera = new Camera();
 const PAUSE = 800;  // milliseconds between scans during playback
 const GLIDE = 0.04;  // fraction of the window's height that one key press moves
+const STEP = 0.023;  // fraction of the window's height that one key press turns: 4 degrees
 let drawing, panel, scan = null, chosen = -1, asked = 0, playing = 0, remembering = 0;
 
 function redraw() {
@@ -117,7 +118,7 @@ const KEYS = [
     moved();
   }],
   [["Q", "E"], "turn", (key) => {
-    camera.turn(key === "Q" ? 12 : -12, 0);
+    camera.turn(key === "Q" ? STEP : -STEP, 0);
     moved();
   }],
   [["↑", "↓"], "zoom in, out", (key) => {

@@ -1,0 +1,139 @@
+"""Every value of a recipe as an option with dots, such as --training.rv.epochs 40."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+from collections.abc import Iterator, Mapping
+from functools import cache
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+import yaml
+
+from amvnet.cli.parser import metavar_of
+from amvnet.config.nested import replace_values
+from amvnet.config.schema import Recipe
+from amvnet.errors import InputError
+
+if TYPE_CHECKING:
+    from amvnet.cli.parser import Parser
+
+PARTS = ("model", "training")  # of a recipe, whose values are options
+
+
+def add_recipe(parser: Parser, recipe: Recipe) -> dict[str, Any]:
+    """Add the values of a recipe as options, one group for each of its parts.
+
+    Args:
+        parser: where to add them.
+        recipe: has the values that the help shows.
+
+    Returns:
+        The types of the options' values, by flag.
+    """
+    kinds: dict[str, Any] = {}
+    for name in PARTS:
+        for path, config in _walk(getattr(recipe, name), name):
+            values = _leaves(config)
+            if not values:
+                continue
+            group = parser.add_argument_group(f"--{path}", _first_line(type(config)))
+            texts = field_texts(type(config))
+            hints = get_type_hints(type(config))
+            for key, value in values.items():
+                flag = f"--{path}.{key}"
+                text = f"{texts[key]} (default: {_to_text(value)})".replace("%", "%%")
+                metavar = metavar_of(key, hints[key])
+                group.add_argument(flag, type=str, default=None, metavar=metavar, help=text)
+                kinds[flag] = hints[key]
+    return kinds
+
+
+def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
+    """Return a recipe with the values of the options that the user gave.
+
+    Args:
+        recipe: the recipe.
+        values: all options of the verb by name, nested by their dots; those of the recipe are
+            removed.
+
+    Raises:
+        InputError: if a value does not fit.
+    """
+    tree: dict[str, Any] = {}
+    for name in PARTS:
+        given = _given(values.pop(name, {}), f"--{name}")
+        if given:
+            tree[name] = given
+    try:
+        return replace_values(recipe, tree, "")
+    except InputError as error:
+        keys, _, rest = str(error).removeprefix(": ").partition(": expected ")
+        raise InputError(f"--{keys.replace(': ', '.')}: expected {rest}") from None
+
+
+def _given(values: Any, flag: str) -> Any:
+    """Return nested values without those that were left out, read as YAML."""
+    if isinstance(values, str):
+        return _read_value(values, flag)
+
+    given: dict[str, Any] = {}
+    for key, value in _items(values):
+        if value is None:
+            continue
+        inner = _given(value, f"{flag}.{key}")
+        if inner != {}:
+            given[key] = inner
+    return given
+
+
+def _items(values: Any) -> Iterator[tuple[str, Any]]:
+    yield from (values if isinstance(values, Mapping) else vars(values)).items()
+
+
+def _read_value(text: str, flag: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise InputError(f"{flag}: expected a value, found {text!r}; correct it") from None
+
+
+def _walk(config: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield a dataclass and those in it, each with its path."""
+    yield path, config
+    for key, value in vars(config).items():
+        if dataclasses.is_dataclass(value):
+            yield from _walk(value, f"{path}.{key}")
+
+
+def _leaves(config: Any) -> dict[str, Any]:
+    """Return the values of a dataclass that are no dataclasses themselves."""
+    return {
+        key: value for key, value in vars(config).items() if not dataclasses.is_dataclass(value)
+    }
+
+
+def _first_line(cls: type) -> str:
+    return (cls.__doc__ or "").strip().splitlines()[0]
+
+
+def _to_text(value: Any) -> str:
+    """Return a value as users write it."""
+    if isinstance(value, tuple):
+        return "[" + ",".join(map(str, value)) + "]"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+@cache
+def field_texts(cls: type) -> dict[str, str]:
+    """Return the line of documentation under each field of a dataclass."""
+    tree = ast.parse(inspect.getsource(cls))
+    body = tree.body[0].body  # type: ignore[attr-defined]
+
+    texts: dict[str, str] = {}
+    for field, text in pairwise(body):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+            texts[field.target.id] = text.value.value  # type: ignore[attr-defined,union-attr]
+    return texts

@@ -1,0 +1,110 @@
+"""Read scans ahead and compute on several at the same time: the way of every command."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any, TypeVar
+
+import torch
+
+AHEAD = 3  # scans that are read ahead of the computing, and that may wait to be written
+
+Record = TypeVar("Record")
+Loaded = TypeVar("Loaded")
+Result = TypeVar("Result")
+
+
+def stream_groups(
+    records: Sequence[Record],
+    load: Callable[[Record], Loaded],
+    compute: Callable[[Sequence[tuple[Record, Future[Loaded]]]], Result],
+    batch: int = 1,
+    at_once: int = 1,
+) -> Generator[Result]:
+    """Read scans and compute on groups of them, of which only a few are in memory at a time.
+
+    Args:
+        records: say what to read.
+        load: reads a scan; called in one other thread, in the order of the records.
+        compute: takes a group of records, each with its scan as it is being read; called in
+            `at_once` other threads, or if that is 1, in this one.
+        batch: scans of a group.
+        at_once: groups that are computed at the same time, each with a share of torch's threads.
+
+    Yields:
+        The result of each group, in order. An exception of `compute` is raised in its turn.
+    """
+    with ThreadPoolExecutor(1) as reader, computing_threads(at_once) as computer:
+        loads = ((record, reader.submit(load, record)) for record in records)
+        reading = deque(islice(loads, max(AHEAD, batch * at_once)))
+        computing = deque[Future[Result]]()
+        # One more group than threads, so that no thread has to wait for the next.
+        most_groups = at_once + 1 if at_once > 1 else 1
+        try:
+            while reading or computing:
+                while reading and len(computing) < most_groups:
+                    group = [reading.popleft() for _ in range(min(batch, len(reading)))]
+                    reading.extend(islice(loads, len(group)))
+                    computing.append(computer.submit(compute, group))
+                yield computing.popleft().result()
+        finally:
+            # After an error, what has been submitted is not needed any more.
+            for pool in (reader, computer):
+                pool.shutdown(wait=False, cancel_futures=True)
+
+
+def stream_scans(
+    records: Sequence[Record],
+    load: Callable[[Record], Loaded],
+    compute: Callable[[Record, Loaded], Result],
+    at_once: int = 1,
+) -> Generator[Result]:
+    """Read scans and compute on each; as `stream_groups` for groups of one scan.
+
+    Yields:
+        The result of each scan, in order. An exception of `load` or `compute` is raised in its
+        turn.
+    """
+
+    def compute_one(group: Sequence[tuple[Record, Future[Loaded]]]) -> Result:
+        ((record, reading),) = group
+        return compute(record, reading.result())
+
+    yield from stream_groups(records, load, compute_one, at_once=at_once)
+
+
+class CallingThread(Executor):
+    """Computes in the thread that submits, with all of torch's threads.
+
+    A second thread would start its own team of OpenMP threads, which would halve the speed of both.
+    """
+
+    def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*args, **kwargs))
+        except BaseException as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def computing_threads(at_once: int) -> Iterator[Executor]:
+    """Yield an executor of `at_once` jobs at a time, each with a share of torch's threads."""
+    if at_once == 1:
+        yield CallingThread()
+        return
+
+    threads = torch.get_num_threads()
+    share = max(threads // at_once, 1)
+    try:
+        with ThreadPoolExecutor(
+            at_once, initializer=torch.set_num_threads, initargs=(share,)
+        ) as pool:
+            yield pool
+    finally:
+        torch.set_num_threads(threads)  # the pool's threads changed it for the whole process

@@ -1,0 +1,132 @@
+"""What the command line says about wrong names and values, and in its help."""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from amvnet.cli.main import VERBS, main
+from amvnet.cli.parser import join_negative_values, make_parser
+from amvnet.cli.recipe_options import field_texts, with_options
+from amvnet.config.schema import ModelConfig, Recipe
+
+from fixtures.worlds import refusal, run_cli
+
+TRAIN = "train simulated-compact --data x --out o"
+PREDICT = "predict a.bin --weights x --out o"
+
+# A command with a mistake, and what its line has to name.
+WRONG_NAMES = {
+    "predikt a.bin": "did you mean predict?",
+    PREDICT + " --methd rv": "did you mean --method?",
+    PREDICT + " --method amvnt": "did you mean amvnet?",
+    PREDICT.replace("x", "sim-hdl64"): "did you mean sim-hdl64e?",
+    TRAIN.replace("compact", "compct"): "did you mean simulated-compact?",
+    TRAIN + " --training.rv.epoch 3": "did you mean --training.rv.epochs?",
+    TRAIN + " --trainig.rv.epochs 3": "did you mean --training.rv.epochs?",
+    TRAIN + " --training.rv.region_loss dicee": "did you mean dice?",
+}
+WRONG_VALUES = {
+    PREDICT + " --height many": "--height: expected a number, found 'many'",
+    PREDICT + " --batch 1.5": "--batch: expected a whole number, found '1.5'",
+    TRAIN + " --training.rv.lr many": "--training.rv.lr: expected a value like",
+    TRAIN + " --training.rv.lr=-1": "--training.rv.lr: expected a number",
+    TRAIN + " --model.range_net.widths [16,16]": "--model.range_net: expected as many widths",
+    TRAIN + " --training.rv.lr {": "--training.rv.lr: expected a value",
+    "train simulated-compact --data x": "expected --out, found none",
+}
+
+
+@pytest.mark.parametrize(("command", "words"), [*WRONG_NAMES.items(), *WRONG_VALUES.items()])
+def test_one_line_names_the_option_and_what_was_meant(command: str, words: str) -> None:
+    line = refusal(command)
+    assert words in line
+    assert line.count("--help") <= 1
+    assert "class" not in line.replace("class_weights", "")
+
+
+def test_values_that_begin_with_a_minus_need_no_equals_sign() -> None:
+    words = ["predict", "a", "--offset", "-1,0,0", "--resume", "--height", "-.5", "--out", "o"]
+    assert join_negative_values(words) == [
+        *["predict", "a", "--offset=-1,0,0", "--resume", "--height=-.5", "--out", "o"]
+    ]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_is_in_words(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main([verb, "--help"])
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    for word in ("class_path", "init_args", "<class", "Literal[", "null", "type:"):
+        assert word not in text
+    assert max(map(len, text.splitlines())) <= 120
+
+
+def test_the_help_of_train_has_every_value_of_the_recipe_with_its_meaning(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["train", "simulated-compact", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "--training.rv.epochs EPOCHS Passes over the training scans. (default: 10)" in text
+    assert "--model.range_view: The range image" in text
+    for key, words in field_texts(type(ModelConfig().polar_net)).items():
+        assert f"--model.polar_net.{key} " in text
+        assert words in text.replace("- ", "-")
+
+
+def test_values_of_the_command_line_replace_those_of_the_recipe() -> None:
+    parser = make_parser("train", VERBS["train"], Recipe())
+    words = ["simulated", "--data", "x", "--out", "o", "--training.rv.lr", "2e-3"]
+    words += ["--model.range_net.gru", "false", "--model.point_head.hidden", "[8,4]"]
+    recipe = with_options(Recipe(), vars(parser.parse_args(words)))
+
+    assert recipe.training.rv == dataclasses.replace(Recipe().training.rv, lr=0.002)
+    assert recipe.model.range_net == dataclasses.replace(Recipe().model.range_net, gru=False)
+    assert recipe.model.point_head.hidden == (8, 4)
+    assert recipe.training.bev == Recipe().training.bev
+
+
+def test_an_empty_recipe_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "empty.yaml"
+    for text in ("", "# nothing yet\n", "{}\n"):
+        path.write_text(text)
+        assert "found an empty file" in refusal(f"train {path} --data x --out o")
+
+
+def test_an_error_of_the_disk_without_a_reason_says_what_is_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("1000 requested and 0 written")
+
+    monkeypatch.setattr(sys.modules["amvnet.cli.main"], "run", fail)
+    code, line = run_cli("info")
+    assert code == 1
+    assert "None" not in line
+    assert "1000 requested and 0 written" in line
+
+
+@pytest.mark.parametrize("verb", ["predict", "view", "fuse"])
+def test_other_formats_are_refused_before_torch_is_imported(verb: str, tmp_path: Path) -> None:
+    picture = tmp_path / "scan.jpg"
+    picture.write_bytes(b"\xff\xd8\xff\xe0 a photograph")
+    words = {
+        "predict": ["--weights", "sim-hdl64e", "--out", str(tmp_path / "out")],
+        "view": ["--weights", "sim-hdl64e", "--html", str(tmp_path / "page.html")],
+        "fuse": ["--scores-a", ".", "--scores-b", ".", "--out", str(tmp_path / "out")],
+    }[verb]
+    code = (
+        "import sys; from amvnet.cli.main import main; code = main(sys.argv[1:]); "
+        "print(code, 'torch' in sys.modules)"
+    )
+    process = subprocess.run(
+        [sys.executable, "-c", code, verb, str(picture), *words], capture_output=True, text=True
+    )
+    assert process.stdout == "2 False\n"
+    assert "found another format" in process.stderr

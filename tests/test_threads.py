@@ -1,0 +1,120 @@
+"""What the threads of a process do on a busy machine, and after a fork."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+import torch
+
+from amvnet.threads import BUSY, WAITING, BusyMachine
+from amvnet.weights.file import save
+
+from fixtures.worlds import fresh_weights
+
+# Segments with two threads, and again in a forked pool.
+FORKING = """
+import multiprocessing, sys
+import numpy as np, torch
+from amvnet.inference.segmenter import Segmenter
+
+torch.set_num_threads(2)
+points = np.random.default_rng(0).normal(0, 10, (2000, 4)).astype(np.float32)
+segmenter = Segmenter(sys.argv[1])
+labels = segmenter(points).labels
+
+def same(_):
+    return bool((segmenter(points).labels == labels).all())
+
+if __name__ == "__main__":
+    with multiprocessing.get_context("fork").Pool(2) as pool:
+        assert pool.map(same, range(4)) == [True] * 4
+"""
+
+# Prints what the command line leaves in the environment before torch is imported.
+PRINTING = """
+import os, sys
+import amvnet.cli.main as cli
+
+cli.run = lambda verb, arguments: print(
+    "torch" in sys.modules, *(os.environ.get(name) for name in sys.argv[1:])
+)
+cli.main(["info"])
+"""
+
+
+def run_python(code: str, *arguments: str, environment: Mapping[str, str] | None = None) -> str:
+    """Run code in a process whose environment says nothing else about waiting threads."""
+    inherited = {key: value for key, value in os.environ.items() if key not in WAITING}
+    process = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**inherited, **(environment or {})},
+    )
+    assert process.returncode == 0, process.stderr
+    return process.stdout.strip()
+
+
+@pytest.mark.skipif(
+    "fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork"
+)
+def test_a_forked_pool_segments_as_its_parent(tmp_path: Path) -> None:
+    save(fresh_weights(), tmp_path / "w.safetensors")
+    run_python(FORKING, str(tmp_path / "w.safetensors"))
+
+
+def test_the_command_line_lets_threads_sleep_before_it_imports_torch() -> None:
+    assert run_python(PRINTING, *WAITING) == "False passive None 0"
+
+
+@pytest.mark.parametrize(("name", "value"), [("OMP_WAIT_POLICY", "active"), ("KMP_BLOCKTIME", "7")])
+def test_what_the_user_has_set_stays(name: str, value: str) -> None:
+    expected = [value if variable == name else "None" for variable in WAITING]
+    output = run_python(PRINTING, *WAITING, environment={name: value})
+    assert output.split() == ["False", *expected]
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> BusyMachine:
+    for name in WAITING:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    return BusyMachine()
+
+
+def test_calls_that_wait_for_a_processor_are_warned_of_once(machine: BusyMachine) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        machine.note(9, 1)  # the first call waits for memory and files, too
+        machine.note(0.9 * BUSY, 1)
+        machine.note(9, 1)
+        machine.note(1, 1)
+        machine.note(9, 1)
+
+    with pytest.warns(RuntimeWarning, match="OMP_WAIT_POLICY=passive"):
+        machine.note(9, 1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        machine.note(9, 1)
+
+
+@pytest.mark.parametrize("setting", ["passive threads", "one thread"])
+def test_threads_that_do_not_spin_are_not_warned_of(
+    machine: BusyMachine, setting: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if setting == "one thread":
+        monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    else:
+        monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(5):
+            machine.note(9, 1)
