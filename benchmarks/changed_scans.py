@@ -4,13 +4,15 @@
 
 DATA is a dataset in the layout of SemanticKITTI, such as semantickitti:PATH; the scans are spread
 evenly over its sequences. Each is changed and then labelled as `amvnet predict` labels a file of
-it: once without any option, once with the option that mends the change. Print the accuracy, and
-its share of the accuracy on the unchanged scans; a refused scan has its message instead.
+it: without any option, and, if that refuses scans or costs more than a tenth of the accuracy, with
+the option that mends the change. An offset is always tried, as it must not hurt. Print the
+accuracy, and its share of the accuracy on the unchanged scans.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +29,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import AXES, HEIGHTS, make_sensor, rotation_from_degrees
 
+GOAL = 0.9  # share of the accuracy on unchanged scans
 HEIGHT = HEIGHTS["hdl64e"]  # metres of the sensor over the ground
 
 
@@ -115,8 +118,26 @@ class Outcome:
     said: str = ""
 
 
+class Labeller:
+    """Labels adapted scans; the same scan only once, as many changes are undone exactly."""
+
+    def __init__(self, weights: str) -> None:
+        self.segmenter = Segmenter(weights).by_ring()
+        self._labels: dict[str, np.ndarray] = {}
+
+    def __call__(self, scan: Scan) -> np.ndarray:
+        """Return the (N,) train ids."""
+        digest = hashlib.sha256(scan.points.tobytes())
+        if scan.ring is not None:
+            digest.update(scan.ring.tobytes())
+        key = digest.hexdigest()
+        if key not in self._labels:
+            self._labels[key] = self.segmenter(scan).labels
+        return self._labels[key]
+
+
 def measure(
-    change: Change, options: dict[str, Any], scans: list[Scan], by_row: Segmenter
+    change: Change, options: dict[str, Any], scans: list[Scan], labeller: Labeller
 ) -> Outcome:
     """Label changed scans, each as if it were alone in its folder."""
     lines: list[str] = [""]
@@ -124,9 +145,9 @@ def measure(
     accuracies = []
     for scan in scans:
         cloud = change.apply(scan.points[:, :3], scan.points[:, 3])
-        adapter = adapter_for(by_row.weights, make_sensor(**options), lines.append)
+        adapter = adapter_for(labeller.segmenter.weights, make_sensor(**options), lines.append)
         try:
-            labels = by_row(adapter(cloud, scan.name)).labels
+            labels = labeller(adapter(cloud, scan.name))
         except InputError as error:
             refusal = str(error)
             continue
@@ -154,27 +175,31 @@ def main() -> None:
     parser.add_argument("data")
     parser.add_argument("weights", nargs="?", default="sim-hdl64e")
     parser.add_argument("--scans", type=int, default=10)
-    parser.add_argument("--only", default="")
+    parser.add_argument("--only", nargs="*", help="titles of changes")
     options = parser.parse_args()
 
     dataset = open_dataset(options.data)
     records = dataset.records(dataset.sequences("all"))
     indices = np.linspace(0, len(records) - 1, options.scans).round().astype(int)
     scans = [dataset.read(records[index]) for index in indices]
-    by_row = Segmenter(options.weights).by_ring()
+    labeller = Labeller(options.weights)
 
     table = Table("change", "without options", "with", "accuracy with it")
     remarks = []
     unchanged = 0.0
     for change in CHANGES:
-        if options.only and change.title not in ("unchanged", options.only):
+        if options.only and change.title not in ("unchanged", *options.only):
             continue
-        alone = measure(change, {}, scans, by_row)
-        unchanged = unchanged or 100 * float(np.mean(alone.accuracies))
+
+        alone = measure(change, {}, scans, labeller)
+        accuracy = 100 * float(np.mean(alone.accuracies or [0]))
+        unchanged = unchanged or accuracy
         row = [change.title, cell(alone, unchanged), "", ""]
-        if change.options:
-            row[2:] = [name_option(change.options)]
-            row.append(cell(measure(change, change.options, scans, by_row), unchanged))
+        is_mended = not alone.refusal and accuracy > GOAL * unchanged
+        if change.options and (not is_mended or "offset" in change.options):
+            mended = measure(change, change.options, scans, labeller)
+            row[2:] = [name_option(change.options), cell(mended, unchanged)]
+
         table.add_row(*row)
         remarks.append(f"{change.title}: {alone.refusal or alone.said}")
         print(*row, sep=" | ", flush=True)

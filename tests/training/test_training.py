@@ -19,6 +19,8 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from amvnet.data.datasets import simulated
+from amvnet.sensors.intensity import KEY as INTENSITIES
+from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import PointGatherer
 from amvnet.weights.file import PARTS, Weights, load
@@ -139,6 +141,8 @@ def test_the_weights_describe_their_training(run: Path) -> None:
         assert training["sequences"] == ["00", "01"]
         assert training["validated_on"] == ["08"]
         assert training["seed"] == 0
+        assert len(training[INTENSITIES]) == len(PROBABILITIES)
+        assert 0 <= training[INTENSITIES][0] < training[INTENSITIES][-1] <= 1
     assert weights.training["range_net"]["rv"]["epochs"] == 3
     assert weights.model.range_view.width == 64
 

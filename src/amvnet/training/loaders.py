@@ -268,15 +268,16 @@ def sample_intensities(dataset: Dataset, records: Sequence[ScanRecord]) -> list[
     """Return the quantiles of the intensities of some scans, as weights carry them.
 
     They are those at `sensors.intensity.PROBABILITIES`, on average over a sample of the scans, and
-    empty if no scan has usable points.
+    empty if no scan has usable points. Broken scans are left out: the training names them.
     """
     indices = np.linspace(0, len(records) - 1, min(SAMPLED_SCANS, len(records))).astype(int)
     found = []
     for index in indices:
-        scan = dataset.read(records[index], labels=False)
-        quantiles = quantiles_of(scan.points[scan.valid, 3])
-        if quantiles is not None:
-            found.append(quantiles)
+        with suppress(InputError):
+            scan = dataset.read(records[index], labels=False)
+            quantiles = quantiles_of(scan.points[scan.valid, 3])
+            if quantiles is not None:
+                found.append(quantiles)
     return np.mean(found, axis=0).round(4).tolist() if found else []
 
 
