@@ -441,6 +441,7 @@ def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
 ) -> None:
     weights = train(world, tmp_path / "run", "--model.assertion.threshold=-1")
     assert weights.parts == PARTS
+    assert weights.usual_uncertain == 0
     assert max(column(tmp_path / "run", "head", "val/acc")) > 0.5
 
 
