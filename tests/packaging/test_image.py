@@ -146,11 +146,9 @@ def test_what_is_copied_is_there_and_not_ignored(source: str) -> None:
 
 
 def test_the_weights_and_all_that_the_package_needs_are_sent_and_nothing_else() -> None:
-    for path in (ROOT / "src/amvnet/pretrained").glob("*.safetensors"):
-        assert is_sent(str(path.relative_to(ROOT)))
-    for name in ("readme", "license-files"):
-        for path in [PROJECT[name]] if isinstance(PROJECT[name], str) else PROJECT[name]:
-            assert path in copied()
+    for weights in (ROOT / "src/amvnet/pretrained").glob("*.safetensors"):
+        assert is_sent(str(weights.relative_to(ROOT)))
+    assert {PROJECT["readme"], *PROJECT["license-files"]} <= set(copied())
 
     for path in (
         ".git/config",
