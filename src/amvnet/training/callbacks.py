@@ -22,6 +22,7 @@ from amvnet.files import atomic_write
 from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
+from amvnet.training.loggers import log_figure
 
 PICTURE_ROUNDS = 10  # about how many times in a training pictures are drawn
 PICTURE_DPI = 60
@@ -292,7 +293,7 @@ class EpochLines(Callback):
 
 
 class Pictures(Callback):
-    """Draws predictions of some validation scans, seen from above, into TensorBoard.
+    """Draws predictions of some validation scans, seen from above, for the logger.
 
     Args:
         scans: with labels.
@@ -331,9 +332,7 @@ class Pictures(Callback):
         figure = scan_figure(view)
         figure.set_dpi(PICTURE_DPI)
 
-        assert trainer.logger is not None
-        writer = trainer.logger.experiment  # type: ignore[attr-defined]
-        writer.add_figure(scan.name, figure, trainer.current_epoch)
+        log_figure(trainer.logger, scan.name, figure, trainer.current_epoch)
 
 
 def _metrics(trainer: L.Trainer) -> dict[str, float]:

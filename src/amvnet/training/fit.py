@@ -12,7 +12,6 @@ from typing import Any
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.strategies import DDPStrategy
 from torch.utils.data import DataLoader
 
@@ -20,6 +19,7 @@ from amvnet.config.schema import TrainingConfig
 from amvnet.distributed import device_of, environment
 from amvnet.errors import InputError
 from amvnet.training.callbacks import AverageWeights, Bar, Curves, EpochLines, SeedBatches, Speed
+from amvnet.training.loggers import make_logger
 from amvnet.training.run_plan import RunOptions
 from amvnet.training.stages import Stage
 from amvnet.training.sync_batch_norm import synchronise_batch_norms
@@ -138,7 +138,7 @@ def _trainer(options: FitOptions, loaders: Loaders, callbacks: Sequence[Callback
         gradient_clip_val=options.clip,
         default_root_dir=folder,
         callbacks=all_callbacks,
-        logger=False if is_trial else TensorBoardLogger(folder, name="", version=""),
+        logger=False if is_trial else make_logger(options.run.logger, folder),
         enable_checkpointing=not is_trial,
         enable_progress_bar=bars,
         enable_model_summary=False,

@@ -11,6 +11,7 @@ from typing import Literal
 
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
+from amvnet.training.memory_estimate import check_memory
 from amvnet.training.run_plan import RunOptions, RunPlan
 from amvnet.training.run_record import write_record
 from amvnet.training.stage_run import HeadRun, NetworkRun, StageRun
@@ -92,12 +93,23 @@ class Run:
         return kind(self.plan, name, part, weights, train_networks=train_networks)
 
     def trials(self, stage: StageName | Literal["all"]) -> Iterator[str]:
-        """Take some steps of each network; yield a line on their time and memory. Write nothing."""
+        """Take some steps of each network; yield lines on their memory and time. Write nothing.
+
+        Raises:
+            InputError: if a step clearly needs more memory than is free; then no step is taken.
+        """
         weights = self._start(None)
-        for name in ("rv", "bev"):
-            if stage in (name, "all"):
-                with TemporaryDirectory() as folder:
-                    yield self._trial(name, weights, Path(folder))
+        names = [name for name in ("rv", "bev") if stage in (name, "all")]
+
+        plan = self.plan
+        scan = plan.scans.dataset.read(plan.scans.train[0], labels=False)
+        for name in names:
+            processes = plan.options.processes.size
+            yield check_memory(plan.recipe, name, scan, weights.taxonomy.size, processes)
+
+        for name in names:
+            with TemporaryDirectory() as folder:
+                yield self._trial(name, weights, Path(folder))
 
     def _trial(self, name: str, weights: Weights, folder: Path) -> str:
         train = self.plan.scans.train

@@ -12,6 +12,7 @@ from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.inference.score_files import ScorePair
 from amvnet.progress import Say, say_nothing
+from amvnet.training.loggers import LoggerName, check_logger
 
 
 @dataclass(frozen=True)
@@ -23,12 +24,20 @@ class RunOptions:
         say: prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
         processes: those that share the run; all must see its folder.
+        logger: where the curves and pictures go.
+
+    Raises:
+        InputError: if the logger lacks its library.
     """
 
     resume: bool = False
     say: Say = say_nothing
     bars: bool = False
     processes: Processes = ALONE
+    logger: LoggerName = "tensorboard"
+
+    def __post_init__(self) -> None:
+        check_logger(self.logger)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from amvnet.training.run_plan import RunPlan
 from amvnet.weights.file import SIZES, Weights
 
 SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
+MOST_CHANGES = 6  # settings that a message names
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")
 
 
@@ -135,11 +136,38 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     path = folder / SETTINGS
     begun = yaml.safe_load(path.read_text()) if path.is_file() else {}
     if begun != settings:
-        changed = [key for key in settings if begun.get(key) != settings[key]]
+        changes = describe_changes(begun, settings)
         raise InputError(
-            f"{folder}: expected the settings of the earlier run ({SETTINGS}), found others for "
-            f"{', '.join(changed)}; resume it with those, or give another folder"
+            f"{folder}: expected the settings of the earlier run ({SETTINGS}), found "
+            f"{', '.join(changes[:MOST_CHANGES])}"
+            + (f" and {len(changes) - MOST_CHANGES} more" if len(changes) > MOST_CHANGES else "")
+            + "; resume it with those, or give another folder"
         )
+
+
+def describe_changes(earlier: Any, settings: Any, name: str = "") -> list[str]:
+    """Return what differs between the settings of a stage, as "training.rv.lr 0.1 instead of 0.2".
+
+    Digests, which say nothing to people, are not shown: "another scans.train".
+
+    Args:
+        earlier: those of the earlier run, nested dictionaries.
+        settings: those of this one.
+        name: of the settings, with dots.
+    """
+    if earlier == settings:
+        return []
+    if isinstance(settings, dict):
+        if not isinstance(earlier, dict):
+            earlier = {}
+        changes: list[str] = []
+        for key in [*settings, *(key for key in earlier if key not in settings)]:
+            inner = f"{name}.{key}".removeprefix(".")
+            changes += describe_changes(earlier.get(key), settings.get(key), inner)
+        return changes
+    if name.split(".")[0] not in ("model", "training"):
+        return [f"another {name}"]
+    return [f"{name} {settings} instead of {earlier}"]
 
 
 def sequence_names(records: Sequence[ScanRecord]) -> list[str]:

@@ -26,6 +26,7 @@ def train(
     val_sequences: str | None = None,
     with_val: bool = False,
     dry_run: bool = False,
+    logger: Literal["tensorboard", "csv", "wandb", "mlflow"] = "tensorboard",
     taxonomy: Path | None = None,
     scores_a: Path | None = None,
     scores_b: Path | None = None,
@@ -49,7 +50,9 @@ def train(
         val_sequences: sequences or scenes, separated by commas, to validate on; default: the
             official split.
         with_val: train on these too, as for a benchmark's server; then nothing is validated.
-        dry_run: only take two steps of each network, and say what these and the training cost.
+        dry_run: only estimate the memory, take two steps of each network, and say what these and
+            the training cost.
+        logger: where the curves go; wandb and mlflow need their library.
         taxonomy: a semantic-kitti.yaml with other classes.
         scores_a: with --stage head: a folder of another model's scores, to train a head for it and
             --scores-b.
@@ -75,7 +78,7 @@ def train(
     weights = None if init is None else load(init)
     scores = parse_scores(scores_a, scores_b, key_a, key_b, logits)
 
-    options = RunOptions(resume=resume, say=say, bars=on_terminal(), processes=processes)
+    options = RunOptions(resume, say, on_terminal(), processes, logger)
     run = Run(RunPlan(recipe, scans, out, options, scores))
     if dry_run:
         for line in run.trials(stage):

@@ -1,0 +1,48 @@
+"""What a refused --resume says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from amvnet.training.fit import LAST
+from amvnet.training.run_record import MOST_CHANGES, SETTINGS, check_begun, describe_changes
+
+from fixtures.worlds import fails
+
+EARLIER = {
+    "model": {"range_net": {"widths": [8, 16], "gru": True}},
+    "training": {"rv": {"lr": 0.003, "batch": 2}, "seed": 0},
+    "scans": {"train": "0123456789abcdef", "val": "fedcba9876543210"},
+}
+
+
+def test_equal_settings_have_no_changes() -> None:
+    assert describe_changes(EARLIER, EARLIER) == []
+
+
+def test_changes_have_both_values_but_no_digests() -> None:
+    settings = {
+        "model": {"range_net": {"widths": [8, 32], "gru": True}},
+        "training": {"rv": {"lr": 0.001, "batch": 2, "ema": 0.9}, "seed": 0},
+        "scans": {"train": "ffffffffffffffff", "val": "fedcba9876543210"},
+    }
+    assert describe_changes(EARLIER, settings) == [
+        "model.range_net.widths [8, 32] instead of [8, 16]",
+        "training.rv.lr 0.001 instead of 0.003",
+        "training.rv.ema 0.9 instead of None",
+        "another scans.train",
+    ]
+
+
+def test_a_refused_resume_says_which_values_differ(tmp_path: Path) -> None:
+    (tmp_path / LAST).write_bytes(b"")
+    (tmp_path / SETTINGS).write_text(yaml.safe_dump(EARLIER))
+    settings = {**EARLIER, "training": {"rv": {"lr": 0.001, "batch": 2}, "seed": 0}}
+    fails(lambda: check_begun(tmp_path, settings, True), "training.rv.lr 0.001 instead of 0.003")
+
+    # Without the earlier settings, everything differs.
+    (tmp_path / SETTINGS).unlink()
+    many = {**EARLIER, "model": {str(index): index for index in range(2 * MOST_CHANGES)}}
+    fails(lambda: check_begun(tmp_path, many, True), "and ", " more")
