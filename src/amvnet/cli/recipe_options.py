@@ -6,7 +6,6 @@ import ast
 import dataclasses
 import inspect
 from collections.abc import Iterator, Mapping
-from functools import cache
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, get_type_hints
 
@@ -126,7 +125,6 @@ def _to_text(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-@cache
 def field_texts(cls: type) -> dict[str, str]:
     """Return the line of documentation under each field of a dataclass."""
     tree = ast.parse(inspect.getsource(cls))
