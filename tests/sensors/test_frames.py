@@ -134,6 +134,17 @@ def test_the_walls_of_a_corridor_are_not_taken_for_the_ground() -> None:
     assert (frame.axes, frame.pitch, frame.roll) == ("x-forward", 0, 0)
 
 
+def test_a_raised_road_is_not_upside_down() -> None:
+    """More of the near points are below the road than above it; far away, all are above."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-20, 20, (2, 40_000))
+    road = np.column_stack([x, y, -1.7 - 0.25 * np.maximum(np.abs(y) - 8, 0)])
+    trees = rng.uniform((25, -60, -1), (70, 60, 6), (50_000, 3))
+    frame = find_frame(np.concatenate([road, trees]), Sensor())
+    assert frame.axes == "x-forward"
+    assert frame.height == pytest.approx(1.7, abs=0.05)
+
+
 def test_scans_that_sway_are_levelled_one_by_one() -> None:
     weights = replace(fresh_weights(), sensor="hdl64e")
     adapter = adapter_for(weights)

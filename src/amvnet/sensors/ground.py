@@ -18,7 +18,8 @@ MIN_CELLS = 30
 MIN_AGREEMENT = 0.25  # weighted share of the cells that must lie in the plane
 
 # Which side of the plane is up: the ground has things on it, and little below it
-OFF_PLANE = 0.3  # metres: points farther from the plane do not belong to it
+OFF_PLANE = 0.3  # metres: points farther from the plane do not belong to it,
+CURVED = 0.02  # nor, for each metre of distance from the sensor, within this more
 MAX_BELOW = 0.1  # share of the points below the plane, if not even more are above it
 MIN_HEIGHT = -0.5  # metres of the origin over the plane; planes above it must be sure
 MAX_HEIGHT = 10.0  # metres of the origin over the plane: farther walls are seen than ground
@@ -89,8 +90,7 @@ def find_ground(xyz: np.ndarray) -> Ground | None:
 
     agreement = weight[is_ground].sum() / weight.sum()
     off_plane = around[:, 2] - _with_ones(around) @ plane
-    above = np.mean(off_plane > OFF_PLANE)
-    below = np.mean(off_plane < -OFF_PLANE)
+    above, below = _sides(xyz[distance > MIN_DISTANCE], plane)
     is_sure = bool(
         agreement > SURE_AGREEMENT
         and weight[is_ground].sum() > SURE_CELLS
@@ -109,6 +109,16 @@ def find_ground(xyz: np.ndarray) -> Ground | None:
 
     normal = np.array([-plane[0], -plane[1], 1])
     return Ground(normal / np.linalg.norm(normal), height, is_sure)
+
+
+def _sides(xyz: np.ndarray, plane: np.ndarray) -> tuple[float, float]:
+    """Return the shares of the (N, 3) points that are clearly above and below a plane.
+
+    Far points count, too: next to a raised road, more near points may be below it than above.
+    """
+    off_plane = xyz[:, 2] - _with_ones(xyz) @ plane
+    least = OFF_PLANE + CURVED * np.hypot(xyz[:, 0], xyz[:, 1])
+    return float(np.mean(off_plane > least)), float(np.mean(off_plane < -least))
 
 
 def _lowest_points(xyz: np.ndarray) -> np.ndarray:
