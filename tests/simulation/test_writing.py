@@ -120,8 +120,8 @@ def test_simulated_nuscenes_is_read_as_the_real_one(nuscenes: Path) -> None:
         x, y, z = scan.points[:, :3].T
         elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
         error = np.abs(elevation - (-30.66 + scan.ring * 4 / 3))[~is_lost]
-        assert np.median(error) < 0.1
-        assert error.max() < 2  # correcting the motion of the sensor moves points off their beams
+        assert np.median(error) < 0.5  # the device of each drive is a little off
+        assert error.max() < 2.5  # correcting the motion of the sensor moves points off their beams
 
     # Car, driveable surface, sidewalk, terrain, manmade, vegetation.
     assert classes >= {4, 11, 13, 14, 15, 16}

@@ -89,10 +89,12 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     performance unused. oneDNN, which computes convolutions, does not; but the gradients of such a
     convolution are slow.
     """
-    # A convolution does not take an empty image.
     needs_gradient = torch.is_grad_enabled() and (x.requires_grad or weight.requires_grad)
-    by_convolution = x.is_cpu and len(x) > 0 and not needs_gradient
-    if not by_convolution or torch.compiler.is_compiling():
+    # An exporter must not see the number of rows, which it would fix.
+    if torch.compiler.is_compiling() or needs_gradient or not x.is_cpu:
+        return F.linear(x, weight, bias)
+    # A convolution does not take an empty image.
+    if not len(x):
         return F.linear(x, weight, bias)
 
     # (1, C, N, 1), with the channels last in memory
