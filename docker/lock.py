@@ -11,7 +11,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-EXTRAS = ("simulate", "formats", "export", "hub")  # all but the Rerun viewer and the tests
+# All but the Rerun viewer, the tests, and the loggers of other services.
+EXTRAS = ("simulate", "formats", "datasets", "e57", "packets", "export", "hub")
 
 # constraints.txt pins torch, which pins these itself, and not all of them are on every machine.
 OF_TORCH = ("cuda-", "nvidia-", "torch", "triton")

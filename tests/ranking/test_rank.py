@@ -290,7 +290,7 @@ def test_wrong_input_is_one_line_and_leaves_nothing(
 
 def test_each_scan_is_read_only_in_its_turn(world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = open_dataset(str(world / "data"))
-    events = []
+    events: list[str | int] = []
     read = type(dataset).read
 
     def recorded_read(dataset: Dataset, record: ScanRecord) -> Scan:

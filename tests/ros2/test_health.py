@@ -6,7 +6,7 @@ from amvnet_ros.health import Health, Labelled, Level
 
 
 def test_clouds_are_counted_and_their_latency_is_measured() -> None:
-    health = Health()
+    health = Health(usual_uncertain=0.3)
     for seconds in (0.2, 0.3, 0.4):
         health.receive(drops=seconds == 0.4)
         health.label(Labelled(seconds, seconds + 1, points=100, uncertain=0.25))
@@ -27,7 +27,7 @@ def test_clouds_are_counted_and_their_latency_is_measured() -> None:
 
 
 def test_counts_go_on_and_measurements_begin_again() -> None:
-    health = Health()
+    health = Health(usual_uncertain=0.3)
     health.receive(drops=True)
     health.label(Labelled(0.2, 0.2, points=100, uncertain=None))
     assert "uncertain points (%)" not in health.report(1.0).values
@@ -41,13 +41,13 @@ def test_counts_go_on_and_measurements_begin_again() -> None:
 
 
 def test_a_cloud_at_work_is_no_reason_to_warn() -> None:
-    health = Health()
+    health = Health(usual_uncertain=0.3)
     health.receive(drops=False)
     assert health.report(1.0).level is Level.OK
 
 
 def test_a_refused_cloud_is_an_error_with_its_reason() -> None:
-    health = Health()
+    health = Health(usual_uncertain=0.3)
     health.receive(drops=False)
     health.refuse("/points: expected columns x, y, z")
     report = health.report(1.0)
@@ -57,10 +57,10 @@ def test_a_refused_cloud_is_an_error_with_its_reason() -> None:
 
 
 def test_scans_that_the_weights_do_not_know_are_told() -> None:
-    health = Health()
+    health = Health(usual_uncertain=0.3)
     health.receive(drops=False)
-    health.label(Labelled(0.2, 0.2, points=100, uncertain=0.97))
+    health.label(Labelled(0.2, 0.2, points=100, uncertain=0.7))
     report = health.report(1.0)
     assert report.level is Level.WARN
-    assert "97 %" in report.message
+    assert "70.0%" in report.message
     assert "axes" in report.message

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ def test_another_range_later_in_a_source_is_that_of_another_sensor() -> None:
 
     lines: list[str] = []
     adapter = adapter_for(weights_with({}), say=lines.append)
-    adapter.learn("a", [lambda cloud=cloud: cloud for cloud in first])
+    adapter.learn("a", [partial(Cloud, cloud.xyz, cloud.intensity, name="a") for cloud in first])
     for height in (1.0, 2.5):
         points = scan_points(height)
         scan = adapter(Cloud(points[:, :3], 255 * points[:, 3], name="b"), "a")

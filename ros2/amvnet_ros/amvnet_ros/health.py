@@ -7,7 +7,7 @@ from enum import Enum
 from statistics import median
 from threading import Lock
 
-UNSURE = 0.9  # share of uncertain points; on scans that weights know it is 0.2 to 0.6
+from amvnet.inference.certainty import Verdict
 
 
 class Level(Enum):
@@ -55,9 +55,15 @@ class _Period:
 
 
 class Health:
-    """Counts what happens to the clouds; any thread may call it."""
+    """Counts what happens to the clouds; any thread may call it.
 
-    def __init__(self) -> None:
+    Args:
+        usual_uncertain: the share of uncertain points in the scans that the weights were validated
+            on, in [0, 1].
+    """
+
+    def __init__(self, usual_uncertain: float) -> None:
+        self._usual_uncertain = usual_uncertain
         self._lock = Lock()
         self._period = _Period()
         self._received = 0
@@ -102,7 +108,7 @@ class Health:
                 "clouds refused": str(self._refused),
             }
         values |= _describe(period, seconds)
-        return Report(*_judge(period), values)
+        return Report(*_judge(period, self._usual_uncertain), values)
 
 
 def _describe(period: _Period, seconds: float) -> dict[str, str]:
@@ -125,16 +131,17 @@ def _describe(period: _Period, seconds: float) -> dict[str, str]:
     return values
 
 
-def _judge(period: _Period) -> tuple[Level, str]:
+def _judge(period: _Period, usual_uncertain: float) -> tuple[Level, str]:
     if period.refusal:
         return Level.ERROR, period.refusal
     if not period.received and not period.labelled:
         return Level.WARN, "no clouds: check the topic, and its QoS"
 
     uncertain = _uncertain(period)
-    if uncertain is not None and uncertain > UNSURE:
-        share = f"{100 * uncertain:.0f} % of the points are uncertain"
-        return Level.WARN, f"{share}: check sensor, height, axes and intensity_scale"
+    if uncertain is not None:
+        verdict = Verdict(uncertain, usual_uncertain)
+        if verdict.is_doubtful:
+            return Level.WARN, f"{verdict}; check sensor, height, unit, axes and intensity_scale"
     return Level.OK, "labelling"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 import traceback
@@ -32,6 +31,7 @@ from amvnet.data.formats.pointcloud2 import (
     PlainCloud,
 )
 from amvnet.errors import InputError
+from amvnet.threads import wait_passively
 from amvnet_ros.health import Health, Labelled
 from amvnet_ros.newest import NewestOnly
 from amvnet_ros.segmentation import CloudSegmenter, Settings
@@ -64,13 +64,12 @@ class SegmentNode(Node):
     def __init__(self) -> None:
         super().__init__("amvnet")
         self.exit_code = DONE
-        self._health = Health()
-        self._report_time = time.monotonic()
-
         settings = self._declare_settings()
         topic = self.resolve_topic_name("points")
         self._segment = CloudSegmenter(settings, topic, self.get_logger().info)
         self._hardware = settings.device
+        self._health = Health(self._segment.usual_uncertain)
+        self._report_time = time.monotonic()
 
         self._labels = self._create_cloud_publisher("~/labels")
         self._cloud = self._create_cloud_publisher("~/cloud")
@@ -198,9 +197,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
     0 after the shutdown, 2 if a parameter is wrong (one line on stderr), 1 after any other error.
     """
-    # A robot runs other programs, too: without this, torch's threads would wait for each other by
-    # spinning. Before torch is imported, because OpenMP reads it once.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    wait_passively()
 
     rclpy.init(args=args)
     try:

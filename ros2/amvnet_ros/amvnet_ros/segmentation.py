@@ -33,8 +33,9 @@ class Settings:
     sensor: str = _parameter("", "a name such as os1-64, or a YAML file; empty: measured")
     height: float = _parameter(-1.0, "metres over the ground; negative: measured")
     intensity_scale: float = _parameter(0.0, "the largest possible intensity; 0: measured")
-    axes: str = _parameter("", "x-forward, y-forward, z-forward or z-down; empty: x-forward")
-    rotate: str = _parameter("", "yaw,pitch,roll in degrees that level the scan")
+    unit: str = _parameter("", "m, cm, mm or ft; empty: measured")
+    axes: str = _parameter("", "x-forward, y-forward, z-forward, z-down or y-up; empty: measured")
+    rotate: str = _parameter("", "yaw,pitch,roll in degrees that level the scan; empty: measured")
     offset: str = _parameter("", "x,y,z in metres, added after the rotation")
 
     def sensor_options(self) -> dict[str, Any]:
@@ -43,6 +44,7 @@ class Settings:
             "sensor": self.sensor or None,
             "height": self.height if self.height >= 0 else None,
             "intensity_scale": self.intensity_scale or None,
+            "unit": self.unit or None,
             "axes": self.axes or None,
             "rotate": self.rotate or None,
             "offset": self.offset or None,
@@ -84,6 +86,11 @@ class CloudSegmenter:
     The sensor is measured in the first messages, as `amvnet predict` measures it in the first scans
     of a folder.
 
+    Attributes:
+        taxonomy: the classes.
+        usual_uncertain: the share of uncertain points in the scans that the weights were validated
+            on, in [0, 1].
+
     Args:
         settings: the parameters of the node.
         topic: where the messages come from, for what is said.
@@ -115,6 +122,7 @@ class CloudSegmenter:
             keep_memory=True,
         )
         self.taxonomy = segmenter.taxonomy
+        self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
         self._adapt = adapter_for(segmenter.weights, sensor, say)
         self._segment = segmenter.by_ring()

@@ -29,7 +29,17 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "topic",
         "scans",
     ),
-    "scan files": ("sensor", "height", "intensity_scale", "axes", "rotate", "offset"),
+    "scan files": (
+        "columns",
+        "dtype",
+        "sensor",
+        "height",
+        "intensity_scale",
+        "unit",
+        "axes",
+        "rotate",
+        "offset",
+    ),
     "scores of two other models": ("scores_a", "scores_b", "key_a", "key_b", "logits"),
     "how it is computed": ("device", "engine", "precision", "batch", "at_once"),
 }

@@ -32,6 +32,7 @@ def view(
     sensor: str | None = None,
     height: float | None = None,
     intensity_scale: float | None = None,
+    unit: str | None = None,
     axes: str | None = None,
     rotate: str | None = None,
     offset: str | None = None,
@@ -62,9 +63,11 @@ def view(
         height: of scan files, the sensor's height over the ground in metres; default: measured.
         intensity_scale: of scan files, the largest possible intensity; default: as the values
             suggest.
-        axes: of scan files, x-forward (y left), y-forward (x right), z-forward (y down) or z-down
-            (y right).
-        rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees.
+        unit: of scan files, m, cm, mm or ft; default: as of predict.
+        axes: of scan files, x-forward (y left), y-forward (x right), z-forward (y down), z-down
+            (y right) or y-up (x right); default: as of predict.
+        rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees; default: as
+            of predict.
         offset: of scan files, what to add to x,y,z after the rotation, in metres.
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
             auto, the fastest here.
@@ -87,6 +90,7 @@ def view(
         sensor,
         height=height,
         intensity_scale=intensity_scale,
+        unit=unit,
         axes=axes,
         rotate=rotate,
         offset=offset,
