@@ -26,6 +26,7 @@ from amvnet.inference.segmenter import Segmenter
 
 torch.set_num_threads(2)
 points = np.random.default_rng(0).normal(0, 10, (2000, 4)).astype(np.float32)
+points[:, 3] = 0.3
 segmenter = Segmenter(sys.argv[1])
 labels = segmenter(points).labels
 

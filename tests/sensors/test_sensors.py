@@ -446,7 +446,7 @@ def test_a_bag_is_segmented_scan_by_scan(
     options = ("--weights", world / "w.safetensors", "--out", tmp_path)
     bag_options = (*options, "--topic", "/top", "--scores")
     assert main(["predict", str(world / "drive.bag"), *map(str, bag_options)]) == 0
-    assert capsys.readouterr().out.count("assumed") == 1
+    assert capsys.readouterr().out.count(": assumed") == 1
 
     expected_files = set()
     for index in range(3):
