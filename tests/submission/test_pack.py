@@ -167,7 +167,7 @@ def test_a_fault_leaves_the_old_archive(case: Case, tmp_path: Path) -> None:
         else:
             prediction.write_bytes(fault)
 
-        code, error = submit(case.spec, "--predictions", folder, "--out", out)
+        code, error = submit(case.spec, "--predictions", folder, "--out", out, "--overwrite")
         assert code == 2
         assert error.count("\n") == 1
         assert case.last in error
