@@ -426,3 +426,30 @@ def test_only_bags_become_bags_and_none_is_overwritten(world: Path, tmp_path: Pa
     code, message = run_cli("predict", world / "scans", *options, tmp_path / "out")
     assert (code, message.count("\n")) == (2, 1)
     assert "--format bag" in message
+
+
+def test_a_bag_of_labels_is_replaced_but_no_other_bag(world: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    bag = write_bag1(tmp_path / "drive.bag", {"/top": [some_points()]})
+    command = (
+        "predict",
+        bag,
+        "--weights",
+        world / "w.safetensors",
+        "--format",
+        "bag",
+        "--out",
+        out,
+    )
+    for _ in range(2):
+        assert run_cli(*command) == (0, "")
+
+    (out / "drive.bag").write_bytes(b"of the user")
+    code, message = run_cli(*command)
+    assert (code, message.count("\n")) == (2, 1)
+    assert "--overwrite" in message
+    assert (out / "drive.bag").read_bytes() == b"of the user"
+    assert not list(out.glob(".drive*"))
+
+    assert run_cli(*command, "--overwrite") == (0, "")
+    assert labels_in(out / "drive.bag", 0).shape == (len(some_points()),)

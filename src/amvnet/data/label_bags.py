@@ -37,15 +37,20 @@ def check_rosbags() -> None:
         ) from None
 
 
-def bag_path(folder: Path, name: str, kind: str) -> Path:
-    """Return the path of the bag with the labels of a scan.
+def bag_path(name: str, kind: str) -> Path:
+    """Return the path of the bag with the labels of a scan, relative to a folder of predictions.
 
     Args:
-        folder: the folder of predictions.
         name: of the scan, such as `drive/000012`.
+        kind: one of `KINDS`.
     """
-    bag = (folder / name).parent
-    return bag.with_name(f"{bag.name}.{kind}")
+    scans = Path(name).parent
+    return scans.with_name(f"{scans.name}.{kind}")
+
+
+def part_path(name: str, kind: str) -> Path:
+    """Return the path of the part of the bag with the labels of one scan, as `bag_path` does."""
+    return _parts(bag_path(name, kind)) / f"{Path(name).name}.npz"
 
 
 def write_part(
@@ -67,14 +72,14 @@ def write_part(
     serialise = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
     data = np.frombuffer(serialise(values, CLOUD_TYPE), np.uint8)
 
-    path = _parts(bag_path(folder, name, kind)) / f"{Path(name).name}.npz"
+    path = folder / part_path(name, kind)
     with atomic_write(path) as part:
         np.savez(part, time=message.time, topic=message.topic + SUFFIX, data=data)
     return path
 
 
 def join_parts(folder: Path, names: Sequence[str], kind: str) -> list[Path]:
-    """Join the parts of each bag, in order of time, and return the paths of the bags.
+    """Join the parts of each bag, in order of time.
 
     The parts are removed if none is missing, so that a later run can add what is.
 
@@ -82,20 +87,24 @@ def join_parts(folder: Path, names: Sequence[str], kind: str) -> list[Path]:
         folder: the folder of predictions.
         names: of all scans.
         kind: one of `KINDS`.
+
+    Returns:
+        The paths of the bags, relative to the folder.
     """
     counts: dict[Path, int] = {}
     for name in names:
-        path = bag_path(folder, name, kind)
+        path = bag_path(name, kind)
         counts[path] = counts.get(path, 0) + 1
 
     written = []
     for path, count in counts.items():
-        parts = sorted(_parts(path).glob("[0-9]*.npz"))
+        folder_of_parts = folder / _parts(path)
+        parts = sorted(folder_of_parts.glob("[0-9]*.npz"))
         if parts:
-            _write_bag(path, parts, kind)
+            _write_bag(folder / path, parts, kind)
             written.append(path)
         if len(parts) == count:
-            shutil.rmtree(_parts(path))
+            shutil.rmtree(folder_of_parts)
     return written
 
 

@@ -91,7 +91,8 @@ class InputScan(Protocol):
         """Return the path of the file of its labels, relative to a folder of predictions.
 
         Args:
-            kind: the format for scan files; datasets have their own.
+            kind: the format for scan files; datasets have their own. Of bags, the file is a part of
+                the bag.
         """
 
     @property
@@ -277,6 +278,8 @@ class FileScan:
         return Path(f"{self.scan.name}.npz")
 
     def labels_path(self, kind: str) -> Path:
+        if kind in label_bags.KINDS:
+            return label_bags.part_path(self.scan.name, kind)
         return Path(f"{self.scan.name}.{kind}")
 
     @property

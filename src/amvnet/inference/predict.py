@@ -20,6 +20,7 @@ from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import ScanAdapter
+from amvnet.written import WrittenFiles
 
 # What to try if the labels are doubtful.
 ADVICE = (
@@ -86,7 +87,8 @@ def predict(
         faults = error
     if is_bag and execution.processes.first:
         names = [scan.name for scan in opened.scans if isinstance(scan, FileScan)]
-        label_bags.join_parts(output.folder, names, output.kind)
+        bags = label_bags.join_parts(output.folder, names, output.kind)
+        WrittenFiles(output.folder).finish(bags)
 
     _report(segment, execution.processes, say)
     if faults is not None:
@@ -95,8 +97,14 @@ def predict(
 
 
 def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
-    """Raise InputError if labels cannot become bags: scans are in other files, or in these bags."""
+    """Check that labels can become bags.
+
+    Raises:
+        InputError: if scans are in other files, or in these bags, or a bag of the user would be
+            replaced.
+    """
     label_bags.check_rosbags()
+    bags = set()
     for scan in scans:
         if not isinstance(scan, FileScan):
             continue
@@ -105,12 +113,16 @@ def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
                 f"{scan.path}: expected a bag for --format {output.kind}, found another file; "
                 "choose another format, such as ply"
             )
-        path = label_bags.bag_path(output.folder, scan.name, output.kind)
-        if path.resolve() == scan.path.resolve():
+        bag = label_bags.bag_path(scan.name, output.kind)
+        bags.add(bag)
+        if (output.folder / bag).resolve() == scan.path.resolve():
             raise InputError(
                 f"{scan.path}: expected another folder for the labels, found the bag's own; "
                 "change --out"
             )
+
+    if not output.overwrite:
+        WrittenFiles(output.folder).check(sorted(bags))
 
 
 class NetworkSegmentation:
