@@ -1,9 +1,10 @@
 """Measure what fitting is worth: segment simulated scans of sensors that the weights do not know.
 
-    python benchmarks/other_sensors.py [FOLDER]
+    python benchmarks/other_sensors.py [FOLDER] [WEIGHTS]
 
 Each scan is segmented as it is, and as `amvnet predict` fits it to the weights. FOLDER
 (other_sensors) keeps the scans: six for each sensor, of three streets that no training has seen.
+WEIGHTS is a name or a file (sim-hdl64e).
 """
 
 from __future__ import annotations
@@ -81,6 +82,6 @@ def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
 if __name__ == "__main__":
     SENSORS.update(OTHERS)
     root = Path(sys.argv[1] if len(sys.argv) > 1 else "other_sensors")
-    segmenter = Segmenter("sim-hdl64e")
+    segmenter = Segmenter(sys.argv[2] if len(sys.argv) > 2 else "sim-hdl64e")
     for name in OTHERS:
         compare(name, root / name, segmenter)
