@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
@@ -15,6 +16,17 @@ class InputError(ValueError):
     """
 
 
+def shown(value: object) -> str:
+    """Return a value of a file or an option for an error message: on one line, and short.
+
+    Values of files may be megabytes long, or refer to themselves.
+    """
+    text = reprlib.Repr()
+    text.maxlevel = 2
+    text.maxstring = text.maxother = 100
+    return text.repr(value)
+
+
 def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") -> str:
     """Return the end of an error message: the most similar name, or else what to do.
 
@@ -24,7 +36,8 @@ def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") ->
         advice: what to do if none is similar.
     """
     names = {name.lower(): name for name in known}
-    similar = difflib.get_close_matches(word.lower(), names, n=1)
+    longest = 2 * max(map(len, names), default=0)  # nobody meant a name by a word that is longer
+    similar = difflib.get_close_matches(word[:longest].lower(), names, n=1)
     if not similar:
         return f"; {advice}"
     return f"; did you mean {names[similar[0]]}?"

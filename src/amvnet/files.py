@@ -1,4 +1,4 @@
-"""Output files that appear whole or not at all."""
+"""Output files that appear whole or not at all, and YAML files."""
 
 from __future__ import annotations
 
@@ -7,9 +7,13 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from amvnet.errors import InputError
 
+LARGEST_YAML = 100_000  # bytes; PyYAML takes a second for as many
 PARTS = f".{'[0-9a-f]' * 32}.part*"  # names of files that `atomic_write` has not finished
 
 
@@ -50,3 +54,29 @@ def make_folder(path: Path) -> None:
         raise InputError(
             f"{path}: expected a folder to write to, found {error.strerror}; give another"
         ) from None
+
+
+def read_yaml(path: Path, content: str) -> Any:
+    """Return what a YAML file holds: dictionaries, lists, texts, numbers. Nothing is executed.
+
+    Args:
+        path: the file.
+        content: what the file should hold, for messages, such as "a label map".
+
+    Raises:
+        InputError: if the file cannot be read, is too large, or is not YAML.
+    """
+    expected = f"{path}: expected {content} (YAML)"
+    try:
+        if path.stat().st_size > LARGEST_YAML:
+            raise InputError(f"{expected}, found {path.stat().st_size} bytes; give a smaller file")
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{expected}, found {error.strerror}; check the path") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{expected}, found bytes that are not text; give another file") from None
+    except RecursionError:
+        raise InputError(f"{expected}, found values nested too deeply; correct the file") from None
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: numbers and dates
+        reason = " ".join(str(error).split())
+        raise InputError(f"{expected}, found {reason}; correct the file") from None

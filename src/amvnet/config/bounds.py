@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, get_args, get_type_hints
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class Range:
         return f"{above} {self.low:g} and {below} {self.high:g}"
 
 
+LONGEST_TEXT = 200
+MOST_ITEMS = 12  # of a list of values, such as the channels of a network's layers
 Count = Annotated[int, Range(1)]
 NotNegative = Annotated[float, Range(0)]
 Positive = Annotated[float, Range(0, open=True)]
@@ -43,17 +45,22 @@ Share = Annotated[float, Range(0, 1)]
 
 
 class Checked:
-    """A base class of dataclasses whose numbers must lie in the `Range` of their annotation."""
+    """A base class of dataclasses whose numbers must be finite and in their `Range`."""
 
     def __post_init__(self) -> None:
         """Check every number.
 
         Raises:
-            InputError: if a number is out of its range; the message names the first.
+            InputError: if a number is not finite or out of its range; the message names the first.
         """
         for name, kind in get_type_hints(type(self), include_extras=True).items():
             value = getattr(self, name)
             if isinstance(value, tuple):
+                self.check(
+                    holds=len(value) <= MOST_ITEMS,
+                    expected=f"at most {MOST_ITEMS} values of {name}",
+                    found=str(len(value)),
+                )
                 item_kind = get_args(kind)[0]
                 for item in value:
                     _check_range(name, item, item_kind)
@@ -76,8 +83,24 @@ class Checked:
 
 
 def _check_range(name: str, value: Any, kind: Any) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise InputError(f"{name}: expected a finite number, found {value}; correct the value")
+
     for allowed in getattr(kind, "__metadata__", ()):  # the ranges of an `Annotated` type
         if value not in allowed:
             raise InputError(
-                f"{name}: expected a number {allowed}, found {value}; correct the value"
+                f"{name}: expected a number {allowed}, found {shown(value)}; correct the value"
             )
+
+
+def check_text(name: str, value: Any) -> None:
+    """Check that a value of a file is a short text of one line.
+
+    Raises:
+        InputError: if it is not.
+    """
+    if not isinstance(value, str) or not value.isprintable() or len(value) > LONGEST_TEXT:
+        raise InputError(
+            f"{name}: expected a text of at most {LONGEST_TEXT} printable characters, "
+            f"found {shown(value)}; correct the value"
+        )

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
-from amvnet.errors import InputError, did_you_mean
+from amvnet.errors import InputError, did_you_mean, shown
 
 T = TypeVar("T")
 
@@ -41,7 +41,9 @@ def from_dict(cls: type[T], tree: Any, where: str = "configuration") -> T:
             default's type, or a number is out of its range.
     """
     if not isinstance(tree, Mapping):
-        raise InputError(f"{where}: expected keys and values, found {tree!r}; correct the value")
+        raise InputError(
+            f"{where}: expected keys and values, found {shown(tree)}; correct the value"
+        )
     return _replace(cls(), tree, where)
 
 
@@ -75,7 +77,7 @@ def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
     for key, value in tree.items():
         if key not in field_types:
             raise InputError(
-                f"{where}: expected one of {', '.join(field_types)}, found {key!r}"
+                f"{where}: expected one of {', '.join(field_types)}, found {shown(key)}"
                 + did_you_mean(str(key), field_types, "correct the key")
             )
 
@@ -114,7 +116,7 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
     if choices:
         if value not in choices:
             raise InputError(
-                f"{where}: expected one of {', '.join(choices)}, found {value!r}"
+                f"{where}: expected one of {', '.join(choices)}, found {shown(value)}"
                 + did_you_mean(str(value), choices, "correct the value")
             )
 
@@ -136,11 +138,11 @@ def _convert_float(default: float, value: Any, where: str) -> float:
 
     try:
         return float(value)
-    except ValueError:
+    except (ValueError, OverflowError):
         raise _wrong_type(default, value, where) from None
 
 
 def _wrong_type(default: Any, value: Any, where: str) -> InputError:
     return InputError(
-        f"{where}: expected a value like {default!r}, found {value!r}; correct the value"
+        f"{where}: expected a value like {default!r}, found {shown(value)}; correct the value"
     )

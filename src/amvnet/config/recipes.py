@@ -6,11 +6,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from amvnet.config.nested import from_dict, merge_trees
 from amvnet.config.schema import Recipe
-from amvnet.errors import InputError, did_you_mean
+from amvnet.errors import InputError, did_you_mean, shown
+from amvnet.files import read_yaml
 
 # The folder of the built-in recipes.
 _FOLDER = resources.files("amvnet.config") / "recipes"
@@ -50,13 +49,7 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
             "found this recipe among its own bases; name another base"
         )
 
-    try:
-        tree = yaml.safe_load(_read_text(name_or_path))
-    except yaml.YAMLError as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"{name_or_path}: expected YAML, found {reason}; correct the file"
-        ) from None
+    tree = read_yaml(_find(name_or_path), "a recipe")
 
     # An empty file, perhaps of an interrupted download, would train at the paper's sizes.
     if tree is None or tree == {}:
@@ -75,7 +68,7 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
         return tree
     if not isinstance(base, str):
         raise InputError(
-            f"{name_or_path}: expected the name of a recipe as base, found {base!r}; "
+            f"{name_or_path}: expected the name of a recipe as base, found {shown(base)}; "
             "correct the value"
         )
 
@@ -83,23 +76,19 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
     return merge_trees(base_tree, tree)
 
 
-def _read_text(name_or_path: str) -> str:
+def _find(name_or_path: str) -> Path:
+    """Return the path of a recipe."""
     if name_or_path in recipe_names():
-        return (_FOLDER / f"{name_or_path}.yaml").read_text(encoding="utf-8")
+        return Path(str(_FOLDER)) / f"{name_or_path}.yaml"
 
-    if not Path(name_or_path).is_file():
+    path = Path(name_or_path)
+    if not path.is_file():
         raise InputError(
-            f"expected a recipe's name or a YAML file, found {name_or_path!r}"
+            f"expected a recipe's name or a YAML file, found {shown(name_or_path)}"
             + did_you_mean(
                 name_or_path,
                 recipe_names(),
                 advice=f"the built-in ones are {', '.join(recipe_names())}",
             )
         )
-
-    try:
-        return Path(name_or_path).read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise InputError(
-            f"{name_or_path}: expected a YAML file, found bytes that are not text; give a recipe"
-        ) from None
+    return path

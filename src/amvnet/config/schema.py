@@ -6,12 +6,28 @@ user's own) states only what differs from them. "Open" marks what the paper does
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from amvnet.config.bounds import Checked, Count, NotNegative, Positive, Range, Share
 
 StageName = Literal["rv", "bev", "head"]
+
+# Upper limits, far above any use: a weights file or a recipe of a stranger cannot fill the memory.
+Channels = Annotated[int, Range(1, 8192)]
+Cells = Annotated[int, Range(1, 16384)]  # along one side of a view
+MOST_CELLS = 2**22  # of a view; the paper's range image has 2**18
+Degrees = Annotated[float, Range(-90, 90)]  # above the horizon
+Metres = Annotated[float, Range(-1000, 1000)]
+
+
+def _check_cells(view: Checked, *sides: int) -> None:
+    view.check(
+        holds=math.prod(sides) <= MOST_CELLS,
+        expected=f"at most {MOST_CELLS} cells",
+        found=" x ".join(map(str, sides)),
+    )
 
 
 @dataclass(frozen=True)
@@ -20,13 +36,13 @@ class RangeViewConfig(Checked):
 
     rows: Literal["elevation", "ring"] = "elevation"
     """What sets a point's row: its elevation in the field of view, or the index of its laser."""
-    height: Count = 64
+    height: Cells = 64
     """Rows of the range image: the lasers of the sensor."""
-    width: Count = 4096
+    width: Cells = 4096
     """Columns of the range image, over 360 degrees."""
-    fov_up: float = 3.0
+    fov_up: Degrees = 3.0
     """Upper end of the field of view, degrees above the horizon; row 0."""
-    fov_down: float = -25.0
+    fov_down: Degrees = -25.0
     """Lower end of the field of view, degrees above the horizon; the last row."""
 
     def __post_init__(self) -> None:
@@ -37,25 +53,26 @@ class RangeViewConfig(Checked):
             expected="fov_up above fov_down",
             found=f"{self.fov_up} and {self.fov_down}",
         )
+        _check_cells(self, self.height, self.width)
 
 
 @dataclass(frozen=True)
 class PolarViewConfig(Checked):
     """The polar grid (section 3.1 of the paper, sizes: 4.2; section 3 of PolarNet's paper)."""
 
-    radial: Count = 480
+    radial: Cells = 480
     """Cells along the radius."""
-    angular: Count = 360
+    angular: Cells = 360
     """Cells around the sensor."""
-    vertical: Count = 32
+    vertical: Annotated[int, Range(1, 512)] = 32
     """Cells along the height: the voxels of a pillar."""
-    radius_min: NotNegative = 3.0
+    radius_min: Annotated[float, Range(0, 1000)] = 3.0
     """Inner radius of the grid, metres; nearer points go to the innermost cells."""
-    radius_max: float = 50.0
+    radius_max: Metres = 50.0
     """Outer radius of the grid, metres; farther points go to the outermost cells."""
-    z_min: float = -3.0
+    z_min: Metres = -3.0
     """Lower end of the grid, metres above the sensor."""
-    z_max: float = 1.5
+    z_max: Metres = 1.5
     """Upper end of the grid, metres above the sensor."""
 
     def __post_init__(self) -> None:
@@ -71,29 +88,30 @@ class PolarViewConfig(Checked):
             expected="z_min below z_max",
             found=f"{self.z_min} and {self.z_max}",
         )
+        _check_cells(self, self.radial, self.angular)
 
 
 @dataclass(frozen=True)
 class RangeNetConfig(Checked):
     """The range-view network (sections 3.1 and 4.2 of the paper; its widths are open)."""
 
-    stem: Count = 32
+    stem: Channels = 32
     """Channels at full resolution."""
-    widths: tuple[Count, ...] = (64, 96, 160, 256, 256, 256, 256)
+    widths: tuple[Channels, ...] = (64, 96, 160, 256, 256, 256, 256)
     """Channels at the width strides 2, 4, 8, ..., one entry per stride."""
-    blocks: tuple[Count, ...] = (2, 4, 4, 4, 2, 2, 2)
+    blocks: tuple[Annotated[int, Range(1, 16)], ...] = (2, 4, 4, 4, 2, 2, 2)
     """Residual blocks at each of these strides."""
-    height_strides: tuple[Count, ...] = (1, 1, 1, 1, 2, 2, 2)
+    height_strides: tuple[Annotated[int, Range(1, 64)], ...] = (1, 1, 1, 1, 2, 2, 2)
     """Height stride of each of these stages: only the later ones reduce the height."""
-    decoder: Count = 128
+    decoder: Channels = 128
     """Channels of the decoder."""
-    head: Count = 64
+    head: Channels = 64
     """Channels of the last layers, at full resolution."""
     dropout: Annotated[float, Range(0, 0.99)] = 0.0
     """Probability of dropping a channel of the decoder's maps, in training (open)."""
     gru: bool = True
     """GRU layers over the maps of the last two strides; off for the ablation (Table 5)."""
-    gru_padding: NotNegative = 0.25
+    gru_padding: Share = 0.25
     """Share of the map's width that pads it circularly before the GRU runs over it."""
 
     def __post_init__(self) -> None:
@@ -113,15 +131,15 @@ class RangeNetConfig(Checked):
 class PolarNetConfig(Checked):
     """The bird's-eye-view network: PolarNet (Zhang et al., CVPR 2020)."""
 
-    point_widths: tuple[Count, ...] = (64, 128, 256, 512)
+    point_widths: tuple[Channels, ...] = (64, 128, 256, 512)
     """Channels of the shared MLP over the points of a pillar."""
-    pillar: Count = 32
+    pillar: Channels = 32
     """Channels of a pillar after pooling."""
-    widths: tuple[Count, ...] = (64, 128, 256, 512, 512)
+    widths: tuple[Channels, ...] = (64, 128, 256, 512, 512)
     """Channels of the U-Net, from the full grid down."""
     dropblock: Annotated[float, Range(0, 0.99)] = 0.5
     """Probability of DropBlock in the decoder, in training."""
-    dropblock_size: Count = 7
+    dropblock_size: Annotated[int, Range(1, 99)] = 7
     """Side of the squares that DropBlock drops, cells."""
 
     def __post_init__(self) -> None:
@@ -146,11 +164,11 @@ class AssertionConfig(Checked):
 class PointHeadConfig(Checked):
     """The point head (section 3.3 of the paper)."""
 
-    neighbours: Count = 15
+    neighbours: Annotated[int, Range(1, 1000)] = 15
     """n: nearest neighbours of an uncertain point, among all raw points."""
-    hidden: tuple[Count, ...] = (64, 32, 32)
+    hidden: tuple[Channels, ...] = (64, 32, 32)
     """Channels of the shared MLP over the neighbours."""
-    fc: Count = 128
+    fc: Channels = 128
     """Channels of the fully connected layer before the scores."""
     position_scale: float = 0.05
     """Factor on x, y, z (metres) as features: brings them to the magnitude of the scores."""

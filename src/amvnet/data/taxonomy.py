@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from amvnet.errors import InputError
+from amvnet.config.bounds import check_text
+from amvnet.errors import InputError, shown
+from amvnet.files import read_yaml
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
+MOST_CLASSES = 255  # train ids are uint8
 UNKNOWN = -1  # in lookup tables: no train id belongs to this raw id
 
 # The tables of a YAML label map, and its name for each split.
@@ -55,6 +57,7 @@ class Taxonomy:
     counts_absent: bool
 
     def __post_init__(self) -> None:
+        self._check_types()
         self._check_length("colours", len(self.colors))
         self._check_length("raw ids", len(self.train_to_raw))
 
@@ -62,15 +65,46 @@ class Taxonomy:
         if wrong_train_ids:
             raise InputError(
                 f"taxonomy {self.name}: expected train ids 0..{self.size}, "
-                f"found {sorted(wrong_train_ids)}; correct the table"
+                f"found {shown(sorted(wrong_train_ids))}; correct the table"
             )
 
         raw_ids = self.raw_ids
         if raw_ids and (min(raw_ids) < 0 or max(raw_ids) > INSTANCE_MASK):
             raise InputError(
                 f"taxonomy {self.name}: expected raw ids 0..{INSTANCE_MASK}, "
-                f"found {min(raw_ids)}..{max(raw_ids)}; correct the table"
+                f"found {shown(min(raw_ids))}..{shown(max(raw_ids))}; correct the table"
             )
+
+    def _check_types(self) -> None:
+        """Check what a file of a stranger may hold in place of names and numbers."""
+        check_text("taxonomy", self.name)
+        for name in self.classes:
+            check_text(f"taxonomy {self.name}: classes", name)
+        if not 1 <= self.size <= MOST_CLASSES:
+            raise InputError(
+                f"taxonomy {self.name}: expected 1 to {MOST_CLASSES} classes, found {self.size}; "
+                "correct the table"
+            )
+
+        numbers = [*self.train_to_raw, *self.raw_to_train.values()]
+        numbers += [raw for raw in self.raw_to_train if not isinstance(raw, str)]
+        for color in self.colors:
+            numbers += color
+        for number in numbers:
+            if type(number) is not int:
+                raise InputError(
+                    f"taxonomy {self.name}: expected whole numbers as ids and colours, "
+                    f"found {shown(number)}; correct the table"
+                )
+
+        if any(not 0 <= value <= 255 for color in self.colors for value in color):
+            raise InputError(
+                f"taxonomy {self.name}: expected colours from 0 to 255, found others; correct them"
+            )
+
+        for sequences in self.splits.values():
+            for sequence in sequences:
+                check_text(f"taxonomy {self.name}: splits", sequence)
 
     def _check_length(self, kind: str, length: int) -> None:
         if length != self.size + 1:
@@ -186,10 +220,12 @@ class Taxonomy:
                 splits={split: tuple(sequences) for split, sequences in values["splits"].items()},
                 counts_absent=bool(values["counts_absent"]),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except InputError:  # a ValueError, too
+            raise
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 "taxonomy: expected its fields as this package writes them, "
-                f"found {error!r}; use a weights file of this package"
+                f"found {shown(error)}; use a weights file of this package"
             ) from None
 
 
@@ -205,16 +241,7 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
             fit each other.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: expected a label map (YAML), found no file; check the path")
-    try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"{path}: expected a label map (YAML), found {reason}; correct the file"
-        ) from None
-
+    config = read_yaml(path, "a label map")
     missing = _missing_tables(config)
     if missing:
         raise InputError(

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from amvnet.errors import InputError
+from amvnet.files import read_yaml
 
 # Metres over the ground on the cars of the datasets that weights are trained for: KITTI, nuScenes.
 HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
@@ -183,13 +183,7 @@ def _read_sensor(text: str) -> Sensor:
             "give one of them"
         )
 
-    try:
-        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError, RecursionError):
-        raise InputError(
-            f"{path}: expected a YAML file that describes a sensor, found none; check it"
-        ) from None
-
+    tree = read_yaml(path, "a description of a sensor")
     if not isinstance(tree, Mapping):
         raise InputError(
             f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md"

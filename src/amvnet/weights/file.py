@@ -7,6 +7,7 @@ import errno
 import hashlib
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -17,10 +18,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from amvnet.config.bounds import check_text
 from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError, did_you_mean
+from amvnet.errors import InputError, did_you_mean, shown
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
@@ -37,6 +39,10 @@ UNCERTAIN = "val/uncertain"  # metric of the point head: the share of uncertain 
 # The share for weights without this metric: that of the paper on nuScenes, and of `sim-hdl64e` on
 # simulated streets.
 USUAL_UNCERTAIN = 0.2
+# Types of parameters, and of counts among them, by safetensors' names.
+FLOATS = ("F16", "BF16", "F32", "F64")
+COUNTS = ("I64",)
+LONGEST = 10_000_000  # characters of a description; those of the built-in weights have 6,000
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
 _FIELD_TYPES = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
@@ -251,44 +257,100 @@ def load(name_or_path: str | Path) -> Weights:
         InputError: if there is no such file or name, or the file does not hold AMVNet weights.
     """
     path = _find(str(name_or_path))
-
-    tensors = {}
     try:
         with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-            description = json.loads(metadata.get(KEY, "null"))
-            for key in file.keys():  # noqa: SIM118  (not a dictionary)
-                tensors[key] = file.get_tensor(key)
-    except (SafetensorError, OSError, ValueError):
+            weights = _from_description((file.metadata() or {}).get(KEY, ""))
+            tensors = _read_tensors(file, weights)
+    except (SafetensorError, OSError):
         raise InputError(
             f"{path}: expected a safetensors file, found something else; give AMVNet weights"
         ) from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
-    _check_description(description, path)
-    return Weights(
-        model=from_dict(ModelConfig, description["model"], f"{path}: model"),
-        taxonomy=Taxonomy.from_dict(description["taxonomy"]),
-        sensor=description["sensor"],
-        tensors=tensors,
-        training=description["training"],
-        metrics=description["metrics"],
-    )
+    return dataclasses.replace(weights, tensors=tensors)
 
 
-def _check_description(description: Any, path: Path) -> None:
-    """Check that a description has this format and all fields, each of the right type."""
+def _from_description(text: str) -> Weights:
+    """Return weights without parameters: what the description in a file says.
+
+    Raises:
+        InputError: if it is not a description of this format, or a value is out of its range.
+    """
+    description = None
+    if len(text) <= LONGEST:
+        with suppress(ValueError, RecursionError):
+            description = json.loads(text)
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         raise InputError(
-            f"{path}: expected weights with AMVNet's description inside, found none; "
-            "give AMVNet weights"
+            "expected weights with AMVNet's description inside, found none; give AMVNet weights"
         )
 
     for key, kind in _FIELD_TYPES.items():
         value = description.get(key)
         if not isinstance(value, kind):
             raise InputError(
-                f"{path}: expected a description with {key}, found {value!r}; train again"
+                f"expected a description with {key}, found {shown(value)}; train again"
             )
+    check_text("sensor", description["sensor"])
+    for key in ("training", "metrics"):
+        for part, record in description[key].items():
+            if part not in PARTS or not isinstance(record, dict):
+                raise InputError(
+                    f"expected {key} of {', '.join(PARTS)}, found {shown(part)}: {shown(record)}; "
+                    "train again"
+                )
+
+    return Weights(
+        model=from_dict(ModelConfig, description["model"], "model"),
+        taxonomy=Taxonomy.from_dict(description["taxonomy"]),
+        sensor=description["sensor"],
+        training=description["training"],
+        metrics=description["metrics"],
+    )
+
+
+def _read_tensors(file: Any, weights: Weights) -> dict[str, Tensor]:
+    """Read the parameters, if they are those of whole parts of the described model.
+
+    Names, sizes and types are checked before anything is read.
+
+    Args:
+        file: an open safetensors file.
+        weights: what its description says.
+
+    Raises:
+        InputError: if they are not, or not finite.
+    """
+    names = set(file.keys())
+    with torch.device("meta"):  # without memory
+        described = build_amvnet(weights.model, weights.taxonomy.size).state_dict()
+    present = {name.partition(".")[0] for name in names}
+    expected = {name for name in described if name.partition(".")[0] in present}
+    if names != expected:
+        name = min(names ^ expected)
+        found = "none" if name in expected else "one"
+        raise InputError(
+            f"expected the parameters of whole parts as described, found {found} named "
+            f"{shown(name)}; train again"
+        )
+
+    for name in names:
+        stored = file.get_slice(name)
+        size = tuple(stored.get_shape())
+        types = FLOATS if described[name].is_floating_point() else COUNTS
+        if size != described[name].shape or stored.get_dtype() not in types:
+            raise InputError(
+                f"expected {name} of size {tuple(described[name].shape)} and type "
+                f"{' or '.join(types)}, found {size} and {stored.get_dtype()}; train again"
+            )
+
+    tensors = {name: file.get_tensor(name) for name in names}
+    for name, tensor in tensors.items():
+        is_variance = name.endswith("running_var")
+        if not tensor.isfinite().all() or (is_variance and (tensor < 0).any()):
+            raise InputError(f"expected finite parameters, found others in {name}; train again")
+    return tensors
 
 
 def built_in() -> dict[str, Path]:
