@@ -162,6 +162,7 @@ BEGINNINGS = {
 }
 HEAD = 4096  # bytes in which the beginning must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
+POSE_COLUMNS = 12  # of poses, as of KITTI: a 3 x 4 matrix in each line of a text file
 KITTI_RAW = "velodyne_points/data"  # the folder of the scans of a drive of KITTI's raw data
 RAW_DRIVES = ("", "*_sync/", "*_extract/", "*/*_sync/", "*/*_extract/")  # where it may lie
 
@@ -313,7 +314,7 @@ def _raw_drives(folder: Path) -> list[Path]:
 def _matches(pattern: str) -> list[Path]:
     """Return the scans that match a pattern, and those of the folders that match."""
     paths: list[Path] = []
-    others: list[Path] = []
+    unnamed: list[Path] = []
     for text in sorted(glob.glob(pattern, recursive=True)):
         path = Path(text)
         if is_scan_file(path) or _is_text_scan(path):
@@ -321,8 +322,8 @@ def _matches(pattern: str) -> list[Path]:
         elif path.is_dir() and "**" not in pattern:
             paths += _scans_in(path) or _raw_drives(path)
         elif path.is_file():
-            others.append(path)
-    return paths or others
+            unnamed.append(path)
+    return paths or unnamed
 
 
 def _advice_to_find(path: Path) -> str:
@@ -419,9 +420,12 @@ def is_scan_file(path: Path) -> bool:
 
 
 def _is_text_scan(path: Path) -> bool:
-    """Return whether a path is that of a text file with points."""
+    """Return whether a path is that of a text file with points, and not with poses."""
     is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
-    return is_text and path.is_file() and find_table(path) is not None
+    if not is_text or not path.is_file():
+        return False
+    table = find_table(path)
+    return table is not None and (bool(table.names) or table.count != POSE_COLUMNS)
 
 
 def scan_stem(path: Path) -> str:
