@@ -187,6 +187,15 @@ def failing(call: Callable[[], None], folder: Path) -> None:
         call()
 
 
+def test_a_file_that_a_command_could_write_and_does_not_stays_the_users(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(MINE)
+    (tmp_path / "b").write_bytes(MINE)
+    with protecting([tmp_path / "a", tmp_path / "b"], overwrite=True):
+        (tmp_path / "a").write_bytes(b"of the command")
+    WrittenFiles(tmp_path).check([Path("a")])
+    fails(lambda: WrittenFiles(tmp_path).check([Path("b")]), tmp_path / "b")
+
+
 def test_a_command_that_fails_lists_nothing(tmp_path: Path) -> None:
     def fail() -> None:
         raise OSError(28, "No space left on device")

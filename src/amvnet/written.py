@@ -77,7 +77,7 @@ def protecting(paths: Sequence[Path], overwrite: bool = False) -> Iterator[None]
     """Check that a command's output files replace no file of the user, and list them at the end.
 
     Args:
-        paths: the files that the block may write.
+        paths: the files that the block may write; those that it leaves as they are stay the user's.
         overwrite: whether to replace a user's files, too.
 
     Raises:
@@ -90,9 +90,14 @@ def protecting(paths: Sequence[Path], overwrite: bool = False) -> Iterator[None]
     if not overwrite:
         for folder, names in names_by_folder.items():
             WrittenFiles(folder).check(names)
+    earlier_stamps = {path: _stamp_of(path) for path in paths}
     yield
     for folder, names in names_by_folder.items():
-        WrittenFiles(folder).finish(names)
+        changed = []
+        for name in names:
+            if _stamp_of(folder / name) != earlier_stamps[folder / name]:
+                changed.append(name)
+        WrittenFiles(folder).finish(changed)
 
 
 def _read(path: Path) -> dict[str, Stamp | None]:

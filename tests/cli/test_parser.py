@@ -46,6 +46,7 @@ def test_one_line_names_the_option_and_what_was_meant(command: str, words: str) 
     line = refusal(command)
     assert words in line
     assert line.count("--help") <= 1
+    assert "?" not in line[:-2]  # nothing after a question
     assert "class" not in line.replace("class_weights", "")
 
 

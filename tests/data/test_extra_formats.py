@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 import sys
 from collections.abc import Mapping
@@ -157,6 +158,18 @@ def test_a_sweep_of_argoverse_is_moved_to_its_lidars(tmp_path: Path) -> None:
     # Labels are written with the coordinates of the file.
     (scan,) = list_scans(path)
     np.testing.assert_array_equal(FileReader(None).read(scan).file_xyz, expected)
+
+
+def test_logs_of_argoverse_are_their_sweeps(tmp_path: Path) -> None:
+    lidars = {"up_lidar": (1.0, 0.0, 1.5)}
+    for log in ("a", "b"):
+        path = write_sweep(tmp_path / log, some_points(), lidars)
+        # A log has other tables, too.
+        shutil.copy(tmp_path / log / "calibration/egovehicle_SE3_sensor.feather", tmp_path / log)
+
+    assert [scan.name for scan in list_scans(tmp_path / "a")] == [path.stem]
+    names = [scan.name for scan in list_scans(tmp_path)]
+    assert names == [f"a/{path.stem}", f"b/{path.stem}"]
 
 
 def test_broken_feather_is_refused(tmp_path: Path) -> None:

@@ -150,6 +150,7 @@ HEADERS = {
     "slashes": "//X,Y,Z,Intensity,ring\n",
     "byte order mark": "\ufeffx,y,z,intensity,ring\n",
     "none": "",
+    "byte order mark alone": "\ufeff",
     "number of points": "5760\n",
 }
 
@@ -189,6 +190,16 @@ def test_text_is_read_with_any_separator_and_name(
     check_text(path, table[:400])
 
 
+@pytest.mark.parametrize("end", [",\n", ";\n", " \n", "\r"])
+def test_text_is_read_with_any_end_of_its_lines(
+    table: np.ndarray, tmp_path: Path, end: str
+) -> None:
+    path = tmp_path / "a.csv"
+    separator = end[0] if end[0] in ",;" else " "
+    path.write_bytes(text_of(table[:50], separator).replace("\n", end).encode())
+    check_text(path, table[:50])
+
+
 def test_columns_of_text_can_have_any_order_and_words_among_them(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("label,z,y,x\ncar,3,2,1\nroad,6,5,4\n")
@@ -197,6 +208,7 @@ def test_columns_of_text_can_have_any_order_and_words_among_them(tmp_path: Path)
 
 def test_text_of_other_things_is_refused(tmp_path: Path) -> None:
     texts = ["hello\n", "1 2\n3 4\n", "x,y,z\n", "P0: 1 2 3\n", "1 2 3\n4 5\n"]
+    texts.append("a line of a log\n" * 30 + "1 2 3\n")
     for text in texts:
         path = tmp_path / "a.txt"
         path.write_text(text)
@@ -212,6 +224,14 @@ def test_text_files_of_a_folder_are_scans_only_if_nothing_else_is(tmp_path: Path
 
     (tmp_path / "c.bin").touch()
     assert find_scans(tmp_path) == [tmp_path / "c.bin"]
+
+
+def test_poses_next_to_a_folder_of_scans_are_no_scan(tmp_path: Path) -> None:
+    scan = tmp_path / "velodyne/000000.bin"
+    scan.parent.mkdir()
+    scan.touch()
+    np.savetxt(tmp_path / "poses.txt", np.ones((30, 12)))
+    fails(lambda: find_scans(tmp_path), scan.parent)
 
 
 # --- which files ---

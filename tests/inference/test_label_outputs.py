@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -426,6 +426,48 @@ def test_only_bags_become_bags_and_none_is_overwritten(world: Path, tmp_path: Pa
     code, message = run_cli("predict", world / "scans", *options, tmp_path / "out")
     assert (code, message.count("\n")) == (2, 1)
     assert "--format bag" in message
+
+
+def test_parts_of_a_killed_run_on_other_scans_stay_out_of_a_bag(
+    world: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    clouds = [some_points(60, seed) for seed in (1, 2, 3)]
+    bag = write_bag1(tmp_path / "drive.bag", {"/front": clouds, "/top": clouds[:2]})
+    options = ("--weights", world / "w.safetensors", "--format", "bag", "--out", out)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(label_bags, "_write_bag", interrupt)
+        assert run_cli("predict", bag, "--topic", "/front", *options)[0] == 1
+
+    assert run_cli("predict", bag, "--topic", "/top", *options) == (0, "")
+    assert len(list(list_scans(out / "drive.bag"))) == 2
+
+
+def test_bags_that_were_written_before_a_run_was_killed_are_its_own(
+    world: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    (tmp_path / "bags").mkdir()
+    for name in ("a", "b"):
+        write_bag1(tmp_path / f"bags/{name}.bag", {"/top": [some_points()]})
+
+    write_bag = label_bags._write_bag
+
+    def write_first(path: Path, parts: Sequence[Path], kind: str) -> None:
+        if path.name == "b.bag":
+            interrupt()
+        write_bag(path, parts, kind)
+
+    options = ("--weights", world / "w.safetensors", "--format", "bag", "--out", out)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(label_bags, "_write_bag", write_first)
+        assert run_cli("predict", tmp_path / "bags", *options)[0] == 1
+    assert run_cli("predict", tmp_path / "bags", *options) == (0, "")
+    assert {name for name in files(out) if not name.startswith(".")} == {"a.bag", "b.bag"}
+
+
+def interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_a_bag_of_labels_is_replaced_but_no_other_bag(world: Path, tmp_path: Path) -> None:

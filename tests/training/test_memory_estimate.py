@@ -106,6 +106,16 @@ def test_steps_that_do_not_fit_are_refused_with_what_would(
     assert not list(tmp_path.iterdir())
 
 
+def test_memory_that_holds_copies_of_files_is_free(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(memory_estimate, "CGROUP", tmp_path)
+    (tmp_path / "memory.max").write_text("1000\n")
+    (tmp_path / "memory.current").write_text("900\n")
+    (tmp_path / "memory.stat").write_text("anon 200\ninactive_file 400\nactive_file 300\n")
+    assert memory_estimate.free_memory("cpu") == 800
+
+
 def test_unknown_free_memory_refuses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory_estimate, "free_memory", lambda accelerator: None)
     recipe = replace_values(Recipe(model=MODEL), {"training": {"accelerator": "cpu"}}, "")

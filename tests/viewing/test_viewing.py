@@ -328,7 +328,9 @@ def test_scans_are_read_as_predict_reads_them(
     world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     points = np.fromfile(world / "lone.bin", np.float32).reshape(-1, 4)
+    capsys.readouterr()
     expected, _ = view_page(tmp_path, world / "lone.bin").scan(0)
+    assert "assumed intensity 0 to 1, axes x-forward" in capsys.readouterr().out
     camera = np.column_stack([-points[:, 1], -points[:, 2], points[:, 0], points[:, 3]])
     write_bag1(tmp_path / "a.bag", {"/camera": [camera], "/empty": [camera[:1]]})
     capsys.readouterr()

@@ -16,6 +16,7 @@ import yaml
 import amvnet
 from amvnet.weights.card import model_card
 from amvnet.weights.file import load, save
+from amvnet.weights.hub import can_be_reached
 
 from fixtures.worlds import fails, fresh_weights, run_cli, street, without
 
@@ -83,6 +84,12 @@ def test_a_hub_that_cannot_be_reached_is_not_asked_again_and_again(hub: Hub) -> 
         hub.constants.ENDPOINT = f"http://127.0.0.1:{server.getsockname()[1]}"
         fails(lambda: load(NAME), "cannot be reached", "name a file")
     assert hub.calls[-1]["local_files_only"] is True
+
+
+@pytest.mark.parametrize("variable", ["http_proxy", "all_proxy"])
+def test_behind_a_proxy_the_hub_is_asked(variable: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(variable, "http://127.0.0.1:1")
+    assert can_be_reached("http://127.0.0.1:1")
 
 
 def test_the_verbs_take_names_of_the_hub(

@@ -106,7 +106,6 @@ class CloudSegmenter:
 
         import amvnet
         from amvnet.inference.inputs import adapter_for
-        from amvnet.models.methods import METHODS
         from amvnet.sensors.lidars import make_sensor
 
         sensor = make_sensor(**settings.sensor_options())
@@ -126,7 +125,6 @@ class CloudSegmenter:
         self._topic = topic
         self._adapt = adapter_for(segmenter.weights, sensor, say)
         self._segment = segmenter.by_ring()
-        self._has_two_networks = len(METHODS[segmenter.method].parts) > 1
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)
 
     def __call__(self, message: Any) -> LabelledCloud:
@@ -141,22 +139,21 @@ class CloudSegmenter:
 
         scan = self._adapt(cloud, self._topic)
         result = self._segment(scan)
-        uncertain = result.uncertain if self._has_two_networks else None
-        share = None if uncertain is None else float(uncertain[scan.valid].mean())
+        verdict = result.verdict  # None for a single network
         return LabelledCloud(
             origin=origin,
             xyz=cloud.xyz,
             raw=self.taxonomy.to_raw(result.labels),
             colors=self._colors[result.labels],
-            uncertain=uncertain,
-            uncertain_share=share,
+            uncertain=None if verdict is None else result.uncertain,
+            uncertain_share=None if verdict is None else verdict.share,
         )
 
     def classes(self) -> str:
         """Return the classes as JSON: id as in the field label, name, color (RGB)."""
         taxonomy = self.taxonomy
-        names = ("unlabelled", *taxonomy.classes)
+        rows = zip(taxonomy.train_to_raw, taxonomy.names, taxonomy.colors, strict=True)
         entries = []
-        for raw, name, color in zip(taxonomy.train_to_raw, names, taxonomy.colors, strict=True):
+        for raw, name, color in rows:
             entries.append({"id": raw, "name": name, "color": list(color)})
         return json.dumps(entries)

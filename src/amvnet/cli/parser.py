@@ -89,8 +89,8 @@ class Parser(ArgumentParser):
         self.kinds: dict[str, Any] = {}  # types of the options' values, by flag
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        line = " ".join(message.split()) or str(ex)
-        raise InputError(f"{self._in_words(line)}; see {self.prog} --help")
+        line = self._in_words(" ".join(message.split()) or str(ex))
+        raise InputError(line if line.endswith("?") else f"{line}; see {self.prog} --help")
 
     def _in_words(self, line: str) -> str:
         """Return what a message of jsonargparse or argparse says, in the words of this project."""
@@ -172,11 +172,9 @@ def make_parser(verb: str, command: Command, recipe: Recipe | None = None) -> Pa
         if name in command.positional:
             continue
         title = grouped.get(name)
-        if title is None:
-            target: Any = parser
-        else:
-            target = groups.setdefault(title, None) or parser.add_argument_group(title)
-            groups[title] = target
+        if title is not None and title not in groups:
+            groups[title] = parser.add_argument_group(title)
+        target = parser if title is None else groups[title]
         _add_option(target, parameter, hints[name], help_texts.get(name, ""))
         parser.kinds[flag_of(name)] = hints[name]
 

@@ -63,9 +63,9 @@ def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
     """
     tree: dict[str, Any] = {}
     for name in PARTS:
-        given = _given(values.pop(name, {}), f"--{name}")
-        if given:
-            tree[name] = given
+        part = _nested_values(values.pop(name, {}), f"--{name}")
+        if part:
+            tree[name] = part
     try:
         return replace_values(recipe, tree, "")
     except InputError as error:
@@ -73,19 +73,19 @@ def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
         raise InputError(f"--{keys.replace(': ', '.')}: expected {rest}") from None
 
 
-def _given(values: Any, flag: str) -> Any:
+def _nested_values(values: Any, flag: str) -> Any:
     """Return nested values without those that were left out, read as YAML."""
     if isinstance(values, str):
         return _read_value(values, flag)
 
-    given: dict[str, Any] = {}
+    nested: dict[str, Any] = {}
     for key, value in _items(values):
         if value is None:
             continue
-        inner = _given(value, f"{flag}.{key}")
+        inner = _nested_values(value, f"{flag}.{key}")
         if inner != {}:
-            given[key] = inner
-    return given
+            nested[key] = inner
+    return nested
 
 
 def _items(values: Any) -> Iterator[tuple[str, Any]]:

@@ -79,7 +79,7 @@ def write_part(
 
 
 def join_parts(folder: Path, names: Sequence[str], kind: str) -> list[Path]:
-    """Join the parts of each bag, in order of time.
+    """Join the parts of each bag, in the order of the scans.
 
     The parts are removed if none is missing, so that a later run can add what is.
 
@@ -91,20 +91,20 @@ def join_parts(folder: Path, names: Sequence[str], kind: str) -> list[Path]:
     Returns:
         The paths of the bags, relative to the folder.
     """
-    counts: dict[Path, int] = {}
+    # Only the parts of these scans: a run that was killed may have left those of others.
+    parts_by_bag: dict[Path, list[Path]] = {}
     for name in names:
-        path = bag_path(name, kind)
-        counts[path] = counts.get(path, 0) + 1
+        part = folder / part_path(name, kind)
+        parts_by_bag.setdefault(bag_path(name, kind), []).append(part)
 
     written = []
-    for path, count in counts.items():
-        folder_of_parts = folder / _parts(path)
-        parts = sorted(folder_of_parts.glob("[0-9]*.npz"))
+    for path, all_parts in parts_by_bag.items():
+        parts = list(filter(Path.is_file, all_parts))
         if parts:
             _write_bag(folder / path, parts, kind)
             written.append(path)
-        if len(parts) == count:
-            shutil.rmtree(folder_of_parts)
+        if parts == all_parts:
+            shutil.rmtree(folder / _parts(path))
     return written
 
 

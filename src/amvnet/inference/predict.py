@@ -69,8 +69,7 @@ def predict(
     adapter = adapter or adapter_for(segmenter.weights)
     opened = open_inputs(inputs, options, segmenter.taxonomy, adapter)
 
-    is_bag = output.kind in label_bags.KINDS
-    if is_bag:
+    if output.kind in label_bags.KINDS:
         _check_bags(opened.scans, output)
 
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
@@ -85,10 +84,8 @@ def predict(
         written = pipeline.run(settings, progress)
     except SomeBroken as error:  # the others are written
         faults = error
-    if is_bag and execution.processes.first:
-        names = [scan.name for scan in opened.scans if isinstance(scan, FileScan)]
-        bags = label_bags.join_parts(output.folder, names, output.kind)
-        WrittenFiles(output.folder).finish(bags)
+    if output.kind in label_bags.KINDS and execution.processes.first:
+        _write_bags(opened.scans, output)
 
     _report(segment, execution.processes, say)
     if faults is not None:
@@ -123,6 +120,14 @@ def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
 
     if not output.overwrite:
         WrittenFiles(output.folder).check(sorted(bags))
+
+
+def _write_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
+    """Join the labels of the scans to bags."""
+    names = [scan.name for scan in scans if isinstance(scan, FileScan)]
+    written = WrittenFiles(output.folder)
+    written.claim({label_bags.bag_path(name, output.kind) for name in names})
+    written.finish(label_bags.join_parts(output.folder, names, output.kind))
 
 
 class NetworkSegmentation:

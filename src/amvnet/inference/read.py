@@ -44,7 +44,7 @@ def read(path: Path | str, topic: str | None = None) -> Scan:
 
     Args:
         path: a scan file of any supported format, or a bag.
-        topic: of bags; None means the only topic with PointCloud2 messages.
+        topic: of bags; None means the only topic with scans.
 
     Raises:
         InputError: if the file is missing, broken, of another format, or holds several scans.
@@ -62,7 +62,7 @@ def read_all(path: Path | str, topic: str | None = None) -> Scans:
 
     Args:
         path: as INPUT of `amvnet predict`.
-        topic: of bags; None means the only topic with PointCloud2 messages.
+        topic: of bags; None means the only topic with scans.
 
     Returns:
         A sequence that reads each scan when it is asked for, as `read` does.

@@ -157,7 +157,7 @@ class Segmenter:
 
         Args:
             path: as INPUT of `amvnet predict`.
-            topic: of bags; None means the only topic with PointCloud2 messages.
+            topic: of bags; None means the only topic with scans.
 
         Returns:
             An iterator that reads and segments one scan at a time.

@@ -172,16 +172,16 @@ class ScanAdapter:
             return False, self._measure(cloud, quantiles)
 
         if median is None or not recording.is_learnt:
-            own = self._measure(cloud, quantiles)
-            recording.add(own)
+            measured = self._measure(cloud, quantiles)
+            recording.add(measured)
             median = recording.median
             assert median is not None
         elif not recording.is_steady:
-            own = self._measure(cloud, quantiles)
+            measured = self._measure(cloud, quantiles)
 
         if recording.is_steady:
             return True, median
-        return True, dataclasses.replace(own, quantiles=median.quantiles)
+        return True, dataclasses.replace(measured, quantiles=median.quantiles)
 
     def _measure(self, cloud: Cloud, quantiles: np.ndarray | None) -> _Measurement:
         """Measure one scan.
@@ -203,28 +203,29 @@ class ScanAdapter:
         return _Measurement(frame, measure_lasers(seen.points[valid], ring), quantiles)
 
     def _intensity_map(self, cloud: Cloud, quantiles: np.ndarray | None) -> IntensityMap:
-        given = self.sensor.intensity_scale
-        scale = given or cloud.full or 1.0
-        if given is None and cloud.full is None and quantiles is not None:
+        given_scale = self.sensor.intensity_scale
+        scale = given_scale or cloud.full or 1.0
+        if given_scale is None and cloud.full is None and quantiles is not None:
             assert cloud.intensity is not None
             scale = usual_scale(quantiles[-1], is_integer=cloud.intensity.dtype.kind in "iu")
-        return intensity_map(quantiles, scale, self._trained_intensity, is_given=given is not None)
+        is_given = given_scale is not None
+        return intensity_map(quantiles, scale, self._trained_intensity, is_given)
 
     def _heights(self, frame: Frame) -> _Moves:
         """Return how far to move a scan up."""
         trained = self._trained_height
-        given = self.sensor.height
+        given_height = self.sensor.height
         ground = frame.height
-        is_on_ground = ground is not None and ground < LOWEST and (given is None or given >= LOWEST)
-        if is_on_ground and ground is not None:
+        is_higher = given_height is None or given_height >= LOWEST
+        if ground is not None and ground < LOWEST and is_higher:
             # The sensor is not at the origin: it is as high as given, or as that of the training.
-            above = given if given is not None else trained
+            above = given_height if given_height is not None else trained
             if above is None:
                 return _Moves(is_on_ground=True)
             target = above if trained is None else trained
             return _Moves(ground - above, ground - target, is_on_ground=True)
 
-        height = given if given is not None else ground
+        height = given_height if given_height is not None else ground
         if height is None or trained is None or abs(height - trained) < SAME_HEIGHT:
             return _Moves()
         return _Moves(to_trained=height - trained)
@@ -329,15 +330,15 @@ class ScanAdapter:
         return texts
 
     def _describe_height(self, frame: Frame) -> str:
-        given = self.sensor.height
-        if given is None and frame.height is None:
+        given_height = self.sensor.height
+        if given_height is None and frame.height is None:
             return "no ground to measure the height by (give --height; --axes if z is not up)"
 
         moves = self._heights(frame)
         if moves.is_on_ground:
             text = f"the ground {-(frame.height or 0):+.2f} m from the origin"
         else:
-            height = given if given is not None else frame.height
+            height = given_height if given_height is not None else frame.height
             text = f"sensor {height:.2f} m over the ground"
         if moves.to_trained:
             text += f" (moved by {moves.to_trained:+.2f} m to {self._trained_height:.2f} m)"
@@ -374,14 +375,12 @@ class _Moves:
 
 
 def _to_scan(cloud: Cloud, sensor: Sensor, to_intensity: IntensityMap | None = None) -> Scan:
-    """Return the scan in the package's axes; lost points, at the file's origin, stay lost."""
+    """Return the scan in the package's axes."""
     intensity = None
     if to_intensity is not None:
         intensity = to_intensity(cloud.intensity, len(cloud.xyz))
 
     xyz = sensor.to_level(cloud.xyz)
-    if xyz is not cloud.xyz:
-        xyz[(cloud.xyz == 0).all(axis=1)] = np.nan
     return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 
 

@@ -191,14 +191,14 @@ def intensity_map(
         return linear
 
     # Equal quantiles of the source, such as many zeros, become the mean of those of the training.
-    found, index = np.unique(quantiles, return_inverse=True)
+    levels, index = np.unique(quantiles, return_inverse=True)
     becomes = np.bincount(index, weights=trained.quantiles) / np.bincount(index)
     text = (
         f"intensity 0 to {scale:g}, spread as in the training: half of it was below "
         f"{quantiles[5] / scale:.2g}, now {trained.quantiles[5]:.2g} "
         f"(--intensity-scale {scale:g} keeps it)"
     )
-    return IntensityMap(text, matched=(found, np.clip(becomes, 0, 1)))
+    return IntensityMap(text, matched=(levels, np.clip(becomes, 0, 1)))
 
 
 def _describe_filler(trained: TrainedIntensity | None) -> str:

@@ -91,8 +91,8 @@ class Sensor:
     def to_level(self, xyz: np.ndarray) -> np.ndarray:
         """Return the (N, 3) points of a file in metres and in the package's axes.
 
-        What is not known of the frame is taken as in order. The points are float64 if they had to
-        be scaled, turned or moved.
+        What is not known of the frame is taken as in order. If the points have to be scaled, turned
+        or moved, they are float64, and lost points, at the file's origin, become NaN.
         """
         scale = UNITS[self.unit or "m"]
         turn = self.turn
@@ -102,7 +102,9 @@ class Sensor:
 
         # Numbers too large to be scaled or turned become infinite, which makes points invalid.
         with np.errstate(over="ignore", invalid="ignore"):
-            return xyz.astype(np.float64) * scale @ turn.T + offset
+            level = xyz.astype(np.float64) * scale @ turn.T + offset
+        level[(xyz == 0).all(axis=1)] = np.nan
+        return level
 
 
 def _is_within(value: float | None, low: float, high: float) -> bool:

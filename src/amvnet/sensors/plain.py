@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import numpy as np
-
 from amvnet.data.formats.cloud import Cloud
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
@@ -17,7 +15,7 @@ class PlainAdapter:
     """Turns the contents of scan files into scans without any weights to adapt them to.
 
     Args:
-        sensor: what is known of the sensor; its axes, rotation, offset and scale of intensity
+        sensor: what is known of the sensor; its unit, axes, rotation, offset and scale of intensity
             count.
         say: is told once for each recording what was assumed.
     """
@@ -37,8 +35,6 @@ class PlainAdapter:
             InputError: if no point is usable.
         """
         xyz = self.sensor.to_level(cloud.xyz)
-        if xyz is not cloud.xyz:
-            xyz[(cloud.xyz == 0).all(axis=1)] = np.nan  # lost points stay lost
         scale = self.sensor.intensity_scale or cloud.intensity_scale()
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
 
@@ -54,7 +50,6 @@ class PlainAdapter:
         intensity = "no intensity"
         if cloud.intensity is not None and scale is not None:
             intensity = f"intensity 0 to {scale:g}"
-        assumed = [intensity, f"axes {self.sensor.axes}"]
-        if cloud.note:
-            assumed.insert(0, cloud.note)
+        assumed = [cloud.note] if cloud.note else []
+        assumed += [intensity, f"axes {self.sensor.axes or 'x-forward'}"]
         return ", ".join(assumed)

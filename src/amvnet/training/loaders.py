@@ -271,14 +271,16 @@ def sample_intensities(dataset: Dataset, records: Sequence[ScanRecord]) -> list[
     empty if no scan has usable points. Broken scans are left out: the training names them.
     """
     indices = np.linspace(0, len(records) - 1, min(SAMPLED_SCANS, len(records))).astype(int)
-    found = []
+    quantiles_of_scans = []
     for index in indices:
         with suppress(InputError):
             scan = dataset.read(records[index], labels=False)
             quantiles = quantiles_of(scan.points[scan.valid, 3])
             if quantiles is not None:
-                found.append(quantiles)
-    return np.mean(found, axis=0).round(4).tolist() if found else []
+                quantiles_of_scans.append(quantiles)
+    if not quantiles_of_scans:
+        return []
+    return np.mean(quantiles_of_scans, axis=0).round(4).tolist()
 
 
 def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:

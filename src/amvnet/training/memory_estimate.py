@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,8 +79,8 @@ def range_memory(
     with FakeTensorMode():
         net = RangeNet(config, classes)
         image = torch.zeros(1, CHANNELS, view.height, narrow)
-        kept = _kept_bytes(net, image, precision)
-    return round(kept * view.width / narrow), _count_parameters(net)
+        size = _kept_bytes(net, image, precision)
+    return round(size * view.width / narrow), _count_parameters(net)
 
 
 def polar_memory(
@@ -92,8 +91,8 @@ def polar_memory(
 
     with FakeTensorMode():
         net = PolarNet(model.polar_net, model.polar_view.vertical, classes)
-        kept = _kept_bytes(net, _without_values(grid), precision)
-    return kept, _count_parameters(net)
+        size = _kept_bytes(net, _without_values(grid), precision)
+    return size, _count_parameters(net)
 
 
 def _without_values(grid: PolarGrid) -> PolarGrid:
@@ -108,23 +107,27 @@ def _without_values(grid: PolarGrid) -> PolarGrid:
 
 def _kept_bytes(net: nn.Module, inputs: Any, precision: str) -> int:
     """Return the bytes that a forward pass keeps for its backward pass, without the weights."""
-    kept: dict[int, Any] = {}  # storages by address; kept alive, so that no address is used twice
+    # Storages by address. They are held here, so that no address is used twice.
+    storages: dict[int, Any] = {}
 
     def keep(tensor: Tensor) -> Tensor:
         storage = tensor.untyped_storage()
-        kept[storage._cdata] = storage
+        storages[storage._cdata] = storage
         return tensor
 
     is_mixed = precision.endswith("-mixed")
     context = torch.autocast("cpu", torch.bfloat16) if is_mixed else nullcontext()
-    unpack: Callable[[Tensor], Tensor] = lambda tensor: tensor  # noqa: E731
-    with context, torch.autograd.graph.saved_tensors_hooks(keep, unpack):
+    with context, torch.autograd.graph.saved_tensors_hooks(keep, _same):
         net.train()(inputs)
 
     for parameter in net.parameters():
-        kept.pop(parameter.untyped_storage()._cdata, None)
-    total = sum(storage.nbytes() for storage in kept.values())
+        storages.pop(parameter.untyped_storage()._cdata, None)
+    total = sum(storage.nbytes() for storage in storages.values())
     return total * 2 if precision == "64-true" else total
+
+
+def _same(tensor: Tensor) -> Tensor:
+    return tensor
 
 
 def _count_parameters(net: nn.Module) -> int:
@@ -150,12 +153,22 @@ def free_memory(accelerator: str) -> int | None:
 
     # A container may have less than its machine.
     try:
-        most = (CGROUP / "memory.max").read_text().strip()
-        used = (CGROUP / "memory.current").read_text().strip()
-        limits.append(max(int(most) - int(used), 0))
+        most = int((CGROUP / "memory.max").read_text())
+        used = int((CGROUP / "memory.current").read_text()) - _cached_files()
+        limits.append(max(most - used, 0))
     except (OSError, ValueError):  # no such file, or no limit: "max"
         pass
     return min(limits, default=None)
+
+
+def _cached_files() -> int:
+    """Return the bytes of this container that hold copies of files, and are freed when needed."""
+    total = 0
+    for line in (CGROUP / "memory.stat").read_text().splitlines():
+        name, _, size = line.partition(" ")
+        if name in ("active_file", "inactive_file"):
+            total += int(size)
+    return total
 
 
 def check_memory(recipe: Recipe, name: str, scan: Scan, classes: int, processes: int) -> str:

@@ -54,7 +54,8 @@ def can_be_reached(address: str) -> bool:
     Behind a proxy, only the proxy could tell; then this is True.
     """
     parts = urlsplit(address)
-    if parts.hostname is None or getproxies().get(parts.scheme):
+    proxies = getproxies()
+    if parts.hostname is None or parts.scheme in proxies or "all" in proxies:
         return True
     try:
         port = parts.port or PORTS.get(parts.scheme, 443)

@@ -334,12 +334,12 @@ class NuScenes:
         if split == "mini_train":
             return scene in MINI_TRAIN
 
-        own = self._split(scene).removeprefix("mini_")
+        scene_split = self._split(scene).removeprefix("mini_")
         if split == "train_detect":
-            return own == "train" and scene in TRAIN_DETECT
+            return scene_split == "train" and scene in TRAIN_DETECT
         if split == "train_track":
-            return own == "train" and scene not in TRAIN_DETECT
-        return split in ("all", own)
+            return scene_split == "train" and scene not in TRAIN_DETECT
+        return split in ("all", scene_split)
 
     def _split(self, scene: str) -> str:
         """Return the official split of a scene in this version: "train", "mini_val", ..."""

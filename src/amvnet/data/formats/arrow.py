@@ -12,6 +12,7 @@ from amvnet.data.formats.cloud import (
     check_point_count,
     make_cloud,
     reading,
+    require,
     require_columns,
 )
 from amvnet.errors import InputError
@@ -69,7 +70,7 @@ def _read_columns(path: Path, names: tuple[str, ...] | None) -> dict[str, np.nda
     Args:
         names: of the columns; None for those of a scan, by the keys of `COLUMN_NAMES`.
     """
-    require_pyarrow(path)
+    require("the package pyarrow", "datasets", path, "pyarrow")
     with reading(path, EXPECTED, ADVICE):
         import pyarrow
 
@@ -103,14 +104,3 @@ def _choose(all_names: list[str], names: tuple[str, ...] | None, path: Path) -> 
     if names is None:
         return require_columns(all_names, path)
     return {name: all_names.index(name) for name in names}
-
-
-def require_pyarrow(path: Path) -> None:
-    """Raise an InputError unless pyarrow is there."""
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError:
-        raise InputError(
-            f"{path}: expected the package pyarrow to read it, found none; "
-            'run pip install "amvnet[datasets]"'
-        ) from None

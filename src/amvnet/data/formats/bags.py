@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from amvnet.data.formats.cloud import Cloud, Message, reading
+from amvnet.data.formats.cloud import Cloud, Message, reading, require
 from amvnet.data.formats.livox import TYPES as LIVOX
 from amvnet.data.formats.livox import read_custom_message, read_header
 from amvnet.data.formats.pointcloud2 import Origin, read_message
@@ -61,8 +61,8 @@ class Bag:
 
         with reading(path, EXPECTED, ADVICE), _open_reader(path, ending) as reader:
             counts = _count_messages(reader)
-            others = _describe_others(reader)
-            self.topic = _choose_topic(counts, topic, path, others)
+            without_scans = _describe_others(reader)
+            self.topic = _choose_topic(counts, topic, path, without_scans)
         self._count = counts[self.topic]
 
         if not 0 < self._count <= _size(path) // MIN_MESSAGE:
@@ -119,14 +119,9 @@ def _open_reader(path: Path, ending: str) -> Iterator[Any]:
     rosbags tells the storage format from the file's name. If the name has another ending, a link
     with the right one is opened.
     """
-    try:
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-    except ImportError:
-        raise InputError(
-            f"{path}: expected the package rosbags to read it, found none; "
-            'run pip install "amvnet[formats]"'
-        ) from None
+    require("the package rosbags", "formats", path, "rosbags")
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
 
     with ExitStack() as stack:
         if ending in (".mcap", ".db3") and path.suffix != ending:
@@ -196,12 +191,12 @@ def _describe_others(reader: Any) -> str:
     return f"found {listing}; {advice}"
 
 
-def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, others: str) -> str:
+def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, without_scans: str) -> str:
     """Return the topic to read: the requested one, or the only one.
 
     Args:
         counts: the number of scans of each topic.
-        others: what else is in the bag, and what to do if it has no scans.
+        without_scans: what else is in the bag, and what to do if it has no scans.
 
     Raises:
         InputError: if it is missing, or there are several and none is requested.
@@ -210,7 +205,7 @@ def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, others:
 
     if not counts:
         expected = "a topic" if topic is None else topic
-        raise InputError(f"{path}: expected {expected} with {KINDS}, {others}")
+        raise InputError(f"{path}: expected {expected} with {KINDS}, {without_scans}")
     if topic is not None:
         if topic in counts:
             return topic

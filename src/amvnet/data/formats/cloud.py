@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -212,6 +213,27 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
     with warnings.catch_warnings(action="ignore"), one_line_errors(message):
         yield
+
+
+def require(packages: str, extra: str, path: Path | str, *modules: str) -> None:
+    """Check that the packages that read a format are installed.
+
+    Args:
+        packages: their names in the message, such as "the package pyarrow".
+        extra: the extra of this package that installs them.
+        path: the file to read.
+        modules: what they are imported as.
+
+    Raises:
+        InputError: if one cannot be imported.
+    """
+    try:
+        for module in modules:
+            import_module(module)
+    except ImportError:
+        raise InputError(
+            f'{path}: expected {packages} to read it, found none; run pip install "amvnet[{extra}]"'
+        ) from None
 
 
 def find_columns(names: Sequence[str]) -> dict[str, int]:

@@ -162,8 +162,10 @@ BEGINNINGS = {
 }
 HEAD = 4096  # bytes in which the beginning must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
+POSE_COLUMNS = 12  # of poses, as of KITTI: a 3 x 4 matrix in each line of a text file
 KITTI_RAW = "velodyne_points/data"  # the folder of the scans of a drive of KITTI's raw data
 RAW_DRIVES = ("", "*_sync/", "*_extract/", "*/*_sync/", "*/*_extract/")  # where it may lie
+ARGOVERSE = "sensors/lidar"  # the folder of the scans of a log of Argoverse 2
 
 
 @dataclass(frozen=True)
@@ -205,9 +207,9 @@ def find_scans(path: Path | str) -> list[Path]:
     """Return the scan files and bags that a text names, sorted by name.
 
     Args:
-        path: a file, a folder of them, a folder of drives of KITTI's raw data, or a pattern such as
-            `drive/*.bin` or `drives/**/*.pcd`. Hidden files are left out, and text files too if a
-            folder has other scans.
+        path: a file, a folder of them, a folder of drives of KITTI's raw data or of logs of
+            Argoverse 2, or a pattern such as `drive/*.bin` or `drives/**/*.pcd`. Hidden files are
+            left out, and text files too if a folder has other scans.
 
     Raises:
         InputError: if nothing has this name, or there is no scan.
@@ -216,7 +218,7 @@ def find_scans(path: Path | str) -> list[Path]:
     if path.is_file() or is_bag_folder(path):
         return [path]
     if path.is_dir():
-        paths = _scans_in(path) or _raw_drives(path)
+        paths = _scans_of_folder(path)
     elif glob.has_magic(str(path)):
         paths = _matches(str(path))
     else:
@@ -250,7 +252,7 @@ def list_scans(
         ending = ending_of(file)
         # Files of several folders can have the same names.
         name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
-        name = name.replace(f"/{KITTI_RAW}/", "/")
+        name = name.replace(f"/{KITTI_RAW}/", "/").replace(f"/{ARGOVERSE}/", "/")
         kind = BY_ENDING_OR_FOLDER[ending]
         if kind.open is None:
             source = str(file.parent / f"*{ending}")
@@ -292,6 +294,14 @@ def _read_file(path: Path, kind: Format, layout: RowLayout) -> Cloud:
     return kind.read(path)
 
 
+def _scans_of_folder(folder: Path) -> list[Path]:
+    """Return the scans that a folder stands for."""
+    # The other files of a log are tables, too.
+    if (folder / ARGOVERSE).is_dir():
+        return _scans_in(folder / ARGOVERSE)
+    return _scans_in(folder) or _drives_in(folder)
+
+
 def _scans_in(folder: Path) -> list[Path]:
     """Return the scans of a folder; its text files only if there are no others."""
     paths = sorted(filter(is_scan_file, folder.iterdir()))
@@ -301,11 +311,12 @@ def _scans_in(folder: Path) -> list[Path]:
     return [path for path in texts if _is_text_scan(path)]
 
 
-def _raw_drives(folder: Path) -> list[Path]:
-    """Return the scans of the drives of KITTI's raw data in a folder, or of one drive."""
+def _drives_in(folder: Path) -> list[Path]:
+    """Return the scans of the recordings in a folder: drives of KITTI, logs of Argoverse 2."""
+    patterns = [drives + KITTI_RAW for drives in RAW_DRIVES]
     paths: list[Path] = []
-    for drives in RAW_DRIVES:
-        for data in sorted(folder.glob(drives + KITTI_RAW)):
+    for pattern in (*patterns, f"*/{ARGOVERSE}"):
+        for data in sorted(folder.glob(pattern)):
             paths += _scans_in(data)
     return paths
 
@@ -313,16 +324,16 @@ def _raw_drives(folder: Path) -> list[Path]:
 def _matches(pattern: str) -> list[Path]:
     """Return the scans that match a pattern, and those of the folders that match."""
     paths: list[Path] = []
-    others: list[Path] = []
+    unnamed: list[Path] = []
     for text in sorted(glob.glob(pattern, recursive=True)):
         path = Path(text)
         if is_scan_file(path) or _is_text_scan(path):
             paths.append(path)
         elif path.is_dir() and "**" not in pattern:
-            paths += _scans_in(path) or _raw_drives(path)
+            paths += _scans_of_folder(path)
         elif path.is_file():
-            others.append(path)
-    return paths or others
+            unnamed.append(path)
+    return paths or unnamed
 
 
 def _advice_to_find(path: Path) -> str:
@@ -419,9 +430,12 @@ def is_scan_file(path: Path) -> bool:
 
 
 def _is_text_scan(path: Path) -> bool:
-    """Return whether a path is that of a text file with points."""
+    """Return whether a path is that of a text file with points, and not with poses."""
     is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
-    return is_text and path.is_file() and find_table(path) is not None
+    if not is_text or not path.is_file():
+        return False
+    table = find_table(path)
+    return table is not None and (bool(table.names) or table.count != POSE_COLUMNS)
 
 
 def scan_stem(path: Path) -> str:

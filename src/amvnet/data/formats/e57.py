@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, reading
+from amvnet.data.formats.cloud import Cloud, check_point_count, reading, require
 from amvnet.errors import InputError
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -61,13 +61,9 @@ class E57:
 
 
 def _open(path: Path) -> Any:
-    try:
-        import pye57
-    except ImportError:
-        raise InputError(
-            f"{path}: expected the package pye57 to read it, found none; "
-            'run pip install "amvnet[e57]"'
-        ) from None
+    require("the package pye57", "e57", path, "pye57")
+    import pye57
+
     return pye57.E57(str(path))
 
 

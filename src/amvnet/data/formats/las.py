@@ -10,7 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, reading, split_records
+from amvnet.data.formats.cloud import (
+    Cloud,
+    check_point_count,
+    make_cloud,
+    reading,
+    require,
+    split_records,
+)
 from amvnet.errors import InputError
 
 ADVICE = "write the file again"
@@ -79,14 +86,8 @@ def check_header(path: Path) -> tuple[int, bool]:
 
 
 def require_laspy(path: Path) -> None:
-    try:
-        import laspy  # noqa: F401
-        import lazrs  # noqa: F401
-    except ImportError:
-        raise InputError(
-            f"{path}: expected the packages laspy and lazrs to read it, found none; "
-            'run pip install "amvnet[formats]"'
-        ) from None
+    """Raise an InputError unless the packages that read LAS and LAZ are installed."""
+    require("the packages laspy and lazrs", "formats", path, "laspy", "lazrs")
 
 
 def read_records(path: Path) -> np.ndarray:

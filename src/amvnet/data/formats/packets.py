@@ -8,7 +8,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, reading, split_records
+from amvnet.data.formats.cloud import (
+    Cloud,
+    check_point_count,
+    make_cloud,
+    reading,
+    require,
+    split_records,
+)
 from amvnet.errors import InputError
 
 EXPECTED = "a capture of Velodyne's packets"
@@ -85,13 +92,9 @@ class Capture:
 
     def _decode(self) -> Iterator[Any]:
         """Yield the records of each scan."""
-        try:
-            import velodyne_decoder
-        except ImportError:
-            raise InputError(
-                f"{self.path}: expected the package velodyne-decoder to read it, found none; "
-                'run pip install "amvnet[packets]"'
-            ) from None
+        require("the package velodyne-decoder", "packets", self.path, "velodyne_decoder")
+        import velodyne_decoder
+
         for _, records in velodyne_decoder.read_pcap(str(self.path), as_pcl_structs=True):
             yield records
 
@@ -137,7 +140,7 @@ def _maker_of_packet(packet: bytes) -> str:
         return "Hesai"
     if data[:2] == b"\xff\xee" and len(data) >= PACKET_BYTES:
         return "Velodyne"
-    if data[:4] == b"\x55\xaa\x05\x0a" or data[:2] == b"\x55\xaa":
+    if data[:2] == b"\x55\xaa":
         return "RoboSense"
     if 56000 <= port <= 57999:
         return "Livox"

@@ -140,7 +140,7 @@ def count_rows(path: Path, dtype: DTypeLike, columns: int, advice: str = "copy i
     if size % row_size:
         raise InputError(
             f"{path}: expected a whole number of rows of {row_size} bytes, found {size} bytes; "
-            f"the file is truncated or has another format, {advice}"
+            f"the file is truncated or has another format; {advice}"
         )
     return size // row_size
 

@@ -12,7 +12,7 @@ from amvnet.data.formats.cloud import Cloud, find_columns, make_cloud, ring_indi
 from amvnet.errors import InputError
 
 NAMES = ("x", "y", "z", "intensity", "ring")  # of the columns, in the usual order
-ADVICE = "say what they hold, for example --columns x,y,z,intensity,ring --dtype float32"
+ADVICE = "say what the rows hold, for example --columns x,y,z,intensity,ring --dtype float32"
 
 # What files without names are tried for.
 DTYPES = ("float32", "float64")

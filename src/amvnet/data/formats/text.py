@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BytesIO, TextIOWrapper
 from itertools import islice
 from pathlib import Path
 
@@ -19,6 +20,8 @@ MOST_COLUMNS = 200
 CHECKED = 20  # lines that must be alike
 USED = 7  # columns without names that are looked at
 COMMENTS = ("#", "//", "%")
+# Numbers are ASCII; comments and names of columns may be in any encoding.
+ENCODING = "utf-8-sig"
 # Separators of the values, and decimal marks, in the order in which they are tried; None is any
 # white space.
 SEPARATORS: tuple[tuple[str | None, str], ...] = (
@@ -111,7 +114,7 @@ def _decode(head: bytes) -> list[str]:
     """Return the lines of the beginning of a file; none if it is no text."""
     if re.search(rb"[\x00-\x08\x0e-\x1f]", head):
         return []
-    return head.decode("latin-1").removeprefix("\xef\xbb\xbf").split("\n")
+    return TextIOWrapper(BytesIO(head), ENCODING, errors="replace").readlines()
 
 
 def _match(lines: list[str], separator: str | None, decimal: str) -> TextTable | None:
@@ -120,7 +123,10 @@ def _match(lines: list[str], separator: str | None, decimal: str) -> TextTable |
     for skipped, line in enumerate(lines):
         values = _split(line, separator)
         if _are_numbers(values, names, decimal):
-            alike = filter(str.strip, islice(lines, skipped, skipped + CHECKED))
+            alike = list(filter(str.strip, lines[skipped : skipped + CHECKED]))
+            # A header is not longer than the points; other text may end in a line of numbers.
+            if len(alike) < min(skipped, CHECKED):
+                return None
             for other in alike:
                 row = _split(other, separator)
                 if len(row) != len(values) or not _are_numbers(row, names, decimal):
@@ -135,7 +141,8 @@ def _match(lines: list[str], separator: str | None, decimal: str) -> TextTable |
 
 
 def _split(line: str, separator: str | None) -> list[str]:
-    return line.strip().split(separator, MOST_COLUMNS)
+    """Return the values of a line; a separator at its end adds none."""
+    return line.strip().removesuffix(separator or "").split(separator, MOST_COLUMNS)
 
 
 def _uncomment(line: str) -> str:
@@ -173,7 +180,7 @@ def _are_numbers(values: list[str], names: tuple[str, ...], decimal: str) -> boo
 
 def _read_values(path: Path, table: TextTable, indices: range | list[int]) -> np.ndarray:
     """Return some columns of all points, (N, columns) float64."""
-    with path.open(encoding="latin-1") as file:
+    with path.open(encoding=ENCODING, errors="replace") as file:
         lines: Iterator[str] = islice(file, table.skipped, None)
         if table.decimal == ",":
             lines = (line.replace(",", ".") for line in lines)
