@@ -13,7 +13,8 @@ import yaml
 
 from amvnet.errors import InputError
 
-LARGEST_YAML = 100_000  # bytes; PyYAML takes a second for as many
+LARGEST_YAML = 50_000  # bytes; PyYAML takes a second for as many
+DEEPEST_YAML = 50  # levels
 PARTS = f".{'[0-9a-f]' * 32}.part*"  # names of files that `atomic_write` has not finished
 
 
@@ -68,15 +69,30 @@ def read_yaml(path: Path, content: str) -> Any:
     """
     expected = f"{path}: expected {content} (YAML)"
     try:
-        if path.stat().st_size > LARGEST_YAML:
-            raise InputError(f"{expected}, found {path.stat().st_size} bytes; give a smaller file")
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        size = path.stat().st_size
+        if size <= LARGEST_YAML:
+            return yaml.load(path.read_text(encoding="utf-8"), _BoundedLoader)
     except OSError as error:
         raise InputError(f"{expected}, found {error.strerror}; check the path") from None
     except UnicodeDecodeError:
         raise InputError(f"{expected}, found bytes that are not text; give another file") from None
-    except RecursionError:
-        raise InputError(f"{expected}, found values nested too deeply; correct the file") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: numbers and dates
         reason = " ".join(str(error).split())
         raise InputError(f"{expected}, found {reason}; correct the file") from None
+    raise InputError(f"{expected} of at most {LARGEST_YAML} bytes, found {size}; give another file")
+
+
+class _BoundedLoader(yaml.SafeLoader):
+    """PyYAML's safe loader, but for values of limited depth: deep ones take seconds."""
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self._depth == DEEPEST_YAML:
+            raise yaml.YAMLError(f"more than {DEEPEST_YAML} levels")
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node

@@ -31,6 +31,7 @@ GRAPHS = {
     "amvnet": ("range_net", *POLAR, "point_head"),
 }
 CHANNELS = 6  # x, y, z, intensity, range, mask
+LARGEST = 10_000_000  # bytes of a description
 PART = 2048  # uncertain points that the point head classifies at a time
 TINY = np.float32(1e-12)  # keeps logarithms and quotients finite
 
@@ -309,8 +310,10 @@ def _fill_in(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
 
 def _read_description(folder: Path) -> dict[str, Any]:
     path = folder / DESCRIPTION
+    description = None
     try:
-        description = json.loads(path.read_text(encoding="utf-8"))
+        if path.stat().st_size <= LARGEST:
+            description = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
         raise InputError(
             f"{folder}: expected {DESCRIPTION} of amvnet export, found none; export again"
@@ -336,12 +339,16 @@ def _read_description(folder: Path) -> dict[str, Any]:
 
 
 def _is_complete(graph: Any) -> bool:
-    """Return whether a graph's description has a file and inputs."""
+    """Return whether a graph's description has a file of the folder, and inputs with names."""
     if not isinstance(graph, dict) or not isinstance(graph.get("file"), str):
+        return False
+    if Path(graph["file"]).name != graph["file"]:
         return False
 
     inputs = graph.get("inputs")
-    return isinstance(inputs, list) and all(isinstance(entry, dict) for entry in inputs)
+    if not isinstance(inputs, list):
+        return False
+    return all(isinstance(entry, dict) and isinstance(entry.get("name"), str) for entry in inputs)
 
 
 def _open_session(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -> Any:

@@ -6,6 +6,7 @@ Skipped without ONNX Runtime.
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 import shutil
@@ -274,6 +275,8 @@ def replace_range_net(folder: Path) -> None:
         (remove("amvnet.json"), "amvnet.json"),
         (write("amvnet.json", "{"), "amvnet.json"),
         (write("amvnet.json", "[]"), "format 2"),
+        (write("amvnet.json", "[" * 100_000), "amvnet.json"),
+        (write("amvnet.json", "9" * 20_000_000), "amvnet.json"),
         (remove("point_head.onnx"), "point_head.onnx"),
         (truncate_range_net, "range_net.onnx"),
         (replace_range_net, "range_net.onnx"),
@@ -293,7 +296,15 @@ def test_a_broken_folder_is_one_line(
         ("graphs", 3, ("range_net", "export again")),
         ("graphs polar_map", {}, ("polar_map", "export again")),
         ("graphs polar_map inputs", [{"name": 1, "shape": 2}], ("polar_map", "export again")),
+        ("graphs polar_map file", "../polar_map.onnx", ("polar_map", "export again")),
         ("range_view height", -4, ("height",)),
+        ("range_view height", 10**12, ("height",)),
+        ("polar_view radial", 10**12, ("radial",)),
+        ("polar_view z_max", math.inf, ("z_max",)),
+        ("range_view fov_up", math.nan, ("fov_up",)),
+        ("point_head neighbours", 10**12, ("neighbours",)),
+        ("point_head position_scale", 10**400, ("position_scale",)),
+        ("assertion threshold", math.nan, ("threshold",)),
         ("range_view width", 32, ("range_net", "export again")),
         ("point_head neighbours", 3, ("point_head", "export again")),
     ],

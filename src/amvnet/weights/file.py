@@ -247,14 +247,15 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
 
 
 def load(name_or_path: str | Path) -> Weights:
-    """Read weights. Nothing in the file is ever executed.
+    """Read weights. Nothing in the file is executed, and nothing is built before it is checked.
 
     Args:
         name_or_path: a weights file, the folder of a training run, the name of built-in weights
             (`sim-hdl64e`), or weights on the hub (`hf-hub:OWNER/NAME`).
 
     Raises:
-        InputError: if there is no such file or name, or the file does not hold AMVNet weights.
+        InputError: if there is no such file or name, the file does not hold AMVNet weights, a value
+            of its description is out of its range, or its parameters do not fit the description.
     """
     path = _find(str(name_or_path))
     try:
