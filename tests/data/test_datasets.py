@@ -203,8 +203,17 @@ def test_nuscenes_tables_that_cannot_be_used(tmp_path: Path) -> None:
     fails(lambda: open_dataset(layout.spec), categories, "a.submarine")
     categories.write_text('[{"token": "a", "name": "vehicle.car"}]')
     fails(lambda: open_dataset(layout.spec), categories, "index")
+    categories.write_text('[{"token": "a", "index": 1}]')
+    fails(lambda: open_dataset(layout.spec), folder, "name")
+    categories.write_text('[{"token": "a", "name": "vehicle.car", "index": 999}]')
+    fails(lambda: open_dataset(layout.spec), folder)
+    categories.write_text("[" * 100_000)
+    fails(lambda: open_dataset(layout.spec), categories)
 
-    (folder / "lidarseg.json").unlink()
+    labels = folder / "lidarseg.json"
+    labels.write_text('[{"sample_data_token": "a"}]')
+    fails(lambda: open_dataset(layout.spec), folder, "filename")
+    labels.unlink()
     samples = folder / "sample.json"
     samples.write_text('[{"token": "a"}]')
     fails(lambda: open_dataset(layout.spec), folder, "scene_token")

@@ -43,6 +43,9 @@ def test_a_refused_resume_says_which_values_differ(tmp_path: Path) -> None:
     fails(lambda: check_begun(tmp_path, settings, True), "training.rv.lr 0.001 instead of 0.003")
 
     # Without the earlier settings, everything differs.
+    for text in ("", "a: [", "- 1"):
+        (tmp_path / SETTINGS).write_text(text)
+        fails(lambda: check_begun(tmp_path, EARLIER, True), "model.range_net.widths")
     (tmp_path / SETTINGS).unlink()
     many = {**EARLIER, "model": {str(index): index for index in range(2 * MOST_CHANGES)}}
     fails(lambda: check_begun(tmp_path, many, True), "and ", " more")

@@ -60,10 +60,10 @@ def _write_yaml(path: Path, tree: dict[str, Any]) -> None:
 
 
 def _entries(path: Path) -> dict[str, Any]:
-    """Return the entries of run.yaml so far, by stage; none if it cannot be read."""
+    """Return the entries of a YAML file of a run; none if it cannot be read."""
     try:
         entries = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, yaml.YAMLError):
+    except (OSError, ValueError, RecursionError, yaml.YAMLError):
         return {}
     return entries if isinstance(entries, dict) else {}
 
@@ -134,7 +134,7 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         )
 
     path = folder / SETTINGS
-    begun = yaml.safe_load(path.read_text()) if path.is_file() else {}
+    begun = _entries(path)
     if begun != settings:
         changes = describe_changes(begun, settings)
         raise InputError(

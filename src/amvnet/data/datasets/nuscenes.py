@@ -75,13 +75,12 @@ class NuScenes:
         self.version = self._find_version(version)
         self.taxonomy = taxonomy
 
-        label_rows = self._table("lidarseg", required=False)
-        self._label_files = _lookup(label_rows, "sample_data_token", "filename")
-        self._category_train_ids = self._category_lookup() if label_rows else None
-
         try:
+            label_rows = self._table("lidarseg", required=False)
+            self._label_files = _lookup(label_rows, "sample_data_token", "filename")
+            self._category_train_ids = self._category_lookup() if label_rows else None
             self._records_by_scene = self._read_records()
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, IndexError) as error:
             raise InputError(
                 f"{self.root / self.version}: expected the tables of nuScenes, "
                 f"found no entry {error}; unpack them"
@@ -222,7 +221,7 @@ class NuScenes:
 
         try:
             rows: list[Row] = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise InputError(
                 f"{path}: expected a table in JSON, found {error}; unpack the file again"
             ) from None
