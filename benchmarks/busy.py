@@ -1,7 +1,9 @@
-"""Measure a call of the segmenter and `amvnet predict` while other programs use the processors.
+"""Measure a call of the segmenter and the commands while other programs use the processors.
 
 python benchmarks/busy.py [--scan FILE] [--calls N] [--scans N] [--busy 0,1,2]
-                          [--settings "passive,one thread"]
+                          [--settings "passive,one thread"] [--commands predict,evaluate]
+
+The last table has the time of each command as it is, next to its time with passive waiting.
 
 Each setting runs in a process of its own. The busy processes only count; each keeps one processor
 busy if it gets one. Run this on a machine that has nothing else to do.
@@ -37,6 +39,18 @@ SETTINGS: dict[str, dict[str, str]] = {
     "spin 1000 times": {"GOMP_SPINCOUNT": "1000"},
     "passive": {"OMP_WAIT_POLICY": "passive"},
     "one thread": {"OMP_NUM_THREADS": "1"},
+}
+
+# The commands that compute: with labelled scans, their files, and a folder to write to.
+COMMANDS = {
+    "predict": "predict {files} --weights {weights} --out {out} --scores",
+    "evaluate": "evaluate semantickitti:{data} --split all --weights {weights}",
+    "rank": "rank semantickitti:{data} --split all --weights {weights} --out {out}/rank.json",
+    "analyze": "analyze semantickitti:{data} --split all --weights {weights} --out {out}",
+    "view": "view {files} --weights {weights} --html {out}/view.html",
+    "export": "export --weights {weights} --out {out}",
+    "train": "train simulated-compact --data semantickitti:{data} --train-sequences 00"
+    " --val-sequences 01 --stage rv --training.rv.epochs 1 --out {out}",
 }
 
 # Prints the seconds of each call.
@@ -100,6 +114,39 @@ def time_predict(scan: Path, setting: str, scans: int) -> float:
         return (time.perf_counter() - start) / scans
 
 
+def time_command(command: str, data: Path, setting: str) -> float:
+    """Return the seconds of a command, with its start."""
+    with TemporaryDirectory() as out:
+        text = COMMANDS[command].format(
+            data=data, files=data / "sequences/00/velodyne", weights=WEIGHTS, out=out
+        )
+        start = time.perf_counter()
+        subprocess.run(
+            [sys.executable, "-m", "amvnet", *text.split()],
+            env=environment(setting),
+            stdout=subprocess.DEVNULL,
+            check=True,
+        )
+        return time.perf_counter() - start
+
+
+def compare_commands(commands: list[str], scans: int, busy: list[int]) -> Table:
+    """Return a table of the commands' seconds as they are, and with passive waiting."""
+    title = "seconds as it is / with OMP_WAIT_POLICY=passive, and their ratio"
+    table = Table("command", *[f"{count} busy" for count in busy], title=title)
+    with TemporaryDirectory() as temporary:
+        data = simulate(Path(temporary), sequences=2, scans=scans)
+        for command in commands:
+            cells = []
+            for count in busy:
+                with busy_processes(count):
+                    plain = time_command(command, data, "default")
+                    passive = time_command(command, data, "passive")
+                cells.append(f"{plain:.1f} / {passive:.1f}, {plain / passive:.2f}")
+            table.add_row(command, *cells)
+    return table
+
+
 def measure(
     scan: Path, settings: list[str], calls: int, scans: int, busy: list[int]
 ) -> list[Table]:
@@ -128,6 +175,7 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=12, help="that predict segments")
     parser.add_argument("--busy", default="0,1,2", help="numbers of busy processes")
     parser.add_argument("--settings", default=",".join(SETTINGS), help="which of them")
+    parser.add_argument("--commands", default=",".join(COMMANDS), help="which of them")
     options = parser.parse_args()
 
     with TemporaryDirectory() as temporary:
@@ -136,8 +184,11 @@ def main() -> None:
             simulate(Path(temporary), scans=1)
             scan = Path(temporary) / "sequences/00/velodyne/000000.bin"
         busy = [int(count) for count in options.busy.split(",")]
-        settings = options.settings.split(",")
+        settings = [setting for setting in options.settings.split(",") if setting]
         tables = measure(scan, settings, options.calls, options.scans, busy=busy)
+    commands = [command for command in options.commands.split(",") if command]
+    if commands:
+        tables.append(compare_commands(commands, options.scans, busy))
 
     console = Console()
     for table in tables:
