@@ -35,7 +35,7 @@ HUGE = 10**12
 # Runs a command for each file, and prints the exit code, the lines on stderr and the seconds of
 # each, and the largest memory of the process in bytes.
 RUNNER = """
-import contextlib, io, json, resource, sys, time
+import contextlib, io, json, sys, time
 from amvnet.cli.main import main
 
 # What is imported does not count.
@@ -51,7 +51,10 @@ for line in sys.stdin:
     with contextlib.redirect_stderr(errors), contextlib.redirect_stdout(io.StringIO()):
         code = main(command)
     results[name] = code, errors.getvalue(), time.process_time() - start
-memory = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+# Not ru_maxrss: it counts the memory of the parent before the exec, too.
+with open("/proc/self/status") as file:
+    status = dict(line.split(":", 1) for line in file)
+memory = 1024 * int(status["VmHWM"].split()[0])
 sys.stdout.write("\\n" + json.dumps([results, memory]))
 """
 
