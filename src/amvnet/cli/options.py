@@ -50,10 +50,11 @@ def refuse_other_formats(inputs: Sequence[str]) -> None:
     Raises:
         InputError: if one has not.
     """
+    from amvnet.data.datasets.own import is_description
     from amvnet.data.formats.detect import ending_of
 
     for text in inputs:
-        if Path(text).is_file():
+        if Path(text).is_file() and not is_description(text):
             ending_of(Path(text))
 
 

@@ -146,6 +146,7 @@ def label_by_weights(
         InputError: if the weights do not have the dataset's classes.
     """
     check_classes(dataset, segmenter.taxonomy)
+    segmenter = segmenter.for_dataset(dataset)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
         return MethodLabels(*segmenter.labels_by_method(check_scan(scan), methods))

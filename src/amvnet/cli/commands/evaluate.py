@@ -59,26 +59,25 @@ def evaluate(
             most 4.
     """
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.open import open_with_classes
+    from amvnet.data.datasets.select import labelled_records
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
+    from amvnet.inference.inputs import open_for_weights
     from amvnet.weights.file import load
 
     processes = join_processes()
     names = parse_names(sequences)
     if weights is not None and predictions is None:
         loaded = load(weights)
-        if taxonomy is None:
-            dataset = open_with_classes(data, loaded.taxonomy)
-        else:
-            dataset = open_data(data, taxonomy)
-        records = choose_records(dataset, names, split)
+        opened = None if taxonomy is None else open_data(data, taxonomy)
+        dataset = open_for_weights(data, loaded, opened)
+        records = labelled_records(dataset, choose_records(dataset, names, split))
         segmenter = make_segmenter(loaded, processes.device(device), engine, precision, at_once)
         labeller = label_by_weights(dataset, segmenter, parse_methods(methods))
     elif predictions is not None and weights is None:
         dataset = open_data(data, taxonomy)
-        records = choose_records(dataset, names, split)
+        records = labelled_records(dataset, choose_records(dataset, names, split))
         labeller = label_from_files(dataset, predictions)
     else:
         raise InputError(
