@@ -27,7 +27,7 @@ from amvnet.sensors.intensity import trained_intensity
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.own import adapted_by
 from amvnet.sensors.plain import PlainAdapter
-from amvnet.sensors.record import trained_sensor
+from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
 
 
@@ -214,7 +214,14 @@ def adapter_for(
     """
     intensity = trained_intensity(weights.training, weights.sensor)
     trained = trained_sensor(weights.training, weights.sensor)
-    return ScanAdapter(weights.model.range_view, trained, given, say, intensity)
+    return ScanAdapter(
+        weights.model.range_view,
+        trained,
+        given,
+        say=say,
+        intensity=intensity,
+        as_is=is_trained_as_is(weights.training),
+    )
 
 
 def open_for_weights(spec: str, weights: Weights, dataset: Dataset | None = None) -> Dataset:

@@ -99,6 +99,8 @@ class ScanAdapter:
         say: is told once for each recording what was assumed.
         intensity: the intensities that the weights were trained with; None means those of the
             named sensor that they were trained for, if they are known.
+        as_is: whether they were trained on scans that were not adapted. Scans of the same field of
+            view then have their rows as in the training, however many points are outside.
     """
 
     def __init__(
@@ -108,11 +110,13 @@ class ScanAdapter:
         sensor: Sensor | None = None,
         say: Say = say_nothing,
         intensity: TrainedIntensity | None = None,
+        as_is: bool = False,
     ) -> None:
         self.sensor = sensor or Sensor()
         self._view = view
         self._trained = trained_for or Sensor()
         self._trained_height = self._trained.height
+        self._as_is = as_is
         self._trained_intensity = intensity or trained_intensity({}, self._trained.name)
         self._say = say
         self._recordings: dict[str, _Recording] = {}
@@ -279,8 +283,8 @@ class ScanAdapter:
         outside. None if the rows are lasers and their elevations are unknown.
         """
         view = self._trained_view(geometry)
-        if view is None:
-            return None
+        if view is None or (self._as_is and self._has_trained_ends(geometry)):
+            return view
 
         elevation = elevations(points[:, :3].astype(np.float64))
         is_outside = (elevation > view.fov_up) | (elevation < view.fov_down)
@@ -389,8 +393,12 @@ class ScanAdapter:
             if not 1 / SAME_BEAMS < ratio < SAME_BEAMS:
                 return False
 
-        return _is_near(geometry.fov_up, trained.fov_up) and _is_near(
-            geometry.fov_down, trained.fov_down
+        return self._has_trained_ends(geometry)
+
+    def _has_trained_ends(self, geometry: SensorGeometry) -> bool:
+        """Return whether a field of view is that of the training, as far as they are known."""
+        return _is_near(geometry.fov_up, self._trained.fov_up) and _is_near(
+            geometry.fov_down, self._trained.fov_down
         )
 
 

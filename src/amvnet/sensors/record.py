@@ -14,7 +14,10 @@ from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
 from amvnet.sensors.measure import SensorGeometry, elevations, measure
 
 KEY = "sensor"  # of a part's training record
+AS_IS = "as_is"  # in it: whether the scans were trained on as they were, not adapted as files are
 MEASURES = ("beams", "fov_up", "fov_down", "height")  # attributes of Sensor that it has
+
+LARGEST = 1e6  # no measure of a sensor is larger
 
 
 def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
@@ -33,13 +36,25 @@ def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
     return known
 
 
+def is_trained_as_is(training: Mapping[str, Any]) -> bool:
+    """Return whether weights were trained on scans that were not adapted, by their records."""
+    for part in ("range_net", "polar_net"):
+        record = training.get(part)
+        carried = record.get(KEY) if isinstance(record, Mapping) else None
+        if isinstance(carried, Mapping) and carried.get(AS_IS) is True:
+            return True
+    return False
+
+
 def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
     """Return the sensor with the measures of a record, if they are possible."""
     measures: dict[str, Any] = {}
     for key in MEASURES:
         value = record.get(key)
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            measures[key] = round(value) if key == "beams" and np.isfinite(value) else value
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            continue
+        if abs(value) < LARGEST:  # also false for NaN
+            measures[key] = round(value) if key == "beams" else float(value)
     try:
         return dataclasses.replace(sensor, **measures)
     except InputError:  # a file of a stranger may hold any numbers

@@ -24,8 +24,8 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITY
 from amvnet.sensors.intensity import quantiles_of
 from amvnet.sensors.own import training_record
+from amvnet.sensors.record import AS_IS, measure_sensor
 from amvnet.sensors.record import KEY as SENSOR
-from amvnet.sensors.record import measure_sensor
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
 SAMPLED_SCANS = 20  # that are measured
@@ -293,7 +293,7 @@ def sensor_record(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, 
     # Scans that are adapted are as the weights will get them: what they are brought to counts.
     if isinstance(dataset, OwnScans) and dataset.is_adapted:
         return {INTENSITY: mean, **training_record(dataset)}
-    return {INTENSITY: mean, SENSOR: measure_sensor(scans)}
+    return {INTENSITY: mean, SENSOR: {**measure_sensor(scans), AS_IS: True}}
 
 
 def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:
