@@ -95,6 +95,12 @@ def test_training_measures_height_lasers_and_field_of_view() -> None:
     ring = np.repeat(np.arange(8), len(azimuth))
     with_ring = measure_sensor([replace(scan, ring=ring)])
     assert (with_ring["fov_up"], with_ring["fov_down"]) == (6, -24)
+
+    # Lost returns of most shots of the highest laser lie next to the sensor, as in nuScenes.
+    lost = points.reshape(-1, 4).astype(np.float32)
+    lost[-600:, :3] = (0.3, 0.1, -0.05)
+    with_lost = measure_sensor([Scan(lost, ring=ring)])
+    assert (with_lost["fov_up"], with_lost["fov_down"]) == (6, -24)
     assert measure_sensor([]) == {}
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from amvnet.errors import InputError
 from amvnet.scan import Scan
+from amvnet.sensors.ground import MIN_DISTANCE
 from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
 from amvnet.sensors.measure import SensorGeometry, elevations, measure
 
@@ -92,7 +93,10 @@ def _with_laser_ends(
     """Return the geometry with the median elevations of the highest and the lowest laser."""
     if ring is None or geometry.fov_up is None:
         return geometry
-    elevation = elevations(points)
+    # Sensors report lost returns as points next to them, at any elevation.
+    is_distant = np.hypot(points[:, 0], points[:, 1]) > MIN_DISTANCE
+    elevation = elevations(points[is_distant])
+    ring = ring[is_distant]
     ends = [float(np.median(elevation[ring == laser])) for laser in (ring.min(), ring.max())]
     if min(ends) == max(ends):
         return geometry
