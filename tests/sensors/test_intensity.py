@@ -19,7 +19,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.ground import ground_height
 from amvnet.sensors.intensity import KEY, PROBABILITIES, QUANTILES, trained_intensity
 from amvnet.sensors.lidars import Sensor
-from amvnet.training.loaders import sample_intensities
+from amvnet.training.loaders import sensor_record
 from amvnet.weights.file import Weights
 
 from fixtures.sensors import LASERS, place
@@ -161,7 +161,7 @@ def test_weights_that_carry_no_quantiles_have_those_of_their_sensor(record: Any)
 def test_training_measures_the_intensities_that_weights_carry(tmp_path: Path) -> None:
     data = SemanticKitti(make_streets(tmp_path, ("00", "01"), 2))
     records = data.records(("00", "01"))
-    quantiles = sample_intensities(data, records)
+    quantiles = sensor_record(data, records)[KEY]
 
     each = [np.quantile(data.read(record).points[:, 3], PROBABILITIES) for record in records]
     np.testing.assert_allclose(quantiles, np.mean(each, axis=0), atol=1e-4)

@@ -211,3 +211,46 @@ def test_a_file_that_is_not_weights_is_refused_in_one_line(
     with pytest.raises(InputError) as error:
         load(broken)
     assert "\n" not in str(error.value)
+
+
+def test_for_other_classes_only_the_layers_that_depend_on_their_number_are_new() -> None:
+    weights = fresh_weights()
+    few = replace(
+        weights.taxonomy,
+        name="few",
+        classes=("ground", "thing"),
+        colors=((0, 0, 0),) * 3,
+        raw_to_train={0: 0, 1: 1, 2: 2},
+        train_to_raw=(0, 1, 2),
+    )
+    begun, new = weights.for_classes(few, seed=1)
+
+    assert {name.split(".")[0] for name in new} == {"range_net", "polar_net", "point_head"}
+    for name, tensor in weights.tensors.items():
+        if name in new:
+            assert begun.tensors[name].shape != tensor.shape or not begun.tensors[name].equal(
+                tensor
+            )
+        else:
+            assert begun.tensors[name].equal(tensor)
+    last = {name for name in new if name.startswith(("range_net", "polar_net"))}
+    assert all(".scores." in name for name in last)
+    assert begun.build()  # the sizes fit
+
+    again, _ = weights.for_classes(few, seed=1)
+    other, _ = weights.for_classes(few, seed=2)
+    key = "range_net.scores.weight"
+    assert again.tensors[key].equal(begun.tensors[key])
+    assert not other.tensors[key].equal(begun.tensors[key])
+
+
+def test_for_other_classes_of_the_same_number_the_same_layers_are_new() -> None:
+    weights = fresh_weights()
+    renamed = replace(
+        weights.taxonomy, classes=tuple(f"other-{name}" for name in weights.taxonomy.classes)
+    )
+    begun, new = weights.for_classes(renamed, seed=1)
+    assert not begun.tensors["range_net.scores.weight"].equal(
+        weights.tensors["range_net.scores.weight"]
+    )
+    assert len(new) < len(weights.tensors) / 3

@@ -11,6 +11,7 @@ from amvnet.errors import InputError
 from amvnet.models.methods import METHODS, EngineName, MethodName, Precision, widest_method
 
 if TYPE_CHECKING:
+    from amvnet.data.class_maps import ClassMap
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.distributed import Processes
     from amvnet.inference.score_files import ScorePair, Which
@@ -44,16 +45,28 @@ def open_data(data: str, taxonomy: Path | None = None) -> Dataset:
     return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
 
 
+def parse_classes(name: str | None) -> ClassMap | None:
+    """Return the map of classes with a name or of a YAML file; None if the option was left out.
+
+    Raises:
+        InputError: if there is no such map.
+    """
+    from amvnet.data.class_maps import class_map
+
+    return None if name is None else class_map(name)
+
+
 def refuse_other_formats(inputs: Sequence[str]) -> None:
     """Check that input files have a known format, before torch is imported.
 
     Raises:
         InputError: if one has not.
     """
+    from amvnet.data.datasets.own import is_description
     from amvnet.data.formats.detect import ending_of
 
     for text in inputs:
-        if Path(text).is_file():
+        if Path(text).is_file() and not is_description(text):
             ending_of(Path(text))
 
 

@@ -97,6 +97,7 @@ def analyze(
             "train these"
         )
 
+    segmenter = segmenter.for_dataset(dataset)
     size = dataset.taxonomy.size + 1
     analysis = Analysis(
         Evaluation(dataset.taxonomy),

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import check_classes
 from amvnet.distributed import ALONE, Processes
@@ -133,7 +134,10 @@ def stream_labelled(
 
 
 def label_by_weights(
-    dataset: Dataset, segmenter: Segmenter, methods: Sequence[str] = PAPER_METHODS
+    dataset: Dataset,
+    segmenter: Segmenter,
+    methods: Sequence[str] = PAPER_METHODS,
+    classes: ClassMap | None = None,
 ) -> Labeller:
     """Return what labels scans by several methods.
 
@@ -141,14 +145,21 @@ def label_by_weights(
         dataset: the dataset that has the scans.
         segmenter: the networks, with the parts that the methods need.
         methods: names of the methods.
+        classes: maps the classes of the weights to those of the dataset; None if they are these.
 
     Raises:
         InputError: if the weights do not have the dataset's classes.
     """
-    check_classes(dataset, segmenter.taxonomy)
+    if classes is None:
+        check_classes(dataset, segmenter.taxonomy)
+        table = np.arange(segmenter.taxonomy.size + 1, dtype=np.uint8)
+    else:
+        table = classes.table(segmenter.taxonomy)
+    segmenter = segmenter.for_dataset(dataset)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
-        return MethodLabels(*segmenter.labels_by_method(check_scan(scan), methods))
+        labels, uncertain = segmenter.labels_by_method(check_scan(scan), methods)
+        return MethodLabels({name: table[ids] for name, ids in labels.items()}, uncertain)
 
     return Labeller(label, segmenter.at_once)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from amvnet.data import label_bags
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
-from amvnet.data.datasets.open import open_if_dataset
+from amvnet.data.datasets.open import open_if_dataset, open_with_classes
+from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.cloud import Cloud, Message
 from amvnet.data.formats.detect import NamedScan, ending_of, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
@@ -24,7 +25,9 @@ from amvnet.scan import Scan
 from amvnet.sensors.adapt import MEASURED, ScanAdapter
 from amvnet.sensors.intensity import trained_intensity
 from amvnet.sensors.lidars import Sensor
+from amvnet.sensors.own import adapted_by
 from amvnet.sensors.plain import PlainAdapter
+from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
 
 
@@ -160,7 +163,10 @@ class DatasetScan:
 
     dataset: Dataset
     record: ScanRecord
-    is_adapted: ClassVar[bool] = False
+
+    @property
+    def is_adapted(self) -> bool:
+        return self.dataset.is_adapted
 
     @property
     def name(self) -> str:
@@ -207,7 +213,34 @@ def adapter_for(
         say: is told what was assumed of the sensor.
     """
     intensity = trained_intensity(weights.training, weights.sensor)
-    return ScanAdapter(weights.model.range_view, weights.sensor, given, say, intensity)
+    trained = trained_sensor(weights.training, weights.sensor)
+    return ScanAdapter(
+        weights.model.range_view,
+        trained,
+        given,
+        say=say,
+        intensity=intensity,
+        as_is=is_trained_as_is(weights.training),
+    )
+
+
+def open_for_weights(spec: str, weights: Weights, dataset: Dataset | None = None) -> Dataset:
+    """Open a dataset whose scans are read as some weights expect them.
+
+    The scans of the benchmarks are as they are; a user's own are adapted as `predict` does.
+
+    Args:
+        spec: as `open_dataset` takes it.
+        weights: the weights.
+        dataset: the dataset, if it is open.
+
+    Raises:
+        InputError: as `open_with_classes`.
+    """
+    dataset = dataset or open_with_classes(spec, weights.taxonomy)
+    if isinstance(dataset, OwnScans):
+        return adapted_by(dataset, adapter_for(weights))
+    return dataset
 
 
 class FileReader:
@@ -361,6 +394,8 @@ def open_inputs(
     for text in inputs:
         dataset = open_if_dataset(text, taxonomy)
         if dataset is not None:
+            if isinstance(dataset, OwnScans) and adapter is not None:
+                dataset = adapted_by(dataset, adapter)
             for record in choose_records(dataset, options.sequences, options.split):
                 scans.append(DatasetScan(dataset, record))
             taxonomies.append(dataset.taxonomy)

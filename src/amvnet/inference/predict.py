@@ -8,13 +8,22 @@ from itertools import groupby
 from typing import Any
 
 from amvnet.data import label_bags
+from amvnet.data.class_maps import ClassMap
+from amvnet.data.datasets.mapped import MappedDataset
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.detect import BY_ENDING_OR_FOLDER, ending_of
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.distributed import Processes
 from amvnet.errors import InputError, SomeBroken
 from amvnet.inference.certainty import UncertainCount, Verdict
-from amvnet.inference.inputs import FileScan, InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.inputs import (
+    DatasetScan,
+    FileScan,
+    InputScan,
+    ScanOptions,
+    adapter_for,
+    open_inputs,
+)
 from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.progress import Progress, Say, no_progress, say_nothing
@@ -36,6 +45,7 @@ def predict(
     options: ScanOptions = ScanOptions(),
     execution: ExecutionOptions = ExecutionOptions(),
     adapter: ScanAdapter | None = None,
+    classes: ClassMap | None = None,
     progress: Progress = no_progress,
     say: Say = say_nothing,
 ) -> int:
@@ -49,6 +59,7 @@ def predict(
         execution: how many scans at a time, and by which processes.
         adapter: adapts scan files to what the weights expect; None measures everything about the
             sensor and says nothing.
+        classes: maps the classes of the weights to those that are written; None writes these.
         say: is told at the end how sure the labels are, if there are two networks.
 
     Returns:
@@ -68,16 +79,23 @@ def predict(
 
     adapter = adapter or adapter_for(segmenter.weights)
     opened = open_inputs(inputs, options, segmenter.taxonomy, adapter)
+    scans = opened.scans
+    taxonomy = segmenter.taxonomy
+    if classes is not None:
+        scans = [_with_classes(scan, classes) for scan in scans]
+        taxonomy = classes.target
 
     if output.kind in label_bags.KINDS:
         _check_bags(opened.scans, output)
 
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
-    segment = NetworkSegmentation(segmenter)
-    pipeline = Pipeline(opened.scans, segment, output, segmenter.taxonomy, execution)
+    segment = NetworkSegmentation(segmenter, classes)
+    pipeline = Pipeline(scans, segment, output, taxonomy, execution)
     settings = _settings(segmenter, output, adapter)
     if options.layout != UNKNOWN:
         settings["layout"] = repr(options.layout)
+    if classes is not None:
+        settings["classes"] = repr(classes)
 
     faults: SomeBroken | None = None
     try:
@@ -91,6 +109,13 @@ def predict(
     if faults is not None:
         raise faults
     return written
+
+
+def _with_classes(scan: InputScan, classes: ClassMap) -> InputScan:
+    """Return a scan whose labels are written as those of mapped classes."""
+    if isinstance(scan, DatasetScan):
+        return replace(scan, dataset=MappedDataset(scan.dataset, classes))
+    return scan
 
 
 def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
@@ -131,10 +156,16 @@ def _write_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
 
 
 class NetworkSegmentation:
-    """Segments scans of the inputs; those that are adapted to the weights, by their rings."""
+    """Segments scans of the inputs; those that are adapted to the weights, by their rings.
 
-    def __init__(self, segmenter: Segmenter) -> None:
+    Args:
+        segmenter: labels the scans.
+        classes: maps the labels to other classes; None leaves them.
+    """
+
+    def __init__(self, segmenter: Segmenter, classes: ClassMap | None = None) -> None:
         self.segmenter = segmenter
+        self._table = None if classes is None else classes.table(segmenter.taxonomy)
         self.by_ring = segmenter.by_ring()
         self.counted = UncertainCount()
 
@@ -148,7 +179,9 @@ class NetworkSegmentation:
 
         for result in results:
             self.counted.add(result.labels, result.uncertain)
-        return results
+        if self._table is None:
+            return results
+        return [replace(result, labels=self._table[result.labels]) for result in results]
 
 
 def _report(segment: NetworkSegmentation, processes: Processes, say: Say) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
@@ -22,7 +23,6 @@ from amvnet.models.methods import METHODS, PAPER_METHODS, MethodName, Precision
 from amvnet.models.precision import InPrecision, check_precision
 from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
-from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import check_intensity, trained_intensity
 from amvnet.threads import BusyMachine, survive_forks
@@ -197,9 +197,12 @@ class Segmenter:
         """
         segmenter = copy.copy(self)
         segmenter.model = copy.copy(self.model)
-        view = replace(self.model.range_view.config, rows="ring")
-        segmenter.model.range_view = RangeView(view)
+        segmenter.model.range_view = self.model.range_view.by_ring()
         return segmenter
+
+    def for_dataset(self, dataset: Dataset) -> Segmenter:
+        """Return the segmenter for the scans of a dataset: `by_ring` if these are adapted."""
+        return self.by_ring() if dataset.is_adapted else self
 
     def labels_by_method(
         self, scan: Scan, methods: Sequence[str] = PAPER_METHODS

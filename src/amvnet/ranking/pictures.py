@@ -22,7 +22,7 @@ def draw(
     """Draw each of the first clusters with its surroundings, and return the files (RANK.png)."""
     paths = []
     for row, path in zip(ranking.clusters, possible_files(folder), strict=False):
-        _draw_cluster(row, ranking, dataset, segmenter, by=by, path=path)
+        _draw_cluster(row, ranking, dataset, segmenter.for_dataset(dataset), by=by, path=path)
         paths.append(path)
 
     return paths

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -26,7 +27,7 @@ from amvnet.sensors.intensity import (
     quantiles_of,
     trained_intensity,
 )
-from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
+from amvnet.sensors.lidars import SENSORS, Sensor
 from amvnet.sensors.measure import SensorGeometry, elevations, measure_lasers
 
 MEASURED = 5  # scans of a recording that are measured; later ones get the median of these
@@ -92,26 +93,31 @@ class ScanAdapter:
 
     Args:
         view: the range view of the weights.
-        trained_for: name of the sensor that the weights were trained for.
+        trained_for: the sensor that the weights were trained for, as far as it is known, from
+            `trained_sensor`; None if nothing is.
         sensor: what is known of the sensor of the scans; the rest is measured.
         say: is told once for each recording what was assumed.
         intensity: the intensities that the weights were trained with; None means those of the
-            sensor that they were trained for, if they are known.
+            named sensor that they were trained for, if they are known.
+        as_is: whether they were trained on scans that were not adapted. Scans of the same field of
+            view then have their rows as in the training, however many points are outside.
     """
 
     def __init__(
         self,
         view: RangeViewConfig,
-        trained_for: str = "",
+        trained_for: Sensor | None = None,
         sensor: Sensor | None = None,
         say: Say = say_nothing,
         intensity: TrainedIntensity | None = None,
+        as_is: bool = False,
     ) -> None:
         self.sensor = sensor or Sensor()
         self._view = view
-        self._trained_sensor = SENSORS.get(trained_for)
-        self._trained_height = HEIGHTS.get(trained_for)
-        self._trained_intensity = intensity or trained_intensity({}, trained_for)
+        self._trained = trained_for or Sensor()
+        self._trained_height = self._trained.height
+        self._as_is = as_is
+        self._trained_intensity = intensity or trained_intensity({}, self._trained.name)
         self._say = say
         self._recordings: dict[str, _Recording] = {}
 
@@ -158,6 +164,37 @@ class ScanAdapter:
                     cloud = read()
                     recording.add(self._measure(cloud, quantiles_of(cloud.intensity)))
         recording.is_learnt |= recording.median is not None
+
+    def for_sensor(self, sensor: Sensor) -> ScanAdapter:
+        """Return an adapter to the same weights for scans of a described sensor."""
+        adapter = copy.copy(self)
+        adapter.sensor = sensor
+        adapter._recordings = {}
+        return adapter
+
+    @property
+    def trained_intensity(self) -> TrainedIntensity | None:
+        """The intensities that scans are brought to; None if they are only scaled."""
+        return self._trained_intensity
+
+    def target(self) -> dict[str, float]:
+        """Return what weights that are trained on the adapted scans should carry of the sensor.
+
+        The height is that which the scans are moved to. The lasers are those of the scans, but if
+        the rows of the range image are lasers, those that decide the rows.
+        """
+        medians = [recording.median for recording in self._recordings.values()]
+        known = [median for median in medians if median is not None]
+        lasers: Sensor | SensorGeometry = self._trained
+        height = self._trained_height
+        if known:
+            measured = _median(known)
+            height = measured.frame.height if height is None else height
+            if self._view.rows != "ring" or _field_of_view(lasers) is None:
+                lasers = _override(measured.lasers, self.sensor)
+
+        values = {key: getattr(lasers, key) for key in KEYS} | {"height": height}
+        return {key: value for key, value in values.items() if value is not None}
 
     def _measurement(self, cloud: Cloud, recording: _Recording) -> tuple[bool, _Measurement]:
         """Return the median of the first scans if this scan is like them, else measure it.
@@ -246,8 +283,8 @@ class ScanAdapter:
         outside. None if the rows are lasers and their elevations are unknown.
         """
         view = self._trained_view(geometry)
-        if view is None:
-            return None
+        if view is None or (self._as_is and self._has_trained_ends(geometry)):
+            return view
 
         elevation = elevations(points[:, :3].astype(np.float64))
         is_outside = (elevation > view.fov_up) | (elevation < view.fov_down)
@@ -266,10 +303,9 @@ class ScanAdapter:
         if view.rows != "ring":
             return view
 
-        lasers: Sensor | SensorGeometry | None = self._trained_sensor
-        if lasers is None and geometry.beams == view.height:
-            lasers = geometry
-        ends = None if lasers is None else _field_of_view(lasers)
+        ends = _field_of_view(self._trained)
+        if ends is None and geometry.beams == view.height:
+            ends = _field_of_view(geometry)
         return None if ends is None else _by_elevation(view, ends, view.height - 1)
 
     def _rows(
@@ -280,7 +316,8 @@ class ScanAdapter:
         None if the weights need rings, and neither the scan nor its elevations tell them.
         """
         ring = scan.ring if self._view.rows == "ring" else None
-        is_trusted = ring is not None and self._trained_sensor is None
+        # Lasers that no data sheet describes need not be evenly spaced.
+        is_trusted = ring is not None and self._trained.name not in SENSORS
         if view is None or is_trusted:
             return ring
 
@@ -306,12 +343,14 @@ class ScanAdapter:
         ]
         line = f"{cloud.name}: assumed {', '.join(assumed)}"
 
-        trained = self._trained_sensor
-        if trained is None or self._is_like(trained, geometry):
+        trained = self._trained
+        if _field_of_view(trained) is None or self._is_like(trained, geometry):
             return line
 
+        sheet = SENSORS.get(trained.name)
+        name = trained.name if sheet and sheet.beams == trained.beams else "a sensor"
         return (
-            f"{line}; the weights were trained for {trained.name} ({_describe_lasers(trained)}) "
+            f"{line}; the weights were trained for {name} ({_describe_lasers(trained)}) "
             "and have seen no such sensor"
         )
 
@@ -346,7 +385,7 @@ class ScanAdapter:
 
     def _is_like(self, trained: Sensor, geometry: SensorGeometry) -> bool:
         """Return whether the sensor is that of the training, or has similar lasers."""
-        if self.sensor.name == trained.name:
+        if self.sensor.name and self.sensor.name == trained.name:
             return True
 
         if geometry.beams and trained.beams:
@@ -354,8 +393,12 @@ class ScanAdapter:
             if not 1 / SAME_BEAMS < ratio < SAME_BEAMS:
                 return False
 
-        return _is_near(geometry.fov_up, trained.fov_up) and _is_near(
-            geometry.fov_down, trained.fov_down
+        return self._has_trained_ends(geometry)
+
+    def _has_trained_ends(self, geometry: SensorGeometry) -> bool:
+        """Return whether a field of view is that of the training, as far as they are known."""
+        return _is_near(geometry.fov_up, self._trained.fov_up) and _is_near(
+            geometry.fov_down, self._trained.fov_down
         )
 
 

@@ -173,6 +173,15 @@ def make_sensor(sensor: str | None = None, **options: Any) -> Sensor:
     return dataclasses.replace(base, **_convert(changes, are_options=True))
 
 
+def sensor_from(attributes: Mapping[Any, Any]) -> Sensor:
+    """Return the sensor with some attributes, as a YAML file has them.
+
+    Raises:
+        InputError: if there is no such attribute, or a value is impossible.
+    """
+    return Sensor(**_convert(attributes))
+
+
 def _read_sensor(text: str) -> Sensor:
     """Return the sensor with this name, or of this YAML file."""
     if text in SENSORS:

@@ -43,6 +43,10 @@ class PlainAdapter:
             self._say(f"{cloud.name}: assumed {self._describe(cloud, scale)}")
         return scan
 
+    def for_sensor(self, sensor: Sensor) -> PlainAdapter:
+        """Return an adapter for scans of a described sensor."""
+        return PlainAdapter(sensor, self._say)
+
     def learn(self, source: str, first: Sequence[Callable[[], Cloud]]) -> None:
         """Do nothing: no scan depends on others."""
 

@@ -43,14 +43,23 @@ class ScoreSource(Protocol):
 
 @dataclass(frozen=True)
 class NetworkScores:
-    """Frozen networks, and the scans that they score."""
+    """Frozen networks, and the scans that they score.
+
+    Attributes:
+        weights: the networks.
+        records: the scans.
+        by_ring: whether `ring` of the scans is the row of each point in the range image.
+    """
 
     weights: Weights
     records: Sequence[ScanRecord]
+    by_ring: bool = False
     augmented: ClassVar[bool] = True
 
     def scorer(self, device: str) -> Scorer:
         model = self.weights.build().to(device)
+        if self.by_ring:
+            model.range_view = model.range_view.by_ring()
 
         def score(record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
             return model.score(*model.project(batch))
@@ -78,9 +87,18 @@ class FileScores:
 
 
 def score_source(
-    weights: Weights, scores: ScorePair | None, records: Sequence[ScanRecord]
+    weights: Weights,
+    scores: ScorePair | None,
+    records: Sequence[ScanRecord],
+    by_ring: bool = False,
 ) -> ScoreSource:
     """Return the scores in files if there are any, else those of the networks.
+
+    Args:
+        weights: the networks.
+        scores: two other models' scores in files, if there are any.
+        records: the scans.
+        by_ring: as of `NetworkScores`.
 
     Raises:
         InputError: if there are no files, and a network is missing.
@@ -93,12 +111,22 @@ def score_source(
                 f"expected trained networks for the head, found no {part}; train it, or give --init"
             )
 
-    return NetworkScores(weights, records)
+    return NetworkScores(weights, records, by_ring)
 
 
-def scorer_with_head(weights: Weights, head: PointHead) -> Callable[[PointBatch], Tensor]:
-    """Return what gives the (P, K) scores of a batch by AMVNet while its head is trained."""
+def scorer_with_head(
+    weights: Weights, head: PointHead, by_ring: bool = False
+) -> Callable[[PointBatch], Tensor]:
+    """Return what gives the (P, K) scores of a batch by AMVNet while its head is trained.
+
+    Args:
+        weights: the networks.
+        head: the head that is trained.
+        by_ring: as of `NetworkScores`.
+    """
     model = weights.build()
+    if by_ring:
+        model.range_view = model.range_view.by_ring()
     model.point_head = head
     if weights.model.assertion.name == "loss":
         # It needs labels, which a picture of a prediction must not use.

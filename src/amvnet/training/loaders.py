@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -14,15 +15,20 @@ from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.own import OwnScans
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import KEY as INTENSITY
 from amvnet.sensors.intensity import quantiles_of
+from amvnet.sensors.own import training_record
+from amvnet.sensors.record import AS_IS, measure_sensor
+from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
-SAMPLED_SCANS = 20  # whose intensities are measured
+SAMPLED_SCANS = 20  # that are measured
 
 Key = tuple[int, int]  # epoch, index in the list of scans
 
@@ -264,23 +270,30 @@ def count_classes(
     return totals
 
 
-def sample_intensities(dataset: Dataset, records: Sequence[ScanRecord]) -> list[float]:
-    """Return the quantiles of the intensities of some scans, as weights carry them.
+def sensor_record(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, Any]:
+    """Return what weights carry of the sensor of their training scans.
 
-    They are those at `sensors.intensity.PROBABILITIES`, on average over a sample of the scans, and
-    empty if no scan has usable points. Broken scans are left out: the training names them.
+    These are the quantiles of the intensities at `sensors.intensity.PROBABILITIES`, on average over
+    a sample of the scans and empty if no scan has usable points, and the measures of
+    `sensors.record`. Broken scans are left out: the training names them.
     """
     indices = np.linspace(0, len(records) - 1, min(SAMPLED_SCANS, len(records))).astype(int)
-    quantiles_of_scans = []
+    scans = []
     for index in indices:
         with suppress(InputError):
-            scan = dataset.read(records[index], labels=False)
-            quantiles = quantiles_of(scan.points[scan.valid, 3])
-            if quantiles is not None:
-                quantiles_of_scans.append(quantiles)
-    if not quantiles_of_scans:
-        return []
-    return np.mean(quantiles_of_scans, axis=0).round(4).tolist()
+            scans.append(dataset.read(records[index], labels=False))
+
+    quantiles_of_scans = []
+    for scan in scans:
+        quantiles = quantiles_of(scan.points[scan.valid, 3])
+        if quantiles is not None:
+            quantiles_of_scans.append(quantiles)
+    mean = np.mean(quantiles_of_scans, axis=0).round(4).tolist() if quantiles_of_scans else []
+
+    # Scans that are adapted are as the weights will get them: what they are brought to counts.
+    if isinstance(dataset, OwnScans) and dataset.is_adapted:
+        return {INTENSITY: mean, **training_record(dataset)}
+    return {INTENSITY: mean, SENSOR: {**measure_sensor(scans), AS_IS: True}}
 
 
 def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -56,7 +56,7 @@ class Run:
             )
 
         # Check all stages before anything is written, and before hours are spent on the first.
-        weights = self._start(init)
+        weights = self._start(init, names)
         for name in names:
             self._stage(name, weights).check_begun()
         processes = plan.options.processes
@@ -73,19 +73,38 @@ class Run:
             processes.wait()
         return path
 
-    def _start(self, init: Weights | None) -> Weights:
-        """Return fresh weights with the parts of `init`, and of this folder's finished stages."""
+    def _start(self, init: Weights | None, trained: Sequence[str] = ()) -> Weights:
+        """Return fresh weights with the parts of `init`, and of this folder's finished stages.
+
+        If `init` has other classes, its parts are only taken for the stages that are to be trained.
+        """
         plan = self.plan
         weights = Weights(plan.recipe.model, plan.scans.dataset.taxonomy, plan.recipe.sensor)
         # A head for other models' scores is of no use to these networks.
         names = list(STAGES) if plan.scores is None else ["head"]
         for name in names:
             part, _ = STAGES[name]
-            if init is not None and part in init.parts:
+            if init is None or part not in init.parts:
+                continue
+            if init.taxonomy.classes == weights.taxonomy.classes:
                 weights = weights.replace_part(part, init)
+            elif name in trained:
+                weights = weights.replace_part(part, self._for_classes(init, part))
         for name in names:
             weights = self._stage(name, weights).finished_weights()
 
+        return weights
+
+    def _for_classes(self, init: Weights, part: str) -> Weights:
+        """Return initial weights whose last layers are new, for the classes of the dataset."""
+        plan = self.plan
+        taxonomy = plan.scans.dataset.taxonomy
+        weights, new = init.for_classes(taxonomy, plan.recipe.training.seed)
+        of_part = [name.removeprefix(f"{part}.") for name in new if name.startswith(f"{part}.")]
+        plan.options.say(
+            f"{part}: for the classes of {taxonomy.name}, all layers of the initial weights "
+            f"({init.taxonomy.name}) but {', '.join(of_part)}, which are new"
+        )
         return weights
 
     def _stage(self, name: str, weights: Weights) -> StageRun:

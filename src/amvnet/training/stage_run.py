@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,17 +17,17 @@ from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 
 from amvnet.config.schema import NetworkTraining
+from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
-from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
 from amvnet.training.fit import FitOptions, Loaders, fit
 from amvnet.training.head_points import PointGatherer, make_head_loader
 from amvnet.training.head_scores import NetworkScores, ScoreSource, score_source, scorer_with_head
 from amvnet.training.head_stage import HeadStage
-from amvnet.training.loaders import ScanSet, count_classes, make_loader, sample_intensities
+from amvnet.training.loaders import ScanSet, count_classes, make_loader, sensor_record
 from amvnet.training.losses import class_weights
 from amvnet.training.run_plan import RunPlan
 from amvnet.training.run_record import SETTINGS, check_begun, sequence_names, stage_settings
@@ -128,6 +128,8 @@ class StageRun:
                     "use the recipe of the weights"
                 ) from None
 
+        if self.plan.scans.dataset.is_adapted:
+            model.range_view = model.range_view.by_ring()
         return model
 
     def class_weights(self) -> np.ndarray:
@@ -145,8 +147,8 @@ class StageRun:
         # Only the first process writes.
         scans = self.plan.scans
         is_first = self.plan.options.processes.first
-        intensities = sample_intensities(scans.dataset, scans.train) if is_first else []
-        writer = PartWriter(self, self.settings, intensities, time.time())
+        sensor = sensor_record(scans.dataset, scans.train) if is_first else {}
+        writer = PartWriter(self, self.settings, sensor, time.time())
         return KeepWeights(writer, self.folder)
 
     def pictures(self, score: Callable[[PointBatch], Tensor]) -> Pictures:
@@ -170,13 +172,13 @@ class PartWriter:
     Attributes:
         stage: the stage.
         settings: those of the stage, computed only once because that takes long.
-        intensities: quantiles of the intensities of the training scans.
+        sensor: what was measured of the sensor of the training scans.
         started: when the training was begun or resumed, by `time.time`.
     """
 
     stage: StageRun
     settings: dict[str, Any]
-    intensities: list[float]
+    sensor: dict[str, Any]
     started: float
 
     def __call__(self, module: nn.Module, path: Path, metrics: dict[str, float]) -> None:
@@ -187,7 +189,7 @@ class PartWriter:
             "sequences": sequence_names(scans.train),
             "validated_on": sequence_names(scans.val),
             "scans": len(scans.train),
-            INTENSITIES: self.intensities,
+            **self.sensor,
         }
         if "scores" in self.settings:
             description["scores"] = self.settings["scores"]
@@ -312,7 +314,7 @@ class HeadRun(StageRun):
         processes = options.processes
 
         # Gather the uncertain points of all scans, with their scores and neighbours.
-        val_source = score_source(self.weights, self.plan.scores, scans.val)
+        val_source = self._score_source(scans.val)
         gatherer = PointGatherer(scans.dataset, self.weights.model, training, processes)
         train = gatherer.gather(
             self._score_sources(), self.folder / "train", config.views, options.say
@@ -348,7 +350,9 @@ class HeadRun(StageRun):
         callbacks: list[Callback] = [self.keep_weights()]
         # Pictures show batches of points, which do not say whose scores to read from files.
         if self.plan.scores is None:
-            callbacks.append(self.pictures(scorer_with_head(self.weights, head)))
+            callbacks.append(
+                self.pictures(scorer_with_head(self.weights, head, scans.dataset.is_adapted))
+            )
 
         # The head multiplies so little that a lower precision would save nothing.
         in_float32 = dataclasses.replace(training, precision="32-true")
@@ -361,6 +365,11 @@ class HeadRun(StageRun):
             for folder in ("train", "val"):
                 shutil.rmtree(self.folder / folder, ignore_errors=True)
 
+    def _score_source(self, records: Sequence[ScanRecord]) -> ScoreSource:
+        """Return the source of the scores of some scans."""
+        by_ring = self.plan.scans.dataset.is_adapted
+        return score_source(self.weights, self.plan.scores, records, by_ring)
+
     def _score_sources(self) -> list[ScoreSource]:
         """Return the sources of the scores to train on, which together have all training scans.
 
@@ -372,7 +381,7 @@ class HeadRun(StageRun):
         train = self.plan.scans.train
         folds = self.plan.recipe.training.head.folds
         if folds < 2 or self.plan.scores is not None:
-            return [score_source(self.weights, self.plan.scores, train)]
+            return [self._score_source(train)]
 
         names = sequence_names(train)
         if len(names) < folds:
@@ -399,4 +408,5 @@ class HeadRun(StageRun):
             options=dataclasses.replace(self.plan.options, resume=True),
         )
 
-        return NetworkScores(load(self.train_networks(plan)), unseen)
+        weights = load(self.train_networks(plan))
+        return NetworkScores(weights, unseen, scans.dataset.is_adapted)

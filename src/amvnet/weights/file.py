@@ -147,6 +147,38 @@ class Weights:
             self.resized(name, other.model), tensors=tensors, training=training, metrics=metrics
         )
 
+    def for_classes(self, taxonomy: Taxonomy, seed: int) -> tuple[Weights, list[str]]:
+        """Return weights to begin a training for other classes with.
+
+        Parameters whose size depends on the number of classes are new: the last layers, and those
+        of the head that see the scores. All others are taken.
+
+        Args:
+            taxonomy: the classes.
+            seed: of the new parameters.
+
+        Returns:
+            The weights, without records of a training, and the names of the new parameters.
+        """
+        with torch.device("meta"):  # without memory
+            few = build_amvnet(self.model, 1).state_dict()
+            more = build_amvnet(self.model, 2).state_dict()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            fresh = build_amvnet(self.model, taxonomy.size).state_dict()
+
+        tensors = {}
+        new = []
+        for key, tensor in self.tensors.items():
+            depends_on_classes = few[key].shape != more[key].shape
+            tensors[key] = fresh[key] if depends_on_classes else tensor
+            if depends_on_classes:
+                new.append(key)
+        weights = dataclasses.replace(
+            self, taxonomy=taxonomy, tensors=tensors, training={}, metrics={}
+        )
+        return weights, new
+
     def resized(self, name: str, model: ModelConfig) -> Weights:
         """Return these weights with the sizes of one part taken from another configuration.
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from amvnet.cli.console import on_terminal, say
-from amvnet.cli.options import describe_records, join_processes, open_data, parse_names
+from amvnet.cli.options import describe_records, join_processes, parse_names
 
 
 def ablate(
@@ -35,10 +35,11 @@ def ablate(
     from amvnet.training.fit import quiet_lightning
     from amvnet.training.run_plan import RunOptions
     from amvnet.training.studies import ablate as ablate_recipe
+    from amvnet.training.training_data import open_for_training
 
     quiet_lightning()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
-    dataset = open_data(data)
+    dataset = open_for_training(data, None, recipe, out)
     scans = split_records(dataset, parse_names(train_sequences), parse_names(val_sequences))
     say(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
 

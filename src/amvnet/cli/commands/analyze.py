@@ -46,11 +46,11 @@ def analyze(
     """
     from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.open import open_with_classes
-    from amvnet.data.datasets.select import TrainingScans
+    from amvnet.data.datasets.select import TrainingScans, labelled_records
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
+    from amvnet.inference.inputs import open_for_weights
     from amvnet.training.fit import quiet_lightning
     from amvnet.training.studies import NeighbourStudy
     from amvnet.weights.file import load
@@ -60,9 +60,10 @@ def analyze(
             "expected --neighbours and --recipe together, found one of them; give both or neither"
         )
     loaded = load(weights)
-    dataset = open_with_classes(data, loaded.taxonomy)
+    dataset = open_for_weights(data, loaded)
     segmenter = make_segmenter(loaded, device, engine, precision, at_once, method="amvnet")
     records = choose_records(dataset, parse_names(sequences), split)
+    records = labelled_records(dataset, records)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
     study = None
@@ -71,7 +72,7 @@ def analyze(
         counts = parse_numbers(str(neighbours))
         quiet_lightning()
         names = parse_names(train_sequences) or dataset.sequences("train")
-        scans = TrainingScans(dataset, dataset.records(names), records)
+        scans = TrainingScans(dataset, labelled_records(dataset, dataset.records(names)), records)
         study = NeighbourStudy(load_recipe(recipe), loaded, scans, out)
         study.check()
 

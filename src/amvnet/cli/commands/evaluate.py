@@ -12,6 +12,7 @@ from amvnet.cli.options import (
     join_processes,
     make_segmenter,
     open_data,
+    parse_classes,
     parse_methods,
     parse_names,
 )
@@ -33,6 +34,7 @@ def evaluate(
     json: Path | None = None,
     pictures: Path | None = None,
     taxonomy: Path | None = None,
+    classes: str | None = None,
     device: str = "cpu",
     engine: EngineName = "auto",
     precision: Precision = "float32",
@@ -51,6 +53,8 @@ def evaluate(
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
         taxonomy: a semantic-kitti.yaml with other classes.
+        classes: score these classes instead, to which those of the data and of the weights are
+            mapped: coarse, or a YAML file.
         device: cpu, cuda, cuda:1, ...
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
             auto, the fastest here.
@@ -59,26 +63,28 @@ def evaluate(
             most 4.
     """
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.open import open_with_classes
+    from amvnet.data.datasets.mapped import map_classes
+    from amvnet.data.datasets.select import labelled_records
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
+    from amvnet.inference.inputs import open_for_weights
     from amvnet.weights.file import load
 
     processes = join_processes()
     names = parse_names(sequences)
+    class_map = parse_classes(classes)
     if weights is not None and predictions is None:
         loaded = load(weights)
-        if taxonomy is None:
-            dataset = open_with_classes(data, loaded.taxonomy)
-        else:
-            dataset = open_data(data, taxonomy)
-        records = choose_records(dataset, names, split)
+        has_own = taxonomy is not None or class_map is not None
+        opened = open_data(data, taxonomy) if has_own else None
+        dataset = map_classes(open_for_weights(data, loaded, opened), class_map)
+        records = labelled_records(dataset, choose_records(dataset, names, split))
         segmenter = make_segmenter(loaded, processes.device(device), engine, precision, at_once)
-        labeller = label_by_weights(dataset, segmenter, parse_methods(methods))
+        labeller = label_by_weights(dataset, segmenter, parse_methods(methods), class_map)
     elif predictions is not None and weights is None:
-        dataset = open_data(data, taxonomy)
-        records = choose_records(dataset, names, split)
+        dataset = map_classes(open_data(data, taxonomy), class_map)
+        records = labelled_records(dataset, choose_records(dataset, names, split))
         labeller = label_from_files(dataset, predictions)
     else:
         raise InputError(

@@ -10,6 +10,7 @@ from amvnet.cli.options import (
     Split,
     join_processes,
     make_segmenter,
+    parse_classes,
     parse_names,
     refuse_other_formats,
 )
@@ -29,6 +30,7 @@ def predict(
     resume: bool = False,
     format: FormatName = "label",
     uncertain: bool = False,
+    classes: str | None = None,
     device: str = "cpu",
     engine: EngineName = "auto",
     precision: Precision = "float32",
@@ -60,6 +62,8 @@ def predict(
         format: of scan files' labels: raw ids alone (label, npy), coloured points (ply, pcd, las),
             or, of bags, a bag of coloured points with the stamps of the scans (bag, mcap).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
+        classes: write the ids of these classes, to which those of the weights are mapped: coarse,
+            or a YAML file.
         device: cpu, cuda, cuda:1, ...
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
             auto, the fastest here.
@@ -94,6 +98,7 @@ def predict(
     from amvnet.sensors.lidars import make_sensor
     from amvnet.weights.file import load
 
+    class_map = parse_classes(classes)
     processes = join_processes()
     given_sensor = make_sensor(
         sensor,
@@ -116,6 +121,7 @@ def predict(
             options=ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
             execution=ExecutionOptions(batch, at_once, resume, processes),
             adapter=adapter_for(segmenter.weights, given_sensor, say),
+            classes=class_map,
             progress=step,
             say=say,
         )

@@ -44,8 +44,8 @@ def rank(
         overwrite: replace files that amvnet did not write, too.
     """
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.open import open_with_classes
     from amvnet.files import make_folder
+    from amvnet.inference.inputs import open_for_weights
     from amvnet.ranking.pictures import draw, possible_files
     from amvnet.ranking.rank import rank as rank_records
     from amvnet.ranking.rank import scans_path, write_ranking
@@ -61,7 +61,7 @@ def rank(
 
     with protecting(files, overwrite):
         loaded = load(weights)
-        dataset = open_with_classes(data, loaded.taxonomy)
+        dataset = open_for_weights(data, loaded)
         records = choose_records(dataset, parse_names(sequences), split)
         segmenter = make_segmenter(loaded, device, engine, precision, at_once)
 

@@ -9,7 +9,6 @@ from amvnet.cli.console import on_terminal, say
 from amvnet.cli.options import (
     describe_records,
     join_processes,
-    open_data,
     parse_names,
     parse_scores,
 )
@@ -39,11 +38,13 @@ def train(
     Args:
         recipe: what to train; a built-in recipe's name or a YAML file.
         data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts;
+            a YAML file that describes scans and classes of your own (docs/own_data.md);
             simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
             the training, with their cache in the folder.
         out: folder of the run.
         stage: which part to train; `all` trains one after the other.
-        init: weights to begin with; parts that are not trained are taken from them.
+        init: weights to begin with; parts that are not trained are taken from them. Of weights for
+            other classes, all layers but the last ones are taken.
         resume: continue an earlier run in the folder.
         train_sequences: sequences or scenes, separated by commas, to train on; default: the
             official split.
@@ -66,16 +67,17 @@ def train(
     from amvnet.training.fit import quiet_lightning
     from amvnet.training.run import Run
     from amvnet.training.run_plan import RunOptions, RunPlan
+    from amvnet.training.training_data import open_for_training
     from amvnet.weights.file import load
 
     quiet_lightning()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
-    dataset = open_data(data, taxonomy)
+    weights = None if init is None else load(init)
+    dataset = open_for_training(data, taxonomy, recipe, out, weights)
     scans = split_records(
         dataset, parse_names(train_sequences), parse_names(val_sequences), with_val
     )
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
-    weights = None if init is None else load(init)
     scores = parse_scores(scores_a, scores_b, key_a, key_b, logits)
 
     options = RunOptions(resume, say, on_terminal(), processes, logger)

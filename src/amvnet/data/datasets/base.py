@@ -48,6 +48,10 @@ class Dataset(Protocol):
     def spec(self) -> str:
         """What `open_dataset` opens the same dataset with."""
 
+    @property
+    def is_adapted(self) -> bool:
+        """Whether `ring` of each scan is the row of each point in the range image, 0 the lowest."""
+
     def sequences(self, split: str) -> tuple[str, ...]:
         """Return the sequences of a split that are on disk.
 

@@ -6,7 +6,7 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -67,6 +67,8 @@ class NuScenes:
         InputError: if `root` does not have this layout, the version is ambiguous, or a table is
             missing.
     """
+
+    is_adapted: ClassVar[bool] = False
 
     def __init__(
         self, root: Path | str, version: str | None = None, taxonomy: Taxonomy = NUSCENES

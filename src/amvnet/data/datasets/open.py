@@ -6,6 +6,7 @@ from pathlib import Path
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
+from amvnet.data.datasets.own import OwnScans, is_description, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
@@ -15,6 +16,7 @@ from amvnet.simulation import SENSORS
 Reader = type[SemanticKitti] | type[NuScenes]
 
 READERS: dict[str, Reader] = {"semantickitti": SemanticKitti, "nuscenes": NuScenes}
+OWN = "files"  # prefix of the YAML file of a user's own scans
 SIMULATED = {f"simulated-{sensor}": sensor for sensor in SENSORS}  # names of sensors by prefix
 
 
@@ -24,7 +26,8 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
     Args:
         spec: `semantickitti:PATH`, `nuscenes:PATH`, `nuscenes:PATH@v1.0-mini`, or a plain path with
             the layout of one of them; or `simulated-hdl64e:PATH` or `simulated-hdl32e:PATH`, for
-            streets that are simulated when they are read and cached in a folder.
+            streets that are simulated when they are read and cached in a folder; or `files:FILE`,
+            or only FILE, the YAML file that describes a user's own scans and classes.
         taxonomy: the classes, if they are not the benchmark's own.
 
     Raises:
@@ -34,6 +37,8 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
     kind, _, rest = str(spec).partition(":")
     if kind in SIMULATED:
         return _open_simulated(kind, rest, taxonomy)
+    if is_own(str(spec)):
+        return _open_own(str(spec).removeprefix(f"{OWN}:"), taxonomy)
 
     path, version = _split_version(rest if kind in READERS else str(spec))
     if not path.is_dir():
@@ -57,7 +62,7 @@ def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
         InputError: as `open_dataset`, or if it has other classes.
     """
     # A benchmark brings its own classes; a user's own ones, it must be read with.
-    is_custom = taxonomy.name not in TAXONOMIES
+    is_custom = taxonomy.name not in TAXONOMIES and not is_own(spec)
     dataset = open_dataset(spec, taxonomy if is_custom else None)
     check_classes(dataset, taxonomy)
     return dataset
@@ -71,14 +76,24 @@ def open_if_dataset(spec: str, taxonomy: Taxonomy | None) -> Dataset | None:
     """
     if not is_dataset(spec):
         return None
+    if is_own(spec):
+        own = open_own(spec.removeprefix(f"{OWN}:"))
+        is_same = taxonomy is None or own.taxonomy.classes == taxonomy.classes
+        # Without its labels, a scan can be labelled by weights of any classes.
+        return own if is_same or taxonomy is None else own.with_classes(taxonomy)
     return open_dataset(spec) if taxonomy is None else open_with_classes(spec, taxonomy)
+
+
+def is_own(spec: str) -> bool:
+    """Return whether a text names the YAML file of a user's own scans."""
+    return spec.partition(":")[0] == OWN or is_description(spec)
 
 
 def is_dataset(spec: str) -> bool:
     """Return whether a text names a dataset, by its prefix or by the layout of its folder."""
     path, version = _split_version(spec)
     kind = spec.partition(":")[0]
-    if kind in READERS or kind in SIMULATED or version is not None:
+    if kind in READERS or kind in SIMULATED or is_own(spec) or version is not None:
         return True
     return path.is_dir() and any(reader.matches(path) for reader in READERS.values())
 
@@ -100,6 +115,16 @@ def _open_simulated(kind: str, path: str, taxonomy: Taxonomy | None) -> Simulate
             "leave --taxonomy out, or write the streets with amvnet simulate"
         )
     return SimulatedStreets(Path(path).expanduser(), SIMULATED[kind])
+
+
+def _open_own(path: str, taxonomy: Taxonomy | None) -> OwnScans:
+    """Return the scans that a user's YAML file describes."""
+    if taxonomy is not None:
+        raise InputError(
+            f"{path}: expected the classes of the file, found those of {taxonomy.name}; "
+            "leave --taxonomy out"
+        )
+    return open_own(path)
 
 
 def _split_version(text: str) -> tuple[Path, str | None]:

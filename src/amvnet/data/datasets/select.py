@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.own import OwnScans
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.errors import InputError
 
@@ -48,6 +49,23 @@ def taxonomy_named(text: str) -> Taxonomy:
     return taxonomy_from_yaml(text)
 
 
+def labelled_records(dataset: Dataset, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+    """Return the scans to train on or to score: of a user's own scans, those with labels.
+
+    Raises:
+        InputError: if a user's own scans are all without labels.
+    """
+    if not isinstance(dataset, OwnScans) or not records:
+        return list(records)
+    labelled = [record for record in records if record.labels_path is not None]
+    if not labelled:
+        raise InputError(
+            f"{dataset.spec}: expected labelled scans, found no label file of {len(records)}; "
+            "correct labels in the file, or name other sequences"
+        )
+    return labelled
+
+
 def split_records(
     dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
 ) -> TrainingScans:
@@ -82,14 +100,20 @@ def split_records(
 
     if with_val:
         added = [name for name in val if name not in train]
-        return TrainingScans(dataset, dataset.records([*train, *added]), [])
+        return TrainingScans(
+            dataset, labelled_records(dataset, dataset.records([*train, *added])), []
+        )
 
     if not train or not val:
         raise InputError(
             f"{dataset.root}: expected two sequences, one to train on and one to validate with, "
             f"found {', '.join(present)}; name them"
         )
-    return TrainingScans(dataset, dataset.records(train), dataset.records(val))
+    return TrainingScans(
+        dataset,
+        labelled_records(dataset, dataset.records(train)),
+        labelled_records(dataset, dataset.records(val)),
+    )
 
 
 def _sequences_on_disk(dataset: Dataset, split: str) -> tuple[str, ...]:

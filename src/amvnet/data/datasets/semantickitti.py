@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +31,7 @@ class SemanticKitti:
 
     root: Path
     taxonomy: Taxonomy = SEMANTICKITTI
+    is_adapted: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", Path(self.root))

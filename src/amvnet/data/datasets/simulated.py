@@ -12,6 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -59,6 +60,7 @@ class SimulatedStreets:
 
     root: Path
     sensor: str = "hdl64e"
+    is_adapted: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", Path(self.root))

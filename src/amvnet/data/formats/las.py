@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import struct
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +57,31 @@ def read_las(path: Path) -> Cloud:
     return make_cloud(split_records(records), str(path))
 
 
+def read_dimension(path: Path, choose: Callable[[Sequence[str]], str]) -> np.ndarray:
+    """Read one dimension of all points, such as the classification.
+
+    Args:
+        choose: returns the name of the dimension, given the names of all.
+
+    Returns:
+        (N,) float64.
+
+    Raises:
+        InputError: as `read_las`.
+    """
+    with reading(path, "a LAS or LAZ file", ADVICE):
+        count, is_compressed = check_header(path)
+        require_laspy(path)
+        import laspy
+
+        with laspy.open(path, read_evlrs=False) as file:
+            name = choose(list(file.header.point_format.dimension_names))
+        record = np.dtype([(name, "f8")])
+        if is_compressed:
+            return _read_in_process(path, count, record)[name]
+        return read_records(path, record)[name]
+
+
 def check_header(path: Path) -> tuple[int, bool]:
     """Return the number of points that the header claims, and whether they are compressed.
 
@@ -90,21 +117,21 @@ def require_laspy(path: Path) -> None:
     require("the packages laspy and lazrs", "formats", path, "laspy", "lazrs")
 
 
-def read_records(path: Path) -> np.ndarray:
-    """Read all points as (N,) records of `RECORD`, coordinates in metres, with laspy."""
+def read_records(path: Path, record: np.dtype = RECORD) -> np.ndarray:
+    """Read some dimensions of all points as (N,) records, coordinates in metres, with laspy."""
     import laspy
 
-    chunks = [np.empty(0, RECORD)]
+    chunks = [np.empty(0, record)]
     with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
         for points in file.chunk_iterator(CHUNK):
-            records = np.empty(len(points), RECORD)
-            for name in RECORD.names or ():
+            records = np.empty(len(points), record)
+            for name in record.names or ():
                 records[name] = points[name]
             chunks.append(records)
     return np.concatenate(chunks)
 
 
-def _read_in_process(path: Path, count: int) -> np.ndarray:
+def _read_in_process(path: Path, count: int, record: np.dtype = RECORD) -> np.ndarray:
     """Read all points as `read_records` does, in a process with limited memory and time.
 
     On broken bytes, lazrs 0.8 can take any amount of memory or abort its process.
@@ -114,7 +141,8 @@ def _read_in_process(path: Path, count: int) -> np.ndarray:
         subprocess.TimeoutExpired: if it takes too long for `count` points.
     """
     code = (
-        "import sys; from amvnet.data.formats.las import write_records; write_records(sys.argv[1])"
+        "import sys; from amvnet.data.formats.las import write_records; "
+        "write_records(*sys.argv[1:])"
     )
     environment = dict(os.environ)
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
@@ -123,7 +151,7 @@ def _read_in_process(path: Path, count: int) -> np.ndarray:
     environment["OPENBLAS_NUM_THREADS"] = "1"
 
     process = subprocess.run(
-        [sys.executable, "-c", code, str(path.absolute())],
+        [sys.executable, "-c", code, str(path.absolute()), json.dumps(record.descr)],
         env=environment,
         stdin=subprocess.DEVNULL,
         capture_output=True,
@@ -131,18 +159,22 @@ def _read_in_process(path: Path, count: int) -> np.ndarray:
     )
     if process.returncode:
         raise ValueError("its points cannot be unpacked")
-    return np.frombuffer(process.stdout, RECORD)
+    return np.frombuffer(process.stdout, record)
 
 
-def write_records(path: str) -> None:
+def write_records(path: str, description: str) -> None:
     """Write the records of a file to standard output, with limited memory.
 
     `_read_in_process` runs this function in its process.
+
+    Args:
+        description: the names and types of the records' fields, as JSON.
     """
+    record = np.dtype([(name, kind) for name, kind in json.loads(description)])
     try:
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     except (ImportError, ValueError):  # Windows has no such limit, and some systems refuse it
         pass
-    sys.stdout.buffer.write(read_records(Path(path)).tobytes())
+    sys.stdout.buffer.write(read_records(Path(path), record).tobytes())

@@ -57,12 +57,53 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
             return _to_cloud(array, path, layout)
 
 
-def _choose_member(names: list[str], path: Path) -> str:
-    """Return the name of the array to read, given those of all members of an archive."""
+def member_names(path: Path) -> list[str]:
+    """Return the names of the arrays in an archive.
+
+    Raises:
+        InputError: if the file is no archive.
+    """
+    with (
+        reading(path, "a NumPy archive", "save it again with np.savez"),
+        zipfile.ZipFile(path) as archive,
+    ):
+        return list(_members(archive.namelist()))
+
+
+def read_array(path: Path, key: str | None = None) -> np.ndarray:
+    """Read an array of numbers of any shape that a scan can have.
+
+    Args:
+        path: a `.npy` or `.npz` file.
+        key: the name of the array in an archive; None means the one that `read_npz` reads.
+
+    Raises:
+        InputError: as `read_npy`.
+    """
+    with reading(path, "NumPy arrays", ADVICE):
+        if not zipfile.is_zipfile(path):
+            with path.open("rb") as file:
+                return _load(file, path.stat().st_size, path)
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            name = _choose_member(names, path) if key is None else _members(names)[key]
+            member = archive.getinfo(name)
+            with archive.open(member) as unpacked:
+                return _load(cast(BinaryIO, unpacked), member.file_size, path)
+
+
+def _members(names: list[str]) -> dict[str, str]:
+    """Return the members of an archive that are arrays, by the names of the arrays."""
     members = {}
     for name in names:
         if name.endswith(".npy"):
             members[name.removesuffix(".npy")] = name
+    return members
+
+
+def _choose_member(names: list[str], path: Path) -> str:
+    """Return the name of the array to read, given those of all members of an archive."""
+    members = _members(names)
 
     if len(members) == 1:
         return next(iter(members.values()))

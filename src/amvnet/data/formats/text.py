@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO, TextIOWrapper
 from itertools import islice
@@ -93,6 +93,24 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         more = "_" * (table.count - len(names))
         note = describe([*names, *more]) if table.count > 4 else ""
         return named_cloud(list(values.T), names, str(path), note)
+
+
+def read_column(path: Path, choose: Callable[[Sequence[str]], str]) -> np.ndarray:
+    """Read one column of all points, (N,) float64.
+
+    Args:
+        choose: returns the name of the column, given the names of all: those of the file, in lower
+            case, or else "0", "1", ...
+
+    Raises:
+        InputError: as `read_text_cloud`.
+    """
+    with reading(path, "lines of numbers", ADVICE):
+        table = find_table(path)
+        if table is None:
+            raise InputError(f"{path}: expected lines of numbers, found other text; {ADVICE}")
+        names = table.names or tuple(map(str, range(table.count)))
+        return _read_values(path, table, [names.index(choose(names))])[:, 0]
 
 
 def find_table(path: Path) -> TextTable | None:

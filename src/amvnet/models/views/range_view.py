@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -45,6 +45,10 @@ class RangeView:
 
     def __init__(self, config: RangeViewConfig) -> None:
         self.config = config
+
+    def by_ring(self) -> RangeView:
+        """Return the same view with the rings of the scans as rows, 0 the lowest."""
+        return RangeView(replace(self.config, rows="ring"))
 
     def project(self, batch: PointBatch) -> RangeImage:
         """Return the range images of a batch of scans.

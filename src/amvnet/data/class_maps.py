@@ -1,0 +1,162 @@
+"""Maps of classes to a few coarse ones, or to a user's own (docs/own_data.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
+from amvnet.errors import InputError, did_you_mean, shown
+from amvnet.files import read_yaml
+
+COARSE_NAME = "coarse"
+
+# Each coarse class with its colour, and the classes of SemanticKITTI and nuScenes that belong to
+# it. nuScenes has no class of poles: they are manmade, as buildings and fences are.
+_COARSE: dict[str, dict[str, Any]] = {
+    "ground": {
+        "color": [160, 130, 160],
+        "from": [
+            *("road", "parking", "sidewalk", "other-ground", "terrain"),
+            *("driveable_surface", "other_flat"),
+        ],
+    },
+    "vegetation": {"color": [0, 175, 0], "from": ["vegetation", "trunk"]},
+    "building": {"color": [255, 200, 0], "from": ["building", "fence", "manmade"]},
+    "vehicle": {
+        "color": [100, 150, 245],
+        "from": [
+            *("car", "truck", "other-vehicle"),
+            *("bus", "construction_vehicle", "trailer"),
+        ],
+    },
+    "two-wheeler": {
+        "color": [100, 230, 245],
+        "from": ["bicycle", "motorcycle", "bicyclist", "motorcyclist"],
+    },
+    "person": {"color": [255, 30, 30], "from": ["person", "pedestrian"]},
+    "pole": {"color": [255, 240, 150], "from": ["pole", "traffic-sign"]},
+    "other": {"color": [112, 128, 144], "from": ["barrier", "traffic_cone"]},
+}
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """A map of the classes of any taxonomy, by their names, to those of another.
+
+    Attributes:
+        target: the classes of the result.
+        sources: the train id in `target` by the name of a class.
+    """
+
+    target: Taxonomy
+    sources: Mapping[str, int]
+
+    def table(self, taxonomy: Taxonomy) -> np.ndarray:
+        """Return the (K + 1,) uint8 train ids in `target` by those of a taxonomy.
+
+        Classes that the map does not name are ignored (0), but for classes with the name of a
+        target class.
+
+        Raises:
+            InputError: if the map names none of the classes.
+        """
+        train_ids = [0]
+        for name in taxonomy.classes:
+            own = self.target.classes.index(name) + 1 if name in self.target.classes else 0
+            train_ids.append(self.sources.get(name, own))
+        if not any(train_ids):
+            raise InputError(
+                f"--classes {self.target.name}: expected a map of the classes of {taxonomy.name} "
+                f"({', '.join(taxonomy.classes)[:200]}), found none of them; write a YAML file"
+            )
+        return np.array(train_ids, dtype=np.uint8)
+
+
+def class_map(name: str) -> ClassMap:
+    """Return the built-in map `coarse`, or that of a YAML file.
+
+    Raises:
+        InputError: if there is neither, or the file is no map.
+    """
+    if name == COARSE_NAME:
+        return _parse(name, {"classes": _COARSE})
+    path = Path(name)
+    if path.suffix not in (".yaml", ".yml"):
+        advice = "give coarse or a YAML file"
+        raise InputError(
+            f"--classes: expected {COARSE_NAME} or a YAML file, found {name!r}"
+            + did_you_mean(name, [COARSE_NAME], advice)
+        )
+    try:
+        return _parse(path.stem, read_yaml(path, "a map of classes"))
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+
+
+def _parse(name: str, tree: Any) -> ClassMap:
+    classes = tree.get("classes") if isinstance(tree, Mapping) else None
+    if not isinstance(classes, Mapping) or not classes:
+        raise InputError(
+            "expected classes with the names of others, such as ground: [road, sidewalk], "
+            f"found {shown(classes)}; write them"
+        )
+
+    sources: dict[str, int] = {}
+    colors = [(0, 0, 0)]
+    raw_ids = [0]
+    for train_id, (title, entry) in enumerate(classes.items(), start=1):
+        values = entry if isinstance(entry, Mapping) else {"from": entry}
+        for source in _names(title, values.get("from", [])):
+            if source in sources:
+                raise InputError(f"expected each class once, found {source} twice; correct the map")
+            sources[source] = train_id
+        colors.append(_color(title, values.get("color")))
+        raw_ids.append(_id(title, values.get("id", train_id)))
+
+    if len(set(raw_ids[1:])) < len(raw_ids) - 1 or 0 in raw_ids[1:]:
+        raise InputError(f"expected different ids from 1, found {shown(raw_ids[1:])}; correct them")
+    target = Taxonomy(
+        name=name if name not in TAXONOMIES else f"own-{name}",
+        classes=tuple(map(str, classes)),
+        colors=tuple(colors),
+        raw_to_train={raw: train_id for train_id, raw in enumerate(raw_ids)},
+        train_to_raw=tuple(raw_ids),
+        splits={},
+        counts_absent=False,
+    )
+    return ClassMap(target, sources)
+
+
+def _names(title: Any, values: Any) -> Sequence[str]:
+    names = values if isinstance(values, list) else [values]
+    for name in names:
+        if not isinstance(name, str):
+            raise InputError(f"{title}: expected names of classes, found {shown(name)}; correct it")
+    return names
+
+
+def _id(title: Any, value: Any) -> int:
+    if type(value) is not int:
+        raise InputError(
+            f"{title}: expected a whole number as id, found {shown(value)}; correct it"
+        )
+    return value
+
+
+def _color(title: Any, values: Any) -> tuple[int, int, int]:
+    """Return the colour of a class; grey if it has none."""
+    if values is None:
+        return (150, 150, 150)
+    is_triple = isinstance(values, list) and len(values) == 3
+    if not is_triple or any(type(value) is not int for value in values):
+        raise InputError(
+            f"{title}: expected a color such as [255, 0, 0], found {shown(values)}; correct it"
+        )
+    red, green, blue = values
+    return red, green, blue

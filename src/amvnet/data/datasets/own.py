@@ -1,0 +1,514 @@
+"""Labelled scans of a user in any layout, described by a YAML file (docs/own_data.md)."""
+
+from __future__ import annotations
+
+import colorsys
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from amvnet.data import scan_files as files
+from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.predictions import read_prediction
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.detect import NamedScan, list_scans, scan_stem
+from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.raw_labels import read_label_field, read_label_file
+from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, Taxonomy
+from amvnet.errors import InputError, shown
+from amvnet.files import read_yaml
+from amvnet.scan import Scan
+
+ENDINGS = (".yaml", ".yml")
+KEYS = ("name", "root", "classes", "ignored", "scans", "labels", "split", "sensor")
+ROW_KEYS = ("columns", "dtype")
+SPLITS = ("train", "val", "test")
+LARGEST_LIST = 50_000_000  # bytes of a file with names of scans
+SATURATION = 0.65  # of the colours of classes without one
+VALUE = 0.95
+GOLDEN_ANGLE = 0.381966  # of the circle of hues: each next colour is far from all earlier ones
+
+# Turns what a file holds into a scan, given the recording that it is from.
+Adapt = Callable[[Cloud, str], Scan]
+
+
+@dataclass(frozen=True)
+class LabelPlace:
+    """Where the labels of a scan are.
+
+    Attributes:
+        file: path of the label file, relative to the scan's folder, with `{name}` for the scan's
+            name without its ending; None if the labels are in the scan's file.
+        field: the column or array that holds them; None in a file of nothing else.
+    """
+
+    file: str | None = None
+    field: str | None = None
+
+
+@dataclass(frozen=True)
+class Description:
+    """What the YAML file of a dataset says.
+
+    Attributes:
+        path: of the YAML file.
+        root: the folder that everything is relative to.
+        taxonomy: the classes.
+        scans: pattern of the scan files.
+        labels: where the labels are; None if there are none.
+        split: names of folders, patterns and list files by split; empty if there is no split.
+        sensor: name or attributes of the sensor; None if it is to be measured.
+        layout: of rows of numbers without names, what they hold.
+    """
+
+    path: Path
+    root: Path
+    taxonomy: Taxonomy
+    scans: str
+    labels: LabelPlace | None = None
+    split: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    sensor: str | Mapping[str, Any] | None = None
+    layout: RowLayout = UNKNOWN
+
+
+@dataclass(frozen=True)
+class OwnScans:
+    """A user's labelled scans. `Dataset` documents the arguments and errors of its methods.
+
+    A scan's sequence is the first folder below the part of the pattern that has no wildcards. If
+    the split cuts through a folder, its parts are sequences: `site-train`, `site-val`.
+
+    Attributes:
+        description: what the YAML file says.
+        adapt: brings the scans to the frame, height, intensities and rows that some weights expect;
+            None reads them as they are.
+        is_adapted: whether it does, so that `ring` is the row of each point.
+    """
+
+    description: Description
+    adapt: Adapt | None = None
+    is_adapted: bool = False
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        return self.description.taxonomy
+
+    @property
+    def root(self) -> Path:
+        return self.description.root
+
+    @property
+    def spec(self) -> str:
+        """The YAML file."""
+        return str(self.description.path)
+
+    def sequences(self, split: str) -> tuple[str, ...]:
+        """Return the sequences of "train", "val", "test" or "all" that have scans."""
+        if split != "all" and split not in SPLITS:
+            raise InputError(
+                f"{self.spec}: expected a split of {', '.join((*SPLITS, 'all'))}, found {split!r}; "
+                "give one of them"
+            )
+
+        names = set()
+        for record, split_of_scan in self._listing:
+            if split in ("all", split_of_scan):
+                names.add(record.sequence)
+        if not names:
+            raise InputError(
+                f"{self.spec}: expected scans of the split {split}, found none; name them under "
+                "split, give --split all, or name the sequences to use"
+            )
+        return tuple(sorted(names))
+
+    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+        """Return the scans of these sequences, in order."""
+        present = self.sequences("all")
+        for name in sequences:
+            if name not in present:
+                raise InputError(
+                    f"{self.spec}: expected a sequence of {', '.join(present[:20])}, "
+                    f"found {name!r}; name one of them"
+                )
+
+        chosen = [record for record, _ in self._listing if record.sequence in sequences]
+        return sorted(chosen, key=lambda record: (record.sequence, record.name))
+
+    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+        """Return the scan itself."""
+        return record
+
+    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+        """Read one scan."""
+        named = self._scans[record.name]
+        cloud = named.read()
+        scan = cloud.to_scan() if self.adapt is None else self.adapt(cloud, named.source)
+
+        ids = self._read_labels(record, len(scan)) if labels else None
+        return dataclasses.replace(scan, labels=ids, name=record.name)
+
+    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
+        """Read the predicted (N,) uint8 train ids of one scan."""
+        path = Path(folder) / record.prediction
+        count = len(self._scans[record.name].read().xyz)
+        return read_prediction(path, np.uint32, count, self.taxonomy)
+
+    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
+        """Write (N,) train ids as raw ids (uint32)."""
+        return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids))
+
+    def recordings(self) -> dict[str, list[NamedScan]]:
+        """Return the scans of each recording, in order: those of one folder and ending."""
+        recordings: dict[str, list[NamedScan]] = {}
+        for scan in self._scans.values():
+            recordings.setdefault(scan.source, []).append(scan)
+        return recordings
+
+    def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
+        """Return the scans for predictions of other classes, without their labels."""
+        description = dataclasses.replace(self.description, taxonomy=taxonomy, labels=None)
+        return dataclasses.replace(self, description=description)
+
+    @cached_property
+    def _scans(self) -> dict[str, NamedScan]:
+        """The scans by name: the path from `root`, without the ending."""
+        pattern = self.description.scans
+        try:
+            matches = sorted(self.root.glob(pattern))
+        except (ValueError, NotImplementedError, OSError) as error:
+            raise InputError(f"scans: expected a pattern, found {pattern!r} ({error})") from None
+        paths = [path for path in matches if path.is_file() and not path.name.startswith(".")]
+
+        # Files of labels may match the pattern of the scans, too.
+        label_paths = {self._place_of_labels(path, scan_stem(path)) for path in paths}
+        scans: dict[str, NamedScan] = {}
+        for path in paths:
+            if path not in label_paths or self._has_fields:
+                for scan in list_scans(path, layout=self.description.layout):
+                    self._add(scans, scan)
+        if not scans:
+            raise InputError(
+                f"{self.root}: expected scan files {pattern}, found none; correct scans or root"
+            )
+        return scans
+
+    def _add(self, scans: dict[str, NamedScan], scan: NamedScan) -> None:
+        name = (scan.path.parent.relative_to(self.root) / scan.name).as_posix()
+        if name in scans:
+            raise InputError(
+                f"{self.spec}: expected one scan named {name}, found {scans[name].path.name} "
+                f"and {scan.path.name}; make the pattern of the scans narrower"
+            )
+        scans[name] = scan
+
+    @cached_property
+    def _listing(self) -> list[tuple[ScanRecord, str]]:
+        """The records of all scans, each with its split ("" if it is in none)."""
+        splits = {name: self._split_of(name, scan.path) for name, scan in self._scans.items()}
+        splits_of_folder: dict[str, set[str]] = {}
+        for name, split in splits.items():
+            splits_of_folder.setdefault(self._folder_of(name), set()).add(split)
+
+        listing = []
+        for name, scan in self._scans.items():
+            sequence = self._folder_of(name)
+            if len(splits_of_folder[sequence]) > 1:
+                sequence = f"{sequence}-{splits[name] or 'rest'}"
+            record = ScanRecord(
+                name=name,
+                sequence=sequence,
+                points_path=scan.path,
+                labels_path=self._labels_path(scan),
+                prediction=f"{name}.label",
+            )
+            listing.append((record, splits[name]))
+        return listing
+
+    def _folder_of(self, name: str) -> str:
+        """Return the folder of a scan that names its sequence."""
+        fixed = _fixed_part(self.description.scans)
+        parts = Path(name).relative_to(fixed).parts
+        if len(parts) > 1:
+            return parts[0]
+        return fixed.name or "all"
+
+    def _split_of(self, name: str, path: Path) -> str:
+        """Return the split of a scan; "" if it is in none.
+
+        Raises:
+            InputError: if it is in two.
+        """
+        folders = [parent.as_posix() for parent in Path(name).parents]
+        texts = {name, path.relative_to(self.root).as_posix(), self._folder_of(name), *folders}
+        splits = []
+        for split, names in self._names.items():
+            if texts & names or any(fnmatchcase(name, pattern) for pattern in _patterns(names)):
+                splits.append(split)
+        if len(splits) > 1:
+            raise InputError(
+                f"{self.spec}: expected a scan in one split, found {name} in "
+                f"{' and '.join(splits)}; correct the split"
+            )
+        return splits[0] if splits else ""
+
+    @cached_property
+    def _names(self) -> dict[str, frozenset[str]]:
+        """Folders, names of scans and patterns by split, with those in list files."""
+        names = {}
+        for split, entries in self.description.split.items():
+            texts: set[str] = set()
+            for entry in entries:
+                path = self.root / entry
+                if path.suffix in (".txt", ".lst") and path.is_file():
+                    texts.update(_read_list(path))
+                else:
+                    texts.add(entry.rstrip("/"))
+            names[split] = frozenset(texts)
+        return names
+
+    @property
+    def _has_fields(self) -> bool:
+        """Whether the labels are in the files of the scans."""
+        return self.description.labels is not None and self.description.labels.file is None
+
+    def _labels_path(self, scan: NamedScan) -> Path | None:
+        """Return the file of a scan's labels; None if it has none."""
+        path = self._place_of_labels(scan.path, scan.name)
+        return path if path is not None and path.is_file() else None
+
+    def _place_of_labels(self, path: Path, name: str) -> Path | None:
+        """Return where the labels of a scan would be; None if there are none."""
+        place = self.description.labels
+        if place is None:
+            return None
+        return path if place.file is None else path.parent / place.file.replace("{name}", name)
+
+    def _read_labels(self, record: ScanRecord, count: int) -> np.ndarray | None:
+        place = self.description.labels
+        path = record.labels_path
+        if place is None or path is None:
+            return None
+        if place.file is not None:
+            raw = read_label_file(path, count, place.field)
+        else:
+            raw = read_label_field(path, count, str(place.field), self.description.layout)
+        try:
+            return self.taxonomy.to_train(raw)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+
+def _patterns(names: frozenset[str]) -> list[str]:
+    return [name for name in names if set(name) & set("*?[")]
+
+
+def _fixed_part(pattern: str) -> Path:
+    """Return the folders at the beginning of a pattern that have no wildcards."""
+    fixed = Path()
+    for part in Path(pattern).parts[:-1]:
+        if set(part) & set("*?["):
+            break
+        fixed /= part
+    return fixed
+
+
+def _read_list(path: Path) -> list[str]:
+    """Return the lines of a list of scans or folders; names may have the ending of the scans."""
+    if path.stat().st_size > LARGEST_LIST:
+        raise InputError(f"{path}: expected a list of scans, found a larger file; give another")
+    lines = map(str.strip, path.read_text(encoding="utf-8", errors="replace").splitlines())
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def is_description(text: str) -> bool:
+    """Return whether a text names a YAML file."""
+    return text.lower().endswith(ENDINGS) and Path(text).expanduser().is_file()
+
+
+def open_own(path: Path | str) -> OwnScans:
+    """Open the dataset that a YAML file describes.
+
+    Raises:
+        InputError: if the file cannot be read, lacks a key or has a wrong one, or there is no scan.
+    """
+    path = Path(path).expanduser()
+    tree = read_yaml(path, "a description of scans and classes")
+    try:
+        dataset = OwnScans(_parse(path, tree))
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    dataset.sequences("all")
+    return dataset
+
+
+def _parse(path: Path, tree: Any) -> Description:
+    """Return what the YAML file says."""
+    _check_keys("the file", tree, (*KEYS, *ROW_KEYS), required=("classes", "scans"))
+    root = (path.parent / Path(_text(tree, "root", ".")).expanduser()).absolute()
+    scans = _text(tree, "scans")
+    if Path(scans).is_absolute() or ".." in Path(scans).parts:
+        raise InputError(
+            f"scans: expected a pattern below the file's folder, found {scans!r}; "
+            "name the folder of the data as root"
+        )
+
+    name = _text(tree, "name", path.stem)
+    sensor = tree.get("sensor")
+    if sensor is not None and not isinstance(sensor, str | Mapping):
+        raise InputError(
+            f"sensor: expected a name or attributes such as height: 0.9, found {shown(sensor)}; "
+            "correct it"
+        )
+    return Description(
+        path,
+        root,
+        taxonomy=_parse_classes(f"own-{name}" if name in TAXONOMIES else name, tree),
+        scans=scans,
+        labels=_parse_labels(tree.get("labels")),
+        split=_parse_split(tree.get("split") or {}),
+        sensor=sensor,
+        layout=RowLayout(*(_texts(key, tree.get(key, ())) for key in ROW_KEYS)),
+    )
+
+
+def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
+    """Return the classes: names with raw ids and, if the user likes, colours."""
+    classes = tree["classes"]
+    if not isinstance(classes, Mapping) or not classes:
+        raise InputError(
+            f"classes: expected names with ids, such as road: [1, 2], found {shown(classes)}; "
+            "write them"
+        )
+
+    colors = [(0, 0, 0)]
+    train_to_raw = []
+    raw_to_train: dict[int | str, int] = {}
+    for train_id, (title, entry) in enumerate(classes.items(), start=1):
+        values = entry if isinstance(entry, Mapping) else {"ids": entry}
+        _check_keys(f"classes: {title}", values, ("ids", "color"), required=("ids",))
+        ids = _ids(f"classes: {title}", values["ids"])
+        if not ids:
+            raise InputError(f"classes: {title}: expected ids, found none; name one or more")
+        train_to_raw.append(ids[0])
+        colors.append(_color(title, values.get("color"), train_id))
+        for raw_id in ids:
+            _add(raw_to_train, raw_id, train_id)
+
+    ignored = _ids("ignored", tree.get("ignored", []))
+    for raw_id in ignored:
+        _add(raw_to_train, raw_id, 0)
+    if not ignored:  # points without a label have to get some id
+        ignored = [next(raw for raw in range(INSTANCE_MASK) if raw not in raw_to_train)]
+        raw_to_train[ignored[0]] = 0
+
+    return Taxonomy(
+        name=name,
+        classes=tuple(map(str, classes)),
+        colors=tuple(colors),
+        raw_to_train=raw_to_train,
+        train_to_raw=(ignored[0], *train_to_raw),
+        splits={},
+        counts_absent=False,
+    )
+
+
+def _add(raw_to_train: dict[int | str, int], raw_id: int, train_id: int) -> None:
+    if raw_id in raw_to_train:
+        raise InputError(f"classes: expected each id once, found {raw_id} twice; correct the ids")
+    raw_to_train[raw_id] = train_id
+
+
+def _ids(title: str, values: Any) -> list[int]:
+    """Return raw ids; -1, which many tools write for no label, becomes the largest id."""
+    ids = values if isinstance(values, list) else [values]
+    for raw_id in ids:
+        if type(raw_id) is not int or not -1 <= raw_id <= INSTANCE_MASK:
+            raise InputError(
+                f"{title}: expected whole numbers from -1 to {INSTANCE_MASK} as ids, "
+                f"found {shown(raw_id)}; correct them"
+            )
+    return [raw_id & INSTANCE_MASK for raw_id in ids]
+
+
+def _color(title: str, values: Any, train_id: int) -> tuple[int, int, int]:
+    """Return the colour of a class, or one unlike the others if there is none."""
+    if values is None:
+        hue = train_id * GOLDEN_ANGLE % 1
+        red, green, blue = colorsys.hsv_to_rgb(hue, SATURATION, VALUE)
+        return round(255 * red), round(255 * green), round(255 * blue)
+
+    is_triple = isinstance(values, list) and len(values) == 3
+    if not is_triple or any(type(value) is not int for value in values):
+        raise InputError(
+            f"classes: {title}: expected a color such as [255, 0, 0], found {shown(values)}; "
+            "correct it"
+        )
+    red, green, blue = values
+    return red, green, blue
+
+
+def _parse_labels(entry: Any) -> LabelPlace | None:
+    """Return where the labels are."""
+    if entry is None:
+        return None
+    if isinstance(entry, str):
+        entry = {"file": entry}
+    _check_keys("labels", entry, ("file", "field"))
+    file = _text(entry, "file", "") or None
+    column = entry.get("field")
+    if file is None and column is None:
+        raise InputError("labels: expected a file or a field, found neither; name one")
+    if file is not None and "{name}" not in file:
+        if not file.startswith("."):
+            raise InputError(
+                f"labels: expected the scan's name in the file, found {file!r}; "
+                "write for example ../labels/{name}.label"
+            )
+        file = "{name}" + file  # only an ending
+    return LabelPlace(file, None if column is None else str(column))
+
+
+def _parse_split(entry: Any) -> dict[str, tuple[str, ...]]:
+    """Return the names by split."""
+    _check_keys("split", entry, SPLITS)
+    return {split: _texts(f"split: {split}", values) for split, values in entry.items()}
+
+
+def _check_keys(title: str, tree: Any, keys: Sequence[str], required: Sequence[str] = ()) -> None:
+    """Raise InputError if a mapping lacks a key or has an unknown one, or is none."""
+    if not isinstance(tree, Mapping):
+        raise InputError(
+            f"{title}: expected the keys {', '.join(keys)}, found {shown(tree)}; "
+            "see docs/own_data.md"
+        )
+    for key in tree:
+        if key not in keys:
+            raise InputError(
+                f"{title}: expected keys of {', '.join(keys)}, found {shown(key)}; correct the key"
+            )
+    for key in required:
+        if key not in tree:
+            raise InputError(f"{title}: expected the key {key}, found none; add it")
+
+
+def _text(tree: Mapping[str, Any], key: str, usual: str | None = None) -> str:
+    value = tree.get(key, usual)
+    if not isinstance(value, str):
+        raise InputError(f"{key}: expected a text, found {shown(value)}; correct it")
+    return value
+
+
+def _texts(title: str, values: Any) -> tuple[str, ...]:
+    """Return one or several texts; numbers, such as the sequence 07, count as texts."""
+    entries = values if isinstance(values, list | tuple) else [values]
+    for entry in entries:
+        if not isinstance(entry, str | int):
+            raise InputError(f"{title}: expected names, found {shown(entry)}; correct them")
+    return tuple(map(str, entries))

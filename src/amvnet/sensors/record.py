@@ -1,0 +1,103 @@
+"""The sensor that weights were trained for: what their training record says of it, or its name."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from amvnet.errors import InputError
+from amvnet.scan import Scan
+from amvnet.sensors.ground import MIN_DISTANCE
+from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
+from amvnet.sensors.measure import SensorGeometry, elevations, measure
+
+KEY = "sensor"  # of a part's training record
+AS_IS = "as_is"  # in it: whether the scans were trained on as they were, not adapted as files are
+MEASURES = ("beams", "fov_up", "fov_down", "height")  # attributes of Sensor that it has
+
+LARGEST = 1e6  # no measure of a sensor is larger
+
+
+def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
+    """Return the sensor that weights were trained for; what is not known of it is None.
+
+    Args:
+        training: the training records of the weights by part.
+        name: of the sensor, as the weights carry it; counts only for what no record tells.
+    """
+    known = dataclasses.replace(SENSORS.get(name, Sensor(name)), height=HEIGHTS.get(name))
+    for part in ("range_net", "polar_net"):
+        record = training.get(part)
+        carried = record.get(KEY) if isinstance(record, Mapping) else None
+        if isinstance(carried, Mapping):
+            known = _replace(known, carried)
+    return known
+
+
+def is_trained_as_is(training: Mapping[str, Any]) -> bool:
+    """Return whether weights were trained on scans that were not adapted, by their records."""
+    for part in ("range_net", "polar_net"):
+        record = training.get(part)
+        carried = record.get(KEY) if isinstance(record, Mapping) else None
+        if isinstance(carried, Mapping) and carried.get(AS_IS) is True:
+            return True
+    return False
+
+
+def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
+    """Return the sensor with the measures of a record, if they are possible."""
+    measures: dict[str, Any] = {}
+    for key in MEASURES:
+        value = record.get(key)
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            continue
+        if abs(value) < LARGEST:  # also false for NaN
+            measures[key] = round(value) if key == "beams" else float(value)
+    try:
+        return dataclasses.replace(sensor, **measures)
+    except InputError:  # a file of a stranger may hold any numbers
+        return sensor
+
+
+def measure_sensor(scans: Iterable[Scan]) -> dict[str, float]:
+    """Measure the sensor of some scans, as weights carry it: the median of each measure.
+
+    If the scans have rings, the field of view ends at the highest and the lowest laser.
+
+    Returns:
+        What could be measured of `MEASURES`.
+    """
+    measured = []
+    for scan in scans:
+        points = scan.points[scan.valid, :3].astype(np.float64)
+        ring = None if scan.ring is None else scan.ring[scan.valid]
+        if len(points):
+            measured.append(_with_laser_ends(measure(points, ring), points, ring))
+
+    record: dict[str, float] = {}
+    for key in MEASURES:
+        values = [getattr(geometry, key) for geometry in measured]
+        known = [value for value in values if value is not None]
+        if known:
+            median = float(np.median(known))
+            record[key] = round(median) if key == "beams" else round(median, 3)
+    return record
+
+
+def _with_laser_ends(
+    geometry: SensorGeometry, points: np.ndarray, ring: np.ndarray | None
+) -> SensorGeometry:
+    """Return the geometry with the median elevations of the highest and the lowest laser."""
+    if ring is None or geometry.fov_up is None:
+        return geometry
+    # Sensors report lost returns as points next to them, at any elevation.
+    is_distant = np.hypot(points[:, 0], points[:, 1]) > MIN_DISTANCE
+    elevation = elevations(points[is_distant])
+    ring = ring[is_distant]
+    ends = [float(np.median(elevation[ring == laser])) for laser in (ring.min(), ring.max())]
+    if min(ends) == max(ends):
+        return geometry
+    return dataclasses.replace(geometry, fov_up=max(ends), fov_down=min(ends))

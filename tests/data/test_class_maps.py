@@ -1,0 +1,139 @@
+"""Maps of classes: coarse ones of both benchmarks, a user's own, in predict and evaluate."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from amvnet.data.class_maps import class_map
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.weights.file import save
+
+from fixtures.worlds import GOLDEN, fails, fresh_weights, make_streets, refusal, run_cli
+
+EQUAL = {  # classes of SemanticKITTI and of nuScenes that are the same coarse class
+    "car": "car",
+    "bicyclist": "bicycle",
+    "person": "pedestrian",
+    "road": "driveable_surface",
+    "building": "manmade",
+    "vegetation": "vegetation",
+    "terrain": "terrain",
+}
+
+
+@pytest.mark.parametrize("taxonomy", [SEMANTICKITTI, NUSCENES])
+def test_every_class_of_the_benchmarks_has_a_coarse_one(taxonomy: Taxonomy) -> None:
+    table = class_map("coarse").table(taxonomy)
+    assert table[0] == 0
+    assert (table[1:] > 0).all()
+
+
+def test_the_same_things_are_the_same_coarse_class_in_both_benchmarks() -> None:
+    coarse = class_map("coarse")
+    for name, other in EQUAL.items():
+        train_id = coarse.table(SEMANTICKITTI)[SEMANTICKITTI.classes.index(name) + 1]
+        assert train_id == coarse.table(NUSCENES)[NUSCENES.classes.index(other) + 1], name
+
+
+def write_map(path: Path, classes: Any) -> Path:
+    path.write_text(yaml.safe_dump({"classes": classes}))
+    return path
+
+
+def test_a_users_map_may_leave_classes_out_and_choose_the_ids(tmp_path: Path) -> None:
+    path = write_map(tmp_path / "few.yaml", {"road": {"id": 50}, "thing": ["car", "truck"]})
+    few = class_map(str(path))
+    table = few.table(SEMANTICKITTI)
+    assert table[SEMANTICKITTI.classes.index("road") + 1] == 1  # the name is the same
+    assert table[SEMANTICKITTI.classes.index("truck") + 1] == 2
+    assert table[SEMANTICKITTI.classes.index("person") + 1] == 0
+    np.testing.assert_array_equal(few.target.to_raw(np.array([0, 1, 2])), [0, 50, 2])
+    fails(lambda: few.table(fake_taxonomy()), "none of them")
+
+
+def fake_taxonomy() -> Taxonomy:
+    return Taxonomy("fake", ("cat",), ((0, 0, 0), (1, 1, 1)), {0: 0, 1: 1}, (0, 1), {}, False)
+
+
+@pytest.mark.parametrize(
+    ("classes", "word"),
+    [
+        ([], "classes"),
+        ({"a": ["car"], "b": ["car"]}, "car twice"),
+        ({"a": [1]}, "names of classes"),
+        ({"a": {"from": "car", "id": 1.5}}, "whole number"),
+        ({"a": {"from": "car", "id": 2}, "b": {"id": 2}}, "different ids"),
+        ({"a": {"color": "red"}}, "color"),
+    ],
+)
+def test_mistakes_in_a_map_are_said_in_one_line(tmp_path: Path, classes: Any, word: str) -> None:
+    path = write_map(tmp_path / "map.yaml", classes)
+    fails(lambda: class_map(str(path)), path, word)
+
+
+def test_predict_writes_the_ids_of_the_map_for_datasets_and_files(tmp_path: Path) -> None:
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    data = make_streets(tmp_path / "data")
+    table = class_map("coarse").table(SEMANTICKITTI)
+    scans = data / "sequences/08/velodyne"
+    for inputs, inner in ((data, "sequences/08/predictions"), (scans, ".")):
+        fine = tmp_path / f"fine-{inputs.name}"
+        coarse = tmp_path / f"coarse-{inputs.name}"
+        for out, options in ((fine, []), (coarse, ["--classes", "coarse"])):
+            code, error = run_cli("predict", inputs, "--weights", weights, "--out", out, *options)
+            assert code == 0, error
+        raw = np.fromfile(fine / inner / "000000.label", np.uint32)
+        expected = table[SEMANTICKITTI.to_train(raw)]
+        found = np.fromfile(coarse / inner / "000000.label", np.uint32)
+        np.testing.assert_array_equal(found, expected)
+
+    message = refusal(f"predict {data} --weights {weights} --out {tmp_path / 'o'} --classes coars")
+    assert "did you mean coarse?" in message
+
+
+def test_weights_of_one_benchmark_are_scored_on_the_other_by_coarse_classes(
+    tmp_path: Path,
+) -> None:
+    # Rows by elevation, as the weights of KITTI have them.
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    figures = tmp_path / "figures.json"
+    code, error = run_cli(
+        *("evaluate", f"nuscenes:{GOLDEN / 'nuscenes'}", "--weights", weights),
+        *("--classes", "coarse", "--split", "all", "--json", figures),
+    )
+    assert code == 0, error
+    report = json.loads(figures.read_text())["methods"]["amvnet"]
+    assert list(report["iou"]) == list(class_map("coarse").target.classes)
+
+
+def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> None:
+    data = make_streets(tmp_path / "data")
+    labels = sorted((data / "sequences/08/labels").glob("*.label"))
+    wrong = {10: 18, 48: 50}  # cars as trucks are the same coarse class; sidewalk as building not
+    matrix = np.zeros(4, dtype=np.int64)  # points of ground: right, missed; building: right, wrong
+    for path in labels:
+        raw = np.fromfile(path, np.uint32)
+        predicted = raw.copy()
+        for truth, mistake in wrong.items():
+            predicted[raw == truth] = mistake
+        target = tmp_path / "out/sequences/08/predictions" / path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        predicted.tofile(target)
+        matrix += [(raw == value).sum() for value in (40, 48, 50, 48)]
+
+    figures = tmp_path / "figures.json"
+    code, error = run_cli(
+        *("evaluate", data, "--predictions", tmp_path / "out"),
+        *("--classes", "coarse", "--json", figures),
+    )
+    assert code == 0, error
+    iou = json.loads(figures.read_text())["methods"]["predictions"]["iou"]
+    assert iou["vehicle"] == 1
+    assert iou["ground"] == pytest.approx(matrix[0] / (matrix[0] + matrix[1]))
+    assert iou["building"] == pytest.approx(matrix[2] / (matrix[2] + matrix[3]))

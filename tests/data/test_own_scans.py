@@ -1,0 +1,194 @@
+"""A user's own scans: places of labels, splits, classes, and files with mistakes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pytest
+import yaml
+
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.own import OwnScans, open_own
+from amvnet.data.datasets.select import split_records
+from amvnet.data.raw_labels import read_label_file
+
+from fixtures.scan_writers import some_points, write_las, write_ply
+from fixtures.worlds import fails
+
+RAW = np.random.default_rng(1).choice([3, 7, 40], 60)
+EXPECTED = np.select([RAW == 3, RAW == 7], [1, 2], 0)  # 40 is ignored
+BASE: dict[str, Any] = {
+    "classes": {"ground": 3, "plant": [7, 8]},
+    "ignored": [40, -1],
+    "scans": "*/*.npy",
+    "labels": ".label",
+}
+
+
+def describe(folder: Path, **changes: Any) -> Path:
+    tree = {**BASE, **changes}
+    path = folder / "own.yaml"
+    path.write_text(yaml.safe_dump({key: value for key, value in tree.items() if value}))
+    return path
+
+
+def only_scan(folder: Path, **changes: Any) -> np.ndarray | None:
+    """Return the labels of the only scan of a dataset."""
+    data = open_dataset(f"files:{describe(folder, **changes)}")
+    (record,) = data.records(data.sequences("all"))
+    scan = data.read(record)
+    assert len(scan) == len(RAW)
+    return scan.labels
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Path:
+    (tmp_path / "site").mkdir()
+    return tmp_path / "site"
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.uint32, np.int64])
+def test_labels_are_read_from_files_of_integers_of_any_size(
+    site: Path, dtype: type[np.integer[Any]]
+) -> None:
+    np.save(site / "a.npy", some_points())
+    RAW.astype(dtype).tofile(site / "a.label")
+    np.testing.assert_array_equal(only_scan(site.parent), EXPECTED)
+
+
+def test_labels_are_read_from_every_kind_of_file_and_field(site: Path) -> None:
+    points = some_points()
+    np.savez(site / "z.npz", points=points, semantic=RAW)
+    labels = only_scan(site.parent, scans="site/*.npz", labels={"field": "semantic"})
+    np.testing.assert_array_equal(labels, EXPECTED)
+
+    table = np.column_stack([points, RAW])
+    np.savetxt(site / "t.csv", table, delimiter=",", header="x,y,z,intensity,kind", comments="")
+    labels = only_scan(site.parent, scans="site/t.csv", labels={"field": "kind"})
+    np.testing.assert_array_equal(labels, EXPECTED)
+
+    table.astype(np.float32).tofile(site / "b.bin")
+    rows = {"columns": ["x", "y", "z", "intensity", "kind"], "dtype": "float32"}
+    labels = only_scan(site.parent, scans="site/*.bin", labels={"field": "kind"}, **rows)
+    np.testing.assert_array_equal(labels, EXPECTED)
+
+    las = laspy.read(write_las(site / "l.las", points))
+    las.classification = RAW % 32  # 40 becomes 8, a plant
+    for ending in ("las", "laz"):
+        las.write(str(site / f"l.{ending}"))
+        labels = only_scan(
+            site.parent, scans=f"site/*.{ending}", labels={"field": "classification"}
+        )
+        np.testing.assert_array_equal(labels, np.where(RAW == 3, 1, 2))
+
+    write_ply(site / "p.ply", points)
+    for name, write in (
+        ("p.npy", lambda path: np.save(path, RAW[:, None])),
+        ("p.npz", lambda path: np.savez(path, labels=RAW, other=points)),
+        ("p.txt", lambda path: np.savetxt(path, RAW, fmt="%d")),
+        ("p.csv", lambda path: np.savetxt(path, RAW, fmt="%d", header="label", comments="")),
+    ):
+        write(site / name)
+        labels = only_scan(site.parent, scans="site/*.ply", labels=Path(name).suffix)
+        np.testing.assert_array_equal(labels, EXPECTED, err_msg=name)
+
+
+def test_scans_without_a_label_file_are_left_out_of_the_training(tmp_path: Path) -> None:
+    for site in ("a", "b"):
+        (tmp_path / site).mkdir()
+        for index in range(3):
+            np.save(tmp_path / f"{site}/{index}.npy", some_points(seed=index))
+    for labelled in ("a/0", "b/1"):
+        RAW.astype(np.uint32).tofile(tmp_path / f"{labelled}.label")
+
+    data = open_own(describe(tmp_path))
+    unlabelled = data.read(data.records(["a"])[1])
+    assert unlabelled.labels is None
+    scans = split_records(data, None, None)
+    assert [record.name for record in scans.train] == ["a/0"]
+    assert [record.name for record in scans.val] == ["b/1"]
+
+    (tmp_path / "b/1.label").unlink()
+    fails(lambda: split_records(data_of(tmp_path), None, None), "labelled scans", "3")
+
+
+def data_of(folder: Path) -> OwnScans:
+    return open_own(folder / "own.yaml")
+
+
+def test_splits_are_folders_patterns_or_lists_and_may_cut_through_a_folder(tmp_path: Path) -> None:
+    for site in ("a", "b", "c"):
+        (tmp_path / site).mkdir()
+        for index in range(4):
+            np.save(tmp_path / f"{site}/{index}.npy", some_points())
+    (tmp_path / "val.txt").write_text("# two scans\nb/0.npy\nb/1\n")
+    data = open_own(describe(tmp_path, split={"train": ["a", "b/[23]"], "val": "val.txt"}))
+
+    assert data.sequences("train") == ("a", "b-train")
+    assert data.sequences("val") == ("b-val",)
+    assert [record.name for record in data.records(["b-val"])] == ["b/0", "b/1"]
+    assert data.sequences("all") == ("a", "b-train", "b-val", "c")
+
+    both = describe(tmp_path, split={"train": "a", "val": "a/0"})
+    fails(lambda: open_own(both), "a/0", "train and val")
+
+
+def test_label_files_that_match_the_pattern_of_scans_are_no_scans(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", some_points())
+    np.save(tmp_path / "a_labels.npy", RAW)
+    labels = only_scan(tmp_path, scans="*.npy", labels="{name}_labels.npy")
+    np.testing.assert_array_equal(labels, EXPECTED)
+
+
+def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> None:
+    np.save(site / "a.npy", some_points())
+    data = open_own(describe(tmp_path))
+    (record,) = data.records(["site"])
+    path = data.write_prediction(record, tmp_path / "out", EXPECTED)
+    assert path == tmp_path / "out/site/a.label"
+    np.testing.assert_array_equal(np.fromfile(path, np.uint32), RAW)
+    np.testing.assert_array_equal(data.read_prediction(record, tmp_path / "out"), EXPECTED)
+
+
+@pytest.mark.parametrize(
+    ("changes", "word"),
+    [
+        ({"classes": [1, 2]}, "names with ids"),
+        ({"classes": {"a": "road"}}, "'road'"),
+        ({"classes": {"a": 1, "b": [2, 1]}}, "1 twice"),
+        ({"classes": {"a": {"ids": 1, "color": "red"}}}, "color"),
+        ({"ignored": [70000]}, "70000"),
+        ({"scans": "../*.npy"}, "below"),
+        ({"scans": "*/*.pcd"}, "found none"),
+        ({"scans": ""}, "the key scans"),
+        ({"labels": {"colour": 1}}, "colour"),
+        ({"labels": "truth.npy"}, "{name}"),
+        ({"split": {"training": "a"}}, "training"),
+        ({"sensor": 3}, "sensor"),
+        ({"clases": {}, "extra": 1}, "extra"),
+    ],
+)
+def test_mistakes_in_the_file_are_said_in_one_line(
+    site: Path, changes: dict[str, Any], word: str
+) -> None:
+    np.save(site / "a.npy", some_points())
+    path = describe(site.parent, **changes)
+    fails(lambda: open_own(path), path.name if word != "found none" else word, word)
+
+
+def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
+    np.save(site / "a.npy", some_points())
+    path = site / "a.label"
+
+    RAW[:-1].astype(np.uint32).tofile(path)
+    fails(lambda: only_scan(site.parent), path, "60 labels")
+    np.full(60, 5, np.uint32).tofile(path)
+    fails(lambda: only_scan(site.parent), path, "[5]")
+    np.save(site / "a.half.npy", np.full(60, 0.5))
+    fails(lambda: read_label_file(site / "a.half.npy", 60), "whole numbers")
+    fails(lambda: read_label_file(site / "none.npy", 60), "no file")
+    np.save(site / "evil.npy", np.array([{}], object), allow_pickle=True)
+    fails(lambda: read_label_file(site / "evil.npy", 1), "evil.npy")
