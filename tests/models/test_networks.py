@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -193,10 +194,15 @@ def test_the_head_costs_a_500th_of_the_paper_size_range_net_for_10_000_points() 
     assert gmac == pytest.approx(0.002 * 500, rel=0.05)
 
 
-@pytest.mark.parametrize("name", ["semantickitti-compact", "nuscenes-compact"])
-def test_the_sizes_of_the_shipped_weights_are_those_of_their_recipe(name: str) -> None:
-    weights = {"semantickitti-compact": "sim-hdl64e", "nuscenes-compact": "sim-hdl32e"}[name]
-    assert load_recipe(name).model == load(weights).model
+@pytest.mark.parametrize(
+    ("recipe", "weights"),
+    [("simulated-compact", "sim-hdl64e"), ("simulated-hdl32e-compact", "sim-hdl32e")],
+)
+def test_the_sizes_of_the_shipped_weights_are_those_of_their_recipe(
+    recipe: str, weights: str
+) -> None:
+    model = load_recipe(recipe).model
+    assert replace(model, assertion=model.assertion.for_prediction()) == load(weights).model
 
 
 @pytest.mark.parametrize(
