@@ -158,11 +158,13 @@ class OnnxSegmenter:
         """Return (P, K) class probabilities of finite points (P, 4) by the bird's-eye view."""
         c = self.polar_view
         features, pillar, voxel = polar_features(c, points)
-        occupied, pooled = pool(pillar, self._run("polar_points", features))
-        pillars = self._run("polar_pillars", pooled)  # (M, C)
+        is_far = distances(points) >= c.nearest
+        seen, pooled = pool(pillar[is_far], self._run("polar_points", features[is_far]))
+        pillars = self._run("polar_pillars", pooled)  # (F, C)
 
+        occupied = np.unique(pillar)  # (M,)
         plane = np.zeros((c.radial * c.angular, pillars.shape[1]), dtype=np.float32)
-        plane[occupied] = pillars
+        plane[seen] = pillars
         image = np.ascontiguousarray(plane.T).reshape(1, -1, c.radial, c.angular)
         decoded = self._run("polar_map", image)[0]  # (C', R, A)
 
@@ -209,7 +211,7 @@ def range_image(
     """
     xyz = points[:, :3]
     x, y, z = xyz.astype(np.float64).T
-    distance = np.sqrt((xyz * xyz).sum(axis=1))
+    distance = distances(points)
     column = _cells(0.5 - np.arctan2(y, x) / (2 * math.pi), view.width)
 
     if view.rows == "ring":
@@ -222,9 +224,17 @@ def range_image(
     # Written from the farthest to the nearest point, so that a pixel keeps the nearest one, and
     # the first of equally near ones.
     order = np.argsort(distance, kind="stable")[::-1]
+    order = order[distance[order] >= view.nearest]
     image = np.zeros((view.height * view.width, CHANNELS), dtype=np.float32)
     image[pixel[order]] = np.column_stack([points, distance, np.ones_like(distance)])[order]
     return np.ascontiguousarray(image.T).reshape(1, CHANNELS, view.height, view.width), pixel
+
+
+def distances(points: np.ndarray) -> np.ndarray:
+    """Return the (P,) distances of points (P, 4) from the sensor, metres."""
+    xyz = points[:, :3]
+    distance: np.ndarray = np.sqrt((xyz * xyz).sum(axis=1))
+    return distance
 
 
 def polar_features(
@@ -266,12 +276,27 @@ def pool(pillar: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def disagree(assertion: AssertionConfig, f: np.ndarray, g: np.ndarray) -> np.ndarray:
     """Return (P,) bool: True if a point is uncertain by the networks' probabilities f, g (P, K)."""
-    if assertion.name == "entropy":
-        mean = (f + g) / 2
-        return -(mean * np.log(np.maximum(mean, TINY))).sum(axis=1) >= assertion.threshold
+    verdicts = [_asserts(name, limit, f, g) for name, limit in assertion.for_prediction().terms]
+    combine = np.any if assertion.combine == "any" else np.all
+    uncertain: np.ndarray = combine(verdicts, axis=0)
+    return uncertain
+
+
+def _asserts(name: str, threshold: float, f: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """Return (P,) bool: the points that one assertion, as in `models/assertions.py`, finds."""
+    if name == "labels":
+        return f.argmax(axis=1) != g.argmax(axis=1)
+
+    mean = (f + g) / 2
+    if name == "entropy":
+        return -(mean * np.log(np.maximum(mean, TINY))).sum(axis=1) >= threshold
+    if name == "margin":
+        second, first = np.partition(mean, (-2, -1), axis=1)[:, -2:].T
+        return first - second <= threshold
 
     squared_lengths = (f * f).sum(axis=1) * (g * g).sum(axis=1)
-    return (f * g).sum(axis=1) / np.sqrt(np.maximum(squared_lengths, TINY)) <= assertion.threshold
+    similarity = (f * g).sum(axis=1) / np.sqrt(np.maximum(squared_lengths, TINY))
+    return np.minimum(similarity, 1) <= threshold
 
 
 def softmax(scores: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,10 +53,6 @@ def _write_weights(root: Path) -> None:
     save(weights, root / "w.safetensors")
     save(without(weights, "point_head"), root / "headless.safetensors")
     save(fresh_weights(NUSCENES), root / "nuscenes.safetensors")
-
-    model = weights.model
-    by_loss = replace(model, assertion=replace(model.assertion, name="loss"))
-    save(replace(weights, model=by_loss), root / "loss.safetensors")
 
 
 def _write_scans(root: Path) -> None:
@@ -152,9 +147,6 @@ MISTAKES = {
         "train {w}/recipe.yaml --data {w}/data --stage rv --out {w}/w.safetensors/run"
     ),
     "figures below a file": EVALUATE + " --json {w}/lone.bin/m.json",
-    "assertion that needs labels": (
-        "predict {w}/lone.bin --weights {w}/loss.safetensors --out {out}"
-    ),
     "device without numbers": PREDICT + " --device meta",
     "unknown sensor": "simulate {out} --sensor eye",
     "nothing to time": BENCH + " --runs 0",

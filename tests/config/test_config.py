@@ -12,7 +12,7 @@ import yaml
 
 from amvnet.config.nested import from_dict, merge_trees, to_dict
 from amvnet.config.recipes import load_recipe, recipe_names
-from amvnet.config.schema import ModelConfig, Recipe
+from amvnet.config.schema import AssertionConfig, ModelConfig, Recipe
 from amvnet.errors import InputError
 
 
@@ -66,7 +66,7 @@ def test_the_semantickitti_recipe_holds_the_papers_numbers() -> None:
     assert (grid.radial, grid.angular, grid.vertical) == (480, 360, 32)
     assert (grid.radius_max, grid.z_min, grid.z_max) == (50.0, -3.0, 1.5)
 
-    assert recipe.model.assertion.threshold == 0.85
+    assert recipe.model.assertion.terms == (("disagreement", 0.85),)
     assert recipe.model.point_head.neighbours == 15
 
     training = recipe.training
@@ -172,13 +172,13 @@ def test_a_users_file_overrides_only_what_it_states(tmp_path: Path, base: str) -
         tmp_path,
         f"base: {base}\n"
         "model: {range_view: {width: 96}}\n"
-        "training: {rv: {lr: 1}, keep: last}\n",
+        "training: {rv: {lr: 1}, keep: best}\n",
     )
     original = flatten(to_dict(load_recipe(base)))
     leaves = flatten(to_dict(load_recipe(path)))
 
     changed = {key: value for key, value in leaves.items() if value != original[key]}
-    assert changed == {"model.range_view.width": 96, "training.rv.lr": 1.0, "training.keep": "last"}
+    assert changed == {"model.range_view.width": 96, "training.rv.lr": 1.0, "training.keep": "best"}
     assert isinstance(leaves["training.rv.lr"], float)
 
 
@@ -246,3 +246,19 @@ def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(
 ) -> None:
     with pytest.raises(InputError, match=r"mine\.yaml: .*expected .* found .*correct the value"):
         load_recipe(write_recipe(tmp_path, text))
+
+
+def test_an_assertion_brings_its_own_threshold_unless_one_is_given() -> None:
+    tree: dict[str, Any] = {"name": "entropy"}
+    assert from_dict(AssertionConfig, tree).terms == (("entropy", 0.7),)
+    tree["threshold"] = 1
+    assert from_dict(AssertionConfig, tree).terms == (("entropy", 1.0),)
+    tree |= {"threshold": None, "others": ["margin", "labels"]}
+    config = from_dict(AssertionConfig, tree)
+    assert [name for name, _ in config.terms] == ["entropy", "margin", "labels"]
+    assert config.describe() == "entropy at 0.7 or margin at 0.3 or different labels"
+    assert from_dict(AssertionConfig, to_dict(config)) == config
+
+    tree["other_thresholds"] = [0.1]
+    with pytest.raises(InputError, match="other_thresholds"):
+        from_dict(AssertionConfig, tree)

@@ -17,6 +17,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation import analysis
 from amvnet.evaluation.analysis import BINS, SWEPT, Analysis, analyze
+from amvnet.evaluation.assertions import SHARES, rank_points
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
@@ -133,7 +134,8 @@ def test_points_that_no_network_sees_count_as_evaluate_counts_them(
     assert evaluation.points == expected.points
     assert evaluation.uncertain == expected.uncertain
 
-    swept = analyzed.sweep()[round(weights.model.assertion.threshold * BINS)]
+    ((_, tau),) = weights.model.assertion.terms
+    swept = analyzed.sweep()[round(tau * BINS)]
     assert swept.uncertain == pytest.approx(expected.uncertain / expected.points, abs=0.005)
 
 
@@ -240,6 +242,54 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
     assert "networks" in refusal(command.replace("weights.safetensors", "other.safetensors"))
 
 
+def test_taus_are_swept_with_heads_of_their_own(world: Path) -> None:
+    out = world / "taus"
+    options = f"--out {out} --taus 1,0.9 --recipe {world}/recipe.yaml"
+    succeed(f"analyze {world}/data --weights {world}/weights.safetensors {options}")
+
+    assert column(out / "taus.csv", "tau, a head for each") == ["0.9", "1.0"]
+    fewer, all_points = map(float, column(out / "taus.csv", "uncertain %"))
+    assert fewer < all_points == 100
+    few = load(out / "taus/0.9/weights.safetensors")
+    many = load(out / "taus/1.0/weights.safetensors")
+    assert few.model.assertion.terms == (("disagreement", 0.9),)
+    assert many.model.assertion.terms == (("disagreement", 1.0),)
+    assert few.digest("point_head") != many.digest("point_head")
+    assert few.digest("range_net") == many.digest("range_net")
+
+
+def test_assertions_are_compared_at_equal_shares(world: Path) -> None:
+    out = world / "compared"
+    succeed(f"analyze {world}/data --weights {world}/weights.safetensors --out {out} --assertions")
+    names = column(out / "assertions.csv", "assertion")
+    assert len(names) == 6 * len(SHARES)
+    assert column(out / "assertions.csv", "uncertain %")[: len(SHARES)] == [
+        "5.0",
+        "10.0",
+        "20.0",
+        "30.0",
+    ]
+
+
+def test_a_union_ranks_a_point_by_the_assertion_that_finds_it_first() -> None:
+    generator = torch.Generator().manual_seed(0)
+    f = (3 * torch.randn(500, 5, generator=generator)).softmax(1)
+    g = (3 * torch.randn(500, 5, generator=generator)).softmax(1)
+    ranks = rank_points(f, g)
+    for rank in ranks.values():
+        assert sorted(rank.tolist()) == list(range(500))
+
+    def found(name: str, count: int) -> set[int]:
+        return set((ranks[name] < count).nonzero()[:, 0].tolist())
+
+    first = found("disagreement", 50)
+    second = found("entropy", 50)
+    assert found("disagreement or entropy", len(first | second)) == first | second
+    assert found("disagreement and entropy", len(first & second)) == first & second
+    different = f.argmax(1) != g.argmax(1)
+    assert found("labels", int(different.sum())) == set(different.nonzero()[:, 0].tolist())
+
+
 def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     save(without(fresh_weights(), "point_head"), world / "headless.safetensors")
     entropy = with_assertion(fresh_weights(), AssertionConfig("entropy", 0.7))
@@ -250,6 +300,9 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
         ("headless", "", "point_head"),
         ("entropy", "", "disagreement"),
         ("weights", "--neighbours 3", "--recipe"),
+        ("weights", "--taus 0.5", "--recipe"),
+        ("weights", f"--taus 0.5,2 {recipe}", "0.5,2"),
+        ("weights", f"--taus nan {recipe}", "nan"),
         ("weights", f"--neighbours 3,x {recipe}", "3,x"),
         ("weights", f"--neighbours ² {recipe}", "²"),
         ("weights", "--neighbours 3 --recipe nonsense", "nonsense"),

@@ -5,16 +5,25 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import permutations
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config.schema import AssertionConfig, PointHeadConfig
-from amvnet.models.amvnet import merge
-from amvnet.models.assertions import Disagreement, HighEntropy, HighLoss, build_assertion
+from amvnet.config.schema import AssertionConfig, ModelConfig, PointHeadConfig
+from amvnet.models.amvnet import build_amvnet, merge
+from amvnet.models.assertions import (
+    DifferentLabels,
+    Disagreement,
+    HighEntropy,
+    HighLoss,
+    SmallMargin,
+    build_assertion,
+)
 from amvnet.models.layers import fold_batch_norms
 from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
 from amvnet.models.point_head import (
@@ -190,6 +199,11 @@ def test_disagreement_equals_a_loop_of_its_formula() -> None:
     assert set(expected) == {False, True}
 
 
+def test_at_tau_1_all_points_are_uncertain_whatever_rounding_does() -> None:
+    f = torch.rand(10_000, K).softmax(1)
+    assert Disagreement(1.0)(f, f, torch.zeros(10_000, 4)).all()
+
+
 def test_at_the_threshold_a_point_is_uncertain() -> None:
     f = torch.eye(2)
     points = torch.zeros(2, 4)
@@ -238,10 +252,56 @@ def test_assertions_stay_finite_at_certainty() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"), [("disagreement", Disagreement), ("entropy", HighEntropy), ("loss", HighLoss)]
+    ("name", "kind"),
+    [
+        ("disagreement", Disagreement),
+        ("entropy", HighEntropy),
+        ("margin", SmallMargin),
+        ("loss", HighLoss),
+    ],
 )
-def test_a_configuration_names_its_assertion(name: str, kind: Callable[[float], object]) -> None:
-    assert build_assertion(AssertionConfig(name, 0.3)) == kind(0.3)  # type: ignore[arg-type]
+def test_a_configuration_names_its_assertion(name: Any, kind: Callable[..., object]) -> None:
+    assert build_assertion(AssertionConfig(name, 0.3), labels=True) == kind(0.3)
+    assert build_assertion(AssertionConfig(name), labels=True) == kind()
+
+
+def test_margin_and_labels_equal_a_loop_of_their_formulas() -> None:
+    f, g, points, _ = random_scores()
+    small = []
+    different = []
+    for i in range(len(f)):
+        mean = sorted((f[i, k].item() + g[i, k].item()) / 2 for k in range(K))
+        small.append(mean[-1] - mean[-2] <= 0.2)
+        different.append(int(f[i].argmax()) != int(g[i].argmax()))
+
+    assert SmallMargin(0.2)(f, g, points).tolist() == small
+    assert DifferentLabels()(f, g, points).tolist() == different
+    assert set(small) == set(different) == {False, True}
+
+
+def test_a_union_is_the_union_and_an_intersection_the_intersection() -> None:
+    f, g, points, _ = random_scores()
+    single = [
+        build_assertion(AssertionConfig("disagreement", 0.8))(f, g, points),
+        build_assertion(AssertionConfig("entropy", 1.0))(f, g, points),
+        build_assertion(AssertionConfig("labels"))(f, g, points),
+    ]
+    config = AssertionConfig("disagreement", 0.8, ("entropy", "labels"), (1.0, 0.0))
+    union = build_assertion(config)(f, g, points)
+    common = build_assertion(replace(config, combine="all"))(f, g, points)
+    for i in range(len(f)):
+        assert bool(union[i]) == any(bool(verdict[i]) for verdict in single)
+        assert bool(common[i]) == all(bool(verdict[i]) for verdict in single)
+    assert 0 < common.sum() < union.sum() < len(f)
+
+
+def test_without_labels_the_loss_is_left_out_of_an_assertion() -> None:
+    assert build_assertion(AssertionConfig("loss", 2.0)) == Disagreement(0.85)
+    assert build_assertion(AssertionConfig("loss", 2.0, ("entropy",))) == HighEntropy(0.7)
+
+    f, g, points, _ = random_scores()
+    model = build_amvnet(ModelConfig(assertion=AssertionConfig("loss")), K)
+    assert torch.equal(model.assertion(f, g, points), Disagreement()(f, g, points))
 
 
 def test_the_ensembles_equal_their_formulas() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config.schema import RangeNetConfig
+from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import PointHeadConfig, RangeNetConfig
 from amvnet.models.layers import (
     AzimuthGRU,
     PointLinear,
@@ -20,10 +22,12 @@ from amvnet.models.layers import (
     upsample,
     wrap_width,
 )
+from amvnet.models.point_head import PointHead
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.upsampled_conv import convolve_joined
 from amvnet.scan import Scan
+from amvnet.weights.file import load
 
 from fixtures.networks import CASES, Case
 
@@ -159,19 +163,46 @@ def test_the_unet_of_polar_net_halves_odd_sizes_upwards() -> None:
     assert sizes == [(5, 6), (3, 3)]
 
 
-def test_the_paper_size_range_net_costs_500_gflops_and_decodes_the_strides_4_to_128() -> None:
+def test_the_paper_size_range_net_costs_500_gmac_and_decodes_the_strides_4_to_128() -> None:
+    width = 512  # an eighth of the image: every map, and the GRUs' padding, are an eighth too
     net = RangeNet(RangeNetConfig(), 19).eval()
     strides: list[int] = []
     for lateral in net.lateral:
         lateral.register_forward_hook(
-            lambda _, inputs, __: strides.append(4096 // inputs[0].shape[-1])
+            lambda _, inputs, __: strides.append(width // inputs[0].shape[-1])
         )
 
     # With gradients, so that `joined` upsamples as the paper's network does
     with FlopCounterMode(display=False) as counter:
-        assert net(torch.zeros(1, 6, 64, 4096)).shape == (1, 19, 64, 4096)
+        assert net(torch.zeros(1, 6, 64, width)).shape == (1, 19, 64, width)
     assert sorted(strides) == [4, 8, 16, 32, 64, 128]
-    assert counter.get_total_flops() == pytest.approx(500e9, rel=0.1)
+
+    # The counter counts a multiply-add as two operations, the paper as one.
+    gmac = counter.get_total_flops() / 2 * (4096 / width) / 1e9
+    assert gmac == pytest.approx(500, rel=0.1)
+
+
+def test_the_head_costs_a_500th_of_the_paper_size_range_net_for_10_000_points() -> None:
+    head = PointHead(PointHeadConfig(), 19).eval()
+    assert sum(parameter.numel() for parameter in head.parameters()) == pytest.approx(
+        18.5e3, rel=0.01
+    )
+
+    with FlopCounterMode(display=False) as counter:
+        head(torch.zeros(100, 42), torch.zeros(100, 15, 42))
+    gmac = counter.get_total_flops() / 2 * (10_000 / 100) / 1e9
+    assert gmac == pytest.approx(0.002 * 500, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "weights"),
+    [("simulated-compact", "sim-hdl64e"), ("simulated-hdl32e-compact", "sim-hdl32e")],
+)
+def test_the_sizes_of_the_shipped_weights_are_those_of_their_recipe(
+    recipe: str, weights: str
+) -> None:
+    model = load_recipe(recipe).model
+    assert replace(model, assertion=model.assertion.for_prediction()) == load(weights).model
 
 
 @pytest.mark.parametrize(

@@ -78,6 +78,8 @@ def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[
         pixels.append(pixel)
 
         distance = math.sqrt(x * x + y * y + z * z)
+        if distance < c.nearest:
+            continue
         if np.float32(distance) < least[pixel]:
             least[pixel] = float(np.float32(distance))
             nearest[pixel] = i
@@ -360,3 +362,47 @@ def test_a_batch_has_rings_only_if_all_scans_have(random_scan: RandomScan) -> No
     scan = random_scan(4)
     assert PointBatch.of([scan, replace(scan, ring=None)]).ring is None
     assert PointBatch.of([replace(scan, ring=None)]).ring is None
+
+
+def test_the_range_view_without_the_cars_own_body_equals_a_loop(random_scan: RandomScan) -> None:
+    config = replace(SPHERICAL, nearest=15.0)
+    scan = random_scan(2000, 5)
+    pixels, nearest, image = range_view_by_loop(scan, config)
+
+    view = RangeView(config).project(PointBatch.of([scan]))
+    assert view.pixel.tolist() == pixels
+    assert view.nearest.tolist() == nearest
+    np.testing.assert_allclose(view.image[0].numpy(), image, rtol=1e-6)
+    assert nearest != range_view_by_loop(scan, SPHERICAL)[1]
+
+
+def test_the_views_without_the_cars_own_body_are_those_of_the_other_points(
+    random_scan: RandomScan,
+) -> None:
+    scans = [random_scan(1500, 6), random_scan(900, 7)]
+    others = []
+    is_far = []
+    for scan in scans:
+        far = np.linalg.norm(scan.points[:, :3], axis=1) >= 15
+        others.append(Scan(scan.points[far]))
+        is_far.append(far)
+    far_points = torch.from_numpy(np.concatenate(is_far))
+    assert 0 < far_points.sum() < len(far_points)
+
+    whole = PointBatch.of(scans)
+    rest = PointBatch.of(others)
+    image = RangeView(replace(SPHERICAL, nearest=15.0)).project(whole)
+    assert torch.equal(image.image, RangeView(SPHERICAL).project(rest).image)
+
+    grid = PolarView(replace(POLAR, nearest=15.0)).project(whole)
+    expected = PolarView(POLAR).project(rest)
+    assert torch.equal(grid.features, expected.features)
+    maps = grid.to_map(grid.pool(grid.features))
+    assert torch.equal(maps, expected.to_map(expected.pool(expected.features)))
+    assert torch.equal(grid.pool_by_parts(lambda x: x, 100), grid.pool(grid.features))
+
+    # Every point has the scores of its cell; far points those that they had without the near ones.
+    scores = torch.randn(2, POLAR.vertical * 3, POLAR.radial, POLAR.angular)
+    points = grid.to_points(grid.at_pillars(scores))
+    assert points.shape == (len(far_points), 3)
+    assert torch.equal(points[far_points], expected.to_points(expected.at_pillars(scores)))

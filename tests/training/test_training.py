@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,19 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from amvnet.config.recipes import load_recipe, recipe_names
+from amvnet.config.schema import AssertionConfig
 from amvnet.data.datasets import simulated
+from amvnet.errors import InputError
+from amvnet.inference.segmenter import Segmenter
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import PROBABILITIES
+from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import PointGatherer
-from amvnet.weights.file import PARTS, Weights, load
+from amvnet.training.run_plan import RunPlan
+from amvnet.training.stages import NetworkStage
+from amvnet.weights.file import PARTS, Weights, load, save
 
 from fixtures.worlds import (
     BUILDING,
@@ -33,6 +41,7 @@ from fixtures.worlds import (
     SIDEWALK,
     fake_drive,
     files,
+    fresh_weights,
     label_map,
     make_streets,
     run_cli,
@@ -398,6 +407,86 @@ def test_folds_score_no_sequence_that_they_learnt_from(
     assert weights.training["range_net"]["sequences"] == ["00", "01"]
 
 
+def test_a_fold_does_not_choose_its_epoch_by_the_scans_that_it_scores(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plans = []
+
+    def stop(plan: RunPlan) -> Path:
+        plans.append(plan)
+        raise InputError("enough")
+
+    save(fresh_weights(), tmp_path / "w.safetensors")
+    monkeypatch.setattr(training_run, "train_networks", stop)
+    options = ("--stage", "head", "--init", tmp_path / "w.safetensors", "--training.keep", "best")
+    fail(*train_arguments(world, tmp_path / "run"), *options, "--training.head.folds", 2)
+    assert plans[0].recipe.training.keep == "last"
+    assert plans[0].recipe.training.rv.epochs > 1
+
+
+def test_every_recipe_takes_the_last_epoch() -> None:
+    assert {load_recipe(name).training.keep for name in recipe_names()} == {"last"}
+
+
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+def test_an_incomplete_batch_of_parts_is_the_mean_of_its_scans(
+    world: Path, tmp_path: Path, stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Four scans in batches of three: a batch of one follows, whether or not it has parts."""
+    # Without batch norm's statistics, which depend on the parts.
+    monkeypatch.setattr(NetworkStage, "on_train_epoch_start", lambda self: self.trained.eval())
+    options = ["--stage", stage, f"--training.{stage}.batch", 3, f"--training.{stage}.epochs", 1]
+    options += [f"--training.{stage}.clip", 1e6, "--model.polar_net.dropblock", 0]
+    options += ["--training.precision", "64-true", "--training.keep", "last"]
+
+    norms: dict[int, list[float]] = {1: [], 3: []}
+    for parts, of_steps in norms.items():
+
+        def note(self: NetworkStage, optimizer: Any, of_steps: list[float] = of_steps) -> None:
+            gradients = [p.grad.norm() for p in self.trained.parameters() if p.grad is not None]
+            of_steps.append(float(torch.stack(gradients).norm()))
+
+        monkeypatch.setattr(NetworkStage, "on_before_optimizer_step", note)
+        train(world, tmp_path / str(parts), *options, f"--training.{stage}.accumulate", parts)
+    assert len(norms[1]) == 2
+    assert norms[3] == pytest.approx(norms[1], rel=1e-9)
+
+
+def test_init_for_a_finished_part_is_refused_unless_it_was_obeyed(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    stage = ("--stage", "rv", "--training.rv.epochs", 1)
+    train(world, tmp_path / "run", *stage)
+    head = ("--stage", "head", "--init", run)
+    error = fail(*train_arguments(world, tmp_path / "run"), *head)
+    assert "--init" in error
+    assert "range_net" in error
+    assert "--init" in fail(
+        *train_arguments(world, tmp_path / "run"), *stage, "--init", run, "--resume"
+    )
+
+    # A run that was begun with these weights goes on with the same command.
+    begun = train(world, tmp_path / "begun", *stage, "--init", run)
+    assert not differing(train(world, tmp_path / "begun", *stage, "--init", run, "--resume"), begun)
+
+    # A part that was taken from elsewhere, or has become the initial one, is no contradiction.
+    train(world, tmp_path / "begun", "--stage", "head", "--init", tmp_path / "begun")
+
+
+def test_a_run_of_an_earlier_version_without_a_newer_value_is_resumed(
+    world: Path, tmp_path: Path
+) -> None:
+    train(world, tmp_path, "--stage", "rv")
+    settings = yaml.safe_load((tmp_path / "rv/stage.yaml").read_text())
+    del settings["model"]["range_view"]["nearest"]
+    del settings["training"]["augment"]["paste"]
+    (tmp_path / "rv/stage.yaml").write_text(yaml.safe_dump(settings))
+
+    train(world, tmp_path, "--stage", "rv", "--resume")
+    other = ("--model.range_view.nearest", 1)
+    assert "nearest" in fail(*train_arguments(world, tmp_path), "--stage", "rv", "--resume", *other)
+
+
 def test_nuscenes_is_trained_predicted_and_evaluated(tmp_path: Path) -> None:
     recipe = write_recipe(tmp_path / "recipe.yaml", "nuscenes-compact")
     data = GOLDEN / "nuscenes"
@@ -445,11 +534,31 @@ def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
     assert max(column(tmp_path / "run", "head", "val/acc")) > 0.5
 
 
-def test_the_head_learns_where_the_loss_is_high(world: Path, run: Path, tmp_path: Path) -> None:
+def test_the_head_learns_where_the_loss_is_high(
+    world: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assertion = ("--model.assertion.name", "loss", "--model.assertion.threshold", 0.5)
     weights = train(world, tmp_path / "run", "--stage", "head", "--init", run, *assertion)
     assert weights.model.assertion.name == "loss"
     assert differing(load(run), weights) == {"point_head"}
+
+    # A prediction has no labels: it asks the head where the networks disagree, and says so.
+    capsys.readouterr()
+    options = ("--weights", tmp_path / "run", "--out", tmp_path / "out", "--sequences", "08")
+    assert run_cli("predict", world / "data", *options) == (0, "")
+    assert "disagreement at 0.85" in capsys.readouterr().out
+    by_disagreement = replace(weights.model, assertion=AssertionConfig("disagreement", 0.85))
+    expected = Segmenter(replace(weights, model=by_disagreement))
+    scan = world / "data/sequences/08/velodyne/000000.bin"
+    assert np.array_equal(Segmenter(weights)(scan).uncertain, expected(scan).uncertain)
+
+    # So do the points that the head is validated with: the metric is that of a prediction.
+    share = weights.usual_uncertain
+    shares = [Segmenter(weights)(path) for path in sorted(scan.parent.iterdir())]
+    uncertain = np.concatenate([result.uncertain for result in shares])
+    labels = sorted((world / "data/sequences/08/labels").iterdir())
+    labelled = np.concatenate([np.fromfile(path, np.uint32) for path in labels]) > 0
+    assert share == pytest.approx(uncertain[labelled].mean(), abs=1e-3)
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from amvnet.cli.console import silence
+from amvnet.cli.console import say, silence
 from amvnet.errors import InputError
 from amvnet.models.methods import METHODS, EngineName, MethodName, Precision, widest_method
 
@@ -96,10 +96,20 @@ def make_segmenter(
 
     chosen = method or widest_method(weights.parts)
     segmenter = Segmenter(weights, device, chosen, precision=precision, keep_memory=True)
+    if chosen == "amvnet":
+        say_assertion(weights)
     if at_once is not None:
         segmenter.at_once = at_once
     use_engine(segmenter, engine)
     return segmenter
+
+
+def say_assertion(weights: Weights) -> None:
+    """Say which assertion stands in for one that needs labels, if there is one."""
+    assertion = weights.model.assertion
+    if assertion.needs_labels:
+        used = assertion.for_prediction().describe()
+        say(f"uncertain points by {used}: {assertion.describe()}, of the training, needs labels")
 
 
 def describe_records(records: Sequence[ScanRecord]) -> str:
@@ -159,6 +169,26 @@ def parse_numbers(text: str) -> list[int]:
     if not all(name.isdecimal() and int(name) for name in names):
         raise InputError(f"expected numbers of neighbours with commas, found {text!r}; say 5,10,15")
     return sorted({int(name) for name in names})
+
+
+def parse_taus(text: str) -> list[float]:
+    """Parse values of tau in [0, 1] separated by commas; return them sorted, each once.
+
+    Raises:
+        InputError: if one is no such number.
+    """
+    values = set()
+    for name in parse_names(text) or [""]:
+        try:
+            value = float(name)
+        except ValueError:
+            value = -1.0
+        if not 0 <= value <= 1:  # nor NaN
+            raise InputError(
+                f"expected values of tau from 0 to 1 with commas, found {text!r}; say 0.7,0.85,1"
+            )
+        values.add(value)
+    return sorted(values)
 
 
 def parse_scores(

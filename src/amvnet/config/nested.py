@@ -110,7 +110,11 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
         if not isinstance(value, list | tuple):
             raise _wrong_type(default, value, where)
         item_kind = get_args(kind)[0]
-        return tuple(_convert(default[0], item, item_kind, where) for item in value)
+        example = default[0] if default else _example(item_kind)
+        return tuple(_convert(example, item, item_kind, where) for item in value)
+
+    if kind == float | None:
+        return None if value is None else _convert_float(0.0, value, where)
 
     choices = get_args(kind)  # the values of a Literal; empty for any other type
     if choices:
@@ -128,6 +132,12 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
     if type(value) is not type(default):
         raise _wrong_type(default, value, where)
     return value
+
+
+def _example(kind: Any) -> Any:
+    """Return a value of the type of the items of a tuple, which may be a Literal."""
+    choices = get_args(kind)
+    return choices[0] if choices else kind()
 
 
 def _convert_float(default: float, value: Any, where: str) -> float:

@@ -7,12 +7,25 @@ user's own) states only what differs from them. "Open" marks what the paper does
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal
 
 from amvnet.config.bounds import Checked, Count, NotNegative, Positive, Range, Share
 
 StageName = Literal["rv", "bev", "head"]
+AssertionName = Literal["disagreement", "entropy", "margin", "labels", "loss"]
+
+# From where on an assertion calls a point uncertain, unless a recipe says otherwise: the paper's
+# tau; nats; the difference of two probabilities; nothing (labels differ or do not); nats. All but
+# tau are open.
+THRESHOLDS: dict[str, float] = {
+    "disagreement": 0.85,
+    "entropy": 0.7,
+    "margin": 0.3,
+    "labels": 0.0,
+    "loss": 0.7,
+}
+NEEDS_LABELS = "loss"  # the assertion that only training can use
 
 # Upper limits, far above any use: a weights file or a recipe of a stranger cannot fill the memory.
 Channels = Annotated[int, Range(1, 8192)]
@@ -44,6 +57,8 @@ class RangeViewConfig(Checked):
     """Upper end of the field of view, degrees above the horizon; row 0."""
     fov_down: Degrees = -25.0
     """Lower end of the field of view, degrees above the horizon; the last row."""
+    nearest: Annotated[float, Range(0, 1000)] = 0.0
+    """Nearer points, metres, are of the car's own body: not seen, but labelled; 0: none (open)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -74,6 +89,8 @@ class PolarViewConfig(Checked):
     """Lower end of the grid, metres above the sensor."""
     z_max: Metres = 1.5
     """Upper end of the grid, metres above the sensor."""
+    nearest: Annotated[float, Range(0, 1000)] = 0.0
+    """Nearer points, metres, are of the car's own body: not seen, but labelled; 0: none (open)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -93,19 +110,23 @@ class PolarViewConfig(Checked):
 
 @dataclass(frozen=True)
 class RangeNetConfig(Checked):
-    """The range-view network (sections 3.1 and 4.2 of the paper; its widths are open)."""
+    """The range-view network (sections 3.1 and 4.2 of the paper; its widths are open).
+
+    With these defaults it costs 500 GMAC (billion multiply-adds) for an image of 64 x 4096: the
+    paper's head costs 1 GMAC for 10,000 points, which it calls 0.2 % of this network (3.3).
+    """
 
     stem: Channels = 32
     """Channels at full resolution."""
-    widths: tuple[Channels, ...] = (64, 96, 160, 256, 256, 256, 256)
+    widths: tuple[Channels, ...] = (96, 128, 224, 384, 384, 384, 384)
     """Channels at the width strides 2, 4, 8, ..., one entry per stride."""
     blocks: tuple[Annotated[int, Range(1, 16)], ...] = (2, 4, 4, 4, 2, 2, 2)
     """Residual blocks at each of these strides."""
     height_strides: tuple[Annotated[int, Range(1, 64)], ...] = (1, 1, 1, 1, 2, 2, 2)
     """Height stride of each of these stages: only the later ones reduce the height."""
-    decoder: Channels = 128
+    decoder: Channels = 160
     """Channels of the decoder."""
-    head: Channels = 64
+    head: Channels = 96
     """Channels of the last layers, at full resolution."""
     dropout: Annotated[float, Range(0, 0.99)] = 0.0
     """Probability of dropping a channel of the decoder's maps, in training (open)."""
@@ -154,10 +175,65 @@ class PolarNetConfig(Checked):
 class AssertionConfig(Checked):
     """The assertion that decides which points are uncertain (section 3.2 of the paper)."""
 
-    name: Literal["disagreement", "entropy", "loss"] = "disagreement"
-    """The assertion: low cosine similarity of the networks' scores, high entropy, or high loss."""
-    threshold: float = 0.85
-    """tau: uncertain points have at most this cosine similarity (entropy, loss: at least, nats)."""
+    name: AssertionName = "disagreement"
+    """Low cosine similarity, high entropy, small margin, different labels, or high loss."""
+    threshold: float | None = None
+    """tau: the largest similarity (margin: largest; entropy, loss: least, nats); null: its own."""
+    others: tuple[AssertionName, ...] = ()
+    """Further assertions, to combine with the first."""
+    other_thresholds: tuple[float, ...] = ()
+    """Their thresholds, one for each; none: their own."""
+    combine: Literal["any", "all"] = "any"
+    """Uncertain are the points of any of the assertions (their union), or those of all."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+
+        thresholds = len(self.other_thresholds)
+        self.check(
+            holds=thresholds in (0, len(self.others)),
+            expected=f"as many other_thresholds as others ({len(self.others)}), or none",
+            found=str(thresholds),
+        )
+
+    @property
+    def terms(self) -> tuple[tuple[AssertionName, float], ...]:
+        """The assertions to combine, each with its threshold."""
+        threshold = THRESHOLDS[self.name] if self.threshold is None else self.threshold
+        defaults = tuple(THRESHOLDS[name] for name in self.others)
+        thresholds = (threshold, *(self.other_thresholds or defaults))
+        return tuple(zip((self.name, *self.others), thresholds, strict=True))
+
+    @property
+    def needs_labels(self) -> bool:
+        """Whether one of the assertions needs labels."""
+        return NEEDS_LABELS in (self.name, *self.others)
+
+    def for_prediction(self) -> AssertionConfig:
+        """Return the configuration without what needs labels, and with every threshold.
+
+        If nothing is left, the result is the paper's assertion.
+        """
+        terms = [term for term in self.terms if term[0] != NEEDS_LABELS]
+        if not terms:
+            return AssertionConfig().for_prediction()
+
+        names = [name for name, _ in terms]
+        thresholds = [threshold for _, threshold in terms]
+        return replace(
+            self,
+            name=names[0],
+            threshold=thresholds[0],
+            others=tuple(names[1:]),
+            other_thresholds=tuple(thresholds[1:]),
+        )
+
+    def describe(self) -> str:
+        """Return a text such as "disagreement at 0.85 or entropy at 0.7"."""
+        texts = []
+        for name, threshold in self.terms:
+            texts.append("different labels" if name == "labels" else f"{name} at {threshold:g}")
+        return (" or " if self.combine == "any" else " and ").join(texts)
 
 
 @dataclass(frozen=True)
@@ -304,6 +380,10 @@ class HeadTraining(Checked):
     """Probability of disturbing the scores of a network in a view of a scan (open)."""
     points: Count = 300_000
     """Limit on the uncertain points of all scans, shared equally; 1.3 kB each on disk (K = 19)."""
+    drawn: Annotated[int, Range(0)] = 0
+    """Points of an epoch, other ones in each, drawn at random from those on disk; 0: all (open)."""
+    balance: Share = 0.0
+    """How far draws even out the classes: 0 draws points alike, 1 classes equally often (open)."""
     folds: Count = 1
     """Folds of cross-fitting: networks score sequences held out from their training; 1: none."""
 
@@ -320,8 +400,8 @@ class TrainingConfig(Checked):
     """The point head."""
     augment: AugmentConfig = AugmentConfig()
     """Augmentation of the points."""
-    keep: Literal["best", "last"] = "best"
-    """Weights of a stage to use: of the epoch of highest validation mIoU, or of the last one."""
+    keep: Literal["best", "last"] = "last"
+    """Weights of a stage to use: of the last epoch, or of that of the highest validation mIoU."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Seed of the initial weights, the order of the scans and the augmentation."""
     workers: Annotated[int, Range(0)] = 0

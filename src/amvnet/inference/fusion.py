@@ -109,12 +109,6 @@ def _build_fusion(head: Head, tau: float | None) -> LateFusion:
         config = head.model.assertion
         head = head.build_head()
 
-    if tau is None and config.name == "loss":
-        raise InputError(
-            "expected an assertion that needs no labels, found loss; "
-            "train the head with another one"
-        )
-
     assertion = build_assertion(config) if tau is None else Disagreement(tau)
     point_head = None if head is None else copy.deepcopy(head).cpu().eval()
     return LateFusion(assertion, point_head)

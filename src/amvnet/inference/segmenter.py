@@ -34,6 +34,9 @@ MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
 class Segmenter:
     """Segments scans with trained weights.
 
+    If the head was trained on points of an assertion that needs labels (`loss`), the uncertain
+    points are those of the rest of it, or by default those on which the networks disagree.
+
     Args:
         weights: trained weights, or the name or path of a weights file.
         device: where to compute: "cpu", "cuda", "cuda:1", ...
@@ -45,8 +48,8 @@ class Segmenter:
             saves time for each scan. This changes the allocator of your program.
 
     Raises:
-        InputError: if the weights lack a part that the method needs, their assertion needs labels,
-            or there is no such method, device or precision.
+        InputError: if the weights lack a part that the method needs, or there is no such method,
+            device or precision.
     """
 
     def __init__(
@@ -59,11 +62,6 @@ class Segmenter:
     ) -> None:
         self.weights = weights if isinstance(weights, Weights) else load(weights)
         self.method = _check_method(method, self.weights)
-        if self.weights.model.assertion.name == "loss":
-            raise InputError(
-                "expected an assertion that needs no labels, found loss; "
-                "train the head with another one"
-            )
         # Weights that were trained with other intensities take them, too.
         trained = trained_intensity(self.weights.training, self.weights.sensor)
         self._are_fractions = trained is None or trained.quantiles[-1] <= 1

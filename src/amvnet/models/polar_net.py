@@ -45,13 +45,13 @@ class PolarNet(nn.Module):
         self.run_unet: Callable[[Tensor], Tensor] | None = None
 
     def forward(self, grid: PolarGrid) -> Tensor:
-        pillars = self.compress(self.pool(grid))  # (M, pillar)
+        pillars = self.compress(self.pool(grid))  # (F, pillar)
         run_unet = self.unet if self.run_unet is None else self.run_unet
         decoded = run_unet(grid.to_map(pillars))  # (B, widths[0], R, A)
         # Most pillars are empty, and have no point to score.
         return self.score(grid.at_pillars(decoded))
 
-    def pool(self, grid: PolarGrid) -> Tensor:  # (M, point_widths[-1])
+    def pool(self, grid: PolarGrid) -> Tensor:  # (F, point_widths[-1])
         if torch.is_grad_enabled():
             return grid.pool(self.point_mlp(grid.features))
         part = PART if grid.features.is_cpu else PART_ON_GPU

@@ -70,7 +70,7 @@ class HeadPoints:
 
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
         """Return the points with these (U,) indices, in this order."""
-        points = np.memmap(self.path, self.dtype, "r", shape=(self.size,))[index]
+        points = self._on_disk()[index]
 
         point = torch.from_numpy(points["point"].copy())
         rows = torch.from_numpy(points["rows"].copy())
@@ -78,12 +78,53 @@ class HeadPoints:
         stands_for = torch.from_numpy(points["stands_for"].copy())
         return point.float(), rows.float(), labels.long(), stands_for
 
+    def labels(self) -> np.ndarray:
+        """Return the (U,) train ids of the points; this reads all of the file."""
+        return np.array(self._on_disk()["labels"])
+
+    def _on_disk(self) -> np.ndarray:
+        return np.memmap(self.path, self.dtype, "r", shape=(self.size,))
+
+
+class PointDraw:
+    """Draws the points of an epoch from those on disk, other ones in each epoch.
+
+    Args:
+        size: number of points on disk.
+        drawn: points of an epoch; 0 for all.
+        labels: (U,) train ids, to balance the classes; None to draw all points alike.
+        balance: in [0, 1]. A point of a class with n points is drawn in proportion to
+            n ** -balance, and may be drawn several times.
+    """
+
+    def __init__(
+        self, size: int, drawn: int = 0, labels: np.ndarray | None = None, balance: float = 0.0
+    ) -> None:
+        self.size = size
+        self.drawn = min(drawn, size) if drawn else size
+        self.cumulative: np.ndarray | None = None
+        if labels is not None and balance > 0:
+            counts = np.bincount(labels)
+            weights = counts[labels] ** -balance
+            self.cumulative = np.cumsum(weights / weights.sum())
+
+    def __len__(self) -> int:
+        return self.drawn
+
+    def __call__(self, rng: np.random.Generator) -> np.ndarray:
+        """Return the indices of an epoch's points, in a random order."""
+        if self.cumulative is None:
+            return rng.permutation(self.size)[: self.drawn]
+
+        index = np.searchsorted(self.cumulative, rng.random(self.drawn), side="right")
+        return np.minimum(index, self.size - 1)
+
 
 class PointSampler(data.Sampler[np.ndarray]):
     """Draws batches of indices; with several processes, each takes its part of every batch.
 
     Args:
-        size: number of points.
+        draw: draws the points of an epoch.
         batch: points in a batch of all processes.
         seed: of the order.
         shuffle: whether to shuffle the points, as in training. A smaller last batch is then left
@@ -92,9 +133,9 @@ class PointSampler(data.Sampler[np.ndarray]):
     """
 
     def __init__(
-        self, size: int, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
+        self, draw: PointDraw, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
     ) -> None:
-        self.size = size
+        self.draw = draw
         self.batch = batch
         self.seed = seed
         self.shuffle = shuffle
@@ -107,14 +148,14 @@ class PointSampler(data.Sampler[np.ndarray]):
 
     def __len__(self) -> int:
         if self.shuffle:
-            return max(self.size // self.batch, 1)
-        return -(-self.size // self.batch)  # rounded up
+            return max(len(self.draw) // self.batch, 1)
+        return -(-self.draw.size // self.batch)  # rounded up
 
     def __iter__(self) -> Iterator[np.ndarray]:
         if self.shuffle:
-            order = np.random.default_rng([self.seed, self.epoch]).permutation(self.size)
+            order = self.draw(np.random.default_rng([self.seed, self.epoch]))
         else:
-            order = np.arange(self.size)
+            order = np.arange(self.draw.size)
 
         for number in range(len(self)):
             batch = order[number * self.batch : (number + 1) * self.batch]
@@ -122,10 +163,18 @@ class PointSampler(data.Sampler[np.ndarray]):
 
 
 def make_head_loader(
-    points: HeadPoints, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
+    points: HeadPoints,
+    batch: int,
+    seed: int,
+    shuffle: bool,
+    processes: Processes = ALONE,
+    draw: PointDraw | None = None,
 ) -> data.DataLoader[HeadBatch]:
-    """Make a loader of this process's parts of the batches; arguments are as for `PointSampler`."""
-    sampler = PointSampler(len(points), batch, seed, shuffle, processes)
+    """Make a loader of this process's parts of the batches; arguments are as for `PointSampler`.
+
+    Without `draw`, an epoch has all points.
+    """
+    sampler = PointSampler(draw or PointDraw(len(points)), batch, seed, shuffle, processes)
     return data.DataLoader(points, batch_size=None, sampler=sampler)  # type: ignore[arg-type]
 
 
@@ -168,6 +217,7 @@ class PointGatherer:
         folder: Path,
         views: int = 0,
         say: Callable[[str], None] = lambda line: None,
+        by_labels: bool = True,
     ) -> HeadPoints:
         """Gather the labelled uncertain points of some scans.
 
@@ -180,6 +230,8 @@ class PointGatherer:
             views: how often each scan is scored, each time augmented differently; 0 to score it
                 once, without augmentation. Taken as 0 if a source cannot score augmented scans.
             say: told the progress, line by line.
+            by_labels: whether an assertion that needs labels may use them, as for training. Points
+                to validate with are those that a prediction finds uncertain.
 
         Raises:
             InputError: if the scans have too few labelled points.
@@ -190,7 +242,8 @@ class PointGatherer:
         jobs = self._jobs(sources, views)
         least = max(2, self.processes.size)  # batch norm needs two, and each process one
 
-        points = self._gather(jobs, folder, build_assertion(self.model.assertion), say)
+        assertion = build_assertion(self.model.assertion, labels=by_labels)
+        points = self._gather(jobs, folder, assertion, say)
         if len(points) < least:
             say("head: the networks agree everywhere; it learns from points drawn from all")
             everywhere = self._gather(jobs, folder, _everywhere, say)

@@ -13,7 +13,6 @@ from torch import Tensor
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.inference.score_files import SURE, ScorePair
-from amvnet.models.assertions import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
@@ -128,9 +127,6 @@ def scorer_with_head(
     if by_ring:
         model.range_view = model.range_view.by_ring()
     model.point_head = head
-    if weights.model.assertion.name == "loss":
-        # It needs labels, which a picture of a prediction must not use.
-        model.assertion = Disagreement()
 
     def score(batch: PointBatch) -> Tensor:
         return model.to(batch.points.device)(batch).merged

@@ -79,8 +79,13 @@ def range_memory(
     with FakeTensorMode():
         net = RangeNet(config, classes)
         image = torch.zeros(1, CHANNELS, view.height, narrow)
+        twice = torch.zeros(1, CHANNELS, view.height, 2 * narrow)
         size = _kept_bytes(net, image, precision)
-    return round(size * view.width / narrow), _count_parameters(net)
+        growth = _kept_bytes(net, twice, precision) - size
+
+    # The weights, which mixed precision copies, do not grow with the width.
+    size += round(growth * (view.width - narrow) / narrow)
+    return size, _count_parameters(net)
 
 
 def polar_memory(

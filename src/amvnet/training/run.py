@@ -13,7 +13,7 @@ from amvnet.config.schema import StageName
 from amvnet.errors import InputError
 from amvnet.training.memory_estimate import check_memory
 from amvnet.training.run_plan import RunOptions, RunPlan
-from amvnet.training.run_record import write_record
+from amvnet.training.run_record import initial_digests, write_record
 from amvnet.training.stage_run import HeadRun, NetworkRun, StageRun
 from amvnet.weights.file import Weights, save
 
@@ -56,6 +56,8 @@ class Run:
             )
 
         # Check all stages before anything is written, and before hours are spent on the first.
+        if init is not None:
+            self._check_init(init, names)
         weights = self._start(init, names)
         for name in names:
             self._stage(name, weights).check_begun()
@@ -106,6 +108,35 @@ class Run:
             f"({init.taxonomy.name}) but {', '.join(of_part)}, which are new"
         )
         return weights
+
+    def _check_init(self, init: Weights, names: Sequence[str]) -> None:
+        """Check that no part of the initial weights would be ignored.
+
+        A finished stage of this folder, or one that is resumed, goes on from its own weights. If it
+        was begun with the same initial weights, or has become them, nothing is ignored.
+
+        Args:
+            init: the initial weights.
+            names: of the stages to train.
+
+        Raises:
+            InputError: if a part would be ignored.
+        """
+        empty = Weights(self.plan.recipe.model, self.plan.scans.dataset.taxonomy)
+        for name, (part, _) in STAGES.items():
+            stage = self._stage(name, empty)
+            is_resumed = name in names and stage.is_begun
+            if part not in init.parts or not (stage.is_finished or is_resumed):
+                continue
+
+            digest = init.digest(part)
+            finished = stage.finished_weights()
+            is_the_same = part in finished.parts and finished.digest(part) == digest
+            if not is_the_same and digest not in initial_digests(self.plan.out, part):
+                raise InputError(
+                    f"{stage.folder}: expected no earlier run of the stage {name} for other "
+                    f"weights with {part}, found one; leave out --init, or give another folder"
+                )
 
     def _stage(self, name: str, weights: Weights) -> StageRun:
         part, kind = STAGES[name]

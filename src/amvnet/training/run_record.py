@@ -6,13 +6,15 @@ import hashlib
 import platform
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from amvnet.config.nested import to_dict
+from amvnet.config.nested import from_dict, to_dict
+from amvnet.config.schema import ModelConfig, TrainingConfig
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -52,6 +54,16 @@ def write_record(plan: RunPlan, stage: str, init: Weights | None) -> None:
     entries[stage] = entry
     _write_yaml(plan.out / "recipe.yaml", to_dict(plan.recipe))
     _write_yaml(plan.out / "run.yaml", entries)
+
+
+def initial_digests(out: Path, part: str) -> set[str]:
+    """Return the digests of the initial weights of a part that calls in a run's folder had."""
+    digests = set()
+    for entry in _entries(out / "run.yaml").values():
+        init = entry.get("init") if isinstance(entry, dict) else None
+        if isinstance(init, dict) and isinstance(init.get(part), str):
+            digests.add(init[part])
+    return digests
 
 
 def _write_yaml(path: Path, tree: dict[str, Any]) -> None:
@@ -134,7 +146,7 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
         )
 
     path = folder / SETTINGS
-    begun = _entries(path)
+    begun = _with_defaults(_entries(path))
     if begun != settings:
         changes = describe_changes(begun, settings)
         raise InputError(
@@ -143,6 +155,19 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
             + (f" and {len(changes) - MOST_CHANGES} more" if len(changes) > MOST_CHANGES else "")
             + "; resume it with those, or give another folder"
         )
+
+
+def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings of an earlier run with the defaults of values that it does not name.
+
+    Values that were added to the recipes since then had no influence on it.
+    """
+    complete = dict(settings)
+    for key, kind in (("model", ModelConfig), ("training", TrainingConfig)):
+        with suppress(InputError):
+            values = to_dict(from_dict(kind, settings.get(key), key))
+            complete[key] = {name: values[name] for name in settings[key]}
+    return complete
 
 
 def describe_changes(earlier: Any, settings: Any, name: str = "") -> list[str]:

@@ -23,8 +23,8 @@ from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
-from amvnet.training.fit import FitOptions, Loaders, fit
-from amvnet.training.head_points import PointGatherer, make_head_loader
+from amvnet.training.fit import LAST, FitOptions, Loaders, fit
+from amvnet.training.head_points import PointDraw, PointGatherer, make_head_loader
 from amvnet.training.head_scores import NetworkScores, ScoreSource, score_source, scorer_with_head
 from amvnet.training.head_stage import HeadStage
 from amvnet.training.loaders import ScanSet, count_classes, make_loader, sensor_record
@@ -76,13 +76,21 @@ class StageRun:
         """What the trained weights of the stage depend on, for YAML."""
         return stage_settings(self.plan, self.name, self.part, self.weights)
 
+    @property
+    def is_begun(self) -> bool:
+        return (self.folder / LAST).is_file()
+
+    @property
+    def is_finished(self) -> bool:
+        return self.weights_path.is_file() and self.done_path.is_file()
+
     def check_begun(self) -> None:
         """Raise InputError if the folder holds a stage that cannot be resumed."""
         check_begun(self.folder, self.settings, self.plan.options.resume)
 
     def finished_weights(self) -> Weights:
         """Return the weights, with the part that this stage trained if it is finished."""
-        if self.weights_path.is_file() and self.done_path.is_file():
+        if self.is_finished:
             return self.weights.replace_part(self.part, load(self.weights_path))
         return self.weights
 
@@ -313,13 +321,20 @@ class HeadRun(StageRun):
         options = self.plan.options
         processes = options.processes
 
+        assertion = self.weights.model.assertion
+        if assertion.needs_labels:
+            used = assertion.for_prediction().describe()
+            options.say(f"head: trained on points of {assertion.describe()}; validated on {used}")
+
         # Gather the uncertain points of all scans, with their scores and neighbours.
         val_source = self._score_source(scans.val)
         gatherer = PointGatherer(scans.dataset, self.weights.model, training, processes)
         train = gatherer.gather(
             self._score_sources(), self.folder / "train", config.views, options.say
         )
-        val = gatherer.gather([val_source], self.folder / "val") if scans.val else None
+        val = None
+        if scans.val:
+            val = gatherer.gather([val_source], self.folder / "val", by_labels=False)
 
         head = self.model().point_head
         assert head is not None
@@ -334,8 +349,14 @@ class HeadRun(StageRun):
             processes=processes,
         )
 
+        labels = train.labels() if config.balance else None
         train_loader = make_head_loader(
-            train, config.batch, shuffle=True, seed=training.seed, processes=processes
+            train,
+            config.batch,
+            shuffle=True,
+            seed=training.seed,
+            processes=processes,
+            draw=PointDraw(len(train), config.drawn, labels, config.balance),
         )
         val_loader = None
         if val is not None:
@@ -401,8 +422,11 @@ class HeadRun(StageRun):
         scans = self.plan.scans
         seen = [record for record in scans.train if record.sequence not in left_out]
         unseen = [record for record in scans.train if record.sequence in left_out]
+        # The scans that a fold scores say nothing about which of its epochs to use.
+        training = dataclasses.replace(self.plan.recipe.training, keep="last")
         plan = dataclasses.replace(
             self.plan,
+            recipe=dataclasses.replace(self.plan.recipe, training=training),
             scans=dataclasses.replace(scans, train=seen, val=unseen),
             out=self.plan.out / "folds" / str(index),
             options=dataclasses.replace(self.plan.options, resume=True),

@@ -217,7 +217,27 @@ class NetworkStage(Stage):
 
         self.check_finite(loss, f"at the scans {', '.join(points.names)}")
         self.log("train/loss", loss, prog_bar=True, batch_size=points.count)
-        return loss
+        return loss * self._share_of_step(points.count, index)
+
+    def _share_of_step(self, count: int, index: int) -> float:
+        """Return the factor that makes the gradient of a step the mean over its scans.
+
+        Lightning divides the loss of each part of a batch by the number of parts. In the last batch
+        of an epoch there may be fewer parts, and fewer scans in the last of them.
+
+        Args:
+            count: scans of this part.
+            index: number of the part in the epoch.
+        """
+        parts = self.trainer.accumulate_grad_batches
+        loader = self.trainer.train_dataloader
+        if loader is None or loader.batch_size is None:
+            return 1.0
+
+        batch = parts * loader.batch_size
+        before = index // parts * batch  # scans of the earlier steps
+        in_step = min(batch, len(loader.sampler) - before)
+        return count * parts / in_step
 
     def validation_step(self, batch: Batch, index: int) -> None:
         points, labels = batch

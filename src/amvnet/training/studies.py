@@ -1,4 +1,4 @@
-"""Studies that train: the number of neighbours, and the ablation of the range-view network."""
+"""Studies that train: heads by tau and by neighbours, and the range-view network's ablation."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from amvnet.config.schema import Recipe
+from amvnet.config.schema import AssertionConfig, Recipe
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.evaluation.analysis import Swept
 from amvnet.evaluation.metrics import metrics
@@ -21,18 +21,20 @@ from amvnet.weights.file import Weights
 
 
 @dataclass(frozen=True)
-class NeighbourStudy:
-    """Heads for different numbers of neighbours (Fig. 8 of the paper).
+class HeadStudy:
+    """Heads for different values of tau or numbers of neighbours (Fig. 8 of the paper).
 
-    Each is kept in OUT/neighbours/N; those that are finished are not trained again.
+    Each is kept in OUT/NAME/VALUE; those that are finished are not trained again.
 
     Attributes:
+        name: of the parameter, and of the folder.
         recipe: how the heads are trained.
         weights: whose networks they are trained for.
         scans: to train on, and to score.
         out: the folder of the analysis.
     """
 
+    name: Literal["neighbours", "taus"]
     recipe: Recipe
     weights: Weights
     scans: TrainingScans
@@ -43,23 +45,23 @@ class NeighbourStudy:
         RunPlan(self.recipe, self.scans, self.out)
 
     def sweep(
-        self, numbers: Sequence[int], say: Say = say_nothing, device: str = "cpu"
+        self, values: Sequence[float], say: Say = say_nothing, device: str = "cpu"
     ) -> Iterator[Swept]:
-        """Train a head for each number of neighbours, and yield its figures.
+        """Train a head for each value, and yield its figures.
 
         Raises:
             InputError: if OUT holds heads for other networks, other scans or another recipe.
         """
-        for number in numbers:
-            yield self._score(number, say, device)
+        for value in values:
+            yield self._score(value, say, device)
 
-    def _score(self, number: int, say: Say, device: str) -> Swept:
-        networks = self._networks(number)
+    def _score(self, value: float, say: Say, device: str) -> Swept:
+        networks = self._networks(value)
         # Folds would train networks of their own.
         head = dataclasses.replace(self.recipe.training.head, folds=1)
         training = dataclasses.replace(self.recipe.training, head=head)
         recipe = dataclasses.replace(self.recipe, model=networks.model, training=training)
-        out = self.out / "neighbours" / str(number)
+        out = self.out / self.name / str(value)
         run = Run(RunPlan(recipe, self.scans, out, RunOptions(resume=True, say=say)))
 
         segmenter = Segmenter(run.stages("head", networks), device)
@@ -67,15 +69,18 @@ class NeighbourStudy:
         evaluation = evaluate(dataset, self.scans.val, label_by_weights(dataset, segmenter))
         uncertain = evaluation.uncertain / max(evaluation.asked, 1)
         matrix = evaluation.matrices["amvnet"][0]
-        return Swept.of(number, uncertain, matrix, dataset.taxonomy)
+        return Swept.of(value, uncertain, matrix, dataset.taxonomy)
 
-    def _networks(self, number: int) -> Weights:
-        """Return the weights without their head, for a head with a number of neighbours."""
+    def _networks(self, value: float) -> Weights:
+        """Return the weights without their head, for a head with a value of the parameter."""
         model = self.weights.model
-        head = dataclasses.replace(model.point_head, neighbours=number)
-        networks = Weights(
-            dataclasses.replace(model, point_head=head), self.weights.taxonomy, self.weights.sensor
-        )
+        if self.name == "neighbours":
+            head = dataclasses.replace(model.point_head, neighbours=int(value))
+            model = dataclasses.replace(model, point_head=head)
+        else:
+            model = dataclasses.replace(model, assertion=AssertionConfig(threshold=value))
+
+        networks = Weights(model, self.weights.taxonomy, self.weights.sensor)
         for part in ("range_net", "polar_net"):
             networks = networks.replace_part(part, self.weights)
 

@@ -127,7 +127,10 @@ def _sizes(weights: Weights) -> list[tuple[str, str]]:
         rows.append(("polar view", f"{cells}, {radius}, {height}"))
 
     assertion = model.assertion
-    rows.append(("uncertain points", f"{assertion.name}, threshold {assertion.threshold:g}"))
+    text = assertion.describe()
+    if assertion.needs_labels:
+        text += f" in training, {assertion.for_prediction().describe()} in predictions"
+    rows.append(("uncertain points", text))
     return rows
 
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, make_segmenter, parse_names, parse_numbers
+from amvnet.cli.options import Split, make_segmenter, parse_names, parse_numbers, parse_taus
 from amvnet.errors import InputError
 from amvnet.models.methods import EngineName, Precision
 
@@ -17,6 +18,8 @@ def analyze(
     split: Split = "val",
     sequences: str | None = None,
     neighbours: str | None = None,
+    taus: str | None = None,
+    assertions: bool = False,
     recipe: str | None = None,
     train_sequences: str | None = None,
     device: str = "cpu",
@@ -34,6 +37,10 @@ def analyze(
         sequences: sequences or scenes, separated by commas, to score instead.
         neighbours: also train a head for each of these numbers of neighbours, separated by commas;
             needs a recipe.
+        taus: also train a head for each of these values of tau, separated by commas (Fig. 8a; 1
+            makes all points uncertain); needs a recipe.
+        assertions: also compare assertions, a union and an intersection at equal shares of
+            uncertain points, with the head as it is.
         recipe: how these heads are trained: a built-in recipe's name or a YAML file.
         train_sequences: sequences or scenes, separated by commas, that these heads learn from;
             default: the official split.
@@ -49,15 +56,17 @@ def analyze(
     from amvnet.data.datasets.select import TrainingScans, labelled_records
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
+    from amvnet.evaluation.assertions import compare_assertions
     from amvnet.files import make_folder
     from amvnet.inference.inputs import open_for_weights
     from amvnet.training.fit import quiet_lightning
-    from amvnet.training.studies import NeighbourStudy
+    from amvnet.training.studies import HeadStudy
     from amvnet.weights.file import load
 
-    if (neighbours is None) != (recipe is None):
+    if (neighbours is None and taus is None) != (recipe is None):
         raise InputError(
-            "expected --neighbours and --recipe together, found one of them; give both or neither"
+            "expected --neighbours or --taus together with --recipe, found only one of them; "
+            "give both or neither"
         )
     loaded = load(weights)
     dataset = open_for_weights(data, loaded)
@@ -66,23 +75,33 @@ def analyze(
     records = labelled_records(dataset, records)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
-    study = None
-    counts: list[int] = []
+    studies: list[tuple[HeadStudy, Sequence[float]]] = []
     if recipe is not None:
-        counts = parse_numbers(str(neighbours))
+        loaded_recipe = load_recipe(recipe)
         quiet_lightning()
         names = parse_names(train_sequences) or dataset.sequences("train")
         scans = TrainingScans(dataset, labelled_records(dataset, dataset.records(names)), records)
-        study = NeighbourStudy(load_recipe(recipe), loaded, scans, out)
-        study.check()
+        if taus is not None:
+            study = HeadStudy("taus", loaded_recipe, loaded, scans, out)
+            studies.append((study, parse_taus(taus)))
+        if neighbours is not None:
+            study = HeadStudy("neighbours", loaded_recipe, loaded, scans, out)
+            studies.append((study, parse_numbers(str(neighbours))))
+        for study, _ in studies:
+            study.check()
 
     make_folder(out)
     with progress("scoring") as step:
         analysis = analyze_records(dataset, records, segmenter, step)
     written = charts.write_all(analysis, data, out)
+    if assertions:
+        with progress("comparing assertions") as step:
+            comparison = compare_assertions(dataset, records, segmenter, step)
+        written += charts.write_assertions(comparison.results(dataset), out / "assertions")
 
-    if study is not None:
-        sweep = list(study.sweep(counts, say, device))
-        used = loaded.model.point_head.neighbours
-        written += charts.write_sweep(sweep, "neighbours", used, data, out / "neighbours")
+    for study, values in studies:
+        sweep = list(study.sweep(values, say, device))
+        used = analysis.tau if study.name == "taus" else loaded.model.point_head.neighbours
+        title = "tau, a head for each" if study.name == "taus" else "neighbours"
+        written += charts.write_sweep(sweep, title, used, data, out / study.name)
     say(f"{len(written)} files in {out}")

@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, parse_names, parse_scores, refuse_other_formats
+from amvnet.cli.options import (
+    Split,
+    parse_names,
+    parse_scores,
+    refuse_other_formats,
+    say_assertion,
+)
 from amvnet.errors import InputError
 
 
@@ -68,6 +74,8 @@ def fuse(
             "expected no --taxonomy together with --head, which defines its classes; leave it out"
         )
     classes = None if taxonomy is None else taxonomy_named(taxonomy)
+    if weights is not None and tau is None:
+        say_assertion(weights)
 
     with progress("fusing") as step:
         written, uncertain = fuse_files(

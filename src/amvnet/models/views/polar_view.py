@@ -20,12 +20,15 @@ class PolarGrid:
     """A batch of scans in the polar grid, and the mapping back to the points.
 
     Attributes:
-        features: (P, 9) float32: offset from the voxel's centre (radius, angle, height), polar
-            coordinates (radius, angle, height), x, y, intensity; metres and radians.
+        features: (S, 9) float32, of the points that the networks see: offset from the voxel's
+            centre (radius, angle, height), polar coordinates (radius, angle, height), x, y,
+            intensity; metres and radians.
         pillar: (P,) int64: each point's pillar, an index into the B * R * A pillars of the batch.
         voxel: (P,) int64: each point's voxel within its pillar; 0 is the lowest.
         occupied: (M,) int64: the pillars that hold points, ascending.
         slot: (P,) int64: each point's pillar as an index into `occupied`.
+        seen: (F,) int64: the pillars that hold points which the networks see, ascending.
+        seen_slot: (S,) int64: the pillar of each of these points as an index into `seen`.
         shape: (B, R, A, Z): scans, and cells along radius, angle and height.
     """
 
@@ -34,12 +37,14 @@ class PolarGrid:
     voxel: Tensor
     occupied: Tensor
     slot: Tensor
+    seen: Tensor
+    seen_slot: Tensor
     shape: tuple[int, int, int, int]
 
     def pool(self, features: Tensor) -> Tensor:
-        """Return the maximum of the points' features (P, C) in each occupied pillar, (M, C)."""
-        index = self.slot[:, None].expand_as(features)
-        zeros = features.new_zeros(len(self.occupied), features.shape[1])
+        """Return the maximum (F, C) of the points' features (S, C) in each seen pillar."""
+        index = self.seen_slot[:, None].expand_as(features)
+        zeros = features.new_zeros(len(self.seen), features.shape[1])
         return zeros.scatter_reduce(0, index, features, "amax", include_self=False)
 
     def pool_by_parts(self, encode: Callable[[Tensor], Tensor], part: int) -> Tensor:
@@ -48,19 +53,21 @@ class PolarGrid:
         The points of a small part stay in a CPU's cache. Use this only without gradients.
         """
         pooled = None
-        for features, slot in zip(self.features.split(part), self.slot.split(part), strict=True):
+        for features, slot in zip(
+            self.features.split(part), self.seen_slot.split(part), strict=True
+        ):
             encoded = encode(features)
             if pooled is None:
-                pooled = encoded.new_full((len(self.occupied), encoded.shape[1]), -torch.inf)
+                pooled = encoded.new_full((len(self.seen), encoded.shape[1]), -torch.inf)
             pooled.scatter_reduce_(0, slot[:, None].expand_as(encoded), encoded, "amax")
 
         assert pooled is not None
         return pooled
 
     def to_map(self, pillars: Tensor) -> Tensor:
-        """Return features (M, C) of the occupied pillars as a map (B, C, R, A), 0 elsewhere."""
+        """Return the maximum (F, C) of the points' features (S, C) in each pillar of `seen`."""
         b, r, a, _ = self.shape
-        dense = pillars.new_zeros(b * r * a, pillars.shape[1]).index_copy(0, self.occupied, pillars)
+        dense = pillars.new_zeros(b * r * a, pillars.shape[1]).index_copy(0, self.seen, pillars)
         return dense.view(b, r, a, -1).permute(0, 3, 1, 2)
 
     def at_pillars(self, maps: Tensor) -> Tensor:
@@ -87,7 +94,8 @@ class PolarView:
     def project(self, batch: PointBatch) -> PolarGrid:
         """Return the polar grids of a batch of scans.
 
-        Points outside the grid go to its nearest cell.
+        Points outside the grid go to its nearest cell. Points of the car's own body
+        (`PolarViewConfig.nearest`) are not seen, but have a voxel.
         """
         c = self.config
 
@@ -103,13 +111,23 @@ class PolarView:
         features = torch.cat([polar.to(batch.points.dtype), batch.points[:, [0, 1, 3]]], dim=1)
 
         pillar = (batch.scan * c.radial + radial_cell) * c.angular + angular_cell
-        occupied, (slot,) = occurring(batch.count * c.radial * c.angular, pillar)
+        pillars = batch.count * c.radial * c.angular
+        occupied, (slot,) = occurring(pillars, pillar)
+        seen = occupied
+        seen_slot = slot
+        if c.nearest > 0:
+            is_far = batch.points[:, :3].norm(dim=1) >= c.nearest
+            features = features[is_far]
+            seen, (seen_slot,) = occurring(pillars, pillar[is_far])
+
         return PolarGrid(
             features=features,
             pillar=pillar,
             voxel=voxel,
             occupied=occupied,
             slot=slot,
+            seen=seen,
+            seen_slot=seen_slot,
             shape=(batch.count, c.radial, c.angular, c.vertical),
         )
 

@@ -55,7 +55,8 @@ class RangeView:
 
         Every point has a pixel; points above or below the field of view are in the first or the
         last row. A pixel with several points shows the nearest to the sensor; of equally near
-        points, it shows the first.
+        points, it shows the first. No pixel shows points of the car's own body
+        (`RangeViewConfig.nearest`).
 
         Raises:
             InputError: if rows are lasers, and the scans have no ring indices or one is out of
@@ -64,7 +65,7 @@ class RangeView:
         c = self.config
         distance = batch.points[:, :3].norm(dim=1)
         pixel = (batch.scan * c.height + self.rows(batch)) * c.width + self.columns(batch)
-        nearest = _nearest(distance, pixel, batch.count * c.height * c.width)
+        nearest = _nearest(distance, pixel, batch.count * c.height * c.width, c.nearest)
 
         # The row of zeros at the end is for pixels without a point.
         mask = torch.ones_like(distance)
@@ -116,13 +117,14 @@ def _cells(fractions: Tensor, cells: int) -> Tensor:
     return (fractions * cells).floor().long().clamp_(0, cells - 1)
 
 
-def _nearest(distance: Tensor, pixel: Tensor, pixels: int) -> Tensor:
+def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tensor:
     """Return the (pixels,) index of the nearest point in each pixel, -1 if it has none.
 
     Args:
         distance: (P,) metres from the sensor.
         pixel: (P,) index of each point's pixel.
         pixels: the number of pixels.
+        least: points nearer than this do not count, metres.
     """
     # The bits of floats >= 0 sort as the floats do, so one integer minimum finds both the least
     # distance and its point.
@@ -130,5 +132,7 @@ def _nearest(distance: Tensor, pixel: Tensor, pixels: int) -> Tensor:
     key = (distance.float().view(torch.int32).long() << _INDEX_BITS) | index
 
     empty = torch.iinfo(torch.int64).max
-    least = torch.full((pixels,), empty, device=key.device).scatter_reduce_(0, pixel, key, "amin")
-    return torch.where(least == empty, -1, least & ((1 << _INDEX_BITS) - 1))
+    if least > 0:
+        key = torch.where(distance < least, empty, key)
+    first = torch.full((pixels,), empty, device=key.device).scatter_reduce_(0, pixel, key, "amin")
+    return torch.where(first == empty, -1, first & ((1 << _INDEX_BITS) - 1))
