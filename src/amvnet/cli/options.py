@@ -12,6 +12,7 @@ from amvnet.models.methods import METHODS, EngineName, MethodName, Precision, wi
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
+    from amvnet.data.datasets.joined import Part
     from amvnet.distributed import Processes
     from amvnet.inference.score_files import ScorePair, Which
     from amvnet.inference.segmenter import Segmenter
@@ -42,6 +43,45 @@ def open_data(data: str, taxonomy: Path | None = None) -> Dataset:
     from amvnet.data.taxonomy import taxonomy_from_yaml
 
     return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
+
+
+def open_training_data(
+    specs: Sequence[str], taxonomy: Path | None, others: float
+) -> tuple[Dataset, list[Part]]:
+    """Open the datasets of a training.
+
+    Args:
+        specs: each DATA, or, after the first, DATA@SHARE.
+        taxonomy: a user's YAML file of classes.
+        others: the share of an epoch of all others that name none; 0 takes all of their scans.
+
+    Returns:
+        The first dataset, and those to mix in with their training scans.
+
+    Raises:
+        InputError: if a dataset cannot be opened, or the first has a share.
+    """
+    from amvnet.data.datasets.joined import Part, split_share
+    from amvnet.data.datasets.select import training_records
+
+    opened = []
+    for spec in specs:
+        data, share = split_share(spec)
+        opened.append((open_data(data, taxonomy), share))
+    (first, first_share), *rest = opened
+    if first_share is not None:
+        raise InputError(
+            f"{specs[0]}: expected the first --data without a share, found {first_share:g}; "
+            "give the others shares"
+        )
+
+    without_share = sum(share is None for _, share in rest)
+    parts = []
+    for dataset, share in rest:
+        if share is None and others > 0:
+            share = others / without_share
+        parts.append(Part(dataset, training_records(dataset), share))
+    return first, parts
 
 
 def refuse_other_formats(inputs: Sequence[str]) -> None:

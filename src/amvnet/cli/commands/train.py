@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from amvnet.cli.console import on_terminal, say
+from amvnet.cli.console import on_terminal, progress, say
 from amvnet.cli.options import (
     describe_records,
     join_processes,
-    open_data,
+    open_training_data,
     parse_names,
     parse_scores,
 )
@@ -17,10 +17,11 @@ from amvnet.cli.options import (
 
 def train(
     recipe: Any,
-    data: str,
+    data: list[str],
     out: Path,
     stage: Literal["rv", "bev", "head", "all"] = "all",
     init: str | None = None,
+    teacher: str | None = None,
     resume: bool = False,
     train_sequences: str | None = None,
     val_sequences: str | None = None,
@@ -40,10 +41,14 @@ def train(
         recipe: what to train; a built-in recipe's name or a YAML file.
         data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts;
             simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
-            the training, with their cache in the folder.
+            the training, with their cache in the folder. If given several times, the first is split
+            and validated, and the training scans of the others are mixed in; DATA@0.5 makes half of
+            each epoch.
         out: folder of the run.
         stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them.
+        teacher: weights that label the training scans without labels; without it, such scans are
+            refused.
         resume: continue an earlier run in the folder.
         train_sequences: sequences or scenes, separated by commas, to train on; default: the
             official split.
@@ -61,21 +66,30 @@ def train(
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.
     """
+    from amvnet.adaptation.teacher import Labeller, teacher_of
+    from amvnet.data.datasets.joined import join
     from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of
     from amvnet.training.fit import quiet_lightning
     from amvnet.training.run import Run
-    from amvnet.training.run_plan import RunOptions, RunPlan
+    from amvnet.training.run_plan import RunOptions, RunPlan, sized_by_init
     from amvnet.weights.file import load
 
     quiet_lightning()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
-    dataset = open_data(data, taxonomy)
+    weights = None if init is None else load(init)
+    recipe = sized_by_init(recipe, weights)
+    dataset, parts = open_training_data(data, taxonomy, recipe.training.others)
     scans = split_records(
         dataset, parse_names(train_sequences), parse_names(val_sequences), with_val
     )
+    if teacher is not None:
+        segmenter = teacher_of(load(teacher))
+        with progress("labelling by the teacher") as step:
+            labeller = Labeller(segmenter, recipe.training.adapt, out / "teacher", step, say)
+            scans, parts = labeller.label(scans, parts)
+    scans = join(scans, parts)
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
-    weights = None if init is None else load(init)
     scores = parse_scores(scores_a, scores_b, key_a, key_b, logits)
 
     options = RunOptions(resume, say, on_terminal(), processes, logger)
