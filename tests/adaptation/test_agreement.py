@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 
@@ -9,10 +11,30 @@ from amvnet.adaptation.agreement import agreement, opinion, pseudo_labels, trust
 from amvnet.config.schema import AdaptConfig
 
 
+class Table(NamedTuple):
+    """Probabilities of both networks, (P, K), and the uncertain points, (P,)."""
+
+    f: np.ndarray
+    g: np.ndarray
+    uncertain: np.ndarray
+
+
+def loop_over_points(tables: list[Table]) -> list[tuple[int, float]]:
+    """Return the train id that both networks name, or 0, and the confidence of each point."""
+    points = []
+    for table in tables:
+        for f, g, uncertain in zip(table.f, table.g, table.uncertain, strict=True):
+            mean = np.sqrt(f * g)
+            agrees = f.argmax() == g.argmax() and not uncertain
+            agreed = int(f.argmax()) + 1 if agrees else 0
+            points.append((agreed, float(np.float16(max(mean) / sum(mean)))))
+    return points
+
+
 def test_pseudo_labels_are_those_of_a_plain_loop() -> None:
     generator = torch.Generator().manual_seed(1)
     classes = 5
-    config = AdaptConfig(quantile=0.3, lowest_confidence=0.45, points=20)
+    config = AdaptConfig(quantile=0.3, lowest_confidence=0.53, points=20)
     opinions = []
     tables = []
     for _ in range(3):
@@ -21,38 +43,26 @@ def test_pseudo_labels_are_those_of_a_plain_loop() -> None:
         g = g / g.sum(dim=1, keepdim=True)
         uncertain = torch.nn.functional.cosine_similarity(f, g) <= 0.85
         opinions.append(opinion(f, g, uncertain))
-        tables.append((f.numpy(), g.numpy(), uncertain.numpy()))
+        tables.append(Table(f.numpy(), g.numpy(), uncertain.numpy()))
 
-    # For each class the confidences of the points that both networks give it.
-    confidences: dict[int, list[float]] = {c: [] for c in range(classes)}
-    points = []
-    for f, g, uncertain in tables:
-        for i in range(len(f)):
-            mean = np.sqrt(f[i] * g[i])
-            confidence = float(np.float16(max(mean) / sum(mean)))
-            agrees = f[i].argmax() == g[i].argmax() and not uncertain[i]
-            points.append((int(f[i].argmax()), confidence) if agrees else None)
-            if agrees:
-                confidences[int(f[i].argmax())].append(confidence)
+    points = loop_over_points(tables)
+    thresholds = {}
+    for name in range(1, classes + 1):
+        confidences = [confidence for agreed, confidence in points if agreed == name]
+        threshold = min(float(np.quantile(np.array(confidences, np.float32), 0.3)), 0.9)
+        count = sum(confidence >= np.float32(threshold) for confidence in confidences)
+        if threshold >= 0.53 and count >= 20:
+            thresholds[name] = np.float32(threshold)
 
     expected = []
-    untold = set()
-    for c, values in confidences.items():
-        threshold = min(float(np.quantile(np.float32(values), 0.3)), 0.9)
-        count = sum(value >= threshold for value in values)
-        if threshold < 0.45 or count < 20:
-            untold.add(c)
-        confidences[c] = [threshold]
-    for point in points:
-        is_trusted = point is not None and point[0] not in untold
-        if is_trusted and point is not None and point[1] >= np.float32(confidences[point[0]][0]):
-            expected.append(point[0] + 1)
-        else:
-            expected.append(0)
+    for agreed, confidence in points:
+        is_sure = agreed in thresholds and confidence >= thresholds[agreed]
+        expected.append(agreed if is_sure else 0)
 
     trusted = trust(opinions, classes, config)
     found = np.concatenate([pseudo_labels(scan, trusted) for scan in opinions])
-    assert {int(c) for c in np.flatnonzero(~trusted.told)} == untold
+    assert set(np.flatnonzero(trusted.told) + 1) == set(thresholds)
+    assert 0 < len(thresholds) < classes
     np.testing.assert_array_equal(found, expected)
     assert 0 < (found > 0).mean() < 1
 
