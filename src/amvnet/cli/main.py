@@ -11,6 +11,7 @@ from typing import Any
 
 from amvnet import __version__
 from amvnet.cli.commands.ablate import ablate
+from amvnet.cli.commands.adapt import adapt
 from amvnet.cli.commands.analyze import analyze
 from amvnet.cli.commands.bench import bench
 from amvnet.cli.commands.demo import demo
@@ -45,6 +46,7 @@ VERBS: dict[str, Command] = {
     "demo": Command(demo, {}),
     "simulate": Command(simulate, {"out": {"metavar": "OUT", "type": Path}}),
     "train": Command(train, _RECIPE),
+    "adapt": Command(adapt, _INPUTS),
     "predict": Command(predict, _INPUTS),
     "evaluate": Command(evaluate, _DATA),
     "submit": Command(submit, _DATA),
@@ -63,6 +65,7 @@ USAGE = f"""usage: amvnet VERB ...
   demo       simulate, segment, score, draw: the first thing to run
   simulate   write labelled scans of simulated streets
   train      train the networks and the point head
+  adapt      adapt weights to your scans, without labels
   predict    segment scans
   evaluate   score weights or predictions by the official formulas
   submit     pack or check predictions for a benchmark's server

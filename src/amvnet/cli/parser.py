@@ -199,6 +199,16 @@ def _add_option(target: Any, parameter: inspect.Parameter, kind: Any, help_text:
         target.add_argument(flag, action=action, default=default, help=text)
         return
 
+    if get_origin(kind) is list:  # may be given several times
+        target.add_argument(
+            flag,
+            action="append",
+            required=True,
+            help=f"{text} (required)",
+            metavar=flag[2:].upper(),
+        )
+        return
+
     metavar = metavar_of(parameter.name, kind)
     if default is inspect.Parameter.empty:
         target.add_argument(

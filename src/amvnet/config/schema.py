@@ -389,6 +389,28 @@ class HeadTraining(Checked):
 
 
 @dataclass(frozen=True)
+class AdaptConfig(Checked):
+    """Pseudo-labels for scans without labels, and the rounds of `amvnet adapt`; all open."""
+
+    quantile: Share = 0.5
+    """A class is trusted from this quantile of its confidence where both networks agree."""
+    highest_confidence: Share = 0.9
+    """A larger confidence than this is not asked for."""
+    lowest_confidence: Share = 0.7
+    """A class whose quantile is lower cannot be told, and gets no pseudo-labels."""
+    points: Count = 200
+    """A class with fewer trusted points cannot be told either."""
+    rounds: Count = 3
+    """Rounds of labelling by the teacher and learning from it."""
+    agreement: Share = 0.8
+    """End before a round after which less of what was trusted at the start still stands."""
+    scans: Count = 400
+    """Most scans to adapt to, drawn evenly from all."""
+    streets: Count = 20
+    """Simulated streets, of six scans each, that are mixed in."""
+
+
+@dataclass(frozen=True)
 class TrainingConfig(Checked):
     """The three stages of training."""
 
@@ -398,10 +420,14 @@ class TrainingConfig(Checked):
     """The bird's-eye-view network."""
     head: HeadTraining = HeadTraining()
     """The point head."""
+    adapt: AdaptConfig = AdaptConfig()
+    """Pseudo-labels, and the rounds of `amvnet adapt`."""
     augment: AugmentConfig = AugmentConfig()
     """Augmentation of the points."""
     keep: Literal["best", "last"] = "last"
     """Weights of a stage to use: of the last epoch, or of that of the highest validation mIoU."""
+    others: Share = 0.0
+    """Share of an epoch for the second and later --data in all; 0: all of their scans."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Seed of the initial weights, the order of the scans and the augmentation."""
     workers: Annotated[int, Range(0)] = 0
@@ -431,6 +457,8 @@ class Recipe:
     """The benchmark that defines the classes."""
     sensor: str = "hdl64e"
     """Name of the scans' sensor, for the weights file."""
+    from_init: bool = False
+    """Take the classes, the sensor and the sizes of the model from the weights of --init."""
     stages: tuple[StageName, ...] = ("rv", "bev", "head")
     """The stages that are trained by default. A baseline trains only one of the networks."""
     model: ModelConfig = ModelConfig()

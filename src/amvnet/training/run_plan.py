@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from amvnet.config.schema import NetworkTraining, Recipe
 from amvnet.data.datasets.select import TrainingScans
@@ -13,6 +16,7 @@ from amvnet.errors import InputError
 from amvnet.inference.score_files import ScorePair
 from amvnet.progress import Say, say_nothing
 from amvnet.training.loggers import LoggerName, check_logger
+from amvnet.weights.file import Weights
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,8 @@ class RunPlan:
         options: how it runs.
         scores: two other models' scores of the scans; the head is trained on them instead of on
             those of the networks. None without other models.
+        class_weights: (K,) weights of the classes in the loss; None computes them from the training
+            scans.
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, or the recipe is for
@@ -63,6 +69,7 @@ class RunPlan:
     out: Path
     options: RunOptions = RunOptions()
     scores: ScorePair | None = None
+    class_weights: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         size = self.options.processes.size
@@ -82,6 +89,27 @@ class RunPlan:
                 f"expected a dataset with the classes of {self.recipe.taxonomy}, "
                 f"found {taxonomy}; use the recipe of that benchmark"
             )
+
+
+def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
+    """Return a recipe with the classes, sensor and sizes of weights, if it asks for them.
+
+    Raises:
+        InputError: if it does, and there are no weights.
+    """
+    if not recipe.from_init:
+        return recipe
+    if init is None:
+        raise InputError("expected weights to begin with for this recipe, found none; add --init")
+
+    name = init.taxonomy.name
+    taxonomy = name if name in TAXONOMIES else recipe.taxonomy
+    return dataclasses.replace(
+        recipe,
+        model=init.model,
+        sensor=init.sensor,
+        taxonomy=taxonomy,  # type: ignore[arg-type]
+    )
 
 
 def _check_batch(config: NetworkTraining, name: str, processes: int) -> None:

@@ -15,7 +15,8 @@ import yaml
 
 from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.schema import ModelConfig, TrainingConfig
-from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.joined import Joined, own_records
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.methods import BOTH_NETWORKS
@@ -39,7 +40,7 @@ def write_record(plan: RunPlan, stage: str, init: Weights | None) -> None:
         "repeat": shlex.join(_repeat_command(plan, stage, init is not None)),
         "versions": {name: version(name) for name in PACKAGES},
         "python": platform.python_version(),
-        "data": dataset.spec,
+        "data": dataset.specs if isinstance(dataset, Joined) else dataset.spec,
         "classes": dataset.taxonomy.name,
         "train": sequence_names(plan.scans.train),
         "val": sequence_names(plan.scans.val),
@@ -84,8 +85,10 @@ def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
     """Return the words of the command that repeats a call."""
     scans = plan.scans
     command = ["amvnet", "train", str(plan.out / "recipe.yaml")]
-    command += ["--data", scans.dataset.spec, "--stage", stage]
-    command += ["--train-sequences", ",".join(sequence_names(scans.train))]
+    for spec in _specs(scans.dataset):
+        command += ["--data", spec]
+    command += ["--stage", stage]
+    command += ["--train-sequences", ",".join(sequence_names(own_records(scans.train)))]
     if scans.val:
         command += ["--val-sequences", ",".join(sequence_names(scans.val))]
     else:
@@ -97,6 +100,11 @@ def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
         command += plan.scores.options()
 
     return [*command, "--out", f"{plan.out}-again"]
+
+
+def _specs(dataset: Dataset) -> list[str]:
+    """Return what each of the joined datasets, or the only one, is opened with."""
+    return dataset.specs if isinstance(dataset, Joined) else [dataset.spec]
 
 
 def stage_settings(plan: RunPlan, name: str, part: str, weights: Weights) -> dict[str, Any]:

@@ -1,14 +1,18 @@
-"""Open the dataset of a training, a user's own scans in the frame that the weights will have."""
+"""Open the datasets of a training, a user's own scans in the frame that the weights will have."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.joined import Part, split_share
 from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.select import training_records
 from amvnet.data.taxonomy import Taxonomy, taxonomy_from_yaml
+from amvnet.errors import InputError
 from amvnet.inference.inputs import open_for_weights
 from amvnet.weights.file import Weights, load
 
@@ -35,6 +39,46 @@ def open_for_training(
     dataset = open_dataset(data, classes)
     earlier = init or _earlier_weights(out)
     return open_for_weights(data, _frame(recipe, dataset.taxonomy, earlier), dataset)
+
+
+def open_parts(
+    specs: Sequence[str], taxonomy: Path | None, recipe: Recipe, out: Path, init: Weights | None
+) -> tuple[Dataset, list[Part]]:
+    """Open the datasets of a training.
+
+    Args:
+        specs: each DATA, or, after the first, DATA@SHARE. The datasets that name no share have that
+            of the recipe, `training.others`; if it is 0, all of their scans are taken.
+        taxonomy: a YAML file of other classes.
+        recipe: of the training.
+        out: folder of the run.
+        init: weights to begin with.
+
+    Returns:
+        The first dataset, and those to mix in with their training scans.
+
+    Raises:
+        InputError: if a dataset cannot be opened, or the first has a share.
+    """
+    opened = []
+    for spec in specs:
+        data, share = split_share(spec)
+        opened.append((open_for_training(data, taxonomy, recipe, out, init), share))
+    (first, first_share), *rest = opened
+    if first_share is not None:
+        raise InputError(
+            f"{specs[0]}: expected the first --data without a share, found {first_share:g}; "
+            "give the others shares"
+        )
+
+    without_share = sum(share is None for _, share in rest)
+    others = recipe.training.others
+    parts = []
+    for dataset, share in rest:
+        if share is None and others > 0:
+            share = others / without_share
+        parts.append(Part(dataset, training_records(dataset), share))
+    return first, parts
 
 
 def _frame(recipe: Recipe, taxonomy: Taxonomy, earlier: Weights | None) -> Weights:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from amvnet.cli.console import on_terminal, say
+from amvnet.cli.console import on_terminal, progress, say
 from amvnet.cli.options import (
     describe_records,
     join_processes,
@@ -16,10 +16,11 @@ from amvnet.cli.options import (
 
 def train(
     recipe: Any,
-    data: str,
+    data: list[str],
     out: Path,
     stage: Literal["rv", "bev", "head", "all"] = "all",
     init: str | None = None,
+    teacher: str | None = None,
     resume: bool = False,
     train_sequences: str | None = None,
     val_sequences: str | None = None,
@@ -40,11 +41,15 @@ def train(
         data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts;
             a YAML file that describes scans and classes of your own (docs/own_data.md);
             simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
-            the training, with their cache in the folder.
+            the training, with their cache in the folder. If given several times, the first is split
+            and validated, and the training scans of the others are mixed in; DATA@0.5 makes half of
+            each epoch.
         out: folder of the run.
         stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them. Of weights for
             other classes, all layers but the last ones are taken.
+        teacher: weights that label the training scans without labels; without it, such scans are
+            refused.
         resume: continue an earlier run in the folder.
         train_sequences: sequences or scenes, separated by commas, to train on; default: the
             official split.
@@ -62,21 +67,30 @@ def train(
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.
     """
+    from amvnet.adaptation.teacher import Labeller, teacher_of
+    from amvnet.data.datasets.joined import join
     from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of
     from amvnet.training.fit import quiet_lightning
     from amvnet.training.run import Run
-    from amvnet.training.run_plan import RunOptions, RunPlan
-    from amvnet.training.training_data import open_for_training
+    from amvnet.training.run_plan import RunOptions, RunPlan, sized_by_init
+    from amvnet.training.training_data import open_parts
     from amvnet.weights.file import load
 
     quiet_lightning()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     weights = None if init is None else load(init)
-    dataset = open_for_training(data, taxonomy, recipe, out, weights)
+    recipe = sized_by_init(recipe, weights)
+    dataset, parts = open_parts(data, taxonomy, recipe, out, weights)
     scans = split_records(
         dataset, parse_names(train_sequences), parse_names(val_sequences), with_val
     )
+    if teacher is not None:
+        segmenter = teacher_of(load(teacher))
+        with progress("labelling by the teacher") as step:
+            labeller = Labeller(segmenter, recipe.training.adapt, out / "teacher", step, say)
+            scans, parts = labeller.label(scans, parts)
+    scans = join(scans, parts)
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
     scores = parse_scores(scores_a, scores_b, key_a, key_b, logits)
 

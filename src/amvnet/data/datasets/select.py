@@ -116,6 +116,12 @@ def split_records(
     )
 
 
+def training_records(dataset: Dataset) -> list[ScanRecord]:
+    """Return the scans of the official training split, or all if none of it is on disk."""
+    names = _sequences_on_disk(dataset, "train") or dataset.sequences("all")
+    return dataset.records(names)
+
+
 def _sequences_on_disk(dataset: Dataset, split: str) -> tuple[str, ...]:
     """Return the sequences of an official split that are on disk; empty if there are none."""
     try:

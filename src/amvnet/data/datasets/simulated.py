@@ -201,13 +201,17 @@ class SimulatedStreets:
         points = scan.points
         if self._is_nuscenes:
             points = _as_nuscenes(points)
-            labels = _nuscenes_train_ids()[nuscenes_indices(scan.labels)]
             np.save(folder / "ring.npy", scan.ring)
-        else:
-            labels = self.taxonomy.to_train(semantickitti_ids(scan.labels))
 
         np.save(folder / "points.npy", points.astype(np.float32))
-        np.save(folder / "labels.npy", labels)
+        np.save(folder / "labels.npy", train_labels(scan.labels, self.taxonomy))
+
+
+def train_labels(labels: np.ndarray, taxonomy: Taxonomy) -> np.ndarray:
+    """Return the (N,) uint8 train ids of simulated labels in one of the benchmarks' taxonomies."""
+    if taxonomy.classes == NUSCENES.classes:
+        return _nuscenes_train_ids()[nuscenes_indices(labels)]
+    return taxonomy.to_train(semantickitti_ids(labels))
 
 
 def _name(number: int) -> str:

@@ -1,0 +1,1 @@
+"""Adaptation to scans without labels: what two views agree on teaches both."""

@@ -1,0 +1,237 @@
+"""Several datasets as one to train on: the first is validated, the others are mixed in."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.open import check_classes
+from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.datasets.simulated import SCANS
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import InputError
+from amvnet.scan import Scan
+
+SEED = 16  # of the order in which the scans of a mixed dataset take their turns
+# Successive scans that take their turns together, in random blocks: a simulated street at once, as
+# it is simulated whole, and several places of a drive.
+BLOCK = SCANS
+
+
+@dataclass(frozen=True)
+class MixedRecord(ScanRecord):
+    """A place in each epoch for a scan of a dataset that is mixed in.
+
+    Attributes:
+        member: number of the dataset, 1 for the second.
+        place: number of the place among those of the dataset.
+        original: the scan of the first epoch.
+    """
+
+    member: int
+    place: int
+    original: ScanRecord
+
+
+@dataclass(frozen=True)
+class Part:
+    """A dataset that is mixed in.
+
+    Attributes:
+        dataset: reads the scans.
+        records: the scans to train on.
+        share: of the scans of an epoch; None takes every scan once per epoch.
+    """
+
+    dataset: Dataset
+    records: Sequence[ScanRecord]
+    share: float | None = None
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Several datasets with the same classes. `Dataset` documents the methods and their errors.
+
+    Scans of the first dataset keep their records. Scans of the others have a `MixedRecord`, and
+    sequences named by the number of the dataset: "2/000012". A dataset with fewer places than scans
+    shows others of its scans in each epoch, all of them equally often.
+
+    Attributes:
+        first: names the split, is validated, and takes predictions.
+        parts: the other datasets.
+        places: of each of them, the scans of an epoch.
+    """
+
+    first: Dataset
+    parts: tuple[Part, ...]
+    places: tuple[int, ...]
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        """The classes of all of them."""
+        return self.first.taxonomy
+
+    @property
+    def root(self) -> Path:
+        """The folder of the first."""
+        return self.first.root
+
+    @property
+    def spec(self) -> str:
+        """What the first is opened with; `specs` has all."""
+        return self.first.spec
+
+    @property
+    def is_adapted(self) -> bool:
+        """Whether the rings of all scans are the rows of the range image."""
+        return self.first.is_adapted
+
+    @property
+    def specs(self) -> list[str]:
+        """What all of them are opened with: PATH or PATH@SHARE."""
+        texts = [self.first.spec]
+        for part in self.parts:
+            share = "" if part.share is None else f"@{part.share:g}"
+            texts.append(f"{part.dataset.spec}{share}")
+        return texts
+
+    def sequences(self, split: str) -> tuple[str, ...]:
+        """Return the sequences of the first."""
+        return self.first.sequences(split)
+
+    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+        """Return scans of the first."""
+        return self.first.records(sequences)
+
+    def mixed_records(self) -> list[MixedRecord]:
+        """Return the places of all others in an epoch."""
+        records = []
+        for member, count in enumerate(self.places, start=1):
+            for place in range(count):
+                records.append(self._record(member, place, epoch=0))
+        return records
+
+    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+        """Return the scan that takes a place in an epoch."""
+        if not isinstance(record, MixedRecord):
+            return self.first.at_epoch(record, epoch)
+
+        turn = self._record(record.member, record.place, epoch)
+        dataset = self.parts[record.member - 1].dataset
+        return dataclasses.replace(turn, original=dataset.at_epoch(turn.original, epoch))
+
+    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
+        """Read a scan of any of them."""
+        if not isinstance(record, MixedRecord):
+            return self.first.read(record, labels)
+        return self.parts[record.member - 1].dataset.read(record.original, labels)
+
+    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
+        """Read the predicted (N,) uint8 train ids of a scan of the first."""
+        return self.first.read_prediction(record, folder)
+
+    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
+        """Write (N,) train ids of a scan of the first."""
+        return self.first.write_prediction(record, folder, ids)
+
+    def _record(self, member: int, place: int, epoch: int) -> MixedRecord:
+        """Return the record of the scan whose turn it is at a place in an epoch."""
+        records = self.parts[member - 1].records
+        turn = epoch * self.places[member - 1] + place
+        original = records[_order(member, len(records))[turn % len(records)]]
+        return MixedRecord(
+            name=f"{member + 1}.{place}/{original.name}",
+            sequence=f"{member + 1}/{original.sequence}",
+            points_path=original.points_path,
+            labels_path=original.labels_path,
+            prediction=original.prediction,
+            member=member,
+            place=place,
+            original=original,
+        )
+
+
+def join(scans: TrainingScans, parts: Sequence[Part]) -> TrainingScans:
+    """Return scans to train on, with others mixed in; the scans to validate with stay.
+
+    Args:
+        scans: of the first dataset.
+        parts: the others; their classes must be the same.
+
+    Raises:
+        InputError: if a dataset has other classes, scans of a user's own are mixed with others, or
+            the shares leave nothing for the first.
+    """
+    if not parts:
+        return scans
+    for part in parts:
+        check_classes(part.dataset, scans.dataset.taxonomy)
+        if part.dataset.is_adapted != scans.dataset.is_adapted:
+            raise InputError(
+                f"{part.dataset.root}: expected either scans of your own (a YAML file) or datasets "
+                "in every --data, found both; train on one after the other, with --init"
+            )
+
+    joined = Joined(scans.dataset, tuple(parts), _places(len(scans.train), parts))
+    return TrainingScans(joined, [*scans.train, *joined.mixed_records()], scans.val)
+
+
+@cache
+def _order(member: int, count: int) -> np.ndarray:
+    """Return the (count,) indices of the scans of a dataset in the order of their turns."""
+    blocks = np.random.default_rng([SEED, member]).permutation(-(-count // BLOCK))  # rounded up
+    indices = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
+    return indices[indices < count]
+
+
+def _places(first: int, parts: Sequence[Part]) -> tuple[int, ...]:
+    """Return how many scans of an epoch each of the parts has, at least one.
+
+    Args:
+        first: scans of the first dataset.
+    """
+    shares = sum(part.share for part in parts if part.share is not None)
+    if shares >= 1:
+        raise InputError(
+            f"expected shares below 1 in all, to leave some for the first --data, found "
+            f"{shares:g}; lower them"
+        )
+
+    whole = first + sum(len(part.records) for part in parts if part.share is None)
+    epoch = whole / (1 - shares)
+    places = []
+    for part in parts:
+        count = len(part.records) if part.share is None else round(part.share * epoch)
+        places.append(max(count, 1))
+    return tuple(places)
+
+
+def split_share(spec: str) -> tuple[str, float | None]:
+    """Split DATA@0.5 into the dataset and its share of an epoch; None if it has none.
+
+    Raises:
+        InputError: if the share is not between 0 and 1.
+    """
+    data, at, text = spec.rpartition("@")
+    if not at or Path(spec).exists():
+        return spec, None
+    try:
+        share = float(text)
+    except ValueError:
+        return spec, None  # such as PATH@v1.0-mini
+    if not 0 < share < 1:
+        raise InputError(
+            f"{spec}: expected a share of an epoch above 0 and below 1, found {text}; correct it"
+        )
+    return data, share
+
+
+def own_records(records: Sequence[ScanRecord]) -> list[ScanRecord]:
+    """Return the scans that are not mixed in."""
+    return [record for record in records if not isinstance(record, MixedRecord)]

@@ -1,0 +1,164 @@
+"""Training on several datasets, from weights, and with scans without labels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from amvnet.config.recipes import load_recipe
+from amvnet.config.schema import AdaptConfig
+from amvnet.data.datasets.joined import MixedRecord, Part, join, split_share
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.select import TrainingScans
+from amvnet.data.taxonomy import NUSCENES
+from amvnet.errors import InputError
+from amvnet.weights.file import load, save
+
+from fixtures.worlds import GOLDEN, fresh_weights, make_streets, refusal, run_cli, write_recipe
+
+
+def joined(tmp_path: Path, share: float | None, first: int = 4, second: int = 14) -> TrainingScans:
+    a = open_dataset(str(make_streets(tmp_path / "a", ("00", "08"), first)))
+    b = open_dataset(str(make_streets(tmp_path / "b", ("00",), second)))
+    scans = TrainingScans(a, a.records(["00"]), a.records(["08"]))
+    return join(scans, [Part(b, b.records(["00"]), share)])
+
+
+def test_without_a_share_every_scan_is_in_every_epoch(tmp_path: Path) -> None:
+    scans = joined(tmp_path, None)
+    assert len(scans.train) == 4 + 14
+    for epoch in range(3):
+        originals = set()
+        for record in scans.train:
+            turn = scans.dataset.at_epoch(record, epoch)
+            if isinstance(turn, MixedRecord):
+                originals.add(turn.original.name)
+        assert len(originals) == 14
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.75])
+def test_a_share_is_that_of_an_epoch(tmp_path: Path, share: float) -> None:
+    scans = joined(tmp_path, share)
+    mixed = sum(isinstance(record, MixedRecord) for record in scans.train)
+    assert mixed / len(scans.train) == pytest.approx(share, abs=0.05)
+    assert [record.sequence for record in scans.val] == ["08"] * 4
+
+
+def test_all_scans_of_a_mixed_dataset_take_equally_many_turns(tmp_path: Path) -> None:
+    scans = joined(tmp_path, 0.5)
+    counts: Counter[str] = Counter()
+    for epoch in range(14 // 2):  # the lowest number of epochs that is a multiple for 4 places
+        for record in scans.train:
+            record = scans.dataset.at_epoch(record, epoch)
+            if isinstance(record, MixedRecord):
+                counts[record.original.name] += 1
+    assert len(counts) == 14
+    assert set(counts.values()) == {2}
+
+
+def test_a_mixed_scan_is_read_from_its_own_dataset(tmp_path: Path) -> None:
+    scans = joined(tmp_path, None)
+    b = open_dataset(str(tmp_path / "b"))
+    record = scans.dataset.at_epoch(scans.train[7], 2)
+    assert isinstance(record, MixedRecord)
+    expected = b.read(record.original)
+    scan = scans.dataset.read(record)
+    np.testing.assert_array_equal(scan.points, expected.points)
+    np.testing.assert_array_equal(scan.labels, expected.labels)
+
+
+def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: Path) -> None:
+    a = open_dataset(str(make_streets(tmp_path / "a")))
+    scans = TrainingScans(a, a.records(["00"]), [])
+    nuscenes = open_dataset(f"nuscenes:{GOLDEN / 'nuscenes'}")
+    assert nuscenes.taxonomy == NUSCENES
+    other = Part(nuscenes, nuscenes.records(nuscenes.sequences("all")))
+    with pytest.raises(InputError, match="classes"):
+        join(scans, [other])
+    half = Part(a, a.records(["08"]), 0.5)
+    with pytest.raises(InputError, match="shares below 1"):
+        join(scans, [half, half])
+
+
+def test_a_share_follows_the_last_at_sign(tmp_path: Path) -> None:
+    assert split_share("simulated-hdl64e:x@0.5") == ("simulated-hdl64e:x", 0.5)
+    assert split_share("nuscenes:x@v1.0-mini@0.25") == ("nuscenes:x@v1.0-mini", 0.25)
+    assert split_share("nuscenes:x@v1.0-mini") == ("nuscenes:x@v1.0-mini", None)
+    assert split_share("x") == ("x", None)
+    with pytest.raises(InputError, match="share"):
+        split_share("x@1.5")
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make two datasets, the second partly without labels, and weights to begin with."""
+    root = tmp_path_factory.mktemp("world")
+    make_streets(root / "a", ("00", "08"))
+    make_streets(root / "b", ("00", "01"), 3)
+    (root / "b/sequences/01/labels/000001.label").unlink()
+    save(fresh_weights(), root / "start.safetensors")
+    write_recipe(root / "recipe.yaml", "finetune")
+    tree = yaml.safe_load((root / "recipe.yaml").read_text())
+    del tree["model"]
+    tree["training"]["adapt"] = {"points": 1, "lowest_confidence": 0.0}
+    (root / "recipe.yaml").write_text(yaml.safe_dump(tree))
+    return root
+
+
+def arguments(world: Path, out: Path, b: str) -> list[object]:
+    return [
+        *("train", world / "recipe.yaml", "--init", world / "start.safetensors", "--out", out),
+        *("--data", world / "a", "--data", b, "--train-sequences", "00", "--val-sequences", "08"),
+    ]
+
+
+def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
+    world: Path, tmp_path: Path
+) -> None:
+    # Without the broken sequence, so that all have labels.
+    make_streets(tmp_path / "b", ("00",), 3)
+    code, error = run_cli(*arguments(world, tmp_path / "run", f"{tmp_path / 'b'}@0.4"))
+    assert code == 0, error
+    start = load(world / "start.safetensors")
+    trained = load(tmp_path / "run")
+    assert trained.model == start.model
+    assert trained.sensor == start.sensor
+    assert trained.digest("range_net") != start.digest("range_net")
+
+    entry = yaml.safe_load((tmp_path / "run/run.yaml").read_text())["all"]
+    assert entry["data"][1].endswith("b@0.4")
+    repeat = entry["repeat"].replace("WEIGHTS", str(world / "start.safetensors")).split()
+    assert run_cli(*repeat[1:])[0] == 0
+    again = load(tmp_path / "run-again")
+    for part in trained.parts:
+        assert again.digest(part) == trained.digest(part)
+
+
+def test_a_fine_tuning_needs_weights(world: Path, tmp_path: Path) -> None:
+    assert "--init" in refusal(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}")
+
+
+def test_scans_without_labels_need_a_teacher_which_labels_only_these(
+    world: Path, tmp_path: Path
+) -> None:
+    call = arguments(world, tmp_path / "run", str(world / "b"))
+    code, error = run_cli(*call)
+    assert code == 2
+    assert error.count("\n") == 1
+
+    call[call.index(tmp_path / "run")] = tmp_path / "taught"
+    code, error = run_cli(*call, "--teacher", world / "start.safetensors")
+    assert code == 0, error
+    labelled = [path.name for path in (tmp_path / "taught/teacher").rglob("*.npy")]
+    assert labelled == ["000001.npy"]
+
+
+def test_the_recipe_mixes_half_of_an_epoch() -> None:
+    recipe = load_recipe("finetune")
+    assert recipe.from_init
+    assert recipe.training.others == 0.5
+    assert recipe.training.adapt == AdaptConfig()
