@@ -18,7 +18,9 @@ from amvnet.adaptation.agreement import Trust
 from amvnet.adaptation.sensor import hidden_directions, sensor_to_simulate
 from amvnet.data.datasets.simulated import SCANS
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import KEY as INTENSITY
 from amvnet.sensors.measure import SensorGeometry
+from amvnet.sensors.record import KEY as SENSOR
 from amvnet.simulation import SENSORS
 from amvnet.training.losses import class_weights
 from amvnet.training.run import Run
@@ -156,7 +158,14 @@ def test_scan_files_are_adapted_to_and_their_rows_kept(world: Path, tmp_path: Pa
     assert code == 0, error
     with np.load(tmp_path / "run/scans/000000.npz") as file:
         assert set(file.files) == {"points", "ring"}
-    assert load(tmp_path / "run").model == load(world / "start").model
+    adapted = load(tmp_path / "run")
+    start = load(world / "start")
+    assert adapted.model == start.model
+
+    # Later scans must be brought to the frame that these were brought to.
+    for part in ("range_net", "polar_net"):
+        for key in (INTENSITY, SENSOR):
+            assert adapted.training[part].get(key) == start.training.get(part, {}).get(key)
 
 
 def test_the_rounds_end_when_too_little_of_the_start_still_stands(

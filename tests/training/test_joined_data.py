@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from amvnet.adaptation.kept_scans import KeptScans
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import AdaptConfig
 from amvnet.data.datasets.joined import MixedRecord, Part, join, split_share
@@ -82,6 +83,14 @@ def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: P
     half = Part(a, a.records(["08"]), 0.5)
     with pytest.raises(InputError, match="shares below 1"):
         join(scans, [half, half])
+
+
+def test_scans_that_are_adapted_are_not_mixed_with_others(tmp_path: Path) -> None:
+    """The rows of their points are given in some of the scans only."""
+    scans = joined(tmp_path, None)
+    adapted = KeptScans(tmp_path, scans.dataset.taxonomy, 1, labelled=True, is_adapted=True)
+    with pytest.raises(InputError, match="found both"):
+        join(scans, [Part(adapted, adapted.records())])
 
 
 def test_a_share_follows_the_last_at_sign(tmp_path: Path) -> None:

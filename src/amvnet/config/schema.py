@@ -178,7 +178,7 @@ class AssertionConfig(Checked):
     name: AssertionName = "disagreement"
     """Low cosine similarity, high entropy, small margin, different labels, or high loss."""
     threshold: float | None = None
-    """tau: the largest similarity (margin: largest; entropy, loss: least, nats); null: its own."""
+    """tau: the largest similarity (margin: largest; entropy, loss: least, nats); or its own."""
     others: tuple[AssertionName, ...] = ()
     """Further assertions, to combine with the first."""
     other_thresholds: tuple[float, ...] = ()
