@@ -65,7 +65,7 @@ class PolarGrid:
         return pooled
 
     def to_map(self, pillars: Tensor) -> Tensor:
-        """Return the maximum (F, C) of the points' features (S, C) in each pillar of `seen`."""
+        """Return the map (B, C, R, A) of the values (F, C) of the seen pillars; 0 elsewhere."""
         b, r, a, _ = self.shape
         dense = pillars.new_zeros(b * r * a, pillars.shape[1]).index_copy(0, self.seen, pillars)
         return dense.view(b, r, a, -1).permute(0, 3, 1, 2)
