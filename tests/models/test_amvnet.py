@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.schema import AssertionConfig, ModelConfig, PointHeadConfig
+from amvnet.models import amvnet as amvnet_module
+from amvnet.models import point_head as point_head_module
 from amvnet.models.amvnet import build_amvnet, merge
 from amvnet.models.assertions import (
     DifferentLabels,
@@ -380,6 +382,33 @@ def test_only_the_points_that_occur_are_selected() -> None:
     assert selected.tolist() == [0, 3, 7, 9]
     assert torch.equal(selected[uncertain_index], uncertain)
     assert torch.equal(selected[near_index], near)
+
+
+def test_a_scan_of_many_uncertain_points_is_settled_by_sectors_with_the_same_result(
+    random_scan: RandomScan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = whole_model()
+    model.point_head = trained_head(TINY.point_head, K)
+    batch = PointBatch.of([random_scan(500)])
+    f, g = torch.rand(2, 500, K).softmax(dim=2)
+    uncertain = torch.rand(500) < 0.7
+    with torch.inference_mode():
+        expected = model.refine(batch, f, g, uncertain)
+
+        settled: list[int] = []
+        select = amvnet_module.select_used_points
+
+        def selected(count: int, index: Tensor, near: Tensor) -> tuple[Tensor, list[Tensor]]:
+            settled.append(len(index))
+            return select(count, index, near)
+
+        monkeypatch.setattr(amvnet_module, "select_used_points", selected)
+        monkeypatch.setattr(point_head_module, "AT_ONCE", 64)
+        h = model.refine(batch, f, g, uncertain)
+
+    assert max(settled) == 64
+    assert sum(settled) == uncertain.sum()
+    torch.testing.assert_close(h, expected)
 
 
 @pytest.mark.parametrize("brightest", [0, 1, 5])

@@ -18,6 +18,7 @@ from amvnet.models.point_head import (
     PointHead,
     nearest_neighbours,
     point_table,
+    sectors,
     select_used_points,
 )
 from amvnet.models.polar_net import PolarNet
@@ -128,12 +129,14 @@ class LateFusion(nn.Module):
         """
         assert self.point_head is not None
 
-        used, (index, near) = select_used_points(len(points), index, near)
-        table = point_table(
-            points.index_select(0, used), f.index_select(0, used), g.index_select(0, used)
-        )
-
-        return self.point_head.score(table, index, near).softmax(dim=1)
+        h = f.new_empty(len(index), f.shape[1])
+        for part in sectors(points, index):
+            used, (i, k) = select_used_points(len(points), index[part], near[part])
+            table = point_table(
+                points.index_select(0, used), f.index_select(0, used), g.index_select(0, used)
+            )
+            h[part] = self.point_head.score(table, i, k).softmax(dim=1)
+        return h
 
     @step("merge")
     def merge(self, f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
@@ -218,7 +221,7 @@ def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
     if h is None:
         return y
     if y.is_cpu:
-        return y.index_put((uncertain,), h)
+        return y.index_put_((uncertain,), h)
 
     # `index_put` would make the CPU wait for the GPU; on a CPU it takes half the time of this.
     return y.masked_scatter(uncertain[:, None], h)

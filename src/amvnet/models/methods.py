@@ -24,7 +24,7 @@ BOTH_NETWORKS = ("range_net", "polar_net")
 
 def geometric_mean(f: Tensor, g: Tensor) -> Tensor:
     """Return the ensemble that AMVNet uses for certain points."""
-    return (f * g).sqrt()
+    return (f * g).sqrt_()
 
 
 def arithmetic_mean(f: Tensor, g: Tensor) -> Tensor:

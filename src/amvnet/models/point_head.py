@@ -17,6 +17,7 @@ from amvnet.models.views.points import occurring
 POINT_VALUES = 4  # x, y, z, intensity
 PART = 1024  # uncertain points scored at a time, so that they fit into a CPU's cache
 PART_ON_GPU = 2**16  # the same for a GPU: enough to keep it busy
+AT_ONCE = 2**17  # uncertain points whose table is in memory: a scan may have millions of them
 
 
 class PointHead(nn.Module):
@@ -85,6 +86,23 @@ def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
         g: (P, K) class probabilities by the bird's-eye view.
     """
     return torch.cat([f, g, points], dim=1)
+
+
+def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
+    """Divide some points by their azimuth, so that each part and its neighbours are a few points.
+
+    Args:
+        points: (P, 4), all points of a scan.
+        index: (U,) indices of the points to divide.
+
+    Returns:
+        Places in `index`, at most `AT_ONCE` in each part; one part if there are not more points.
+    """
+    if len(index) <= AT_ONCE:
+        return [slice(None)]
+
+    azimuth = torch.atan2(points[index, 1], points[index, 0])
+    return list(azimuth.argsort().split(AT_ONCE))
 
 
 def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
