@@ -248,6 +248,8 @@ class PointHeadConfig(Checked):
     """Channels of the fully connected layer before the scores."""
     position_scale: float = 0.05
     """Factor on x, y, z (metres) as features: brings them to the magnitude of the scores."""
+    pooling: Literal["max", "attention"] = "max"
+    """How the neighbours are pooled: by their maximum (the paper), or by attention."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
