@@ -138,9 +138,9 @@ def test_other_methods_say_what_torch_says(
     assert (expected.uncertain == actual.uncertain).mean() >= 0.9999
 
 
-def test_other_heads_say_what_torch_says(tmp_path: Path) -> None:
+def test_an_ensemble_of_attention_heads_says_what_torch_says(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
-    weights = fresh_weights(head={"pooling": "attention"})
+    weights = fresh_weights(head={"pooling": "attention", "heads": 2})
     onnx_export.export(weights, tmp_path)
 
     scan = make_scan(5)

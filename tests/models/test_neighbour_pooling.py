@@ -13,8 +13,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import PointHeadConfig
+from amvnet.models.head_ensemble import Head
 from amvnet.models.neighbour_pooling import QUERIES, AttentionPooling, MaxPooling
-from amvnet.models.point_head import PointHead
 
 from fixtures.networks import trained_head
 
@@ -78,7 +78,7 @@ def test_max_pooling_equals_the_maximum_after_the_activation_and_so_does_its_gra
     assert torch.equal(found, expected)
 
 
-def multiply_adds(head: PointHead, classes: int, fast: bool) -> float:
+def multiply_adds(head: Head, classes: int, fast: bool) -> float:
     """Count the multiply-adds of a head for 100 points, by `forward` or by `score`."""
     width = 2 * classes + 4
     neighbours = head.config.neighbours

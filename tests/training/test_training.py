@@ -561,6 +561,29 @@ def test_the_head_learns_where_the_loss_is_high(
     assert share == pytest.approx(uncertain[labelled].mean(), abs=1e-3)
 
 
+def test_an_ensemble_of_attention_heads_is_trained_in_one_stage_on_the_networks_of_any_weights(
+    world: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head = ("--model.point_head.heads", 2, "--model.point_head.pooling", "attention")
+    options = ("--stage", "head", "--init", run, *head)
+    weights = train(world, tmp_path / "run", *options)
+    assert "head: new, as that of the initial weights has other sizes" in capsys.readouterr().out
+    assert weights.model.point_head.heads == 2
+    assert weights.model.point_head.pooling == "attention"
+    for part in ("range_net", "polar_net"):
+        assert weights.digest(part) == load(run).digest(part)
+
+    first, second = weights.build().point_head.heads
+    assert not torch.equal(first.fc[1].weight, second.fc[1].weight)
+    assert not torch.equal(first.pool.query.weight, second.pool.query.weight)
+
+    # A finished stage is not trained again; one of another head is refused.
+    again = train(world, tmp_path / "run", *options, "--resume")
+    assert not differing(weights, again)
+    arguments = (*train_arguments(world, tmp_path / "run"), "--stage", "head", "--resume")
+    assert "point_head.heads" in fail(*arguments, "--model.point_head.heads", 3)
+
+
 @pytest.mark.parametrize("stage", ["rv", "bev"])
 def test_a_loss_that_is_not_finite_stops_with_the_names_of_the_scans(
     world: Path, tmp_path: Path, stage: str

@@ -31,6 +31,7 @@ class PointHead(nn.Module):
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
         super().__init__()
         self.config = config
+        self.classes = classes
 
         width = 2 * classes + POINT_VALUES
         # The pooling applies the last ReLU of the shared MLP.
