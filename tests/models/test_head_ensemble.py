@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import nn
 
 from amvnet.config.schema import PointHeadConfig
 from amvnet.models.amvnet import build_amvnet
@@ -67,7 +68,9 @@ def test_a_scan_gets_the_mean_of_what_the_heads_say_of_it_alone() -> None:
 def test_an_ensemble_survives_certainty() -> None:
     ensemble = trained_head(replace(TINY.point_head, heads=2), K)
     for head in heads_of(ensemble):
-        torch.nn.init.constant_(head.fc[-1].weight, 1e3)
+        last = head.fc[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.constant_(last.weight, 1e3)
     with torch.no_grad():
         logits = ensemble(torch.randn(10, 2 * K + 4), torch.randn(10, 3, 2 * K + 4))
     assert torch.isfinite(logits.softmax(dim=1)).all()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.utils import data
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import PointHeadConfig, TrainingConfig
@@ -64,7 +65,7 @@ def learn(head: Head, points: HeadPoints, folder: Path, index: int | None = None
     if index is not None:
         sampler = OneHeads(draw, 32, seed=0, shuffle=True)
         sampler.index = index
-        loader = torch.utils.data.DataLoader(points, batch_size=None, sampler=sampler)
+        loader = data.DataLoader(points, batch_size=None, sampler=sampler)  # type: ignore[arg-type]
 
     options = FitOptions(TRAINING, folder, TRAINING.head.epochs, RunOptions(say=lambda line: None))
     fit(stage, options, Loaders(loader, None))

@@ -24,6 +24,7 @@ from amvnet.config.schema import AssertionConfig
 from amvnet.data.datasets import simulated
 from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.head_ensemble import heads_of
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.training import run as training_run
@@ -573,9 +574,9 @@ def test_an_ensemble_of_attention_heads_is_trained_in_one_stage_on_the_networks_
     for part in ("range_net", "polar_net"):
         assert weights.digest(part) == load(run).digest(part)
 
-    first, second = weights.build().point_head.heads
-    assert not torch.equal(first.fc[1].weight, second.fc[1].weight)
-    assert not torch.equal(first.pool.query.weight, second.pool.query.weight)
+    first, second = [head.state_dict() for head in heads_of(weights.build_head())]
+    for name in ("fc.1.weight", "pool.query.weight"):
+        assert not torch.equal(first[name], second[name])
 
     # A finished stage is not trained again; one of another head is refused.
     again = train(world, tmp_path / "run", *options, "--resume")
