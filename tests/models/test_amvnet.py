@@ -54,8 +54,12 @@ def test_the_papers_point_head_has_18500_parameters_and_costs_one_gmac_for_10000
     assert counter.get_total_flops() / 2 == pytest.approx(1e9, rel=0.05)
 
 
-def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> None:
-    head = trained_head(TINY.point_head, K)
+HEADS = pytest.mark.parametrize("kind", [{}, {"pooling": "attention"}, {"heads": 3}])
+
+
+@HEADS
+def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order(kind: Any) -> None:
+    head = trained_head(replace(TINY.point_head, **kind), K)
     point = torch.randn(5, 2 * K + 4)
     rows = torch.randn(5, 3, 2 * K + 4)
     expected = head(point, rows)
@@ -70,9 +74,10 @@ def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> No
     assert (head(point + 1, rows) != expected).any(dim=1).all()
 
 
-def test_folded_batch_norms_change_no_output_of_the_point_head() -> None:
+@HEADS
+def test_folded_batch_norms_change_no_output_of_the_point_head(kind: Any) -> None:
     torch.manual_seed(0)
-    head = trained_head(TINY.point_head, K)
+    head = trained_head(replace(TINY.point_head, **kind), K)
     point = torch.randn(20, 2 * K + 4)
     rows = torch.randn(20, 3, 2 * K + 4)
     head.train()(point, rows)  # changes the norms' initial statistics
@@ -355,12 +360,13 @@ def test_agreement_leaves_the_scores_alone(random_scan: RandomScan) -> None:
     assert model(PointBatch.of([random_scan(30)])).uncertain.all()
 
 
+@HEADS
 @pytest.mark.parametrize("uncertain", [0, 1, 2500])
 @pytest.mark.parametrize("folded", [False, True])
 def test_scoring_points_from_the_table_equals_scoring_their_features(
-    uncertain: int, folded: bool
+    uncertain: int, folded: bool, kind: Any
 ) -> None:
-    head = trained_head(PointHeadConfig(), 19)
+    head = trained_head(PointHeadConfig(**kind), 19)
     if folded:
         fold_batch_norms(head)
 

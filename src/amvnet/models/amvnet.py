@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from amvnet.config.schema import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
+from amvnet.models.head_ensemble import Head, build_head
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import (
-    PointHead,
     nearest_neighbours,
     point_table,
     sectors,
@@ -79,7 +79,7 @@ class LateFusion(nn.Module):
         watch: returns the context in which a step runs, to time the steps; does nothing by default.
     """
 
-    def __init__(self, assertion: Assertion, point_head: PointHead | None) -> None:
+    def __init__(self, assertion: Assertion, point_head: Head | None) -> None:
         super().__init__()
         self.assertion = assertion
         self.point_head = point_head
@@ -161,7 +161,7 @@ class AMVNet(LateFusion):
         range_net: nn.Module,
         polar_net: nn.Module,
         assertion: Assertion,
-        point_head: PointHead | None,
+        point_head: Head | None,
     ) -> None:
         super().__init__(assertion, point_head)
         self.range_view = range_view
@@ -235,5 +235,5 @@ def build_amvnet(config: ModelConfig, classes: int) -> AMVNet:
         range_net=RangeNet(config.range_net, classes),
         polar_net=PolarNet(config.polar_net, config.polar_view.vertical, classes),
         assertion=build_assertion(config.assertion),
-        point_head=PointHead(config.point_head, classes),
+        point_head=build_head(config.point_head, classes),
     )

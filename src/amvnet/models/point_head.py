@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from amvnet.config.schema import PointHeadConfig
 from amvnet.models.layers import PointLinear
+from amvnet.models.neighbour_pooling import build_pooling
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import occurring
@@ -31,17 +32,21 @@ class PointHead(nn.Module):
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
         super().__init__()
         self.config = config
+        self.classes = classes
 
         width = 2 * classes + POINT_VALUES
-        self.mlp = _mlp((width, *config.hidden))
+        # The pooling applies the last ReLU of the shared MLP.
+        self.mlp = nn.Sequential(*_layers((width, *config.hidden))[:-1])
+        self.pool = build_pooling(config.pooling, width, config.hidden[-1])
         self.fc = nn.Sequential(
-            _mlp((width + config.hidden[-1], config.fc)), PointLinear(config.fc, classes)
+            nn.Sequential(*_layers((width + config.hidden[-1], config.fc))),
+            PointLinear(config.fc, classes),
         )
 
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
         encoded = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1])
-        pooled = encoded.amax(dim=1)  # (U, hidden[-1])
+        pooled = self.pool(point, encoded)  # (U, hidden[-1])
         return self.fc(torch.cat([pooled, point], dim=1))
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
@@ -56,8 +61,7 @@ class PointHead(nn.Module):
             near: (U, n) indices of their nearest neighbours.
         """
         first = self.mlp[0]
-        middle = self.mlp[1:-1]
-        activation = self.mlp[-1]
+        rest = self.mlp[1:]
         assert isinstance(first, nn.Linear)
 
         encoded = first(table)  # (P, hidden[0]): W [f_k, g_k, x_k] of every point
@@ -69,10 +73,8 @@ class PointHead(nn.Module):
             rows = encoded.index_select(0, k.flatten()).unflatten(0, k.shape)
             rows = rows.sub_(shift[:, None])  # (part, n, hidden[0])
 
-            # ReLU is monotonic: after the maximum it gives the same for a fraction of the work.
-            pooled = activation(middle(rows.flatten(0, 1)).unflatten(0, k.shape).amax(dim=1))
-
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
+            pooled = self.pool(point, rest(rows.flatten(0, 1)).unflatten(0, k.shape))
             logits.append(self.fc(torch.cat([pooled, point], dim=1)))
         return torch.cat(logits)
 
@@ -161,8 +163,9 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
     return torch.from_numpy(nearest).to(points.device)
 
 
-def _mlp(widths: tuple[int, ...]) -> nn.Sequential:
+def _layers(widths: tuple[int, ...]) -> list[nn.Module]:
+    """Return linear layers between these numbers of channels, each with batch norm and ReLU."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [PointLinear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers)
+    return layers

@@ -26,7 +26,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, did_you_mean, shown
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
-from amvnet.models.point_head import PointHead
+from amvnet.models.head_ensemble import Head, build_head
 from amvnet.weights import hub
 
 # The parts of the method, each with the fields of `ModelConfig` that set its sizes.
@@ -179,6 +179,13 @@ class Weights:
         )
         return weights, new
 
+    def fits(self, name: str, model: ModelConfig) -> bool:
+        """Return whether the parameters of one part have the sizes of another configuration."""
+        with torch.device("meta"):  # without memory
+            part = getattr(build_amvnet(model, self.taxonomy.size), name)
+        expected = {key: tensor.shape for key, tensor in part.state_dict().items()}
+        return expected == {key: tensor.shape for key, tensor in self.part(name).items()}
+
     def resized(self, name: str, model: ModelConfig) -> Weights:
         """Return these weights with the sizes of one part taken from another configuration.
 
@@ -204,7 +211,7 @@ class Weights:
             model.point_head = None
         return model.eval()
 
-    def build_head(self) -> PointHead:
+    def build_head(self) -> Head:
         """Return only the point head, in evaluation mode.
 
         Raises:
@@ -215,7 +222,7 @@ class Weights:
                 "expected weights with a point head, found none; train one with --stage head"
             )
 
-        head = PointHead(self.model.point_head, self.taxonomy.size)
+        head = build_head(self.model.point_head, self.taxonomy.size)
         self._load_part("point_head", head)
         return head.eval()
 
