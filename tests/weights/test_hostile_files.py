@@ -245,6 +245,11 @@ def hostile_weights(folder: Path, weights: Weights, description: dict[str, Any])
     changes.append({name: value for name, value in weights.tensors.items() if name != WEIGHT})
     for index, tensors in enumerate(changes):
         paths.append(write_weights(folder / f"t{index}.safetensors", tensors, good_text))
+
+    # A network that the file lacks would be built all the same, with random values.
+    large = change(description, "model polar_net widths", [8192] * 8)
+    present = {name: value for name, value in weights.tensors.items() if "range_net" in name}
+    paths.append(write_weights(folder / "absent.safetensors", present, json.dumps(large)))
     return paths
 
 

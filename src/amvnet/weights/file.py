@@ -44,6 +44,7 @@ USUAL_UNCERTAIN = 0.2
 FLOATS = ("F16", "BF16", "F32", "F64")
 COUNTS = ("I64",)
 LONGEST = 10_000_000  # characters of a description; those of the built-in weights have 6,000
+MOST_PARAMETERS = 500_000_000  # of a model; that of the paper has about 60 million
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
 _FIELD_TYPES = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
@@ -366,6 +367,13 @@ def _read_tensors(file: Any, weights: Weights) -> dict[str, Tensor]:
     names = set(file.keys())
     with torch.device("meta"):  # without memory
         described = build_amvnet(weights.model, weights.taxonomy.size).state_dict()
+    parameters = sum(tensor.numel() for tensor in described.values())
+    if parameters > MOST_PARAMETERS:  # parts that the file lacks are built as well
+        raise InputError(
+            f"expected a model of at most {MOST_PARAMETERS:,} parameters, found {parameters:,}; "
+            "use other weights"
+        )
+
     present = {name.partition(".")[0] for name in names}
     expected = {name for name in described if name.partition(".")[0] in present}
     if names != expected:
