@@ -398,7 +398,7 @@ class JointTraining(Checked):
 
     epochs: Count = 4
     """Passes over the training scans."""
-    batch: Count = 2
+    batch: Count = 8
     """Scans of one optimizer step."""
     lr: Positive = 1e-4
     """Peak of the one-cycle learning rate; low, as all parts are trained already."""
