@@ -1,22 +1,25 @@
 """Score weights place by place, as one easy place may carry the mean over all of them.
 
-    python benchmarks/places.py DATA WEIGHTS [--no-intensity]
+    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--methods M,...] [--tta flips]
+        [--every N]
 
 DATA is a dataset such as semantickitti:PATH; each of its sequences is a place. Print mIoU over all
 classes and accuracy of each method, and the share of uncertain points, for each place and for all.
-With --no-intensity, the intensities of all scans are set to 0.
+With --no-intensity, the intensities of all scans are set to 0. --methods and --tta are those of
+`amvnet evaluate`. With --every N, only every Nth scan is scored.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.segmenter import Segmenter
@@ -24,13 +27,19 @@ from amvnet.models.methods import PAPER_METHODS
 from amvnet.scan import Scan
 
 
-def score(dataset: Dataset, place: str, segmenter: Segmenter, intensity: bool) -> Evaluation:
-    """Score all methods on the scans of one place."""
+def score(
+    dataset: Dataset,
+    records: Sequence[ScanRecord],
+    segmenter: Segmenter,
+    methods: Sequence[str],
+    intensity: bool,
+) -> Evaluation:
+    """Score some methods on some scans."""
     evaluation = Evaluation(dataset.taxonomy)
-    for record in dataset.records([place]):
+    for record in records:
         scan = dataset.read(record)
         shown = scan if intensity else without_intensity(scan)
-        ids, uncertain = segmenter.labels_by_method(shown, PAPER_METHODS)
+        ids, uncertain = segmenter.labels_by_method(shown, methods)
         assert scan.labels is not None
         evaluation.add(scan.points, scan.labels, ids, uncertain)
     return evaluation
@@ -47,8 +56,7 @@ def add_row(table: Table, name: str, evaluation: Evaluation, classes: int) -> No
     """Add the figures of one place to a table, in percent."""
     report = evaluation.report(name)
     cells = [name]
-    for method in PAPER_METHODS:
-        values = report["methods"][method]
+    for values in report["methods"].values():
         ious = [iou for iou in values["iou"].values() if iou is not None]
         cells.append(f"{100 * np.sum(ious) / classes:.1f} ({100 * values['accuracy']:.1f})")
     cells.append(f"{100 * report['uncertain_fraction']:.1f}")
@@ -61,14 +69,22 @@ def main() -> None:
     parser.add_argument("data")
     parser.add_argument("weights")
     parser.add_argument("--no-intensity", action="store_true")
+    parser.add_argument("--methods", default=",".join(PAPER_METHODS))
+    parser.add_argument("--tta")
+    parser.add_argument("--every", type=int, default=1)
     options = parser.parse_args()
 
     dataset = open_dataset(options.data)
-    segmenter = Segmenter(options.weights)
-    table = Table("place", *PAPER_METHODS, "uncertain, %")
+    segmenter = Segmenter(options.weights, tta=options.tta)
+    methods = options.methods.split(",")
+    chosen = dataset.records(dataset.sequences("all"))[:: options.every]
+    table = Table("place", *methods, "uncertain, %")
     total = Evaluation(dataset.taxonomy)
     for place in dataset.sequences("all"):
-        evaluation = score(dataset, place, segmenter, intensity=not options.no_intensity)
+        records = [record for record in chosen if record.sequence == place]
+        if not records:
+            continue
+        evaluation = score(dataset, records, segmenter, methods, not options.no_intensity)
         add_row(table, place, evaluation, dataset.taxonomy.size)
         total.merge(evaluation)
     add_row(table, "all", total, dataset.taxonomy.size)

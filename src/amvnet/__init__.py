@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from amvnet.inference.read import read, read_all
     from amvnet.inference.segmentation import Segmentation
     from amvnet.inference.segmenter import Segmenter
-    from amvnet.models.methods import MethodName, Precision
+    from amvnet.models.methods import MethodName, Precision, TtaName
     from amvnet.scan import Scan
     from amvnet.simulation import simulate
     from amvnet.weights.file import Weights
@@ -63,6 +63,7 @@ def load(
     precision: Precision = "float32",
     engine: str = "torch",
     keep_memory: bool = False,
+    tta: TtaName | None = None,
 ) -> Segmenter:
     """Return a segmenter with trained weights.
 
@@ -70,17 +71,21 @@ def load(
         weights: the path of a weights file, the name of built-in weights (`sim-hdl64e`,
             `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
         device: "cpu", "cuda", "cuda:1", ...
-        method: "amvnet", or a part of it: "rv", "bev", "ensemble", "arithmetic" or "maximum".
+        method: "amvnet", or a part of it: "rv", "rv-knn" (with a vote of neighbours in the range
+            image), "bev", "ensemble", "arithmetic" or "maximum".
         precision: of the two networks: "float32", "bfloat16", or on a GPU "float16".
         engine: what runs the networks: "torch", "compile", "onnx", or "auto", the fastest here.
         keep_memory: let the whole process keep freed memory, see `Segmenter`.
+        tta: test-time augmentation: "flips", "yaw" or "both", see `Segmenter`.
 
     Raises:
         InputError: if there are no such weights, they lack a part that the method needs, or the
             engine lacks a library.
     """
     segmenter_class = import_module("amvnet.inference.segmenter").Segmenter
-    segmenter: Segmenter = segmenter_class(weights, device, method, precision, keep_memory)
+    segmenter: Segmenter = segmenter_class(
+        weights, device, method, precision, keep_memory=keep_memory, tta=tta
+    )
     if engine != "torch":
         import_module("amvnet.export.engines").use_engine(segmenter, engine)
     return segmenter

@@ -187,6 +187,9 @@ def check_kept(folder: Path, times: dict[str, int]) -> None:
 def test_an_interrupted_run_is_not_gone_on_with_by_others(world: Path, tmp_path: Path) -> None:
     Journal(tmp_path, {**settings_of(world), "method": "rv"})
     assert "method" in refusal(predict(world, tmp_path, "--resume"))
+    Journal(tmp_path, {**settings_of(world), "tta": "flips"})
+    assert "tta" in refusal(predict(world, tmp_path, "--resume"))
+    assert "tta" in refusal(predict(world, tmp_path, "--resume --tta yaw"))
 
     # Without --resume it starts again.
     succeed(predict(world, tmp_path))

@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.schema import AssertionConfig, ModelConfig, PointHeadConfig
+from amvnet.models import amvnet as amvnet_module
+from amvnet.models import point_head as point_head_module
 from amvnet.models.amvnet import build_amvnet, merge
 from amvnet.models.assertions import (
     DifferentLabels,
@@ -52,8 +54,12 @@ def test_the_papers_point_head_has_18500_parameters_and_costs_one_gmac_for_10000
     assert counter.get_total_flops() / 2 == pytest.approx(1e9, rel=0.05)
 
 
-def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> None:
-    head = trained_head(TINY.point_head, K)
+HEADS = pytest.mark.parametrize("kind", [{}, {"pooling": "attention"}, {"heads": 3}])
+
+
+@HEADS
+def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order(kind: Any) -> None:
+    head = trained_head(replace(TINY.point_head, **kind), K)
     point = torch.randn(5, 2 * K + 4)
     rows = torch.randn(5, 3, 2 * K + 4)
     expected = head(point, rows)
@@ -68,9 +74,10 @@ def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> No
     assert (head(point + 1, rows) != expected).any(dim=1).all()
 
 
-def test_folded_batch_norms_change_no_output_of_the_point_head() -> None:
+@HEADS
+def test_folded_batch_norms_change_no_output_of_the_point_head(kind: Any) -> None:
     torch.manual_seed(0)
-    head = trained_head(TINY.point_head, K)
+    head = trained_head(replace(TINY.point_head, **kind), K)
     point = torch.randn(20, 2 * K + 4)
     rows = torch.randn(20, 3, 2 * K + 4)
     head.train()(point, rows)  # changes the norms' initial statistics
@@ -353,12 +360,13 @@ def test_agreement_leaves_the_scores_alone(random_scan: RandomScan) -> None:
     assert model(PointBatch.of([random_scan(30)])).uncertain.all()
 
 
+@HEADS
 @pytest.mark.parametrize("uncertain", [0, 1, 2500])
 @pytest.mark.parametrize("folded", [False, True])
 def test_scoring_points_from_the_table_equals_scoring_their_features(
-    uncertain: int, folded: bool
+    uncertain: int, folded: bool, kind: Any
 ) -> None:
-    head = trained_head(PointHeadConfig(), 19)
+    head = trained_head(PointHeadConfig(**kind), 19)
     if folded:
         fold_batch_norms(head)
 
@@ -380,6 +388,33 @@ def test_only_the_points_that_occur_are_selected() -> None:
     assert selected.tolist() == [0, 3, 7, 9]
     assert torch.equal(selected[uncertain_index], uncertain)
     assert torch.equal(selected[near_index], near)
+
+
+def test_a_scan_of_many_uncertain_points_is_settled_by_sectors_with_the_same_result(
+    random_scan: RandomScan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = whole_model()
+    model.point_head = trained_head(TINY.point_head, K)
+    batch = PointBatch.of([random_scan(500)])
+    f, g = torch.rand(2, 500, K).softmax(dim=2)
+    uncertain = torch.rand(500) < 0.7
+    with torch.inference_mode():
+        expected = model.refine(batch, f, g, uncertain)
+
+        settled: list[int] = []
+        select = amvnet_module.select_used_points
+
+        def selected(count: int, index: Tensor, near: Tensor) -> tuple[Tensor, list[Tensor]]:
+            settled.append(len(index))
+            return select(count, index, near)
+
+        monkeypatch.setattr(amvnet_module, "select_used_points", selected)
+        monkeypatch.setattr(point_head_module, "AT_ONCE", 64)
+        h = model.refine(batch, f, g, uncertain)
+
+    assert max(settled) == 64
+    assert sum(settled) == uncertain.sum()
+    torch.testing.assert_close(h, expected)
 
 
 @pytest.mark.parametrize("brightest", [0, 1, 5])

@@ -24,6 +24,7 @@ from amvnet.config.schema import AssertionConfig
 from amvnet.data.datasets import simulated
 from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.head_ensemble import heads_of
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import PROBABILITIES
 from amvnet.training import run as training_run
@@ -563,6 +564,29 @@ def test_the_head_learns_where_the_loss_is_high(
     labels = sorted((world / "data/sequences/08/labels").iterdir())
     labelled = np.concatenate([np.fromfile(path, np.uint32) for path in labels]) > 0
     assert share == pytest.approx(uncertain[labelled].mean(), abs=1e-3)
+
+
+def test_an_ensemble_of_attention_heads_is_trained_in_one_stage_on_the_networks_of_any_weights(
+    world: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    head = ("--model.point_head.heads", 2, "--model.point_head.pooling", "attention")
+    options = ("--stage", "head", "--init", run, *head)
+    weights = train(world, tmp_path / "run", *options)
+    assert "head: new, as that of the initial weights has other sizes" in capsys.readouterr().out
+    assert weights.model.point_head.heads == 2
+    assert weights.model.point_head.pooling == "attention"
+    for part in ("range_net", "polar_net"):
+        assert weights.digest(part) == load(run).digest(part)
+
+    first, second = [head.state_dict() for head in heads_of(weights.build_head())]
+    for name in ("fc.1.weight", "pool.query.weight"):
+        assert not torch.equal(first[name], second[name])
+
+    # A finished stage is not trained again; one of another head is refused.
+    again = train(world, tmp_path / "run", *options, "--resume")
+    assert not differing(weights, again)
+    arguments = (*train_arguments(world, tmp_path / "run"), "--stage", "head", "--resume")
+    assert "point_head.heads" in fail(*arguments, "--model.point_head.heads", 3)
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])

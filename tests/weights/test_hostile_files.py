@@ -98,6 +98,7 @@ SIZES = (
     "point_head neighbours",
     "point_head hidden 0",
     "point_head fc",
+    "point_head heads",
 )
 NUMBERS = (
     "range_view fov_up",
@@ -124,6 +125,8 @@ MODEL: dict[str, tuple[str, Any]] = {
     "widths in widths": ("range_net widths", [[4], [4]]),
     "large image": ("range_view", {"height": 16384, "width": 16384}),
     "large grid": ("polar_view", {"radial": 16384, "angular": 16384}),
+    "many large heads": ("point_head", {"heads": 16, "hidden": [8192] * 12}),
+    "another pooling": ("point_head pooling", "mean"),
     "long text as a size": ("range_net stem", "9" * 1_000_000),
     "long key": ("range_net", {"k" * 1_000_000: 1}),
 }
@@ -242,6 +245,11 @@ def hostile_weights(folder: Path, weights: Weights, description: dict[str, Any])
     changes.append({name: value for name, value in weights.tensors.items() if name != WEIGHT})
     for index, tensors in enumerate(changes):
         paths.append(write_weights(folder / f"t{index}.safetensors", tensors, good_text))
+
+    # A network that the file lacks would be built all the same, with random values.
+    large = change(description, "model polar_net widths", [8192] * 8)
+    present = {name: value for name, value in weights.tensors.items() if "range_net" in name}
+    paths.append(write_weights(folder / "absent.safetensors", present, json.dumps(large)))
     return paths
 
 

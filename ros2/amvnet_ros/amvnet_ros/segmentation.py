@@ -25,7 +25,7 @@ class Settings:
     """
 
     weights: str = _parameter("sim-hdl64e", "a name, a path, or hf-hub:OWNER/NAME")
-    method: str = _parameter("amvnet", "amvnet, rv, bev, ensemble, arithmetic or maximum")
+    method: str = _parameter("amvnet", "amvnet, rv, rv-knn, bev, ensemble, arithmetic or maximum")
     device: str = _parameter("cpu", "cpu, cuda, cuda:1, ...")
     engine: str = _parameter("auto", "auto, torch, compile or onnx")
     precision: str = _parameter("float32", "float32, bfloat16, or on a GPU float16")

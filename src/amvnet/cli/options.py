@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import say, silence
 from amvnet.errors import InputError
-from amvnet.models.methods import METHODS, EngineName, MethodName, Precision, widest_method
+from amvnet.models.methods import (
+    METHODS,
+    EngineName,
+    MethodName,
+    Precision,
+    TtaName,
+    widest_method,
+)
 
 if TYPE_CHECKING:
     from amvnet.data.class_maps import ClassMap
@@ -77,6 +84,7 @@ def make_segmenter(
     precision: Precision,
     at_once: int | None,
     method: MethodName | None = None,
+    tta: TtaName | None = None,
 ) -> Segmenter:
     """Return the segmenter of a verb.
 
@@ -87,6 +95,7 @@ def make_segmenter(
         precision: as for --precision.
         at_once: as for --at-once; None means the best number.
         method: by which it labels scans; by default the widest that the weights have parts for.
+        tta: as for --tta.
 
     Raises:
         InputError: if one of the options does not fit the weights or this machine.
@@ -95,7 +104,7 @@ def make_segmenter(
     from amvnet.inference.segmenter import Segmenter
 
     chosen = method or widest_method(weights.parts)
-    segmenter = Segmenter(weights, device, chosen, precision=precision, keep_memory=True)
+    segmenter = Segmenter(weights, device, chosen, precision, keep_memory=True, tta=tta)
     if chosen == "amvnet":
         say_assertion(weights)
     if at_once is not None:

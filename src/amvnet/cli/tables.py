@@ -45,6 +45,8 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     methods = report["methods"]
     figures = list(methods.values())
     title = f"{report['dataset']}: {report['scans']} scans, {report['points']:,} points"
+    if "tta" in report:
+        title += f", test-time augmentation: {report['tta']}"
     table = Table(title=title, show_edge=False)
     table.add_column("IoU in %")
     for name in methods:

@@ -28,7 +28,8 @@ THRESHOLDS: dict[str, float] = {
 NEEDS_LABELS = "loss"  # the assertion that only training can use
 
 # Upper limits, far above any use: a weights file or a recipe of a stranger cannot fill the memory.
-Channels = Annotated[int, Range(1, 8192)]
+MOST_CHANNELS = 8192
+Channels = Annotated[int, Range(1, MOST_CHANNELS)]
 Cells = Annotated[int, Range(1, 16384)]  # along one side of a view
 MOST_CELLS = 2**22  # of a view; the paper's range image has 2**18
 Degrees = Annotated[float, Range(-90, 90)]  # above the horizon
@@ -248,11 +249,21 @@ class PointHeadConfig(Checked):
     """Channels of the fully connected layer before the scores."""
     position_scale: float = 0.05
     """Factor on x, y, z (metres) as features: brings them to the magnitude of the scores."""
+    pooling: Literal["max", "attention"] = "max"
+    """How the neighbours are pooled: by their maximum (the paper), or by attention."""
+    heads: Annotated[int, Range(1, 16)] = 1
+    """Heads, each trained from its own seed on its own draws, whose probabilities are averaged."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
 
         self.check(len(self.hidden) > 0, "one or more hidden layers", "none")
+        channels = self.heads * max(*self.hidden, self.fc)
+        self.check(
+            holds=channels <= MOST_CHANNELS,
+            expected=f"at most {MOST_CHANNELS} channels of all heads together",
+            found=str(channels),
+        )
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,13 @@ from amvnet.inference.score_files import SURE, check_probabilities
 from amvnet.inference.segmenter import Segmentation, check_scan, to_segmentation
 from amvnet.models.amvnet import LateFusion, Scores
 from amvnet.models.assertions import Disagreement, build_assertion
+from amvnet.models.head_ensemble import HeadEnsemble
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights, load
 
-Head = PointHead | Weights | Path | str | None
+Head = PointHead | HeadEnsemble | Weights | Path | str | None
 
 
 class Fusion:
@@ -70,7 +71,7 @@ class Fusion:
         if self.model.point_head is None:
             return
 
-        classes = self.model.point_head.fc[-1].out_features
+        classes = self.model.point_head.classes
         if classes != f.shape[1]:
             raise InputError(
                 f"expected scores of the head's {classes} classes, found {f.shape[1]}; "

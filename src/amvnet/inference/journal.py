@@ -114,4 +114,5 @@ def _changed_keys(earlier: Any, settings: dict[str, Any]) -> list[str]:
     """Return the keys of the settings whose values differ from those of an earlier run."""
     if not isinstance(earlier, dict):
         return list(settings)
-    return [key for key, value in settings.items() if earlier.get(key) != value]
+    keys = {**earlier, **settings}  # an option that was left out may have no key
+    return [key for key in keys if earlier.get(key) != settings.get(key)]

@@ -26,6 +26,7 @@ from amvnet.inference.inputs import (
 )
 from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.segmenter import Segmentation, Segmenter
+from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import ScanAdapter
@@ -71,7 +72,7 @@ def predict(
             write; at the end, if every scan is broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
-    if output.uncertain and segmenter.method in ("rv", "bev"):
+    if output.uncertain and not METHODS[segmenter.method].has_two_networks:
         raise InputError(
             f"expected a method of two networks for --uncertain, found {segmenter.method}; "
             "use amvnet"
@@ -189,7 +190,7 @@ def _report(segment: NetworkSegmentation, processes: Processes, say: Say) -> Non
     shares = processes.gather((segment.counted.points, segment.counted.uncertain))
     points = sum(points for points, _ in shares)
     uncertain = sum(uncertain for _, uncertain in shares)
-    if not points or segment.segmenter.method in ("rv", "bev"):
+    if not points or not METHODS[segment.segmenter.method].has_two_networks:
         return
 
     verdict = Verdict(uncertain / points, segment.segmenter.weights.usual_uncertain)
@@ -210,4 +211,6 @@ def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter)
 
     if segmenter.precision != "float32":
         settings["precision"] = segmenter.precision
+    if segmenter.tta is not None:
+        settings["tta"] = segmenter.tta
     return settings

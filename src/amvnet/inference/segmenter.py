@@ -16,13 +16,15 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.segmentation import Origin, Segmentation
+from amvnet.inference.test_time import SYMMETRIES, average
 from amvnet.memory import keep_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.layers import fold_batch_norms
-from amvnet.models.methods import METHODS, PAPER_METHODS, MethodName, Precision
+from amvnet.models.methods import METHODS, PAPER_METHODS, MethodName, Precision, TtaName
 from amvnet.models.precision import InPrecision, check_precision
 from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
+from amvnet.models.voting import Voting
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import check_intensity, trained_intensity
 from amvnet.threads import BusyMachine, survive_forks
@@ -40,16 +42,18 @@ class Segmenter:
     Args:
         weights: trained weights, or the name or path of a weights file.
         device: where to compute: "cpu", "cuda", "cuda:1", ...
-        method: "amvnet", or for comparison "rv" or "bev" (one network), "ensemble" (geometric
-            mean), "arithmetic" or "maximum".
+        method: "amvnet", or for comparison "rv" or "bev" (one network), "rv-knn" (the range view
+            with `models.voting`), "ensemble" (geometric mean), "arithmetic" or "maximum".
         precision: of the two networks: "float32", "bfloat16", or on a GPU "float16". Everything
             else is computed in float32, the projections in float64.
         keep_memory: on a CPU, let the whole process keep freed memory (`keep_freed_memory`), which
             saves time for each scan. This changes the allocator of your program.
+        tta: test-time augmentation: the networks' class probabilities are means over "flips" of the
+            scan in x and y, "yaw" turns by quarters (4 passes of the networks each), or "both" (8).
 
     Raises:
         InputError: if the weights lack a part that the method needs, or there is no such method,
-            device or precision.
+            device, precision or augmentation.
     """
 
     def __init__(
@@ -59,9 +63,11 @@ class Segmenter:
         method: MethodName = "amvnet",
         precision: Precision = "float32",
         keep_memory: bool = False,
+        tta: TtaName | None = None,
     ) -> None:
         self.weights = weights if isinstance(weights, Weights) else load(weights)
         self.method = _check_method(method, self.weights)
+        self.tta = _check_tta(tta)
         # Weights that were trained with other intensities take them, too.
         trained = trained_intensity(self.weights.training, self.weights.sensor)
         self._are_fractions = trained is None or trained.quantiles[-1] <= 1
@@ -244,16 +250,16 @@ class Segmenter:
             As `scores_by_method`.
         """
         model = self.model
-        if "range_net" not in parts and "polar_net" not in parts:
-            return {}, None
-        if "polar_net" not in parts:
-            return {"rv": model.score_range_view(batch)}, None
-        if "range_net" not in parts:
-            return {"bev": model.score_polar_view(batch)}, None
+        scores = self._network_scores(batch, parts)
+        if "rv-knn" in methods and "rv" in scores:
+            image = model.range_view.project(batch)
+            scores["rv-knn"] = Voting()(scores["rv"], batch, image)
+        if "rv" not in scores or "bev" not in scores:
+            return scores, None
 
-        f, g = model.score(*model.project(batch))
+        f = scores["rv"]
+        g = scores["bev"]
         uncertain = model.compare(batch, f, g)
-        scores = {"rv": f, "bev": g}
         for name in methods:
             ensemble = METHODS[name].ensemble
             if ensemble is not None:
@@ -263,6 +269,25 @@ class Segmenter:
             h = model.refine(batch, f, g, uncertain)
             scores["amvnet"] = model.merge(f, g, uncertain, h)
         return scores, uncertain
+
+    def _network_scores(self, batch: PointBatch, parts: Collection[str]) -> dict[str, Tensor]:
+        """Return the (P, K) class probabilities by each network among `parts`: `rv`, `bev`."""
+        if self.tta is None:
+            return self._scores_of_one_pass(batch, parts)
+        symmetries = SYMMETRIES[self.tta]
+        return average(lambda changed: self._scores_of_one_pass(changed, parts), batch, symmetries)
+
+    def _scores_of_one_pass(self, batch: PointBatch, parts: Collection[str]) -> dict[str, Tensor]:
+        """Return what `_network_scores` does, without test-time augmentation."""
+        model = self.model
+        if "range_net" in parts and "polar_net" in parts:
+            f, g = model.score(*model.project(batch))
+            return {"rv": f, "bev": g}
+        if "range_net" in parts:
+            return {"rv": model.score_range_view(batch)}
+        if "polar_net" in parts:
+            return {"bev": model.score_polar_view(batch)}
+        return {}
 
     def _batch(self, scans: Sequence[Scan]) -> PointBatch:
         if self._are_fractions:
@@ -312,6 +337,15 @@ def _check_method(method: MethodName, weights: Weights) -> MethodName:
         )
 
     return method
+
+
+def _check_tta(tta: TtaName | None) -> TtaName | None:
+    if tta is not None and tta not in SYMMETRIES:
+        raise InputError(
+            f"expected a test-time augmentation of {', '.join(SYMMETRIES)}, found {tta!r}; "
+            "use one of them, or None"
+        )
+    return tta
 
 
 def _check_device(name: str) -> str:

@@ -13,11 +13,12 @@ from torch import Tensor, nn
 
 from amvnet.config.schema import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
+from amvnet.models.head_ensemble import Head, build_head
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import (
-    PointHead,
     nearest_neighbours,
     point_table,
+    sectors,
     select_used_points,
 )
 from amvnet.models.polar_net import PolarNet
@@ -78,7 +79,7 @@ class LateFusion(nn.Module):
         watch: returns the context in which a step runs, to time the steps; does nothing by default.
     """
 
-    def __init__(self, assertion: Assertion, point_head: PointHead | None) -> None:
+    def __init__(self, assertion: Assertion, point_head: Head | None) -> None:
         super().__init__()
         self.assertion = assertion
         self.point_head = point_head
@@ -128,12 +129,14 @@ class LateFusion(nn.Module):
         """
         assert self.point_head is not None
 
-        used, (index, near) = select_used_points(len(points), index, near)
-        table = point_table(
-            points.index_select(0, used), f.index_select(0, used), g.index_select(0, used)
-        )
-
-        return self.point_head.score(table, index, near).softmax(dim=1)
+        h = f.new_empty(len(index), f.shape[1])
+        for part in sectors(points, index):
+            used, (i, k) = select_used_points(len(points), index[part], near[part])
+            table = point_table(
+                points.index_select(0, used), f.index_select(0, used), g.index_select(0, used)
+            )
+            h[part] = self.point_head.score(table, i, k).softmax(dim=1)
+        return h
 
     @step("merge")
     def merge(self, f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
@@ -158,7 +161,7 @@ class AMVNet(LateFusion):
         range_net: nn.Module,
         polar_net: nn.Module,
         assertion: Assertion,
-        point_head: PointHead | None,
+        point_head: Head | None,
     ) -> None:
         super().__init__(assertion, point_head)
         self.range_view = range_view
@@ -218,7 +221,7 @@ def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
     if h is None:
         return y
     if y.is_cpu:
-        return y.index_put((uncertain,), h)
+        return y.index_put_((uncertain,), h)
 
     # `index_put` would make the CPU wait for the GPU; on a CPU it takes half the time of this.
     return y.masked_scatter(uncertain[:, None], h)
@@ -232,5 +235,5 @@ def build_amvnet(config: ModelConfig, classes: int) -> AMVNet:
         range_net=RangeNet(config.range_net, classes),
         polar_net=PolarNet(config.polar_net, config.polar_view.vertical, classes),
         assertion=build_assertion(config.assertion),
-        point_head=PointHead(config.point_head, classes),
+        point_head=build_head(config.point_head, classes),
     )

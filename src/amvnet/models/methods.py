@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Literal, get_args
 if TYPE_CHECKING:
     from torch import Tensor
 
-MethodName = Literal["rv", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
+MethodName = Literal["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
+TtaName = Literal["flips", "yaw", "both"]  # of a scan, over which probabilities are averaged
 Precision = Literal["float32", "bfloat16", "float16"]  # of the two networks
 EngineName = Literal["auto", "torch", "compile", "onnx"]  # what runs the two networks
 Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]  # f, g: (P, K) -> (P, K)
@@ -23,7 +24,7 @@ BOTH_NETWORKS = ("range_net", "polar_net")
 
 def geometric_mean(f: Tensor, g: Tensor) -> Tensor:
     """Return the ensemble that AMVNet uses for certain points."""
-    return (f * g).sqrt()
+    return (f * g).sqrt_()
 
 
 def arithmetic_mean(f: Tensor, g: Tensor) -> Tensor:
@@ -53,12 +54,18 @@ class Method:
     parts: tuple[str, ...]
     ensemble: Ensemble | None = None
 
+    @property
+    def has_two_networks(self) -> bool:
+        """Whether the method compares two networks, so that it knows uncertain points."""
+        return set(BOTH_NETWORKS) <= set(self.parts)
 
-# In the order of the paper's tables: each method may need more parts than those before it.
+
+# In the order of the paper's tables.
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
         Method("rv", "RV", ("range_net",)),
+        Method("rv-knn", "RV + kNN", ("range_net",)),
         Method("bev", "BEV", ("polar_net",)),
         Method("arithmetic", "arithmetic mean", BOTH_NETWORKS, arithmetic_mean),
         Method("maximum", "maximum", BOTH_NETWORKS, maximum),
@@ -78,11 +85,9 @@ def title_of(name: str) -> str:
 
 
 def widest_method(parts: Collection[str]) -> MethodName:
-    """Return the last method, in the order of the paper's tables, whose parts are all present.
+    """Return the last method of the paper's tables whose parts are all present.
 
     Without any such method this is "amvnet", whose check names the missing parts.
     """
-    names: list[MethodName] = [
-        method.name for method in METHODS.values() if set(method.parts) <= set(parts)
-    ]
+    names = [name for name in PAPER_METHODS if set(METHODS[name].parts) <= set(parts)]
     return names[-1] if names else "amvnet"

@@ -10,6 +10,7 @@ from torch.nn import functional as F
 
 from amvnet.config.schema import PointHeadConfig
 from amvnet.models.layers import PointLinear
+from amvnet.models.neighbour_pooling import build_pooling
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import occurring
@@ -17,6 +18,7 @@ from amvnet.models.views.points import occurring
 POINT_VALUES = 4  # x, y, z, intensity
 PART = 1024  # uncertain points scored at a time, so that they fit into a CPU's cache
 PART_ON_GPU = 2**16  # the same for a GPU: enough to keep it busy
+AT_ONCE = 2**17  # uncertain points whose table is in memory: a scan may have millions of them
 
 
 class PointHead(nn.Module):
@@ -30,17 +32,21 @@ class PointHead(nn.Module):
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
         super().__init__()
         self.config = config
+        self.classes = classes
 
         width = 2 * classes + POINT_VALUES
-        self.mlp = _mlp((width, *config.hidden))
+        # The pooling applies the last ReLU of the shared MLP.
+        self.mlp = nn.Sequential(*_layers((width, *config.hidden))[:-1])
+        self.pool = build_pooling(config.pooling, width, config.hidden[-1])
         self.fc = nn.Sequential(
-            _mlp((width + config.hidden[-1], config.fc)), PointLinear(config.fc, classes)
+            nn.Sequential(*_layers((width + config.hidden[-1], config.fc))),
+            PointLinear(config.fc, classes),
         )
 
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
         encoded = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1])
-        pooled = encoded.amax(dim=1)  # (U, hidden[-1])
+        pooled = self.pool(point, encoded)  # (U, hidden[-1])
         return self.fc(torch.cat([pooled, point], dim=1))
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
@@ -55,8 +61,7 @@ class PointHead(nn.Module):
             near: (U, n) indices of their nearest neighbours.
         """
         first = self.mlp[0]
-        middle = self.mlp[1:-1]
-        activation = self.mlp[-1]
+        rest = self.mlp[1:]
         assert isinstance(first, nn.Linear)
 
         encoded = first(table)  # (P, hidden[0]): W [f_k, g_k, x_k] of every point
@@ -68,10 +73,8 @@ class PointHead(nn.Module):
             rows = encoded.index_select(0, k.flatten()).unflatten(0, k.shape)
             rows = rows.sub_(shift[:, None])  # (part, n, hidden[0])
 
-            # ReLU is monotonic: after the maximum it gives the same for a fraction of the work.
-            pooled = activation(middle(rows.flatten(0, 1)).unflatten(0, k.shape).amax(dim=1))
-
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
+            pooled = self.pool(point, rest(rows.flatten(0, 1)).unflatten(0, k.shape))
             logits.append(self.fc(torch.cat([pooled, point], dim=1)))
         return torch.cat(logits)
 
@@ -85,6 +88,23 @@ def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
         g: (P, K) class probabilities by the bird's-eye view.
     """
     return torch.cat([f, g, points], dim=1)
+
+
+def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
+    """Divide some points by their azimuth, so that each part and its neighbours are a few points.
+
+    Args:
+        points: (P, 4), all points of a scan.
+        index: (U,) indices of the points to divide.
+
+    Returns:
+        Places in `index`, at most `AT_ONCE` in each part; one part if there are not more points.
+    """
+    if len(index) <= AT_ONCE:
+        return [slice(None)]
+
+    azimuth = torch.atan2(points[index, 1], points[index, 0])
+    return list(azimuth.argsort().split(AT_ONCE))
 
 
 def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
@@ -143,8 +163,9 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
     return torch.from_numpy(nearest).to(points.device)
 
 
-def _mlp(widths: tuple[int, ...]) -> nn.Sequential:
+def _layers(widths: tuple[int, ...]) -> list[nn.Module]:
+    """Return linear layers between these numbers of channels, each with batch norm and ReLU."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [PointLinear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers)
+    return layers

@@ -95,12 +95,19 @@ class PointDraw:
         labels: (U,) train ids, to balance the classes; None to draw all points alike.
         balance: in [0, 1]. A point of a class with n points is drawn in proportion to
             n ** -balance, and may be drawn several times.
+        heads: of the ensemble; each has its own draw.
     """
 
     def __init__(
-        self, size: int, drawn: int = 0, labels: np.ndarray | None = None, balance: float = 0.0
+        self,
+        size: int,
+        drawn: int = 0,
+        labels: np.ndarray | None = None,
+        balance: float = 0.0,
+        heads: int = 1,
     ) -> None:
         self.size = size
+        self.heads = heads
         self.drawn = min(drawn, size) if drawn else size
         self.cumulative: np.ndarray | None = None
         if labels is not None and balance > 0:
@@ -112,7 +119,7 @@ class PointDraw:
         return self.drawn
 
     def __call__(self, rng: np.random.Generator) -> np.ndarray:
-        """Return the indices of an epoch's points, in a random order."""
+        """Return the indices of an epoch's points for one head, in a random order."""
         if self.cumulative is None:
             return rng.permutation(self.size)[: self.drawn]
 
@@ -123,9 +130,11 @@ class PointDraw:
 class PointSampler(data.Sampler[np.ndarray]):
     """Draws batches of indices; with several processes, each takes its part of every batch.
 
+    A batch to learn from has the points of each head of an ensemble, one after the other.
+
     Args:
         draw: draws the points of an epoch.
-        batch: points in a batch of all processes.
+        batch: points in a batch of all processes, for each head.
         seed: of the order.
         shuffle: whether to shuffle the points, as in training. A smaller last batch is then left
             out, as batch norm learns nothing good from a few points.
@@ -152,14 +161,24 @@ class PointSampler(data.Sampler[np.ndarray]):
         return -(-self.draw.size // self.batch)  # rounded up
 
     def __iter__(self) -> Iterator[np.ndarray]:
-        if self.shuffle:
-            order = self.draw(np.random.default_rng([self.seed, self.epoch]))
-        else:
-            order = np.arange(self.draw.size)
-
+        orders = self._orders()
         for number in range(len(self)):
-            batch = order[number * self.batch : (number + 1) * self.batch]
-            yield batch[self.processes.rank :: self.processes.size]
+            batch = slice(number * self.batch, (number + 1) * self.batch)
+            parts = [order[batch][self.processes.rank :: self.processes.size] for order in orders]
+            yield np.concatenate(parts)
+
+    def _orders(self) -> list[np.ndarray]:
+        """Return the points of the epoch in their order, for each head."""
+        if not self.shuffle:
+            return [np.arange(self.draw.size)]
+
+        orders = []
+        for head in range(self.draw.heads):
+            entropy = [self.seed, self.epoch]
+            if head > 0:  # the first head draws the same points as a single one
+                entropy.append(head)
+            orders.append(self.draw(np.random.default_rng(entropy)))
+        return orders
 
 
 def make_head_loader(

@@ -92,6 +92,10 @@ class Run:
             part, _ = STAGES[name]
             if init is None or part not in init.parts:
                 continue
+            # A new kind of head can be trained on the networks of any weights.
+            if name == "head" and name in trained and not init.fits(part, plan.recipe.model):
+                plan.options.say("head: new, as that of the initial weights has other sizes")
+                continue
             if init.taxonomy.classes == weights.taxonomy.classes:
                 weights = weights.replace_part(part, init)
             elif name in trained:

@@ -21,6 +21,7 @@ from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.models.head_ensemble import heads_of
 from amvnet.models.views.points import PointBatch
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
 from amvnet.training.fit import LAST, FitOptions, Loaders, fit
@@ -388,7 +389,7 @@ class HeadRun(StageRun):
             shuffle=True,
             seed=training.seed,
             processes=processes,
-            draw=PointDraw(len(train), config.drawn, labels, config.balance),
+            draw=PointDraw(len(train), config.drawn, labels, config.balance, len(heads_of(head))),
         )
         val_loader = None
         if val is not None:

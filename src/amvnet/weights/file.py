@@ -26,7 +26,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, did_you_mean, shown
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
-from amvnet.models.point_head import PointHead
+from amvnet.models.head_ensemble import Head, build_head
 from amvnet.weights import hub
 
 # The parts of the method, each with the fields of `ModelConfig` that set its sizes.
@@ -44,6 +44,7 @@ USUAL_UNCERTAIN = 0.2
 FLOATS = ("F16", "BF16", "F32", "F64")
 COUNTS = ("I64",)
 LONGEST = 10_000_000  # characters of a description; those of the built-in weights have 6,000
+MOST_PARAMETERS = 500_000_000  # of a model; that of the paper has about 60 million
 FORMAT = 1  # version of the description
 KEY = "amvnet"  # key of the description in the file's metadata
 _FIELD_TYPES = {"model": dict, "taxonomy": dict, "sensor": str, "training": dict, "metrics": dict}
@@ -179,6 +180,13 @@ class Weights:
         )
         return weights, new
 
+    def fits(self, name: str, model: ModelConfig) -> bool:
+        """Return whether the parameters of one part have the sizes of another configuration."""
+        with torch.device("meta"):  # without memory
+            part = getattr(build_amvnet(model, self.taxonomy.size), name)
+        expected = {key: tensor.shape for key, tensor in part.state_dict().items()}
+        return expected == {key: tensor.shape for key, tensor in self.part(name).items()}
+
     def resized(self, name: str, model: ModelConfig) -> Weights:
         """Return these weights with the sizes of one part taken from another configuration.
 
@@ -204,7 +212,7 @@ class Weights:
             model.point_head = None
         return model.eval()
 
-    def build_head(self) -> PointHead:
+    def build_head(self) -> Head:
         """Return only the point head, in evaluation mode.
 
         Raises:
@@ -215,7 +223,7 @@ class Weights:
                 "expected weights with a point head, found none; train one with --stage head"
             )
 
-        head = PointHead(self.model.point_head, self.taxonomy.size)
+        head = build_head(self.model.point_head, self.taxonomy.size)
         self._load_part("point_head", head)
         return head.eval()
 
@@ -359,6 +367,13 @@ def _read_tensors(file: Any, weights: Weights) -> dict[str, Tensor]:
     names = set(file.keys())
     with torch.device("meta"):  # without memory
         described = build_amvnet(weights.model, weights.taxonomy.size).state_dict()
+    parameters = sum(tensor.numel() for tensor in described.values())
+    if parameters > MOST_PARAMETERS:  # parts that the file lacks are built as well
+        raise InputError(
+            f"expected a model of at most {MOST_PARAMETERS:,} parameters, found {parameters:,}; "
+            "use other weights"
+        )
+
     present = {name.partition(".")[0] for name in names}
     expected = {name for name in described if name.partition(".")[0] in present}
     if names != expected:

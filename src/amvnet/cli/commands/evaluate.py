@@ -17,7 +17,7 @@ from amvnet.cli.options import (
     parse_names,
 )
 from amvnet.errors import InputError
-from amvnet.models.methods import EngineName, Precision
+from amvnet.models.methods import EngineName, Precision, TtaName
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
@@ -31,6 +31,7 @@ def evaluate(
     split: Split = "val",
     sequences: str | None = None,
     methods: str = "rv,bev,ensemble,amvnet",
+    tta: TtaName | None = None,
     json: Path | None = None,
     pictures: Path | None = None,
     taxonomy: Path | None = None,
@@ -48,8 +49,11 @@ def evaluate(
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
         split: the official split to score.
         sequences: sequences or scenes, separated by commas, to score instead.
-        methods: what to score of weights, separated by commas; arithmetic and maximum are the other
-            ensembles.
+        methods: what to score of weights, separated by commas; rv-knn is rv with a vote of
+            neighbours in the range image, arithmetic and maximum are the other ensembles.
+        tta: test-time augmentation of weights, the mean of the networks' probabilities over flips
+            or quarter turns (yaw) of the scan, 4 times the work of the networks, or over both, 8
+            times.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
         taxonomy: a semantic-kitti.yaml with other classes.
@@ -80,9 +84,13 @@ def evaluate(
         opened = open_data(data, taxonomy) if has_own else None
         dataset = map_classes(open_for_weights(data, loaded, opened), class_map)
         records = labelled_records(dataset, choose_records(dataset, names, split))
-        segmenter = make_segmenter(loaded, processes.device(device), engine, precision, at_once)
+        segmenter = make_segmenter(
+            loaded, processes.device(device), engine, precision, at_once, tta=tta
+        )
         labeller = label_by_weights(dataset, segmenter, parse_methods(methods), class_map)
     elif predictions is not None and weights is None:
+        if tta is not None:
+            raise InputError("--tta: expected --weights, found --predictions; leave --tta out")
         dataset = map_classes(open_data(data, taxonomy), class_map)
         records = labelled_records(dataset, choose_records(dataset, names, split))
         labeller = label_from_files(dataset, predictions)
@@ -100,17 +108,26 @@ def evaluate(
             dataset, records, labeller, pictures, progress=step, processes=processes
         )
     if processes.first:
-        show_evaluation(evaluation, data, dataset.taxonomy, json)
+        show_evaluation(evaluation, data, dataset.taxonomy, json, tta)
 
 
 def show_evaluation(
-    evaluation: Evaluation, dataset: str, taxonomy: Taxonomy, path: Path | None
+    evaluation: Evaluation,
+    dataset: str,
+    taxonomy: Taxonomy,
+    path: Path | None,
+    tta: TtaName | None = None,
 ) -> None:
-    """Print the table, and write the same figures as JSON if there is a path."""
+    """Print the table, and write the same figures as JSON if there is a path.
+
+    Both say so if there was a test-time augmentation.
+    """
     from amvnet.cli.tables import evaluation_table
     from amvnet.files import atomic_write
 
     figures = evaluation.report(dataset)
+    if tta is not None:
+        figures["tta"] = tta
     console.print(evaluation_table(figures, taxonomy))
     if path is not None:
         with atomic_write(path) as part:

@@ -14,7 +14,7 @@ from amvnet.cli.options import (
     parse_names,
     refuse_other_formats,
 )
-from amvnet.models.methods import EngineName, MethodName, Precision
+from amvnet.models.methods import EngineName, MethodName, Precision, TtaName
 
 FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
 
@@ -24,6 +24,7 @@ def predict(
     weights: str,
     out: Path,
     method: MethodName = "amvnet",
+    tta: TtaName | None = None,
     split: Split = "all",
     sequences: str | None = None,
     scores: bool = False,
@@ -55,6 +56,8 @@ def predict(
         weights: a weights file, or the name of a built-in one.
         out: folder for the labels.
         method: the whole of AMVNet, or a part of it.
+        tta: test-time augmentation, the mean of the networks' probabilities over flips or quarter
+            turns (yaw) of the scan, 4 times the work of the networks, or over both, 8 times.
         split: of datasets, the official split.
         sequences: of datasets, these sequences or scenes instead, separated by commas.
         scores: also write the probabilities of both networks.
@@ -110,7 +113,7 @@ def predict(
         offset=offset,
     )
     segmenter = make_segmenter(
-        load(weights), processes.device(device), engine, precision, at_once, method=method
+        load(weights), processes.device(device), engine, precision, at_once, method=method, tta=tta
     )
 
     with progress("segmenting") as step:
