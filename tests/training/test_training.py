@@ -46,6 +46,7 @@ from fixtures.worlds import (
     label_map,
     make_streets,
     run_cli,
+    without,
     write_recipe,
 )
 
@@ -826,3 +827,113 @@ for _ in range(100):
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert result.returncode == 0
+
+
+JOINT = ("--stage", "joint")
+
+
+@pytest.fixture(scope="module")
+def joint(world: Path, run: Path) -> Path:
+    """Fine-tune all parts of the run together, in a copy of its folder."""
+    shutil.copytree(run, world / "joint")
+    train(world, world / "joint", *JOINT)
+    return world / "joint"
+
+
+def test_the_stage_joint_goes_on_with_all_parts_but_the_statistics_of_batch_norms(
+    run: Path, joint: Path
+) -> None:
+    before = load(run)
+    after = load(joint)
+    assert differing(before, after) == set(PARTS)
+    for name, tensor in before.tensors.items():
+        if "running" in name or "num_batches" in name:
+            assert torch.equal(tensor, after.tensors[name]), name
+
+    for part in PARTS:
+        assert after.training[part]["joint"]["epochs"] == 2
+        assert after.training[part]["sequences"] == ["00", "01"]
+    assert after.usual_uncertain != before.usual_uncertain
+
+
+def test_the_metrics_of_the_stage_joint_are_those_of_each_part(
+    world: Path, joint: Path, tmp_path: Path
+) -> None:
+    report = tmp_path / "report.json"
+    options = ("--weights", joint, "--methods", "rv,bev,amvnet", "--json", report)
+    assert run_cli("evaluate", world / "data", *options)[0] == 0
+    methods = json.loads(report.read_text())["methods"]
+
+    weights = load(joint)
+    for part, method in {"range_net": "rv", "polar_net": "bev", "point_head": "amvnet"}.items():
+        miou = methods[method]["miou"]
+        assert weights.metrics[part]["val/miou"] == pytest.approx(miou, abs=2e-3)
+        assert weights.metrics[part]["val/acc"] == pytest.approx(methods[method]["accuracy"], 5e-3)
+    assert column(joint, "joint", "val/miou")[-1] == weights.metrics["point_head"]["val/miou"]
+
+
+def test_the_loss_of_the_stage_joint_is_the_weighted_sum_of_the_three(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    weights = {"rv": 0.5, "bev": 2.0, "head": 3.0}
+    options: list[object] = [*JOINT, "--init", run]
+    for name, value in weights.items():
+        options += [f"--training.joint.{name}_loss", value]
+    train(world, tmp_path, *options)
+
+    total = np.array(column(tmp_path, "joint", "train/loss"))
+    parts = [w * np.array(column(tmp_path, "joint", f"train/{n}")) for n, w in weights.items()]
+    assert total == pytest.approx(np.sum(parts, axis=0), rel=1e-4)
+
+
+def test_a_stage_joint_with_init_or_interrupted_ends_with_the_same_weights(
+    world: Path, run: Path, joint: Path, tmp_path: Path
+) -> None:
+    options = (*JOINT, "--init", run)
+    train_interrupted("joint", 1, world, tmp_path, *options)
+    assert not differing(train(world, tmp_path, *options, "--resume"), load(joint))
+    # Once more, now that it is finished.
+    assert not differing(train(world, tmp_path, *options, "--resume"), load(joint))
+
+
+def test_after_the_stage_joint_the_other_stages_are_over(
+    world: Path, run: Path, joint: Path, tmp_path: Path
+) -> None:
+    expected = load(joint)
+    assert not differing(train(world, joint, "--resume"), expected)
+    assert not differing(train(world, joint, *JOINT, "--resume"), expected)
+
+    shutil.copytree(joint / "joint", tmp_path / "joint")
+    error = fail(*train_arguments(world, tmp_path), "--stage", "rv", "--resume")
+    assert "before the stage joint" in error
+
+
+@pytest.mark.parametrize("precision", ["bf16-mixed", "64-true"])
+def test_the_stage_joint_averages_weights_and_works_in_other_precisions(
+    world: Path, run: Path, tmp_path: Path, precision: str
+) -> None:
+    options = ("--training.precision", precision, "--training.joint.ema", 0.5)
+    weights = train(world, tmp_path, *JOINT, "--init", run, *options)
+    last = load(tmp_path / "joint/last.safetensors")
+    assert not differing(weights, last)
+    assert differing(weights, load(run)) == set(PARTS)
+
+
+def test_the_stage_joint_refuses_what_it_cannot_train(
+    world: Path, run: Path, joint: Path, tmp_path: Path
+) -> None:
+    arguments = [*train_arguments(world, tmp_path / "run"), *JOINT]
+    assert "found no range_net" in fail(*arguments)
+    save(without(load(run), "point_head"), tmp_path / "networks.safetensors")
+    assert "found no point_head" in fail(*arguments, "--init", tmp_path / "networks.safetensors")
+    scores = ("--scores-a", tmp_path, "--scores-b", tmp_path)
+    assert "--stage head" in fail(*arguments, "--init", run, *scores)
+    assert "recipe's sizes" in fail(*arguments, "--init", run, "--model.range_net.decoder", 24)
+    assert "dry run" in fail(*arguments, "--init", run, "--dry-run")
+
+    # Neither other weights nor other values go on with it.
+    arguments = [*train_arguments(world, tmp_path), *JOINT, "--resume"]
+    shutil.copytree(joint / "joint", tmp_path / "joint")
+    save(fresh_weights(), tmp_path / "others.safetensors")
+    assert "parts.range_net" in fail(*arguments, "--init", tmp_path / "others.safetensors")
+    assert "joint.lr" in fail(*arguments, "--init", run, "--training.joint.lr", 0.5)

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from amvnet.config.bounds import Checked, Count, NotNegative, Positive, Range, Share
 
-StageName = Literal["rv", "bev", "head"]
+StageName = Literal["rv", "bev", "head", "joint"]
 AssertionName = Literal["disagreement", "entropy", "margin", "labels", "loss"]
 
 # From where on an assertion calls a point uncertain, unless a recipe says otherwise: the paper's
@@ -360,11 +360,15 @@ class NetworkTraining(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
 
-        self.check(
-            holds=self.batch % self.accumulate == 0,
-            expected=f"a batch that is a multiple of {self.accumulate}",
-            found=str(self.batch),
-        )
+        _check_parts(self, self.batch, self.accumulate)
+
+
+def _check_parts(training: Checked, batch: int, accumulate: int) -> None:
+    training.check(
+        holds=batch % accumulate == 0,
+        expected=f"a batch that is a multiple of {accumulate}",
+        found=str(batch),
+    )
 
 
 @dataclass(frozen=True)
@@ -400,6 +404,41 @@ class HeadTraining(Checked):
 
 
 @dataclass(frozen=True)
+class JointTraining(Checked):
+    """Fine-tuning of both networks and the head, end to end (the paper's outlook); all open."""
+
+    epochs: Count = 4
+    """Passes over the training scans."""
+    batch: Count = 8
+    """Scans of one optimizer step."""
+    lr: Positive = 1e-4
+    """Peak of the one-cycle learning rate; low, as all parts are trained already."""
+    weight_decay: NotNegative = 0.01
+    """AdamW's weight decay."""
+    warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
+    """Share of the steps before the learning rate's peak."""
+    rv_loss: NotNegative = 1.0
+    """Weight of the range view's own loss."""
+    bev_loss: NotNegative = 1.0
+    """Weight of the bird's-eye view's own loss."""
+    head_loss: NotNegative = 1.0
+    """Weight of the head's loss, whose gradient reaches both networks."""
+    points: Count = 4096
+    """Limit on the uncertain points of each scan for the head, drawn at random in each step."""
+    clip: Positive = 5.0
+    """Largest norm of the gradient; larger ones are scaled down."""
+    ema: Annotated[float, Range(0, 0.99999)] = 0.0
+    """Decay of the exponential moving average of the weights that is used in the end; 0: none."""
+    accumulate: Count = 1
+    """Parts that each process splits its batch into, if it does not fit into memory."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+
+        _check_parts(self, self.batch, self.accumulate)
+
+
+@dataclass(frozen=True)
 class AdaptConfig(Checked):
     """Pseudo-labels for scans without labels, and the rounds of `amvnet adapt`; all open."""
 
@@ -423,7 +462,7 @@ class AdaptConfig(Checked):
 
 @dataclass(frozen=True)
 class TrainingConfig(Checked):
-    """The three stages of training."""
+    """The stages of training."""
 
     rv: NetworkTraining = NetworkTraining(epochs=160, batch=32, lr=4e-3)
     """The range-view network."""
@@ -431,6 +470,8 @@ class TrainingConfig(Checked):
     """The bird's-eye-view network."""
     head: HeadTraining = HeadTraining()
     """The point head."""
+    joint: JointTraining = JointTraining()
+    """Both networks and the head together; a stage that only --stage joint trains."""
     adapt: AdaptConfig = AdaptConfig()
     """Pseudo-labels, and the rounds of `amvnet adapt`."""
     augment: AugmentConfig = AugmentConfig()
@@ -475,4 +516,4 @@ class Recipe:
     model: ModelConfig = ModelConfig()
     """The networks and their sizes."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
-    """The three stages."""
+    """The stages."""

@@ -83,7 +83,8 @@ def fit(
     if options.training.precision == DOUBLE:
         stage.double()
     if options.training.compile:
-        stage.trained.compile()
+        for net in stage.compilable:
+            net.compile()
 
     checkpoint = options.folder / LAST
     begun = checkpoint if options.run.resume and checkpoint.is_file() else None

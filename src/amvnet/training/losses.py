@@ -170,11 +170,12 @@ def _loss(
     if not labelled.any():
         return logits.sum() * 0  # so that backward() finds a graph, with gradients of 0
 
-    logits = _at_least_float32(logits[labelled])
+    logits = at_least_float32(logits[labelled])
     target = labels[labelled].long() - 1
     cross_entropy = F.cross_entropy(logits, target, weights)
     return cross_entropy + region * region_loss(logits.softmax(dim=1), target)
 
 
-def _at_least_float32(x: Tensor) -> Tensor:
+def at_least_float32(x: Tensor) -> Tensor:
+    """Return half precision as float32, and float64 as it is."""
     return x.to(torch.promote_types(x.dtype, torch.float32))

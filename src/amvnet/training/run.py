@@ -11,11 +11,12 @@ from typing import Literal
 
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
+from amvnet.training.joint_run import JointRun
 from amvnet.training.memory_estimate import check_memory
 from amvnet.training.run_plan import RunOptions, RunPlan
 from amvnet.training.run_record import initial_digests, write_record
 from amvnet.training.stage_run import HeadRun, NetworkRun, StageRun
-from amvnet.weights.file import Weights, save
+from amvnet.weights.file import PARTS, Weights, save
 
 # The stages in order: the part of the weights that each trains, and how.
 STAGES: dict[str, tuple[str, type[StageRun]]] = {
@@ -23,6 +24,7 @@ STAGES: dict[str, tuple[str, type[StageRun]]] = {
     "bev": ("polar_net", NetworkRun),
     "head": ("point_head", HeadRun),
 }
+JOINT = "joint"  # the stage after all of these, which goes on with their parts
 TRIAL_STEPS = 2  # the second of them is timed
 
 
@@ -45,8 +47,9 @@ class Run:
             The weights file, with all parts that have been trained so far.
 
         Raises:
-            InputError: if the head is to be trained without trained networks, or the folder holds a
-                run that is not to be resumed or was begun with other settings.
+            InputError: if the head is to be trained without trained networks, or all parts together
+                without trained parts, or the folder holds a run that is not to be resumed or was
+                begun with other settings.
         """
         plan = self.plan
         names = plan.recipe.stages if stage == "all" else (stage,)
@@ -59,6 +62,7 @@ class Run:
         if init is not None:
             self._check_init(init, names)
         weights = self._start(init, names)
+        self._check_joint(names, weights)
         for name in names:
             self._stage(name, weights).check_begun()
         processes = plan.options.processes
@@ -71,7 +75,7 @@ class Run:
         for name in names:
             weights = self._stage(name, weights).train()
             if processes.first:
-                save(weights, path)
+                save(self._stage(JOINT, weights).finished_weights(), path)
             processes.wait()
         return path
 
@@ -100,6 +104,17 @@ class Run:
             weights = self._stage(name, weights).finished_weights()
 
         return weights
+
+    def _check_joint(self, names: Sequence[str], weights: Weights) -> None:
+        """Raise InputError if a stage is to be trained after the joint one has begun."""
+        joint = self._stage(JOINT, weights)
+        for name in names:
+            is_over = name == JOINT or self._stage(name, weights).is_finished
+            if joint.is_begun and not is_over:
+                raise InputError(
+                    f"{joint.folder}: expected the stage {name} before the stage joint, found it "
+                    "begun; give another folder, and --init"
+                )
 
     def _for_classes(self, init: Weights, part: str) -> Weights:
         """Return initial weights whose last layers are new, for the classes of the dataset."""
@@ -143,17 +158,24 @@ class Run:
                 )
 
     def _stage(self, name: str, weights: Weights) -> StageRun:
+        if name == JOINT:
+            return JointRun(self.plan, name, PARTS, weights, train_networks=train_networks)
         part, kind = STAGES[name]
-        return kind(self.plan, name, part, weights, train_networks=train_networks)
+        return kind(self.plan, name, (part,), weights, train_networks=train_networks)
 
     def trials(self, stage: StageName | Literal["all"]) -> Iterator[str]:
         """Take some steps of each network; yield lines on their memory and time. Write nothing.
 
         Raises:
-            InputError: if a step clearly needs more memory than is free; then no step is taken.
+            InputError: if a step clearly needs more memory than is free, or the stage trains none
+                of the networks alone; then no step is taken.
         """
         weights = self._start(None)
         names = [name for name in ("rv", "bev") if stage in (name, "all")]
+        if not names:
+            raise InputError(
+                f"expected --stage rv, bev or all for a dry run, found {stage}; give one of these"
+            )
 
         plan = self.plan
         scan = plan.scans.dataset.read(plan.scans.train[0], labels=False)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.config.schema import NetworkTraining, Recipe
+from amvnet.config.schema import JointTraining, NetworkTraining, Recipe
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.distributed import ALONE, Processes
@@ -80,7 +80,7 @@ class RunPlan:
                 "name more validation sequences"
             )
         for name in ("rv", "bev"):
-            _check_batch(getattr(self.recipe.training, name), name, size)
+            check_batch(getattr(self.recipe.training, name), name, size)
 
         taxonomy = self.scans.dataset.taxonomy.name
         # A user's own classes fit any recipe.
@@ -112,8 +112,8 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
     )
 
 
-def _check_batch(config: NetworkTraining, name: str, processes: int) -> None:
-    """Raise InputError if a batch cannot be divided evenly."""
+def check_batch(config: NetworkTraining | JointTraining, name: str, processes: int) -> None:
+    """Raise InputError if a batch of a stage cannot be divided evenly among processes."""
     if config.batch % (processes * config.accumulate):
         raise InputError(
             f"expected a batch for {processes} processes, each in {config.accumulate} parts, found "

@@ -107,7 +107,9 @@ def _specs(dataset: Dataset) -> list[str]:
     return dataset.specs if isinstance(dataset, Joined) else [dataset.spec]
 
 
-def stage_settings(plan: RunPlan, name: str, part: str, weights: Weights) -> dict[str, Any]:
+def stage_settings(
+    plan: RunPlan, name: str, parts: Sequence[str], weights: Weights
+) -> dict[str, Any]:
     """Return what the trained weights of a stage depend on, for YAML.
 
     Paths are left out, so that the data may move to another folder before the stage is resumed.
@@ -115,15 +117,17 @@ def stage_settings(plan: RunPlan, name: str, part: str, weights: Weights) -> dic
     Args:
         plan: of the run.
         name: name of the stage.
-        part: the part of the weights that the stage trains.
+        parts: the parts of the weights that the stage trains.
         weights: the weights that the stage begins with.
     """
     recipe = to_dict(plan.recipe)
-    training_keys = (name, "augment", "seed", "precision")
+    training_keys = [name, "augment", "seed", "precision"]
+    if name == "joint":
+        training_keys += ["rv", "bev", "head"]  # they have the losses
     train = plan.scans.train
     val = plan.scans.val
     settings: dict[str, Any] = {
-        "model": {key: recipe["model"][key] for key in SIZES[part]},
+        "model": {key: recipe["model"][key] for part in parts for key in SIZES[part]},
         "training": {key: recipe["training"][key] for key in training_keys},
         "scans": {"train": _digest_of_scans(train), "val": _digest_of_scans(val)},
     }
@@ -132,6 +136,8 @@ def stage_settings(plan: RunPlan, name: str, part: str, weights: Weights) -> dic
         settings["scores"] = plan.scores.digests([*train, *val])
     elif name == "head":
         settings["networks"] = {network: weights.digest(network) for network in BOTH_NETWORKS}
+    elif name == "joint":
+        settings["parts"] = {part: weights.digest(part) for part in parts}
     return settings
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ import yaml
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 
-from amvnet.config.schema import NetworkTraining
+from amvnet.config.schema import JointTraining, NetworkTraining
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -46,7 +46,7 @@ class StageRun:
     Attributes:
         plan: of the run.
         name: name of the stage, as for --stage.
-        part: the part of the weights that the stage trains.
+        parts: the parts of the weights that the stage trains.
         weights: the weights that the stage begins with.
         train_networks: trains both networks of another plan, as the folds of the head need them;
             returns their weights file.
@@ -54,7 +54,7 @@ class StageRun:
 
     plan: RunPlan
     name: str
-    part: str
+    parts: tuple[str, ...]
     weights: Weights
     train_networks: Callable[[RunPlan], Path]
 
@@ -75,7 +75,7 @@ class StageRun:
     @property
     def settings(self) -> dict[str, Any]:
         """What the trained weights of the stage depend on, for YAML."""
-        return stage_settings(self.plan, self.name, self.part, self.weights)
+        return stage_settings(self.plan, self.name, self.parts, self.weights)
 
     @property
     def is_begun(self) -> bool:
@@ -90,29 +90,31 @@ class StageRun:
         check_begun(self.folder, self.settings, self.plan.options.resume)
 
     def finished_weights(self) -> Weights:
-        """Return the weights, with the part that this stage trained if it is finished."""
+        """Return the weights, with the parts that this stage trained if it is finished."""
         if self.is_finished:
-            return self.weights.replace_part(self.part, load(self.weights_path))
+            return self._replaced(self.weights, load(self.weights_path))
         return self.weights
 
     def train(self) -> Weights:
-        """Fit the stage; return the weights with the trained part.
+        """Fit the stage; return the weights with the trained parts.
 
         Raises:
             InputError: if the weights to begin with do not fit the recipe, or a scan is broken.
         """
         if self.done_path.is_file() and self.plan.options.resume:
-            return self.weights
+            return self.finished_weights()
 
-        # The recipe decides the sizes of the part, whatever the weights have.
+        # The recipe decides the sizes of the parts, whatever the weights have.
         L.seed_everything(self.plan.recipe.training.seed, verbose=False)
-        resized = self.weights.resized(self.part, self.plan.recipe.model)
+        resized = self.weights
+        for part in self.parts:
+            resized = resized.resized(part, self.plan.recipe.model)
         dataclasses.replace(self, weights=resized).fit()
 
         # The first process has written the weights; the others read them too.
         processes = self.plan.options.processes
         processes.wait()
-        trained = resized.replace_part(self.part, load(self.weights_path))
+        trained = self._replaced(resized, load(self.weights_path))
         if processes.first:
             self.done_path.write_text("")
         return trained
@@ -121,19 +123,36 @@ class StageRun:
         """Fit the stage, and write its weights after each epoch."""
         raise NotImplementedError
 
+    def _replaced(self, weights: Weights, trained: Weights) -> Weights:
+        """Return weights with the parts of this stage taken from the trained ones."""
+        for part in self.parts:
+            weights = weights.replace_part(part, trained)
+        return weights
+
+    def state(self, module: nn.Module) -> dict[str, Tensor]:
+        """Return the parameters of what Lightning has trained, named as in `Weights.tensors`."""
+        (part,) = self.parts
+        return part_state(part, module)
+
+    def metrics_of(self, part: str, metrics: Mapping[str, float]) -> dict[str, float]:
+        """Return those of the validation metrics that are about one of the parts."""
+        return dict(metrics)
+
     def model(self) -> AMVNet:
-        """Return a model; the part to train has the parameters of the weights, if they have it.
+        """Return a model; the parts to train have the parameters of the weights, if these do.
 
         Raises:
             InputError: if these parameters have other sizes.
         """
         model = build_amvnet(self.weights.model, self.weights.taxonomy.size)
-        if self.part in self.weights.parts:
+        for part in self.parts:
+            if part not in self.weights.parts:
+                continue
             try:
-                getattr(model, self.part).load_state_dict(self.weights.part(self.part))
+                getattr(model, part).load_state_dict(self.weights.part(part))
             except RuntimeError:
                 raise InputError(
-                    f"expected weights whose {self.part} has the recipe's sizes, found others; "
+                    f"expected weights whose {part} has the recipe's sizes, found others; "
                     "use the recipe of the weights"
                 ) from None
 
@@ -154,7 +173,7 @@ class StageRun:
         return class_weights(counts)
 
     def keep_weights(self) -> KeepWeights:
-        """Return the callback that writes the trained part after each epoch."""
+        """Return the callback that writes the trained parts after each epoch."""
         # Only the first process writes.
         scans = self.plan.scans
         is_first = self.plan.options.processes.first
@@ -178,7 +197,7 @@ class StageRun:
 
 @dataclass(frozen=True)
 class PartWriter:
-    """Writes the part that a stage trains, with a description of its training.
+    """Writes the parts that a stage trains, with a description of their training.
 
     Attributes:
         stage: the stage.
@@ -193,7 +212,6 @@ class PartWriter:
     started: float
 
     def __call__(self, module: nn.Module, path: Path, metrics: dict[str, float]) -> None:
-        part = self.stage.part
         scans = self.stage.plan.scans
         description = {
             **self.settings["training"],
@@ -208,9 +226,9 @@ class PartWriter:
 
         trained = dataclasses.replace(
             self.stage.weights,
-            tensors=part_state(part, module),
-            training={part: description},
-            metrics={part: metrics},
+            tensors=self.stage.state(module),
+            training=dict.fromkeys(self.stage.parts, description),
+            metrics={part: self.stage.metrics_of(part, metrics) for part in self.stage.parts},
         )
         save(trained, path)
         with atomic_write(path.parent / SETTINGS) as file:
@@ -239,42 +257,16 @@ NETWORKS = {
 
 
 @dataclass(frozen=True)
-class NetworkRun(StageRun):
-    """Stage `rv` or `bev`: one of the two networks (section 3.1 of the paper)."""
+class ScanRun(StageRun):
+    """A stage that learns from batches of scans."""
 
     @property
-    def config(self) -> NetworkTraining:
-        config: NetworkTraining = getattr(self.plan.recipe.training, self.name)
+    def config(self) -> NetworkTraining | JointTraining:
+        config: NetworkTraining | JointTraining = getattr(self.plan.recipe.training, self.name)
         return config
 
-    def fit(self) -> None:
-        model = self.model()
-        weights = self.class_weights() if self.config.class_weights else None
-        score = getattr(model, NETWORKS[self.name].score)
-        callbacks = [self.keep_weights(), self.pictures(score)]
-        fit(self._stage(model, weights), self._options(), self._loaders(), callbacks)
-
-    def trial(self, steps: int) -> Speed:
-        """Take some steps, and return their speed; nothing is written."""
-        model = self.model()
-        # To compute class weights would need every scan; their values do not change the speed.
-        uniform = class_weights(np.ones(self.weights.taxonomy.size))
-        stage = self._stage(model, uniform if self.config.class_weights else None)
-        options = dataclasses.replace(self._options(), steps=steps)
-        return fit(stage, options, self._loaders())
-
-    def _stage(self, model: AMVNet, weights: np.ndarray | None) -> NetworkStage:
-        network = NETWORKS[self.name]
-        return network.stage(
-            getattr(model, network.view),
-            getattr(model, self.part),
-            config=self.config,
-            taxonomy=self.weights.taxonomy,
-            weights=weights,
-            processes=self.plan.options.processes,
-        )
-
-    def _options(self) -> FitOptions:
+    def fit_options(self) -> FitOptions:
+        """Return how the stage is fitted."""
         config = self.config
         return FitOptions(
             self.plan.recipe.training,
@@ -286,7 +278,8 @@ class NetworkRun(StageRun):
             ema=config.ema,
         )
 
-    def _loaders(self) -> Loaders:
+    def loaders(self) -> Loaders:
+        """Return the batches of scans."""
         training = self.plan.recipe.training
         scans = self.plan.scans
         processes = self.plan.options.processes
@@ -311,6 +304,43 @@ class NetworkRun(StageRun):
             processes=processes,
         )
         return Loaders(train, val)
+
+
+@dataclass(frozen=True)
+class NetworkRun(ScanRun):
+    """Stage `rv` or `bev`: one of the two networks (section 3.1 of the paper)."""
+
+    @property
+    def config(self) -> NetworkTraining:
+        config: NetworkTraining = getattr(self.plan.recipe.training, self.name)
+        return config
+
+    def fit(self) -> None:
+        model = self.model()
+        weights = self.class_weights() if self.config.class_weights else None
+        score = getattr(model, NETWORKS[self.name].score)
+        callbacks = [self.keep_weights(), self.pictures(score)]
+        fit(self._stage(model, weights), self.fit_options(), self.loaders(), callbacks)
+
+    def trial(self, steps: int) -> Speed:
+        """Take some steps, and return their speed; nothing is written."""
+        model = self.model()
+        # To compute class weights would need every scan; their values do not change the speed.
+        uniform = class_weights(np.ones(self.weights.taxonomy.size))
+        stage = self._stage(model, uniform if self.config.class_weights else None)
+        options = dataclasses.replace(self.fit_options(), steps=steps)
+        return fit(stage, options, self.loaders())
+
+    def _stage(self, model: AMVNet, weights: np.ndarray | None) -> NetworkStage:
+        network = NETWORKS[self.name]
+        return network.stage(
+            getattr(model, network.view),
+            getattr(model, self.parts[0]),
+            config=self.config,
+            taxonomy=self.weights.taxonomy,
+            weights=weights,
+            processes=self.plan.options.processes,
+        )
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import lightning as L
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from amvnet.config.schema import HeadTraining, NetworkTraining
+from amvnet.config.schema import HeadTraining, JointTraining, NetworkTraining
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
@@ -52,7 +53,7 @@ class Stage(L.LightningModule):
 
     def __init__(
         self,
-        config: NetworkTraining | HeadTraining,
+        config: NetworkTraining | HeadTraining | JointTraining,
         taxonomy: Taxonomy,
         weights: np.ndarray | None,
         processes: Processes = ALONE,
@@ -66,11 +67,16 @@ class Stage(L.LightningModule):
         tensor = None if weights is None else torch.from_numpy(weights)
         self.register_buffer("class_weights", tensor, persistent=False)
 
-        self.matrix = self._empty_matrix()
+        self.matrix = self.empty_matrix()
 
     def size_of(self, batch: Any) -> int:
         """Return how many units a batch has."""
         raise NotImplementedError
+
+    @property
+    def compilable(self) -> list[nn.Module]:
+        """What --training.compile compiles."""
+        return [self.trained]
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
         """Convert floating-point values of a batch to the precision of the weights.
@@ -101,24 +107,40 @@ class Stage(L.LightningModule):
             labels: (P,) train ids.
             prediction: (P,) predicted train ids.
         """
-        self.matrix += confusion(labels.cpu().numpy(), prediction.cpu().numpy(), self.taxonomy.size)
+        self.matrix += self.confusion(labels, prediction)
+
+    def confusion(self, labels: Tensor, prediction: Tensor) -> np.ndarray:
+        """Return the (K + 1, K + 1) confusion matrix of points; arguments as for `count`."""
+        return confusion(labels.cpu().numpy(), prediction.cpu().numpy(), self.taxonomy.size)
 
     def whole_matrix(self) -> np.ndarray:
         """Return the (K + 1, K + 1) confusion matrix of the validation, summed over processes."""
-        return np.sum(self.processes.gather(self.matrix), axis=0)
+        return self.summed(self.matrix)
+
+    def summed(self, counts: np.ndarray) -> np.ndarray:
+        """Return the sum of counts over all processes."""
+        return np.sum(self.processes.gather(counts), axis=0)
 
     def on_validation_epoch_start(self) -> None:
-        self.matrix = self._empty_matrix()
+        self.matrix = self.empty_matrix()
 
     def on_validation_epoch_end(self) -> None:
-        values = metrics(self.whole_matrix(), self.taxonomy)
-
-        self.log("val/miou", values["miou"] or 0.0, prog_bar=True)
-        self.log("val/miou_present", values["miou_present"] or 0.0)
-        self.log("val/acc", values["accuracy"] or 0.0)
+        values = self.log_metrics("val", self.whole_matrix())
         for name, iou in values["iou"].items():
             if iou is not None:
                 self.log(f"iou/{name}", iou)
+
+    def log_metrics(self, folder: str, matrix: np.ndarray) -> dict[str, Any]:
+        """Log the metrics of a confusion matrix under the names folder/miou and so on.
+
+        Returns:
+            What `evaluation.metrics.metrics` returns.
+        """
+        values = metrics(matrix, self.taxonomy)
+        self.log(f"{folder}/miou", values["miou"] or 0.0, prog_bar=folder == "val")
+        self.log(f"{folder}/miou_present", values["miou_present"] or 0.0)
+        self.log(f"{folder}/acc", values["accuracy"] or 0.0)
+        return values
 
     def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
         """Return an optimizer with the one-cycle schedule, as Lightning expects it.
@@ -142,7 +164,8 @@ class Stage(L.LightningModule):
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
-    def _empty_matrix(self) -> np.ndarray:
+    def empty_matrix(self) -> np.ndarray:
+        """Return a (K + 1, K + 1) confusion matrix without counts."""
         ids = self.taxonomy.size + 1
         return np.zeros((ids, ids))
 
@@ -152,7 +175,43 @@ class Stage(L.LightningModule):
         return values
 
 
-class NetworkStage(Stage):
+class ScanStage(Stage):
+    """The base of the stages that learn from batches of scans, by AdamW."""
+
+    unit = "scans"
+    config: NetworkTraining | JointTraining
+
+    def size_of(self, batch: Batch) -> int:
+        return batch[0].count
+
+    def share_of_step(self, count: int, index: int) -> float:
+        """Return the factor that makes the gradient of a step the mean over its scans.
+
+        Lightning divides the loss of each part of a batch by the number of parts. In the last batch
+        of an epoch there may be fewer parts, and fewer scans in the last of them.
+
+        Args:
+            count: scans of this part.
+            index: number of the part in the epoch.
+        """
+        parts = self.trainer.accumulate_grad_batches
+        loader = self.trainer.train_dataloader
+        if loader is None or loader.batch_size is None:
+            return 1.0
+
+        batch = parts * loader.batch_size
+        before = index // parts * batch  # scans of the earlier steps
+        in_step = min(batch, len(loader.sampler) - before)
+        return count * parts / in_step
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.AdamW(
+            self.trained.parameters(), lr=self.config.lr, weight_decay=self.config.weight_decay
+        )
+        return self.one_cycle(optimizer)
+
+
+class NetworkStage(ScanStage):
     """The base of the two networks' stages, which define `logits` and `loss`.
 
     Args:
@@ -162,7 +221,6 @@ class NetworkStage(Stage):
     The other arguments are those of `Stage`.
     """
 
-    unit = "scans"
     config: NetworkTraining
     view: RangeView | PolarView
 
@@ -202,53 +260,27 @@ class NetworkStage(Stage):
         """The region loss of the recipe; None for that of the paper."""
         return REGION_LOSSES[self.config.region_loss]
 
-    def size_of(self, batch: Batch) -> int:
-        return batch[0].count
+    def mean_loss(self, logits: Sequence[Tensor], labels: Sequence[Tensor]) -> Tensor:
+        """Return the mean loss of some scans, given (M, K) logits and (M,) train ids of each."""
+        # The mean over scans stays the same if a batch is split, over processes or to save memory.
+        losses = []
+        for scan_logits, scan_labels in zip(logits, labels, strict=True):
+            losses.append(self.loss(scan_logits, scan_labels))
+        return torch.stack(losses).mean()
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         points, labels = batch
         logits_by_scan, labels_by_scan, _ = self.logits(points, labels)
-
-        # The mean over scans stays the same if a batch is split, over processes or to save memory.
-        losses = []
-        for scan_logits, scan_labels in zip(logits_by_scan, labels_by_scan, strict=True):
-            losses.append(self.loss(scan_logits, scan_labels))
-        loss = torch.stack(losses).mean()
+        loss = self.mean_loss(logits_by_scan, labels_by_scan)
 
         self.check_finite(loss, f"at the scans {', '.join(points.names)}")
         self.log("train/loss", loss, prog_bar=True, batch_size=points.count)
-        return loss * self._share_of_step(points.count, index)
-
-    def _share_of_step(self, count: int, index: int) -> float:
-        """Return the factor that makes the gradient of a step the mean over its scans.
-
-        Lightning divides the loss of each part of a batch by the number of parts. In the last batch
-        of an epoch there may be fewer parts, and fewer scans in the last of them.
-
-        Args:
-            count: scans of this part.
-            index: number of the part in the epoch.
-        """
-        parts = self.trainer.accumulate_grad_batches
-        loader = self.trainer.train_dataloader
-        if loader is None or loader.batch_size is None:
-            return 1.0
-
-        batch = parts * loader.batch_size
-        before = index // parts * batch  # scans of the earlier steps
-        in_step = min(batch, len(loader.sampler) - before)
-        return count * parts / in_step
+        return loss * self.share_of_step(points.count, index)
 
     def validation_step(self, batch: Batch, index: int) -> None:
         points, labels = batch
         _, _, logits = self.logits(points, labels)
         self.count(labels, logits.argmax(dim=1) + 1)
-
-    def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.AdamW(
-            self.trained.parameters(), lr=self.config.lr, weight_decay=self.config.weight_decay
-        )
-        return self.one_cycle(optimizer)
 
 
 class RangeStage(NetworkStage):
