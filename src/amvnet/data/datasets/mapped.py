@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,13 +11,14 @@ import numpy as np
 from amvnet.data import scan_files as files
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.wrapped import WrappedDataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.scan import Scan
 
 
 @dataclass(frozen=True)
-class MappedDataset:
-    """The scans of a dataset. `Dataset` documents the arguments and errors of its methods.
+class MappedDataset(WrappedDataset):
+    """The scans of a dataset, with mapped labels. `Dataset` documents the methods and their errors.
 
     Attributes:
         dataset: has the scans, and labels and predictions of its own classes.
@@ -28,7 +28,6 @@ class MappedDataset:
         InputError: if the map has none of the dataset's classes.
     """
 
-    dataset: Dataset
     classes: ClassMap
 
     def __post_init__(self) -> None:
@@ -37,27 +36,6 @@ class MappedDataset:
     @property
     def taxonomy(self) -> Taxonomy:
         return self.classes.target
-
-    @property
-    def root(self) -> Path:
-        return self.dataset.root
-
-    @property
-    def spec(self) -> str:
-        return self.dataset.spec
-
-    @property
-    def is_adapted(self) -> bool:
-        return self.dataset.is_adapted
-
-    def sequences(self, split: str) -> tuple[str, ...]:
-        return self.dataset.sequences(split)
-
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
-        return self.dataset.records(sequences)
-
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        return self.dataset.at_epoch(record, epoch)
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan, with mapped labels."""
