@@ -16,9 +16,10 @@ import numpy as np
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
 from amvnet.models.neighbours import nearest_others
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity, are_quantiles, match_scan
 
 DESCRIPTION = "amvnet.json"  # in the folder of the graphs
 FORMAT = 2
@@ -72,6 +73,7 @@ class OnnxSegmenter:
 
         self.description = description
         self.method: str = description["method"]
+        self.intensity = _read_intensity(folder, description)
         self.range_view = from_dict(RangeViewConfig, description.get("range_view", {}), source)
         self.polar_view = from_dict(PolarViewConfig, description.get("polar_view", {}), source)
         self.assertion = from_dict(AssertionConfig, description.get("assertion", {}), source)
@@ -96,6 +98,7 @@ class OnnxSegmenter:
         """
         ring = None if ring is None else np.asarray(ring)
         scan = Scan(np.asarray(points, dtype=np.float32), ring=ring)
+        scan = match_scan(scan, self.intensity)
         valid = scan.valid
         if not valid.any():
             raise InputError(
@@ -196,6 +199,25 @@ class OnnxSegmenter:
         for entry, values in zip(self.description["graphs"][name]["inputs"], inputs, strict=True):
             feed[entry["name"]] = values
         return np.asarray(self._graphs[name].run(None, feed)[0])
+
+
+def _read_intensity(folder: Path, description: Mapping[str, Any]) -> TrainedIntensity | None:
+    """Return what the intensities of each scan are brought to; None if they stay as they are.
+
+    Raises:
+        InputError: if the description says neither.
+    """
+    values = description.get("intensity")
+    if values is None:
+        return None
+
+    quantiles = values.get("quantiles") if isinstance(values, Mapping) else None
+    if not are_quantiles(quantiles):
+        raise InputError(
+            f"{folder}: expected {len(PROBABILITIES)} quantiles of the intensity, in order, found "
+            f"{shown(quantiles)}; export again"
+        )
+    return TrainedIntensity(quantiles, is_matched=True)
 
 
 def range_image(

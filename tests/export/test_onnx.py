@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +24,13 @@ from torch import Tensor
 
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.export import onnx as onnx_export
+from amvnet.export.onnx import describe_export
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.methods import MethodName
+from amvnet.models.methods import BOTH_NETWORKS, MethodName
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES, QUANTILES
 from amvnet.weights.file import Weights, save
 
 from fixtures.worlds import (
@@ -150,6 +152,27 @@ def test_an_ensemble_of_attention_heads_says_what_torch_says(tmp_path: Path) -> 
     assert expected.uncertain.any()
     assert same.mean() >= 0.9999
     assert np.abs(expected.scores - actual.scores)[same].max() <= 1e-4
+
+
+def test_matched_intensities_are_in_the_description(exported: Exports, folder: Path) -> None:
+    quantiles = QUANTILES["hdl64e"]
+    records = {part: {MATCHED: True, KEY: list(quantiles)} for part in BOTH_NETWORKS}
+    weights = replace(exported["elevation"].weights, training=records)
+    description = describe_export(Segmenter(weights), read_description(folder)["graphs"])
+    assert description["intensity"] == {
+        "probabilities": list(PROBABILITIES),
+        "quantiles": list(quantiles),
+    }
+
+    change(folder, "intensity", to=description["intensity"])
+    scan = make_scan(3)
+    expected = Segmenter(weights)(scan)
+    actual = OnnxSegmenter(folder)(scan.points)
+    same = expected.uncertain == actual.uncertain
+    assert same.mean() >= 0.9999
+    assert np.abs(expected.scores - actual.scores)[same].max() <= 1e-4
+    unmatched = Segmenter(exported["elevation"].weights)(scan)
+    assert np.abs(expected.scores - unmatched.scores).max() > 0.001
 
 
 # ---- the files
@@ -320,6 +343,9 @@ def test_a_broken_folder_is_one_line(
         ("point_head position_scale", 10**400, ("position_scale",)),
         ("assertion threshold", math.nan, ("threshold",)),
         ("range_view width", 32, ("range_net", "export again")),
+        ("intensity", {"quantiles": [0.5, math.nan]}, ("quantiles", "export again")),
+        ("intensity", {"quantiles": [10**400] * 11}, ("quantiles", "export again")),
+        ("intensity", [0.5] * 11, ("quantiles", "export again")),
         ("point_head neighbours", 3, ("point_head", "export again")),
     ],
 )

@@ -17,7 +17,15 @@ from amvnet.inference.inputs import adapter_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.ground import ground_height
-from amvnet.sensors.intensity import KEY, PROBABILITIES, QUANTILES, trained_intensity
+from amvnet.sensors.intensity import (
+    KEY,
+    MATCHED,
+    PROBABILITIES,
+    QUANTILES,
+    TrainedIntensity,
+    match_scan,
+    trained_intensity,
+)
 from amvnet.sensors.lidars import Sensor
 from amvnet.training.loaders import sensor_record
 from amvnet.weights.file import Weights
@@ -185,3 +193,65 @@ def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> 
 
     raw = {"range_net": {KEY: np.linspace(0, 255, 11).tolist()}}
     assert len(Segmenter(weights_with(raw))(wrong).labels) == len(points)
+
+
+BY_SCAN = TrainedIntensity(QUANTILES["hdl64e"], is_matched=True)
+MATCHED_RECORDS = {"range_net": {MATCHED: True}, "polar_net": {MATCHED: True}}
+
+
+@pytest.mark.parametrize(
+    "change", [lambda i: i, lambda i: i / 100, lambda i: 1 - 0.5 * (1 - i) ** 2]
+)
+def test_a_matched_scan_has_the_intensities_of_the_training_in_the_same_order(
+    change: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    points = scan_points()
+    points[:, 3] = change(points[:, 3])
+    points[7, 3] = np.nan
+    scan = match_scan(Scan(points), BY_SCAN)
+
+    valid = scan.valid
+    found = np.quantile(scan.points[valid, 3], PROBABILITIES)
+    np.testing.assert_allclose(found, QUANTILES["hdl64e"], atol=0.01)
+    order = np.argsort(points[valid, 3], kind="stable")
+    assert (np.diff(scan.points[valid, 3][order]) >= 0).all()
+    np.testing.assert_array_equal(scan.points[:, :3], points[:, :3])
+    assert np.isnan(scan.points[7, 3])
+
+
+def test_a_scan_without_intensity_is_not_matched() -> None:
+    points = scan_points()
+    points[:, 3] = 0
+    scan = Scan(points)
+    assert match_scan(scan, BY_SCAN) is scan
+
+
+def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> None:
+    weights = weights_with(MATCHED_RECORDS)
+    points = scan_points()
+    dark = points.copy()
+    dark[:, 3] = points[:, 3] ** 2 / 2
+    segmenter = Segmenter(weights)
+    expected = segmenter(points)
+    darker = segmenter(dark)
+    np.testing.assert_allclose(darker.scores, expected.scores, atol=0.02)
+
+    # The scan is labelled alike as a file: its adapter leaves the intensities to the segmenter.
+    said: list[str] = []
+    adapter = adapter_for(weights, None, said.append)
+    adapted = adapter(Cloud(dark[:, :3], dark[:, 3], name="a"), "a")
+    np.testing.assert_allclose(adapted.points[:, 3], dark[:, 3], atol=1e-6)
+    assert "spread as in the training" in said[0]
+
+
+@pytest.mark.parametrize("parts", [("range_net",), ("polar_net",)])
+def test_a_network_of_real_scans_ends_the_matching(parts: tuple[str, ...]) -> None:
+    records: dict[str, Any] = {name: {MATCHED: True} for name in ("range_net", "polar_net")}
+    trained = trained_intensity(records, "hdl64e")
+    assert trained is not None
+    assert trained.is_matched
+    for part in parts:
+        records[part] = {}
+    trained = trained_intensity(records, "hdl64e")
+    assert trained is not None
+    assert not trained.is_matched

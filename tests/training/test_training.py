@@ -26,7 +26,7 @@ from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.head_ensemble import heads_of
 from amvnet.sensors.intensity import KEY as INTENSITIES
-from amvnet.sensors.intensity import PROBABILITIES
+from amvnet.sensors.intensity import MATCHED, PROBABILITIES
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import PointGatherer
@@ -263,6 +263,8 @@ def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
     assert streets == {"000000", "000001", "001000", "001001", "900000"}
     with np.load(tmp_path / "whole/class_counts.npz") as file:
         assert {name[:6] for name in file["scans"].tolist()} == {"000000", "000001"}
+
+    assert whole.training["range_net"][MATCHED] is True
 
     # Another cache, which a worker fills.
     others = ("--data", f"simulated-hdl64e:{tmp_path / 'other'}", "--training.workers", 1)

@@ -40,6 +40,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import BOTH_NETWORKS, widest_method
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.sensors.intensity import KEY as INTENSITY
+from amvnet.sensors.intensity import MATCHED
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.losses import class_weights
 from amvnet.training.run import Run
@@ -49,7 +50,7 @@ from amvnet.weights.file import Weights, load, save
 PICTURES = 3  # scans that are drawn before and after
 SETTINGS = "adapt.yaml"  # in the folder of a run: what it was begun with
 REPORT = "adaptation.json"
-FRAME = (INTENSITY, SENSOR)  # what weights carry of the sensor that scans are brought to
+FRAME = (INTENSITY, MATCHED, SENSOR)  # what weights carry of the sensor that scans are brought to
 
 Watch = Callable[[str], AbstractContextManager[Progress]]  # shows the progress of a step
 

@@ -31,6 +31,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
+from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.weights.file import Weights, load
 
 EXTRA = ("onnx", "onnxscript", "onnxruntime")
@@ -199,6 +200,7 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
         "method": segmenter.method,
         "sensor": segmenter.weights.sensor,
         "points": {"columns": ["x", "y", "z", "intensity"], "farthest": FARTHEST},
+        "intensity": _describe_intensity(segmenter.intensity),
         "range_view": to_dict(model.range_view),
         "range_channels": ["x", "y", "z", "intensity", "range", "mask"],
         "polar_view": to_dict(model.polar_view),
@@ -228,6 +230,13 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
         "graphs": graphs,
     }
     return description
+
+
+def _describe_intensity(trained: TrainedIntensity | None) -> dict[str, list[float]] | None:
+    """Return what the intensities of each scan are brought to; None if they stay as they are."""
+    if trained is None or not trained.is_matched:
+        return None
+    return {"probabilities": list(PROBABILITIES), "quantiles": list(trained.quantiles)}
 
 
 def _graphs(segmenter: Segmenter) -> dict[str, Graph]:

@@ -26,7 +26,7 @@ from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import Voting
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import check_intensity, trained_intensity
+from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
 from amvnet.threads import BusyMachine, survive_forks
 from amvnet.weights.file import Weights, load
 
@@ -71,6 +71,7 @@ class Segmenter:
         # Weights that were trained with other intensities take them, too.
         trained = trained_intensity(self.weights.training, self.weights.sensor)
         self._are_fractions = trained is None or trained.quantiles[-1] <= 1
+        self.intensity = trained
         self.engine = "torch"
         self._at_once: int | None = None
         self.device = _check_device(device)
@@ -292,6 +293,7 @@ class Segmenter:
     def _batch(self, scans: Sequence[Scan]) -> PointBatch:
         if self._are_fractions:
             scans = [check_intensity(scan) for scan in scans]
+        scans = [match_scan(scan, self.intensity) for scan in scans]
         batch = PointBatch.of(scans)
         if _is_gpu(self.device):
             batch = batch.pin_memory()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -33,7 +33,9 @@ QUANTILES = {
     "hdl64e": (0.0, 0.0, 0.07, 0.133, 0.232, 0.311, 0.396, 0.492, 0.565, 0.755, 0.986),
     "hdl32e": (0.0, 0.0, 0.005, 0.007, 0.011, 0.039, 0.066, 0.11, 0.17, 0.265, 0.792),
 }
+LARGEST = 1e9  # no device writes larger intensities
 KEY = "intensity_quantiles"  # of a part's training record
+MATCHED = "match_intensity"  # of a part's training record, see `TrainedIntensity.is_matched`
 
 
 @dataclass(frozen=True)
@@ -43,10 +45,13 @@ class TrainedIntensity:
     Attributes:
         quantiles: of the intensities of the training scans in [0, 1], at `PROBABILITIES`.
         is_optional: whether the networks learnt to do without intensities, as zeros.
+        is_matched: whether each scan's intensities are brought to this distribution, as those of a
+            simulated training are distributed as no real sensor's.
     """
 
     quantiles: Sequence[float]
     is_optional: bool = False
+    is_matched: bool = False
 
     def filler(self, count: int) -> np.ndarray:
         """Return (count,) float32 intensities for a scan that has none.
@@ -69,31 +74,64 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
     """
     quantiles = QUANTILES.get(sensor)
     shares = []
+    matched = []
     for part in ("range_net", "polar_net"):
         record = training.get(part)
         if not isinstance(record, Mapping):
             continue
 
         carried = record.get(KEY)
-        if _are_quantiles(carried):
+        if are_quantiles(carried):
             quantiles = carried
         augment = record.get("augment")
         share = augment.get("no_intensity") if isinstance(augment, Mapping) else None
         shares.append(share if isinstance(share, (int, float)) else 0)
+        matched.append(record.get(MATCHED) is True)
 
     if quantiles is None:
         return None
-    return TrainedIntensity(quantiles, is_optional=min(shares, default=0) >= BLIND_SHARE)
+    return TrainedIntensity(
+        quantiles,
+        is_optional=min(shares, default=0) >= BLIND_SHARE,
+        is_matched=bool(matched) and all(matched),
+    )
 
 
-def _are_quantiles(values: Any) -> bool:
-    """Return whether a value of a weights file can be quantiles at `PROBABILITIES`."""
+def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
+    """Return a scan whose intensities have the distribution of a training.
+
+    The scan stays as it is if the training does not ask for it (`TrainedIntensity.is_matched`), or
+    if its intensities say nothing, such as zeros everywhere.
+    """
+    if trained is None or not trained.is_matched:
+        return scan
+    quantiles = quantiles_of(scan.points[scan.valid, 3])
+    if quantiles is None or is_constant(quantiles):
+        return scan
+
+    points = scan.points.copy()
+    levels, becomes = matching(quantiles, trained.quantiles)
+    points[scan.valid, 3] = np.interp(points[scan.valid, 3], levels, becomes)
+    return dataclasses.replace(scan, points=points)
+
+
+def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quantiles of a source, increasing, and what they become; linear in between.
+
+    Equal quantiles of the source, such as many zeros, become the mean of those of the training.
+    """
+    levels, index = np.unique(quantiles, return_inverse=True)
+    becomes = np.bincount(index, weights=trained) / np.bincount(index)
+    return levels, np.clip(becomes, 0, 1)
+
+
+def are_quantiles(values: Any) -> TypeGuard[list[float]]:
+    """Return whether a value of a file can be quantiles at `PROBABILITIES`."""
     if not isinstance(values, list) or len(values) != len(PROBABILITIES):
         return False
-    numbers = np.array([value for value in values if isinstance(value, (int, float))], float)
-    if len(numbers) != len(values) or not np.isfinite(numbers).all():
-        return False
-    return bool((np.diff(numbers) >= 0).all())
+    if not all(isinstance(value, (int, float)) and abs(value) < LARGEST for value in values):
+        return False  # NaN, too
+    return bool((np.diff(values) >= 0).all())
 
 
 def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
@@ -187,18 +225,17 @@ def intensity_map(
     if is_constant(quantiles):
         text = f"intensity {quantiles[5]:g} everywhere, so none ({_describe_filler(trained)})"
         return IntensityMap(text, trained=trained)
+    if trained is not None and trained.is_matched:  # by the segmenter, scan by scan
+        return dataclasses.replace(linear, text=f"{linear.text}, spread as in the training")
     if trained is None or _are_alike(quantiles / scale, trained.quantiles, ALIKE, DARKEST):
         return linear
 
-    # Equal quantiles of the source, such as many zeros, become the mean of those of the training.
-    levels, index = np.unique(quantiles, return_inverse=True)
-    becomes = np.bincount(index, weights=trained.quantiles) / np.bincount(index)
     text = (
         f"intensity 0 to {scale:g}, spread as in the training: half of it was below "
         f"{quantiles[5] / scale:.2g}, now {trained.quantiles[5]:.2g} "
         f"(--intensity-scale {scale:g} keeps it)"
     )
-    return IntensityMap(text, matched=(levels, np.clip(becomes, 0, 1)))
+    return IntensityMap(text, matched=matching(quantiles, trained.quantiles))
 
 
 def _describe_filler(trained: TrainedIntensity | None) -> str:

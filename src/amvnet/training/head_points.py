@@ -24,6 +24,7 @@ from amvnet.evaluation.metrics import confusion
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
+from amvnet.sensors.intensity import TrainedIntensity, match_scan
 from amvnet.training.disturb import disturb
 from amvnet.training.head_scores import Scorer, ScoreSource
 from amvnet.training.loaders import ScanSet, collate
@@ -223,12 +224,15 @@ class PointGatherer:
         model: says which points are uncertain, and how the head sees them.
         training: says how many points are kept, and how scans are augmented.
         processes: those that share the scans; all must see the folder of the points.
+        intensity: of the training of the networks, to which intensities are brought as for a
+            prediction; None for other models' scores.
     """
 
     dataset: Dataset
     model: ModelConfig
     training: TrainingConfig
     processes: Processes = ALONE
+    intensity: TrainedIntensity | None = None
 
     def gather(
         self,
@@ -359,7 +363,7 @@ class PointGatherer:
             ensemble over the certain and over all uncertain points of the scan.
         """
         device = self._device
-        scan = job.scans[job.view, job.index]
+        scan = match_scan(job.scans[job.view, job.index], self.intensity)
         batch, labels = collate([scan])
         batch = batch.to(device)
         labels = labels.to(device)

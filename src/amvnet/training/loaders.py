@@ -16,13 +16,14 @@ from torch.utils import data
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.own import OwnScans
+from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITY
-from amvnet.sensors.intensity import quantiles_of
+from amvnet.sensors.intensity import MATCHED, quantiles_of
 from amvnet.sensors.own import training_record
 from amvnet.sensors.record import AS_IS, measure_sensor
 from amvnet.sensors.record import KEY as SENSOR
@@ -293,7 +294,10 @@ def sensor_record(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, 
     # Scans that are adapted are as the weights will get them: what they are brought to counts.
     if isinstance(dataset, OwnScans) and dataset.is_adapted:
         return {INTENSITY: mean, **training_record(dataset)}
-    return {INTENSITY: mean, SENSOR: {**measure_sensor(scans), AS_IS: True}}
+    record: dict[str, Any] = {INTENSITY: mean, SENSOR: {**measure_sensor(scans), AS_IS: True}}
+    if isinstance(dataset, SimulatedStreets):
+        record[MATCHED] = True
+    return record
 
 
 def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:

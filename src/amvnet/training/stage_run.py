@@ -23,6 +23,7 @@ from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.head_ensemble import heads_of
 from amvnet.models.views.points import PointBatch
+from amvnet.sensors.intensity import trained_intensity
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
 from amvnet.training.fit import LAST, FitOptions, Loaders, fit
 from amvnet.training.head_points import PointDraw, PointGatherer, make_head_loader
@@ -361,7 +362,10 @@ class HeadRun(StageRun):
 
         # Gather the uncertain points of all scans, with their scores and neighbours.
         val_source = self._score_source(scans.val)
-        gatherer = PointGatherer(scans.dataset, self.weights.model, training, processes)
+        intensity = None
+        if self.plan.scores is None:
+            intensity = trained_intensity(self.weights.training, self.weights.sensor)
+        gatherer = PointGatherer(scans.dataset, self.weights.model, training, processes, intensity)
         train = gatherer.gather(
             self._score_sources(), self.folder / "train", config.views, options.say
         )
