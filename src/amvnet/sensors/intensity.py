@@ -72,7 +72,7 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
         training: the training records of the weights by part.
         sensor: name of the sensor that the weights were trained for.
     """
-    quantiles = QUANTILES.get(sensor)
+    quantiles: Sequence[float] | None = QUANTILES.get(sensor)
     shares = []
     matched = []
     for part in ("range_net", "polar_net"):
