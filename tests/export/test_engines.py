@@ -23,6 +23,7 @@ from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.simulation import simulate
 from amvnet.weights.file import Weights
 
@@ -177,7 +178,8 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
     its voxel among all voxels, and SciPy finds the neighbours.
     """
     model = weights.build()
-    batch = PointBatch.of([scan])
+    intensity = trained_intensity(weights.training, weights.sensor)
+    batch = PointBatch.of([match_scan(scan, intensity)])
     f = model.score_range_view(batch)
 
     net = model.polar_net

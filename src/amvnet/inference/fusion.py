@@ -18,6 +18,7 @@ from amvnet.models.head_ensemble import HeadEnsemble
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.weights.file import Weights, load
 
 Head = PointHead | HeadEnsemble | Weights | Path | str | None
@@ -36,7 +37,13 @@ class Fusion:
     """
 
     def __init__(self, head: Head = None, tau: float | None = None) -> None:
+        if isinstance(head, str | Path):
+            head = load(head)
         self.model = _build_fusion(head, tau)
+        # The head sees the intensities, too.
+        self._intensity = None
+        if isinstance(head, Weights):
+            self._intensity = trained_intensity(head.training, head.sensor)
 
     def __call__(self, points: np.ndarray | Scan, f: np.ndarray, g: np.ndarray) -> Segmentation:
         """Fuse (N, K) class probabilities of one scan's N points.
@@ -44,7 +51,7 @@ class Fusion:
         Raises:
             InputError: if the shapes do not fit, or the scores are not probabilities.
         """
-        scan = check_scan(points)
+        scan = match_scan(check_scan(points), self._intensity)
         self._check_shapes(scan, f, g)
 
         f_valid = np.asarray(f, dtype=np.float32)[scan.valid]
@@ -100,11 +107,8 @@ def fuse(
     return Fusion(head, tau)(points, f, g).labels
 
 
-def _build_fusion(head: Head, tau: float | None) -> LateFusion:
+def _build_fusion(head: PointHead | HeadEnsemble | Weights | None, tau: float | None) -> LateFusion:
     """Return the head with the assertion that chooses its points."""
-    if isinstance(head, str | Path):
-        head = load(head)
-
     config = AssertionConfig()
     if isinstance(head, Weights):
         config = head.model.assertion
