@@ -26,7 +26,7 @@ from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.head_ensemble import heads_of
 from amvnet.sensors.intensity import KEY as INTENSITIES
-from amvnet.sensors.intensity import MATCHED, PROBABILITIES
+from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import PointGatherer
@@ -264,7 +264,10 @@ def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
     with np.load(tmp_path / "whole/class_counts.npz") as file:
         assert {name[:6] for name in file["scans"].tolist()} == {"000000", "000001"}
 
-    assert whole.training["range_net"][MATCHED] is True
+    # The intensities of all scans were brought to those that predictions are brought to.
+    record = whole.training["range_net"]
+    assert record[MATCHED] is True
+    assert record[INTENSITIES] == list(QUANTILES["hdl64e"])
 
     # Another cache, which a worker fills.
     others = ("--data", f"simulated-hdl64e:{tmp_path / 'other'}", "--training.workers", 1)
@@ -275,6 +278,27 @@ def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
 
     repeat = yaml.safe_load((tmp_path / "cut/run.yaml").read_text())["rv"]["repeat"]
     assert f"--data simulated-hdl64e:{tmp_path / 'other'}" in repeat
+
+
+def test_tuning_weights_of_matched_intensities_matches_the_other_scans_too(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    weights = load(run / "weights.safetensors")
+    matched = {MATCHED: True, INTENSITIES: (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist()}
+    records = {part: {**record, **matched} for part, record in weights.training.items()}
+    save(replace(weights, training=records), tmp_path / "init.safetensors")
+
+    options = ("--stage", "rv", "--init", tmp_path / "init.safetensors")
+    tuned = train(world, tmp_path / "run", *options).training["range_net"]
+    assert {name: tuned[name] for name in matched} == matched
+
+    # In training, the network is validated on what it gets in a prediction.
+    report = tmp_path / "report.json"
+    last = tmp_path / "run/weights.safetensors"
+    options_of_report = ("--weights", last, "--methods", "rv", "--json", report)
+    assert run_cli("evaluate", world / "data", *options_of_report)[0] == 0
+    accuracy = json.loads(report.read_text())["methods"]["rv"]["accuracy"]
+    assert accuracy == pytest.approx(column(tmp_path / "run", "rv", "val/acc")[-1], abs=1e-4)
 
 
 def test_reading_in_other_processes_changes_nothing_resumed_or_not(

@@ -51,6 +51,13 @@ class Segmenter:
         tta: test-time augmentation: the networks' class probabilities are means over "flips" of the
             scan in x and y, "yaw" turns by quarters (4 passes of the networks each), or "both" (8).
 
+    Attributes:
+        weights, device, precision, tta: as given; the weights as `Weights`.
+        method: the name of the method.
+        intensity: the intensities of the training, to which those of a scan may be brought
+            (`sensors.intensity.match_scan`); None if unknown.
+        model: the networks and the head, on the device.
+
     Raises:
         InputError: if the weights lack a part that the method needs, or there is no such method,
             device, precision or augmentation.

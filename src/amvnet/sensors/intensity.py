@@ -97,6 +97,15 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
     )
 
 
+def simulated_intensity(sensor: str) -> TrainedIntensity:
+    """Return the intensities that the scans of a simulated sensor are brought to in training.
+
+    Raises:
+        KeyError: if no sensor of this name is simulated.
+    """
+    return TrainedIntensity(QUANTILES[sensor], is_matched=True)
+
+
 def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
     """Return a scan whose intensities have the distribution of a training.
 
@@ -105,13 +114,15 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
     """
     if trained is None or not trained.is_matched:
         return scan
-    quantiles = quantiles_of(scan.points[scan.valid, 3])
+    valid = scan.valid
+    intensity = scan.points[valid, 3]
+    quantiles = quantiles_of(intensity)
     if quantiles is None or is_constant(quantiles):
         return scan
 
     points = scan.points.copy()
     levels, becomes = matching(quantiles, trained.quantiles)
-    points[scan.valid, 3] = np.interp(points[scan.valid, 3], levels, becomes)
+    points[valid, 3] = np.interp(intensity, levels, becomes)
     return dataclasses.replace(scan, points=points)
 
 

@@ -24,7 +24,7 @@ from amvnet.evaluation.metrics import confusion
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
-from amvnet.sensors.intensity import TrainedIntensity, match_scan
+from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.disturb import disturb
 from amvnet.training.head_scores import Scorer, ScoreSource
 from amvnet.training.loaders import ScanSet, collate
@@ -285,7 +285,8 @@ class PointGatherer:
 
         jobs = []
         for source in sources:
-            scans = ScanSet(self.dataset, source.records, augment, self.training.seed)
+            seed = self.training.seed
+            scans = ScanSet(self.dataset, source.records, augment, seed, self.intensity)
             for view in range(max(views, 1)):
                 for index in range(len(scans)):
                     jobs.append(_Job(source, scans, view, index))
@@ -363,7 +364,7 @@ class PointGatherer:
             ensemble over the certain and over all uncertain points of the scan.
         """
         device = self._device
-        scan = match_scan(job.scans[job.view, job.index], self.intensity)
+        scan = job.scans[job.view, job.index]
         batch, labels = collate([scan])
         batch = batch.to(device)
         labels = labels.to(device)

@@ -16,14 +16,13 @@ from torch.utils import data
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.own import OwnScans
-from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITY
-from amvnet.sensors.intensity import MATCHED, quantiles_of
+from amvnet.sensors.intensity import MATCHED, TrainedIntensity, match_scan, quantiles_of
 from amvnet.sensors.own import training_record
 from amvnet.sensors.record import AS_IS, measure_sensor
 from amvnet.sensors.record import KEY as SENSOR
@@ -64,6 +63,7 @@ class ScanSet(data.Dataset[Scan]):
         records: the scans.
         augment: how they are augmented, or None for scans as they are.
         seed: of the augmentation.
+        intensity: what the intensities of each scan are brought to, after its augmentation.
     """
 
     def __init__(
@@ -72,11 +72,13 @@ class ScanSet(data.Dataset[Scan]):
         records: Sequence[ScanRecord],
         augment: AugmentConfig | None = None,
         seed: int = 0,
+        intensity: TrainedIntensity | None = None,
     ) -> None:
         self.dataset = dataset
         self.records = list(records)
         self.augment = augment
         self.seed = seed
+        self.intensity = intensity
 
         classes = enumerate(dataset.taxonomy.classes, start=1)
         self.pasted = [train_id for train_id, name in classes if name in PASTED]
@@ -87,7 +89,7 @@ class ScanSet(data.Dataset[Scan]):
     def __getitem__(self, key: Key) -> Scan:
         epoch, index = key
         if self.augment is None:
-            return self._read(self.records[index])
+            return match_scan(self._read(self.records[index]), self.intensity)
 
         # The order of the random draws decides which scan a seed gives: keep it.
         config = self.augment
@@ -111,7 +113,7 @@ class ScanSet(data.Dataset[Scan]):
         assert self.augment is not None
         epoch, index = key
         record = self.dataset.at_epoch(self.records[index], epoch)
-        return augment(self._read(record), self.augment, rng)
+        return match_scan(augment(self._read(record), self.augment, rng), self.intensity)
 
     def _read(self, record: ScanRecord) -> Scan:
         scan = self.dataset.read(record)
@@ -271,12 +273,19 @@ def count_classes(
     return totals
 
 
-def sensor_record(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, Any]:
+def sensor_record(
+    dataset: Dataset, records: Sequence[ScanRecord], intensity: TrainedIntensity | None = None
+) -> dict[str, Any]:
     """Return what weights carry of the sensor of their training scans.
 
     These are the quantiles of the intensities at `sensors.intensity.PROBABILITIES`, on average over
     a sample of the scans and empty if no scan has usable points, and the measures of
     `sensors.record`. Broken scans are left out: the training names them.
+
+    Args:
+        dataset: reads the scans.
+        records: the scans.
+        intensity: what the intensities of the scans are brought to.
     """
     indices = np.linspace(0, len(records) - 1, min(SAMPLED_SCANS, len(records))).astype(int)
     scans = []
@@ -290,13 +299,15 @@ def sensor_record(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, 
         if quantiles is not None:
             quantiles_of_scans.append(quantiles)
     mean = np.mean(quantiles_of_scans, axis=0).round(4).tolist() if quantiles_of_scans else []
+    record: dict[str, Any] = {INTENSITY: mean}
 
     # Scans that are adapted are as the weights will get them: what they are brought to counts.
     if isinstance(dataset, OwnScans) and dataset.is_adapted:
-        return {INTENSITY: mean, **training_record(dataset)}
-    record: dict[str, Any] = {INTENSITY: mean, SENSOR: {**measure_sensor(scans), AS_IS: True}}
-    if isinstance(dataset, SimulatedStreets):
-        record[MATCHED] = True
+        record |= training_record(dataset)
+    else:
+        record[SENSOR] = {**measure_sensor(scans), AS_IS: True}
+    if intensity is not None and intensity.is_matched:
+        record |= {INTENSITY: list(intensity.quantiles), MATCHED: True}
     return record
 
 

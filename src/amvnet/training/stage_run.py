@@ -18,12 +18,18 @@ from torch import Tensor, nn
 
 from amvnet.config.schema import JointTraining, NetworkTraining
 from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.head_ensemble import heads_of
 from amvnet.models.views.points import PointBatch
-from amvnet.sensors.intensity import trained_intensity
+from amvnet.sensors.intensity import (
+    TrainedIntensity,
+    match_scan,
+    simulated_intensity,
+    trained_intensity,
+)
 from amvnet.training.callbacks import KeepWeights, Pictures, Speed
 from amvnet.training.fit import LAST, FitOptions, Loaders, fit
 from amvnet.training.head_points import PointDraw, PointGatherer, make_head_loader
@@ -77,6 +83,11 @@ class StageRun:
     def settings(self) -> dict[str, Any]:
         """What the trained weights of the stage depend on, for YAML."""
         return stage_settings(self.plan, self.name, self.parts, self.weights)
+
+    @property
+    def intensity(self) -> TrainedIntensity | None:
+        """What the intensities of each scan are brought to, as in a prediction; None: nothing."""
+        return trained_intensity(self.weights.training, self.weights.sensor)
 
     @property
     def is_begun(self) -> bool:
@@ -178,7 +189,7 @@ class StageRun:
         # Only the first process writes.
         scans = self.plan.scans
         is_first = self.plan.options.processes.first
-        sensor = sensor_record(scans.dataset, scans.train) if is_first else {}
+        sensor = sensor_record(scans.dataset, scans.train, self.intensity) if is_first else {}
         writer = PartWriter(self, self.settings, sensor, time.time())
         return KeepWeights(writer, self.folder)
 
@@ -192,7 +203,9 @@ class StageRun:
         indices = np.linspace(0, len(val) - 1, min(PICTURED_SCANS, len(val))).astype(int)
         dataset = self.plan.scans.dataset
         is_first = self.plan.options.processes.first
-        scans = [dataset.read(val[index]) for index in indices] if is_first else []
+        scans = []
+        if is_first:
+            scans = [match_scan(dataset.read(val[index]), self.intensity) for index in indices]
         return Pictures(scans, dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
 
 
@@ -288,7 +301,7 @@ class ScanRun(StageRun):
         # Scans that one process takes at a time.
         batch = self.config.batch // self.config.accumulate // processes.size
         train = make_loader(
-            ScanSet(scans.dataset, scans.train, training.augment, training.seed),
+            ScanSet(scans.dataset, scans.train, training.augment, training.seed, self.intensity),
             batch,
             shuffle=True,
             workers=training.workers,
@@ -298,7 +311,7 @@ class ScanRun(StageRun):
             return Loaders(train, None)
 
         val = make_loader(
-            ScanSet(scans.dataset, scans.val),
+            ScanSet(scans.dataset, scans.val, intensity=self.intensity),
             1,
             shuffle=False,
             workers=training.workers,
@@ -315,6 +328,13 @@ class NetworkRun(ScanRun):
     def config(self) -> NetworkTraining:
         config: NetworkTraining = getattr(self.plan.recipe.training, self.name)
         return config
+
+    @property
+    def intensity(self) -> TrainedIntensity | None:
+        dataset = self.plan.scans.dataset
+        if isinstance(dataset, SimulatedStreets):
+            return simulated_intensity(dataset.sensor)
+        return super().intensity
 
     def fit(self) -> None:
         model = self.model()
@@ -348,6 +368,11 @@ class NetworkRun(ScanRun):
 class HeadRun(StageRun):
     """Stage `head`: the point head on scores of frozen networks (section 3.3 of the paper)."""
 
+    @property
+    def intensity(self) -> TrainedIntensity | None:
+        # Other models' scores are of the scans as they are.
+        return super().intensity if self.plan.scores is None else None
+
     def fit(self) -> None:
         training = self.plan.recipe.training
         config = training.head
@@ -362,10 +387,8 @@ class HeadRun(StageRun):
 
         # Gather the uncertain points of all scans, with their scores and neighbours.
         val_source = self._score_source(scans.val)
-        intensity = None
-        if self.plan.scores is None:
-            intensity = trained_intensity(self.weights.training, self.weights.sensor)
-        gatherer = PointGatherer(scans.dataset, self.weights.model, training, processes, intensity)
+        model = self.weights.model
+        gatherer = PointGatherer(scans.dataset, model, training, processes, self.intensity)
         train = gatherer.gather(
             self._score_sources(), self.folder / "train", config.views, options.say
         )

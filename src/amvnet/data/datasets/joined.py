@@ -14,7 +14,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import check_classes
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.simulated import SCANS
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.datasets.wrapped import WrappedDataset
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -55,7 +55,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Joined:
+class Joined(WrappedDataset):
     """Several datasets with the same classes. `Dataset` documents the methods and their errors.
 
     Scans of the first dataset keep their records. Scans of the others have a `MixedRecord`, and
@@ -63,51 +63,22 @@ class Joined:
     shows others of its scans in each epoch, all of them equally often.
 
     Attributes:
-        first: names the split, is validated, and takes predictions.
-        parts: the other datasets.
+        dataset: the first of them; names the split, is validated, and takes predictions.
+        parts: the others.
         places: of each of them, the scans of an epoch.
     """
 
-    first: Dataset
     parts: tuple[Part, ...]
     places: tuple[int, ...]
 
     @property
-    def taxonomy(self) -> Taxonomy:
-        """The classes of all of them."""
-        return self.first.taxonomy
-
-    @property
-    def root(self) -> Path:
-        """The folder of the first."""
-        return self.first.root
-
-    @property
-    def spec(self) -> str:
-        """What the first is opened with; `specs` has all."""
-        return self.first.spec
-
-    @property
-    def is_adapted(self) -> bool:
-        """Whether the rings of all scans are the rows of the range image."""
-        return self.first.is_adapted
-
-    @property
     def specs(self) -> list[str]:
         """What all of them are opened with: PATH or PATH@SHARE."""
-        texts = [self.first.spec]
+        texts = [self.dataset.spec]
         for part in self.parts:
             share = "" if part.share is None else f"@{part.share:g}"
             texts.append(f"{part.dataset.spec}{share}")
         return texts
-
-    def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of the first."""
-        return self.first.sequences(split)
-
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
-        """Return scans of the first."""
-        return self.first.records(sequences)
 
     def mixed_records(self) -> list[MixedRecord]:
         """Return the places of all others in an epoch."""
@@ -120,7 +91,7 @@ class Joined:
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
         """Return the scan that takes a place in an epoch."""
         if not isinstance(record, MixedRecord):
-            return self.first.at_epoch(record, epoch)
+            return super().at_epoch(record, epoch)
 
         turn = self._record(record.member, record.place, epoch)
         dataset = self.parts[record.member - 1].dataset
@@ -129,16 +100,8 @@ class Joined:
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read a scan of any of them."""
         if not isinstance(record, MixedRecord):
-            return self.first.read(record, labels)
+            return super().read(record, labels)
         return self.parts[record.member - 1].dataset.read(record.original, labels)
-
-    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
-        """Read the predicted (N,) uint8 train ids of a scan of the first."""
-        return self.first.read_prediction(record, folder)
-
-    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids of a scan of the first."""
-        return self.first.write_prediction(record, folder, ids)
 
     def _record(self, member: int, place: int, epoch: int) -> MixedRecord:
         """Return the record of the scan whose turn it is at a place in an epoch."""
