@@ -8,6 +8,11 @@ Progress = Callable[[int, int], None]  # takes what is done, and the total
 Say = Callable[[str], None]  # takes a line
 
 
+def ends_tenth(done: int, total: int) -> bool:
+    """Return whether the last of `done` things completes another tenth of all of them."""
+    return done * 10 // total > (done - 1) * 10 // total
+
+
 def no_progress(done: int, total: int) -> None:
     """Report nothing."""
 

@@ -22,6 +22,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.config.schema import AssertionConfig
 from amvnet.data.datasets import simulated
+from amvnet.data.datasets.open import open_dataset
 from amvnet.errors import InputError
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.head_ensemble import heads_of
@@ -30,6 +31,7 @@ from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import PointGatherer
+from amvnet.training.loaders import count_classes
 from amvnet.training.run_plan import RunPlan
 from amvnet.training.stages import NetworkStage
 from amvnet.weights.file import PARTS, Weights, load, save
@@ -146,6 +148,16 @@ def test_the_class_counts_of_a_run_are_those_of_its_training_scans(world: Path, 
     raw_ids = {0: CAR, 8: ROAD, 10: SIDEWALK, 12: BUILDING}  # by index of the class
     for index, count in enumerate(counts):
         assert count == np.count_nonzero(raw_labels == raw_ids.get(index, -1))
+
+
+def test_counting_classes_reports_ten_times_and_only_once(tmp_path: Path) -> None:
+    dataset = open_dataset(str(make_streets(tmp_path, ("00",), 23)))
+    records = dataset.records(["00"])
+    lines: list[str] = []
+    for _ in range(2):  # the second time, the counts are those of the file
+        count_classes(dataset, records, tmp_path / "counts.npz", say=lines.append)
+    assert len(lines) == 10
+    assert lines[-1] == "classes: counted in 23 of 23 scans"
 
 
 def test_the_weights_describe_their_training(run: Path) -> None:

@@ -24,6 +24,7 @@ from amvnet.evaluation.metrics import confusion
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
+from amvnet.progress import ends_tenth
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.disturb import disturb
 from amvnet.training.head_scores import Scorer, ScoreSource
@@ -347,8 +348,7 @@ class PointGatherer:
                 counts.append(len(points))
                 matrices += scan_matrices
 
-                # A line after every tenth of the scans.
-                if number * 10 // len(share) > (number - 1) * 10 // len(share):
+                if ends_tenth(number, len(share)):
                     say(f"head: scored {number * len(jobs) // len(share)} of {len(jobs)} scans")
 
         return counts, matrices

@@ -20,6 +20,7 @@ from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
+from amvnet.progress import Say, ends_tenth, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITY
 from amvnet.sensors.intensity import MATCHED, TrainedIntensity, match_scan, quantiles_of
@@ -237,12 +238,18 @@ def make_loader(
 
 
 def count_classes(
-    dataset: Dataset, records: Sequence[ScanRecord], path: Path, processes: Processes = ALONE
+    dataset: Dataset,
+    records: Sequence[ScanRecord],
+    path: Path,
+    processes: Processes = ALONE,
+    say: Say = say_nothing,
 ) -> np.ndarray:
     """Count the points of each class in some scans, or read the counts of an earlier call.
 
     Args:
         path: an .npz file of counts; written unless it already has those of these scans.
+        processes: those that share the scans.
+        say: told the progress, line by line.
 
     Returns:
         (K,) int64.
@@ -258,10 +265,14 @@ def count_classes(
         return earlier
 
     counts = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
-    for record in processes.share(records):
+    share = processes.share(records)
+    for number, record in enumerate(share, start=1):
         labels = dataset.read(record).labels
         if labels is not None:
             counts += np.bincount(labels, minlength=len(counts))
+        if ends_tenth(number, len(share)):
+            done = number * len(records) // len(share)
+            say(f"classes: counted in {done} of {len(records)} scans")
 
     totals = np.sum(processes.gather(counts), axis=0)[1:]
 

@@ -181,6 +181,7 @@ class StageRun:
             self.plan.scans.train,
             self.plan.out / "class_counts.npz",
             self.plan.options.processes,
+            self.plan.options.say,
         )
         return class_weights(counts)
 
