@@ -37,32 +37,33 @@ def main() -> None:
     dataset = open_dataset(options.data)
     segmenter = Segmenter(options.weights)
     size = dataset.taxonomy.size + 1
-    confusion = {method: np.zeros((size, size), np.int64) for method in PAPER_METHODS}
+    matrices = {method: np.zeros((size, size), np.int64) for method in PAPER_METHODS}
     uncertain_points = 0
     points = 0
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record, labels=False)
-        ids, uncertain = segmenter.labels_by_method(scan, PAPER_METHODS)
+        labels, uncertain = segmenter.labels_by_method(scan, PAPER_METHODS)
+        assert uncertain is not None
         uncertain_points += int(uncertain.sum())
         points += len(scan)
 
         name = record.points_path.name.removesuffix(".pcd.bin")
         boxes = np.fromfile(options.boxes / f"{name}_boxseg.bin", np.uint8)
         is_boxed = (boxes >= 1) & (boxes <= BOXED)
-        for method, predicted in ids.items():
-            np.add.at(confusion[method], (boxes[is_boxed], predicted[is_boxed]), 1)
+        for method, matrix in matrices.items():
+            np.add.at(matrix, (boxes[is_boxed], labels[method][is_boxed]), 1)
 
     table = Table("points in boxes of", "points", *PAPER_METHODS)
-    classes = dataset.taxonomy.classes
-    large = [classes.index(name) + 1 for name in LARGE_VEHICLES]
-    rows = {name: [train_id] for train_id, name in enumerate(classes[:BOXED], start=1)}
-    for name, ids in {**rows, ", ".join(LARGE_VEHICLES): large}.items():
-        count = confusion["amvnet"][ids].sum()
+    names = dataset.taxonomy.classes
+    rows = {name: [train_id] for train_id, name in enumerate(names[:BOXED], start=1)}
+    rows[", ".join(LARGE_VEHICLES)] = [names.index(name) + 1 for name in LARGE_VEHICLES]
+    for title, train_ids in rows.items():
+        count = matrices["amvnet"][train_ids].sum()
         cells = []
-        for method in PAPER_METHODS:
-            right = confusion[method][np.ix_(ids, ids)].sum()
+        for matrix in matrices.values():
+            right = matrix[np.ix_(train_ids, train_ids)].sum()
             cells.append(f"{100 * right / max(count, 1):.0f} %")
-        table.add_row(name, str(count), *cells)
+        table.add_row(title, str(count), *cells)
     Console().print(table)
     print(f"{100 * uncertain_points / points:.1f} % of the points are uncertain")
 

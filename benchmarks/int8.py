@@ -24,6 +24,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.onnx_runner import OnnxSegmenter, disagree
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import match_scan
 
 GRAPHS = ("range_net", "polar_map")
 RUNS = 15
@@ -48,6 +49,7 @@ class Runner(OnnxSegmenter):
 
     def label(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Return the finite points' labels by method, and which of them are uncertain."""
+        scan = match_scan(scan, self.intensity)
         points = scan.points[scan.valid]
         ring = None if scan.ring is None else scan.ring[scan.valid]
         f = self.score_range_view(points, ring)

@@ -74,7 +74,8 @@ def load(
         method: "amvnet", or a part of it: "rv", "rv-knn" (with a vote of neighbours in the range
             image), "bev", "ensemble", "arithmetic" or "maximum".
         precision: of the two networks: "float32", "bfloat16", or on a GPU "float16".
-        engine: what runs the networks: "torch", "compile", "onnx", or "auto", the fastest here.
+        engine: what runs the networks: "torch", "compile", "onnx", "int8", or "auto", the fastest
+            that gives the same labels here.
         keep_memory: let the whole process keep freed memory, see `Segmenter`.
         tta: test-time augmentation: "flips", "yaw" or "both", see `Segmenter`.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch.nn import functional as F
 
 import amvnet
 from amvnet.data.datasets.open import open_dataset
-from amvnet.export import engines
+from amvnet.export import engines, int8
 from amvnet.export.engines import cache_folder, exported, use_engine
 from amvnet.inference.segmenter import Segmenter, expand_to_scan
 from amvnet.models import layers
@@ -25,7 +26,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.simulation import simulate
-from amvnet.weights.file import Weights
+from amvnet.weights.file import Weights, load
 
 from fixtures.worlds import fails, files, fresh_weights
 
@@ -89,12 +90,41 @@ def test_onnx_says_what_torch_says_and_exports_once(cache: Path) -> None:
 
 def test_other_weights_have_another_export(monkeypatch: pytest.MonkeyPatch) -> None:
     folders: list[Path] = []
-    monkeypatch.setattr(engines, "export", lambda weights, folder: folders.append(folder))
+    monkeypatch.setattr(engines, "export", lambda weights, folder, int8: folders.append(folder))
     monkeypatch.setattr(engines, "check_libraries", lambda: None)
     for seed in (7, 8, 7):
         exported(Segmenter(fresh_weights(seed=seed)))
+    exported(Segmenter(fresh_weights(seed=7)), int8="simulated")
     assert folders[0] == folders[2]
-    assert folders[0] != folders[1]
+    assert len(set(folders)) == 3
+
+
+def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnxruntime")
+    pytest.importorskip("embreex")
+    monkeypatch.setattr(int8, "SCANS", 3)
+    weights = load("sim-hdl64e")
+    scan = int8.calibration_scans("simulated", Segmenter(weights))[0]
+
+    segmenter = Segmenter(weights)
+    expected = segmenter(scan).labels
+    said: list[str] = []
+    for _ in range(2):
+        segmenter = Segmenter(weights)
+        assert use_engine(segmenter, "int8", said.append) == "int8"
+    assert len(said) == 1
+    assert "calibrated" in said[0]
+
+    labels = segmenter(scan).labels
+    assert 0.9 < (labels == expected).mean() < 1
+
+
+def test_int8_of_a_sensor_that_cannot_be_simulated_is_one_line() -> None:
+    pytest.importorskip("onnxruntime")
+    weights = replace(fresh_weights(), sensor="mine")
+    fails(lambda: use_engine(Segmenter(weights), "int8"), "mine", "simulate")
 
 
 @pytest.mark.parametrize("method", ["rv", "bev"])

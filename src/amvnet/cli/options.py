@@ -109,7 +109,7 @@ def make_segmenter(
         say_assertion(weights)
     if at_once is not None:
         segmenter.at_once = at_once
-    use_engine(segmenter, engine)
+    use_engine(segmenter, engine, say)
     return segmenter
 
 

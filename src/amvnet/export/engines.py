@@ -1,4 +1,4 @@
-"""Other engines for the networks of a segmenter: torch.compile, or ONNX Runtime."""
+"""Other engines for the networks of a segmenter: torch.compile, or ONNX Runtime, also in int8."""
 
 from __future__ import annotations
 
@@ -7,39 +7,48 @@ import os
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor, nn
 
 from amvnet.errors import InputError
+from amvnet.export.int8 import SIMULATED
 from amvnet.export.onnx import OPSET, check_libraries, export
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.methods import METHODS
+from amvnet.models.methods import METHODS, ONNX_ENGINES, EngineName
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.precision import InPrecision
 from amvnet.models.views.range_view import CHANNELS
 from amvnet.onnx_runner import DESCRIPTION
+from amvnet.progress import Say, say_nothing
 
-ENGINES = ("auto", "torch", "compile", "onnx")
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 FASTEST = "torch"  # what "auto" means: the others start slowly, see docs/performance.md
 CACHE = "AMVNET_CACHE"  # the environment variable with the folder of exported networks
 
 Runner = Callable[[Tensor], Tensor]
 
 
-def use_engine(segmenter: Segmenter, engine: str) -> str:
+def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> str:
     """Let an engine run the networks of a segmenter from now on.
 
     Everything around the networks stays with torch. `compile` takes a minute before the first scan.
     `onnx` exports the networks once, in half a minute, and keeps them in `cache_folder`; it takes
-    scans one by one.
+    scans one by one. So does `int8`, which also converts the convolutions to 8-bit integers; it
+    calibrates them once, in a few minutes, on simulated scans of the weights' sensor.
+
+    Args:
+        segmenter: the segmenter.
+        engine: one of `ENGINES`.
+        say: told what takes long.
 
     Returns:
         The name of the engine; for "auto", the one that it stands for.
 
     Raises:
-        InputError: if there is no such engine, or it lacks a library, a compiler or the device.
+        InputError: if there is no such engine, it lacks a library, a compiler or the device, or the
+            sensor of the weights cannot be simulated for int8.
     """
     if engine not in ENGINES:
         raise InputError(
@@ -50,8 +59,8 @@ def use_engine(segmenter: Segmenter, engine: str) -> str:
         engine = FASTEST
     if engine == "compile":
         _use_compile(segmenter)
-    if engine == "onnx":
-        _use_onnx(segmenter)
+    if engine in ONNX_ENGINES:
+        _use_onnx(segmenter, engine, say)
 
     segmenter.engine = engine
     return engine
@@ -73,13 +82,15 @@ def _use_compile(segmenter: Segmenter) -> None:
         polar_net.run_unet = _compiled(polar_net.unet, shape, segmenter.device)
 
 
-def _use_onnx(segmenter: Segmenter) -> None:
+def _use_onnx(segmenter: Segmenter, engine: str, say: Say) -> None:
     if segmenter.device != "cpu" or segmenter.precision != "float32":
         found = f"{segmenter.precision} on {segmenter.device}"
-        raise InputError(f"expected float32 on cpu for the engine onnx, found {found}; use compile")
+        raise InputError(
+            f"expected float32 on cpu for the engine {engine}, found {found}; use compile"
+        )
 
     parts = METHODS[segmenter.method].parts
-    folder = exported(segmenter)
+    folder = exported(segmenter, SIMULATED if engine == "int8" else None, say)
     threads = torch.get_num_threads()
     if "range_net" in parts:
         _set_range_net(segmenter, OnnxGraph(folder / "range_net.onnx", threads))
@@ -135,17 +146,27 @@ def cache_folder() -> Path:
     return Path(caches) / "amvnet"
 
 
-def exported(segmenter: Segmenter) -> Path:
-    """Return the folder of a segmenter's exported networks, which are exported if necessary."""
+def exported(segmenter: Segmenter, int8: str | None = None, say: Say = say_nothing) -> Path:
+    """Return the folder of a segmenter's exported networks, which are exported if necessary.
+
+    Args:
+        segmenter: the segmenter.
+        int8: as for `export`.
+        say: told what takes long.
+    """
     check_libraries()
     weights = segmenter.weights
     digests = [weights.digest(part) for part in weights.parts]
     key = [*digests, repr(weights.model), version("amvnet"), torch.__version__]
+    if int8 is not None:
+        key.append(f"int8 {int8}")
     name = hashlib.sha256(repr((key, OPSET)).encode()).hexdigest()[:16]
 
     folder = cache_folder() / "onnx" / name
     if not (folder / DESCRIPTION).is_file():
-        export(weights, folder)
+        calibrated = "" if int8 is None else " and calibrated in int8"
+        say(f"the networks are exported{calibrated}, once for these weights; kept in {folder}")
+        export(weights, folder, int8=int8)
     return folder
 
 
@@ -170,12 +191,12 @@ class OnnxGraph(nn.Module):
         # The runtime's threads are not part of a forked process, which would wait for them forever.
         if os.getpid() != self.process:
             raise InputError(
-                "expected the process that loaded the engine onnx, found one forked from it; "
-                "load the weights in the forked process, or use the engine torch"
+                "expected the process that loaded an engine of ONNX Runtime, found one forked "
+                "from it; load the weights in the forked process, or use the engine torch"
             )
         if len(x) != 1:
             raise InputError(
-                f"expected one scan at a time for the engine onnx, found {len(x)}; use torch"
+                f"expected one scan at a time for this engine, found {len(x)}; use the engine torch"
             )
         inputs = {self.input: x.contiguous().numpy()}
         return torch.from_numpy(self.session.run(None, inputs)[0])

@@ -16,6 +16,7 @@ from amvnet.inference.inputs import ScanOptions, adapter_for, open_inputs
 from amvnet.inference.segmenter import Segmenter
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import match_scan
 
 SIMULATED = "simulated"  # instead of scans: simulated streets, seen by the weights' sensor
 SEED = 20_261_121  # of these streets, far from the seeds of any training
@@ -99,7 +100,7 @@ class _Recorder(OnnxSegmenter):
 
 
 def _read(text: str, segmenter: Segmenter) -> list[Scan]:
-    """Read up to `SCANS` scans, evenly spaced, adapted to the weights as `predict` does.
+    """Read up to `SCANS` scans, evenly spaced, as the networks take them in `predict`.
 
     Raises:
         InputError: if an input is missing or broken, or no scan has a finite point.
@@ -110,7 +111,7 @@ def _read(text: str, segmenter: Segmenter) -> list[Scan]:
     indices = np.linspace(0, count - 1, min(SCANS, count)).astype(int)
     loaded = [opened.scans[index].load().scan for index in indices]
 
-    scans = [scan for scan in loaded if scan.valid.any()]
+    scans = [match_scan(scan, segmenter.intensity) for scan in loaded if scan.valid.any()]
     if not scans:
         raise InputError(
             f"{text}: expected scans to calibrate with, found none with a finite point; name others"

@@ -20,7 +20,14 @@ from amvnet.inference.test_time import SYMMETRIES, average
 from amvnet.memory import keep_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.layers import fold_batch_norms
-from amvnet.models.methods import METHODS, PAPER_METHODS, MethodName, Precision, TtaName
+from amvnet.models.methods import (
+    METHODS,
+    ONNX_ENGINES,
+    PAPER_METHODS,
+    MethodName,
+    Precision,
+    TtaName,
+)
 from amvnet.models.precision import InPrecision, check_precision
 from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
@@ -149,7 +156,7 @@ class Segmenter:
             InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
         checked = [check_scan(points) for points in scans]
-        uses_team = self.device == "cpu" and self.engine != "onnx"
+        uses_team = self.device == "cpu" and self.engine not in ONNX_ENGINES
         with self._machine.watch(uses_team):
             batch = self._batch(checked)
             labels, scores = _fetch(self._scores(batch))

@@ -45,8 +45,9 @@ def analyze(
         train_sequences: sequences or scenes, separated by commas, that these heads learn from;
             default: the official split.
         device: cpu, cuda, cuda:1, ...
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
-            auto, the fastest here.
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
+            (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
+            here that changes none.
         precision: of the networks; float16 on a GPU only.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.

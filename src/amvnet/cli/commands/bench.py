@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from amvnet.cli.console import console, progress
+from amvnet.cli.console import console, progress, say
 from amvnet.cli.options import WEIGHTS, parse_names
 from amvnet.models.methods import Precision
 
@@ -37,7 +37,8 @@ def bench(
         runs: the number of timed runs, after two warm-up runs; medians and quartiles are shown.
         uncertain: the share of the points that counts as uncertain; default: the share that the
             networks disagree on, or 0.1 with --recipe.
-        engines: torch, compile, onnx, or several separated by commas, which are timed in turn.
+        engines: torch, compile, onnx, int8, or several separated by commas, which are timed in
+            turn.
         device: cpu, cuda, cuda:1, ...
         precision: of the networks; float16 on a GPU only.
         json: also write the figures to this file.
@@ -63,7 +64,7 @@ def bench(
         jobs = []
         for engine in parse_names(engines) or []:
             segmenter = Segmenter(timed_weights, device, precision=precision, keep_memory=True)
-            name = use_engine(segmenter, engine)
+            name = use_engine(segmenter, engine, say)
             if precision != "float32":
                 name = f"{name}, {precision}"
             jobs.append(_job(segmenter, scan, folder, name, uncertain))

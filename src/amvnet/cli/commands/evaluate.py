@@ -60,8 +60,9 @@ def evaluate(
         classes: score these classes instead, to which those of the data and of the weights are
             mapped: coarse, or a YAML file.
         device: cpu, cuda, cuda:1, ...
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
-            auto, the fastest here.
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
+            (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
+            here that changes none.
         precision: of the networks; float16 on a GPU only.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.

@@ -36,8 +36,9 @@ def rank(
         sequences: sequences or scenes instead, separated by commas.
         pictures: folder for drawings of the first clusters from above.
         device: cpu, cuda, cuda:1, ...
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
-            auto, the fastest here.
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
+            (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
+            here that changes none.
         precision: of the networks; float16 on a GPU only.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.

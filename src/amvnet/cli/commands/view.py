@@ -69,8 +69,9 @@ def view(
         rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees; default: as
             of predict.
         offset: of scan files, what to add to x,y,z after the rotation, in metres.
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), or
-            auto, the fastest here.
+        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
+            (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
+            here that changes none.
         precision: of the networks; float16 on a GPU only.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
