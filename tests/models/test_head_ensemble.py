@@ -12,7 +12,7 @@ from torch import nn
 from amvnet.config.schema import PointHeadConfig
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.head_ensemble import HeadEnsemble, build_head, heads_of
-from amvnet.models.point_head import PointHead
+from amvnet.models.point_head import PointHead, head_features
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 
@@ -92,3 +92,48 @@ def test_many_wide_heads_are_refused() -> None:
     assert PointHeadConfig(heads=16).heads == 16
     fails(lambda: PointHeadConfig(heads=17), "heads", "16")
     fails(lambda: PointHeadConfig(heads=16, hidden=(1024,)), "all heads together", "16384")
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5])
+def test_a_share_is_the_weight_of_the_head_in_a_mean_with_the_ensemble(share: float) -> None:
+    alone = trained_head(TINY.point_head, K)
+    shared = trained_head(replace(TINY.point_head, share=share), K)
+    f = torch.randn(12, K).softmax(dim=1)
+    g = (3 * torch.randn(12, K)).softmax(dim=1)
+    points = torch.randn(12, 4)
+    table = torch.cat([f, g, points], dim=1)
+    uncertain = torch.tensor([2, 5, 11])
+    near = torch.randint(0, 12, (3, TINY.point_head.neighbours))
+
+    with torch.no_grad():
+        h = alone.score(table, uncertain, near).softmax(dim=1)
+        fast = shared.score(table, uncertain, near).softmax(dim=1)
+        plain = shared(*head_features(shared.config, table, uncertain, near)).softmax(dim=1)
+    for row, i in enumerate(uncertain.tolist()):
+        weighted = []
+        for k in range(K):
+            ensemble = math.sqrt(f[i, k].item() * g[i, k].item())
+            weighted.append(h[row, k].item() ** share * ensemble ** (1 - share))
+        for k in range(K):
+            expected = weighted[k] / sum(weighted)
+            assert fast[row, k].item() == pytest.approx(expected, abs=1e-5)
+            assert plain[row, k].item() == pytest.approx(expected, abs=1e-5)
+
+
+def test_a_head_learns_alone_whatever_its_share() -> None:
+    point = torch.rand(10, 2 * K + 4)
+    rows = torch.rand(10, TINY.point_head.neighbours, 2 * K + 4)
+    logits = []
+    for share in (1.0, 0.5):
+        head = trained_head(replace(TINY.point_head, share=share), K).train()
+        logits.append(head(point, rows))
+    assert torch.equal(*logits)
+
+
+def test_a_share_survives_probabilities_of_zero() -> None:
+    head = trained_head(replace(TINY.point_head, share=0.5), K)
+    point = torch.zeros(1, 2 * K + 4)
+    point[0, [1, K + 2]] = 1  # the networks are sure, of different classes
+    with torch.no_grad():
+        logits = head(point, torch.zeros(1, TINY.point_head.neighbours, 2 * K + 4))
+    assert logits.isfinite().all()

@@ -253,6 +253,8 @@ class PointHeadConfig(Checked):
     """How the neighbours are pooled: by their maximum (the paper), or by attention."""
     heads: Annotated[int, Range(1, 16)] = 1
     """Heads, each trained from its own seed on its own draws, whose probabilities are averaged."""
+    share: Share = 1.0
+    """Weight of the head in its geometric mean with the ensemble, in predictions (1: the paper)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

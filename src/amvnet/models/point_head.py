@@ -16,6 +16,7 @@ from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import occurring
 
 POINT_VALUES = 4  # x, y, z, intensity
+LEAST = 1e-24  # product of two probabilities whose logarithm is still taken
 PART = 1024  # uncertain points scored at a time, so that they fit into a CPU's cache
 PART_ON_GPU = 2**16  # the same for a GPU: enough to keep it busy
 AT_ONCE = 2**17  # uncertain points whose table is in memory: a scan may have millions of them
@@ -26,7 +27,8 @@ class PointHead(nn.Module):
 
     Its inputs are the features p_i (U, 2 K + 4) of U uncertain points and the rows S_i
     (U, n, 2 K + 4) of their n neighbours each, as `head_features` returns them. Its outputs are
-    logits (U, K).
+    logits (U, K). In evaluation mode they are those of the weighted geometric mean with the
+    ensemble of f_i and g_i, if `config.share` is below 1.
     """
 
     def __init__(self, config: PointHeadConfig, classes: int) -> None:
@@ -47,7 +49,7 @@ class PointHead(nn.Module):
         u, n, width = rows.shape
         encoded = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1])
         pooled = self.pool(point, encoded)  # (U, hidden[-1])
-        return self.fc(torch.cat([pooled, point], dim=1))
+        return self._classify(pooled, point)
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
         """Return the (U, K) logits of `forward(*head_features(...))`, at less cost.
@@ -75,8 +77,19 @@ class PointHead(nn.Module):
 
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
             pooled = self.pool(point, rest(rows.flatten(0, 1)).unflatten(0, k.shape))
-            logits.append(self.fc(torch.cat([pooled, point], dim=1)))
+            logits.append(self._classify(pooled, point))
         return torch.cat(logits)
+
+    def _classify(self, pooled: Tensor, point: Tensor) -> Tensor:
+        """Return the (U, K) logits."""
+        logits = self.fc(torch.cat([pooled, point], dim=1))
+        share = self.config.share
+        if share == 1 or self.training:
+            return logits
+
+        f, g, _ = point.split([self.classes, self.classes, POINT_VALUES], dim=1)
+        ensemble = (f * g).clamp_min(LEAST).log() / 2
+        return share * logits + (1 - share) * ensemble
 
 
 def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
