@@ -64,7 +64,7 @@ class ScanSet(data.Dataset[Scan]):
         records: the scans.
         augment: how they are augmented, or None for scans as they are.
         seed: of the augmentation.
-        intensity: what the intensities of each scan are brought to, after its augmentation.
+        intensity: what the intensities of each scan are brought to, before its augmentation.
     """
 
     def __init__(
@@ -90,7 +90,7 @@ class ScanSet(data.Dataset[Scan]):
     def __getitem__(self, key: Key) -> Scan:
         epoch, index = key
         if self.augment is None:
-            return match_scan(self._read(self.records[index]), self.intensity)
+            return self._read(self.records[index])
 
         # The order of the random draws decides which scan a seed gives: keep it.
         config = self.augment
@@ -114,7 +114,7 @@ class ScanSet(data.Dataset[Scan]):
         assert self.augment is not None
         epoch, index = key
         record = self.dataset.at_epoch(self.records[index], epoch)
-        return match_scan(augment(self._read(record), self.augment, rng), self.intensity)
+        return augment(self._read(record), self.augment, rng)
 
     def _read(self, record: ScanRecord) -> Scan:
         scan = self.dataset.read(record)
@@ -129,7 +129,8 @@ class ScanSet(data.Dataset[Scan]):
                 f"{scan.name}: expected at least two valid points to train with, found {valid}; "
                 "leave the scan out"
             )
-        return scan
+        # Not after the augmentation: it would undo the changes of the intensity.
+        return match_scan(scan, self.intensity)
 
 
 class EpochSampler(data.Sampler[Key]):
