@@ -17,7 +17,6 @@ from amvnet.inference.inputs import FileScan, InputScan
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import ScanAdapter
-from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.sensors.measure import SensorGeometry, measure
 from amvnet.simulation import LidarModel, SimulatedScan, drive_street
 from amvnet.weights.file import Weights
@@ -42,10 +41,9 @@ class Targets:
 
     def read(self, step: Progress = no_progress) -> None:
         """Read the scans that have not been kept yet; their labels are never read."""
-        intensity = trained_intensity(self.weights.training, self.weights.sensor)
         for index, scan in enumerate(self.scans):
             if not self.kept.path(index).is_file():
-                self.kept.keep(index, match_scan(scan.load(labels=False).scan, intensity))
+                self.kept.keep(index, scan.load(labels=False).scan)
             step(index + 1, len(self.scans))
 
     def sensor(self) -> LidarModel:

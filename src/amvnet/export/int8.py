@@ -42,7 +42,7 @@ def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
     if sensor not in SENSORS:
         raise InputError(
             f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; "
-            "name scans"
+            "give scans of it to amvnet export --int8"
         )
     with TemporaryDirectory() as folder:
         simulate(folder, sensor=sensor, sequences=SCANS, scans=1, seed=SEED)

@@ -225,8 +225,8 @@ class PointGatherer:
         model: says which points are uncertain, and how the head sees them.
         training: says how many points are kept, and how scans are augmented.
         processes: those that share the scans; all must see the folder of the points.
-        intensity: of the training of the networks, to which intensities are brought as for a
-            prediction; None for other models' scores.
+        intensity: of the training of the networks, to which intensities are brought before the
+            augmentation; None for other models' scores.
     """
 
     dataset: Dataset
