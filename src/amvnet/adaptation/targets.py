@@ -31,7 +31,7 @@ class Targets:
 
     Attributes:
         scans: of the inputs, those that are used.
-        kept: the same as the networks take them, without labels.
+        kept: the same, adapted to the weights, without labels.
         weights: to begin with.
     """
 
@@ -62,7 +62,7 @@ class Targets:
         """Return the geometry of the sensor, as its first scans were measured.
 
         Args:
-            kept: the first scan, as the networks take it.
+            kept: the first scan, adapted to the weights.
         """
         scan = self.scans[0]
         if not isinstance(scan, FileScan):
