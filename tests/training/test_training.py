@@ -262,6 +262,35 @@ def test_averaged_weights_are_validated_and_written_and_resume_to_the_bit(
     assert not differing(train(world, tmp_path / "cut", *options, "--resume"), whole)
 
 
+def test_a_share_of_the_initial_weights_is_kept_and_resumes_to_the_bit(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    init = run / "weights.safetensors"
+    options = ("--stage", "bev", "--init", init)
+    trained = train(world, tmp_path / "trained", *options).part("polar_net")
+    kept = train(world, tmp_path / "kept", *options, "--training.bev.initial", 0.25)
+    initial = load(init).part("polar_net")
+    for name, tensor in kept.part("polar_net").items():
+        if tensor.is_floating_point():
+            expected = 0.75 * trained[name] + 0.25 * initial[name]
+            torch.testing.assert_close(tensor, expected)
+    assert differing(load(tmp_path / "kept"), load(tmp_path / "trained")) == {"polar_net"}
+
+    averaged = (*options, "--training.bev.initial", 0.25, "--training.bev.ema", 0.8)
+    whole = train(world, tmp_path / "whole", *averaged)
+    train_interrupted("bev", 1, world, tmp_path / "cut", *averaged)
+    assert not differing(train(world, tmp_path / "cut", *averaged, "--resume"), whole)
+
+
+def test_no_initial_weights_to_keep_a_share_of_is_one_line(world: Path, tmp_path: Path) -> None:
+    code, error = run_cli(
+        *("train", world / "recipe.yaml", "--data", world / "data", "--out", tmp_path / "run"),
+        *("--training.rv.initial", 0.5),
+    )
+    assert code == 2
+    assert "--init" in error
+
+
 def test_epochs_on_simulated_streets_have_fresh_ones_resumed_or_not(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

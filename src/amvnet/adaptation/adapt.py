@@ -177,7 +177,10 @@ class Adaptation:
         say(f"at the start: {self._describe(start)}")
 
         final, rounds = self._learn_in_rounds(start)
-        trained = self._train_head(final.weights)
+        # A head learns when to believe which view, and from simulated scans alone: that of the
+        # weights has seen more of them than are made here.
+        has_head = "point_head" in final.weights.parts
+        trained = final.weights if has_head else self._train_head(final.weights)
         return self._finish(trained, start, final, rounds)
 
     def _begin(self) -> None:
@@ -293,22 +296,16 @@ class Adaptation:
         return np.where(look.trusted.told, weights, np.minimum(weights, 1)).astype(np.float32)
 
     def _train_head(self, networks: Weights) -> Weights:
-        """Train a new head on what the adapted networks say about the simulated scans.
+        """Train a head on what the adapted networks say about the simulated scans.
 
         Its labels must be right where the networks disagree, so it learns from no pseudo-labels.
         """
-        tensors = {}
-        for name, tensor in networks.tensors.items():
-            if not name.startswith("point_head."):
-                tensors[name] = tensor
-        without_head = dataclasses.replace(networks, tensors=tensors)
-
         records = self.streets.records()
         held_out = SCANS if len(records) > SCANS else 0
         train: Sequence[ScanRecord] = records[: len(records) - held_out]
         scans = TrainingScans(self.streets, train, records[len(train) :])
         plan = self._plan(("head",), scans, self.out, None)
-        path = Run(dataclasses.replace(plan, out=self.out / "head")).stages("all", without_head)
+        path = Run(dataclasses.replace(plan, out=self.out / "head")).stages("all", networks)
         return load(path)
 
     def _plan(
@@ -332,8 +329,9 @@ class Adaptation:
             "uncertain": {"before": round(start.uncertain, 4), "after": round(final.uncertain, 4)},
             "rounds": rounds,
         }
-        training = {}
-        for name, description in trained.training.items():
+        training = dict(trained.training)
+        for name in BOTH_NETWORKS:
+            description = trained.training[name]
             of_stage = {key: value for key, value in description.items() if key not in FRAME}
             # The scans were brought to what the weights carried of their sensor.
             before = self.weights.training.get(name, {})

@@ -356,6 +356,8 @@ class NetworkTraining(Checked):
     """Largest norm of the gradient; larger ones are scaled down (open)."""
     ema: Annotated[float, Range(0, 0.99999)] = 0.0
     """Decay of the exponential moving average of the weights that is used in the end; 0: none."""
+    initial: Share = 0.0
+    """Share of the initial weights in those that are used in the end, for `--init` (open)."""
     accumulate: Count = 1
     """Parts that each process splits its batch into, if it does not fit into memory."""
 
@@ -452,7 +454,7 @@ class AdaptConfig(Checked):
     """A class whose quantile is lower cannot be told, and gets no pseudo-labels."""
     points: Count = 200
     """A class with fewer trusted points cannot be told either."""
-    rounds: Count = 3
+    rounds: Count = 1
     """Rounds of labelling by the teacher and learning from it."""
     agreement: Share = 0.8
     """End before a round after which less of what was trusted at the start still stands."""

@@ -36,19 +36,24 @@ class AverageWeights(Callback):
 
     Args:
         decay: share of the average that a step keeps. Early steps keep less, so that the initial
-            weights are soon forgotten.
+            weights are soon forgotten. 0 keeps the weights of the last step alone.
+        initial_share: of the weights that the training begins with in what is validated and
+            written (WiSE-FT: Wortsman et al., Robust fine-tuning of zero-shot models, 2022).
     """
 
-    def __init__(self, decay: float) -> None:
+    def __init__(self, decay: float, initial_share: float = 0.0) -> None:
         self.decay = decay
+        self.initial_share = initial_share
+        self.initial: dict[str, Tensor] = {}
         self.average: dict[str, Tensor] = {}
         self.steps = 0  # that are in the average
         self._raw: dict[str, Tensor] = {}  # the weights of the training, while it is validated
 
     def state_dict(self) -> dict[str, Any]:
-        return {"average": self.average, "steps": self.steps}
+        return {"initial": self.initial, "average": self.average, "steps": self.steps}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.initial = state_dict["initial"]
         self.average = state_dict["average"]
         self.steps = state_dict["steps"]
 
@@ -56,9 +61,11 @@ class AverageWeights(Callback):
         weights = _trained_part(pl_module).state_dict()
         if not self.average:
             self.average = _copies(weights)
+            self.initial = _copies(weights) if self.initial_share else {}
 
-        for name, value in weights.items():
-            self.average[name] = self.average[name].to(value.device)
+        for kept in (self.initial, self.average):
+            for name in kept:
+                kept[name] = kept[name].to(weights[name].device)
 
     @torch.no_grad()
     def on_train_batch_end(
@@ -93,7 +100,15 @@ class AverageWeights(Callback):
 
     def _insert(self, part: nn.Module) -> None:
         self._raw = _copies(part.state_dict())
-        part.load_state_dict(self.average)
+        part.load_state_dict({**self.average, **self._mixed()})
+
+    def _mixed(self) -> dict[str, Tensor]:
+        """Return the mean of the initial weights and the average, by their shares."""
+        mixed = {}
+        for name, initial in self.initial.items():
+            if initial.is_floating_point():
+                mixed[name] = self.average[name].lerp(initial, self.initial_share)
+        return mixed
 
     def _remove(self, part: nn.Module) -> None:
         part.load_state_dict(self._raw)

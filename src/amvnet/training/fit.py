@@ -41,6 +41,7 @@ class FitOptions:
         accumulate: parts of a batch, whose gradients are accumulated before a step.
         clip: largest norm of the gradient; None does not clip.
         ema: decay of the moving average of the weights; 0 for none.
+        initial: share of the initial weights in those that are used in the end.
         steps: end after this many, for a trial; then nothing is validated or written.
     """
 
@@ -51,6 +52,7 @@ class FitOptions:
     accumulate: int = 1
     clip: float | None = None
     ema: float = 0.0
+    initial: float = 0.0
     steps: int | None = None
 
 
@@ -106,8 +108,8 @@ def _trainer(options: FitOptions, loaders: Loaders, callbacks: Sequence[Callback
     bars = options.run.bars and processes.first
 
     all_callbacks = [*callbacks, SeedBatches(training.seed, processes.rank)]
-    if options.ema:
-        all_callbacks.append(AverageWeights(options.ema))
+    if options.ema or options.initial:
+        all_callbacks.append(AverageWeights(options.ema, options.initial))
     if not is_trial:
         all_callbacks += [
             Curves(folder / "metrics.csv"),

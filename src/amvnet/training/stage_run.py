@@ -337,6 +337,19 @@ class NetworkRun(ScanRun):
             return simulated_intensity(dataset.sensor)
         return super().intensity
 
+    def fit_options(self) -> FitOptions:
+        """Return how the stage is fitted.
+
+        Raises:
+            InputError: if initial weights are to be kept, but there are none.
+        """
+        if self.config.initial and self.parts[0] not in self.weights.parts:
+            raise InputError(
+                f"training.{self.name}.initial: expected weights to begin with, found none; give "
+                "--init, or set it to 0"
+            )
+        return dataclasses.replace(super().fit_options(), initial=self.config.initial)
+
     def fit(self) -> None:
         model = self.model()
         weights = self.class_weights() if self.config.class_weights else None
