@@ -351,11 +351,12 @@ class NetworkRun(ScanRun):
         return dataclasses.replace(super().fit_options(), initial=self.config.initial)
 
     def fit(self) -> None:
+        options = self.fit_options()  # refused before the scans are read for the class weights
         model = self.model()
         weights = self.class_weights() if self.config.class_weights else None
         score = getattr(model, NETWORKS[self.name].score)
         callbacks = [self.keep_weights(), self.pictures(score)]
-        fit(self._stage(model, weights), self.fit_options(), self.loaders(), callbacks)
+        fit(self._stage(model, weights), options, self.loaders(), callbacks)
 
     def trial(self, steps: int) -> Speed:
         """Take some steps, and return their speed; nothing is written."""
