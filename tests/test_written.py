@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +15,16 @@ from amvnet.onnx_runner import DESCRIPTION
 from amvnet.weights.file import save
 from amvnet.written import RECORD, WrittenFiles, protecting
 
-from fixtures.worlds import fails, files, fresh_weights, make_streets, refusal, street, succeed
+from fixtures.worlds import (
+    fails,
+    files,
+    fresh_weights,
+    make_streets,
+    refusal,
+    run_cli,
+    street,
+    succeed,
+)
 
 MINE = b"hours of work"
 
@@ -150,6 +160,29 @@ def test_what_a_killed_run_has_written_is_its_own(world: Path, tmp_path: Path) -
     assert not list(tmp_path.glob(PATTERN))
 
 
+def test_the_labels_of_a_broken_scan_stay_the_users(world: Path, tmp_path: Path) -> None:
+    """`--overwrite` replaces only labels of scans that could be read."""
+    out = tmp_path / "out"
+    out.mkdir()
+    shutil.copytree(world / "scans", tmp_path / "scans")
+    (tmp_path / "scans/b.bin").write_bytes(b"truncated")
+    (out / "b.label").write_bytes(MINE)
+    command = f"predict {tmp_path}/scans --weights {world}/w.safetensors --out {out}"
+    code, error = run_cli(*shlex.split(f"{command} --overwrite"))
+    assert code == 3
+    assert "b.bin" in error
+    assert (out / "b.label").read_bytes() == MINE
+    assert "b.label" in refusal(command)
+
+
+def test_a_run_that_writes_nothing_leaves_no_folder(world: Path, tmp_path: Path) -> None:
+    scan = tmp_path / "a.bin"
+    scan.write_bytes(b"truncated")
+    refusal(f"predict {scan} --weights {world}/w.safetensors --out {tmp_path}/out")
+    assert files(tmp_path) == {"a.bin"}
+    assert not (tmp_path / "out").exists()
+
+
 # ---- the record
 
 
@@ -180,6 +213,10 @@ def test_the_message_counts_the_files(tmp_path: Path) -> None:
     for path in paths:
         (tmp_path / path).write_bytes(MINE)
     fails(lambda: WrittenFiles(tmp_path).check(paths), tmp_path / "a", "and 2 more")
+
+
+def test_a_folder_is_not_called_another_file(tmp_path: Path) -> None:
+    fails(lambda: WrittenFiles(tmp_path.parent).check([Path(tmp_path.name)]), tmp_path, "a folder")
 
 
 def failing(call: Callable[[], None], folder: Path) -> None:

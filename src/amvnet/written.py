@@ -29,14 +29,21 @@ class WrittenFiles:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._stamps = _read(folder / RECORD)
+        self._replaced: dict[str, Stamp | None] = {}  # a user's files when they were claimed
 
     def check(self, paths: Iterable[Path]) -> None:
         """Check that writing these files would replace no file of the user.
 
         Raises:
-            InputError: if a file exists that is not listed, or was changed since.
+            InputError: if a file exists that is not listed, or was changed since, or is a folder.
         """
         foreign = [path for path in paths if self._is_foreign(path)]
+        for path in foreign:
+            if (self.folder / path).is_dir():
+                raise InputError(
+                    f"{self.folder / path}: expected a file to write, found a folder; "
+                    "give the name of a file in it"
+                )
         if foreign:
             more = f" (and {len(foreign) - 1} more)" if len(foreign) > 1 else ""
             raise InputError(
@@ -54,11 +61,22 @@ class WrittenFiles:
 
     def claim(self, paths: Iterable[Path]) -> None:
         """List files before they are written."""
+        paths = list(paths)
+        for path in paths:
+            if self._is_foreign(path):
+                self._replaced[path.as_posix()] = _stamp_of(self.folder / path)
         self._update({path.as_posix(): None for path in paths})
 
     def finish(self, paths: Iterable[Path]) -> None:
-        """List files with their stamps after they are written; forget those that do not exist."""
-        self._update({path.as_posix(): _stamp_of(self.folder / path) for path in paths}, True)
+        """List files with their stamps after they are written.
+
+        Forget those that do not exist, and files of the user that were claimed and not replaced.
+        """
+        stamps = {path.as_posix(): _stamp_of(self.folder / path) for path in paths}
+        for name, stamp in stamps.items():
+            if stamp == self._replaced.get(name):
+                stamps[name] = None
+        self._update(stamps, is_finished=True)
 
     def _update(self, stamps: dict[str, Stamp | None], is_finished: bool = False) -> None:
         """Write the record with other stamps; entries of other runs stay."""
@@ -68,6 +86,9 @@ class WrittenFiles:
                 if stamp is None:
                     del self._stamps[name]
 
+        if not self._stamps:
+            (self.folder / RECORD).unlink(missing_ok=True)
+            return
         with atomic_write(self.folder / RECORD) as part:
             part.write_text(json.dumps(self._stamps, indent=0))
 

@@ -14,7 +14,15 @@ from amvnet.data.class_maps import class_map
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.weights.file import save
 
-from fixtures.worlds import GOLDEN, fails, fresh_weights, make_streets, refusal, run_cli
+from fixtures.worlds import (
+    GOLDEN,
+    fails,
+    fresh_weights,
+    make_streets,
+    refusal,
+    run_cli,
+    succeed,
+)
 
 EQUAL = {  # classes of SemanticKITTI and of nuScenes that are the same coarse class
     "car": "car",
@@ -137,3 +145,26 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
     assert iou["vehicle"] == 1
     assert iou["ground"] == pytest.approx(matrix[0] / (matrix[0] + matrix[1]))
     assert iou["building"] == pytest.approx(matrix[2] / (matrix[2] + matrix[3]))
+
+
+def test_mapped_predictions_score_as_their_own_ids_do(tmp_path: Path) -> None:
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    data = make_streets(tmp_path / "data")
+    reports = []
+    for out, options, mapped in (
+        ("fine", [], []),
+        ("coarse", ["--classes", "coarse"], ["--mapped"]),
+    ):
+        succeed(f"predict {data} --weights {weights} --out {tmp_path / out} {' '.join(options)}")
+        figures = tmp_path / f"{out}.json"
+        code, error = run_cli(
+            *("evaluate", data, "--predictions", tmp_path / out, "--classes", "coarse"),
+            *("--json", figures, *mapped),
+        )
+        assert code == 0, error
+        reports.append(json.loads(figures.read_text())["methods"])
+    assert reports[0] == reports[1]
+
+    coarse = f"evaluate {data} --predictions {tmp_path / 'coarse'}"
+    assert "--mapped" in refusal(f"{coarse} --classes coarse")
+    assert "--classes" in refusal(f"{coarse} --mapped")

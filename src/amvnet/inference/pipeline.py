@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -211,6 +211,7 @@ class Pipeline:
         if not self.output.overwrite:
             written.check(paths)
 
+        is_new = not self.output.folder.exists()
         journal = Journal(self.output.folder, settings, self.execution.resume, processes)
         if processes.first:
             written.claim(paths)
@@ -230,6 +231,9 @@ class Pipeline:
         journal.close()
         if processes.first:
             written.finish(paths)
+            if is_new:
+                with suppress(OSError):  # stays unless all scans were broken
+                    self.output.folder.rmdir()
 
         all_faults = list(chain.from_iterable(processes.gather(faults)))
         _raise_faults(all_faults, len(self.scans))

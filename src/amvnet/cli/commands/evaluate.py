@@ -36,6 +36,7 @@ def evaluate(
     pictures: Path | None = None,
     taxonomy: Path | None = None,
     classes: str | None = None,
+    mapped: bool = False,
     device: str = "cpu",
     engine: EngineName = "auto",
     precision: Precision = "float32",
@@ -59,6 +60,7 @@ def evaluate(
         taxonomy: a semantic-kitti.yaml with other classes.
         classes: score these classes instead, to which those of the data and of the weights are
             mapped: coarse, or a YAML file.
+        mapped: the predictions have the ids of --classes, as predict --classes writes them.
         device: cpu, cuda, cuda:1, ...
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
             (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
@@ -79,6 +81,10 @@ def evaluate(
     processes = join_processes()
     names = parse_names(sequences)
     class_map = parse_classes(classes)
+    if mapped and (class_map is None or predictions is None):
+        raise InputError(
+            "--mapped: expected --predictions and --classes, found not both; leave --mapped out"
+        )
     if weights is not None and predictions is None:
         loaded = load(weights)
         has_own = taxonomy is not None or class_map is not None
@@ -92,7 +98,7 @@ def evaluate(
     elif predictions is not None and weights is None:
         if tta is not None:
             raise InputError("--tta: expected --weights, found --predictions; leave --tta out")
-        dataset = map_classes(open_data(data, taxonomy), class_map)
+        dataset = map_classes(open_data(data, taxonomy), class_map, mapped)
         records = labelled_records(dataset, choose_records(dataset, names, split))
         labeller = label_from_files(dataset, predictions)
     else:
