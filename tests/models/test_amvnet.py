@@ -97,9 +97,11 @@ def neighbours_by_loop(points: Tensor, own: int) -> tuple[list[int], list[float]
     return nearest, distances
 
 
-@pytest.fixture(params=["pykdtree", "scipy"])
+@pytest.fixture(params=["pykdtree", "scipy", "by parts"])
 def tree(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Search for neighbours by each of the two libraries."""
+    """Search for neighbours by each of the two libraries, and of a few points at a time."""
+    if request.param == "by parts":
+        monkeypatch.setattr("amvnet.models.neighbours.AT_ONCE", 3)
     if request.param == "scipy":
         monkeypatch.setitem(sys.modules, "pykdtree.kdtree", None)  # as if it were not installed
 

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.spatial import cKDTree
 
 FREQUENT_TIES = 0.001  # share of the queries with a tie; chance alone causes fewer
+AT_ONCE = 2**17  # queries whose distances are in memory: a scan may have millions
+
+# Takes (Q, 3) queries; returns the (Q, m) indices of the nearest points, and whether others are as
+# near as the last of them, (Q,) bool.
+Query = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
@@ -14,44 +21,79 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     If a scan has fewer than n other points, the farthest is repeated. A lone point is its own
     neighbour.
 
+    pykdtree takes half of SciPy's time. If ties are frequent, SciPy chooses among points that are
+    as near as the n-th, so that labels do not depend on which library is installed. (A sixth of
+    the points of the real nuScenes scans at hand occur twice.)
+
     Args:
         xyz: (P, 3) metres.
         own: (U,) indices of the points whose neighbours are searched for.
         n: neighbours per point.
     """
+    nearest = np.empty((len(own), n), dtype=np.int64)
     if not len(own):
-        return np.zeros((0, n), dtype=np.int64)
+        return nearest
 
-    nearest = _nearest(np.ascontiguousarray(xyz), xyz[own], min(n + 1, len(xyz)))
-    return _drop_self(nearest, own, n)
-
-
-def _nearest(xyz: np.ndarray, queries: np.ndarray, n: int) -> np.ndarray:
-    """Return (U, n) indices of the points nearest to the queries (U, 3), some of the same points.
-
-    pykdtree takes half of SciPy's time. If ties are frequent, SciPy chooses among points that are
-    as near as the n-th, so that labels do not depend on which library is installed. (A sixth of
-    the points of the real nuScenes scans at hand occur twice.)
-    """
+    xyz = np.ascontiguousarray(xyz)
+    m = min(n + 1, len(xyz))
     try:
-        from pykdtree.kdtree import KDTree
+        query = _query_by_pykdtree(xyz, m)
     except ImportError:  # not required by `onnx_runner`
-        return _nearest_by_scipy(xyz, queries, n)
+        query = _query_by_scipy(xyz, m)
+    is_tied = _search(query, xyz, own, np.arange(len(own)), nearest)
 
-    # One neighbour more than needed shows whether the n-th has a tie.
-    distances, nearest = KDTree(xyz).query(queries, k=n + 1)
-    is_tied = distances[:, -1] == distances[:, -2]
-    nearest = nearest[:, :n].astype(np.int64)
     if is_tied.mean() > FREQUENT_TIES:
-        nearest[is_tied] = _nearest_by_scipy(xyz, queries[is_tied], n)
+        _search(_query_by_scipy(xyz, m), xyz, own, is_tied.nonzero()[0], nearest)
     return nearest
 
 
-def _nearest_by_scipy(xyz: np.ndarray, queries: np.ndarray, n: int) -> np.ndarray:
+def _search(
+    query: Query, xyz: np.ndarray, own: np.ndarray, rows: np.ndarray, nearest: np.ndarray
+) -> np.ndarray:
+    """Write some rows of the result of `nearest_others`, a part of them at a time.
+
+    Args:
+        rows: (R,) indices into `own` and `nearest`.
+
+    Returns:
+        (R,) bool, as a `Query` returns it.
+    """
+    is_tied = np.empty(len(rows), dtype=bool)
+    for start in range(0, len(rows), AT_ONCE):
+        part = rows[start : start + AT_ONCE]
+        found, is_tied[start : start + AT_ONCE] = query(xyz[own[part]])
+        nearest[part] = _drop_self(found, own[part], nearest.shape[1])
+    return is_tied
+
+
+def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
+    """Return a search for the m nearest of the points (P, 3).
+
+    Raises:
+        ImportError: if pykdtree is not installed.
+    """
+    from pykdtree.kdtree import KDTree
+
+    tree = KDTree(xyz)
+
+    def query(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # One neighbour more than needed shows whether the m-th has a tie.
+        distances, nearest = tree.query(queries, k=m + 1)
+        return nearest[:, :m].astype(np.int64), distances[:, -1] == distances[:, -2]
+
+    return query
+
+
+def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
+    """Return a search for the m nearest of the points (P, 3); it says nothing of ties."""
     # An unbalanced tree takes a third of the time to build, and a tenth more to query.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
-    _, nearest = tree.query(queries, k=np.arange(1, n + 1), workers=-1)
-    return np.asarray(nearest)
+
+    def query(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        _, nearest = tree.query(queries, k=np.arange(1, m + 1), workers=-1)
+        return np.asarray(nearest), np.zeros(len(queries), dtype=bool)
+
+    return query
 
 
 def _drop_self(nearest: np.ndarray, index: np.ndarray, n: int) -> np.ndarray:
