@@ -5,11 +5,14 @@ from __future__ import annotations
 import ctypes
 import resource
 import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
 # Options of glibc's mallopt, from malloc.h.
 M_TRIM_THRESHOLD = -1  # free bytes from which on they are returned to the system
 M_MMAP_MAX = -4  # blocks that may each have a mapping of their own
 M_ARENA_MAX = -8  # heaps that the process may have
+DEFAULTS = {M_MMAP_MAX: 65536, M_TRIM_THRESHOLD: 128 * 1024}  # of glibc
 
 
 def keep_freed_memory() -> bool:
@@ -25,16 +28,33 @@ def keep_freed_memory() -> bool:
     Returns:
         Whether the C library supports it: glibc on Linux does.
     """
+    # No block has a mapping of its own, no memory is returned (-1), and there is one heap.
+    return _set_options({M_MMAP_MAX: 0, M_TRIM_THRESHOLD: -1, M_ARENA_MAX: 1})
+
+
+@contextmanager
+def return_freed_memory() -> Iterator[None]:
+    """Return freed memory to the system within the block, after `keep_freed_memory`.
+
+    Blocks of a very large scan, freed and requested in turn, leave gaps in the heap that no other
+    block fits into.
+    """
+    _set_options(DEFAULTS)
+    try:
+        yield
+    finally:
+        keep_freed_memory()
+
+
+def _set_options(options: Mapping[int, int]) -> bool:
+    """Set options of glibc's allocator; return whether all were set."""
     if not sys.platform.startswith("linux"):
         return False
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):  # musl has no mallopt
         return False
-
-    # No block has a mapping of its own, no memory is returned (-1), and there is one heap.
-    options = ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, -1), (M_ARENA_MAX, 1))
-    return all(mallopt(option, value) for option, value in options)
+    return all(mallopt(option, value) for option, value in options.items())
 
 
 def peak_memory() -> int:

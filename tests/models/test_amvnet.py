@@ -152,7 +152,7 @@ def test_a_lone_point_is_its_own_neighbour() -> None:
 def test_without_an_uncertain_point_there_are_no_neighbours(points: int) -> None:
     nearest = nearest_neighbours(torch.randn(points, 4), torch.zeros(0, dtype=torch.long), 3)
     assert nearest.shape == (0, 3)
-    assert nearest.dtype == torch.long
+    assert nearest.dtype == torch.int32
 
 
 def head_features_by_loop(

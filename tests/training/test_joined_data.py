@@ -15,8 +15,9 @@ from amvnet.config.schema import AdaptConfig
 from amvnet.data.datasets.joined import MixedRecord, Part, join, split_share
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans
-from amvnet.data.taxonomy import NUSCENES
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
+from amvnet.training.run_plan import without_mean
 from amvnet.weights.file import load, save
 
 from fixtures.worlds import GOLDEN, fresh_weights, make_streets, refusal, run_cli, write_recipe
@@ -123,6 +124,28 @@ def arguments(world: Path, out: Path, b: str) -> list[object]:
         *("train", world / "recipe.yaml", "--init", world / "start.safetensors", "--out", out),
         *("--data", world / "a", "--data", b, "--train-sequences", "00", "--val-sequences", "08"),
     ]
+
+
+def test_the_mean_with_initial_weights_needs_their_classes() -> None:
+    recipe = load_recipe("finetune")
+    assert recipe.training.rv.initial > 0
+    lines: list[str] = []
+    for init in (None, fresh_weights()):
+        assert without_mean(recipe, init, SEMANTICKITTI, lines.append) is recipe
+    assert not lines
+
+    training = without_mean(recipe, fresh_weights(NUSCENES), SEMANTICKITTI, lines.append).training
+    assert training.rv.initial == training.bev.initial == 0
+    assert training.rv.lr == recipe.training.rv.lr
+    assert [line.split(":")[0] for line in lines] == ["rv", "bev"]
+
+
+def test_a_fine_tuning_can_be_tried(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [*arguments(world, tmp_path / "run", str(world / "a")), "--dry-run"]
+    assert run_cli(*command) == (0, "")
+    assert "bev: " in capsys.readouterr().out
 
 
 def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Collection, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from amvnet.errors import InputError
 from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.segmentation import Origin, Segmentation
 from amvnet.inference.test_time import SYMMETRIES, average
-from amvnet.memory import keep_freed_memory
+from amvnet.memory import keep_freed_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.layers import fold_batch_norms
 from amvnet.models.methods import (
@@ -38,6 +39,7 @@ from amvnet.threads import BusyMachine, survive_forks
 from amvnet.weights.file import Weights, load
 
 MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
+LARGE = 1_000_000  # points, from which on freed memory is returned: it would not be used again
 
 
 class Segmenter:
@@ -91,7 +93,8 @@ class Segmenter:
         self.device = _check_device(device)
         self.precision = precision
         check_precision(precision, device)
-        if keep_memory and device == "cpu":
+        self._keeps_memory = keep_memory and device == "cpu"
+        if self._keeps_memory:
             keep_freed_memory()
         survive_forks()
         self._machine = BusyMachine()
@@ -157,7 +160,9 @@ class Segmenter:
         """
         checked = [check_scan(points) for points in scans]
         uses_team = self.device == "cpu" and self.engine not in ONNX_ENGINES
-        with self._machine.watch(uses_team):
+        is_large = sum(map(len, checked)) >= LARGE
+        memory = return_freed_memory() if self._keeps_memory and is_large else nullcontext()
+        with self._machine.watch(uses_team), memory:
             batch = self._batch(checked)
             labels, scores = _fetch(self._scores(batch))
 

@@ -108,7 +108,7 @@ class LateFusion(nn.Module):
             index = uncertain[scan].nonzero()[:, 0]  # (U,)
             near = self.find_neighbours(points, index)  # (U, n)
             parts.append(self.settle(points, f[scan], g[scan], index, near))
-        return torch.cat(parts)
+        return parts[0] if len(parts) == 1 else torch.cat(parts)
 
     @step("neighbours")
     def find_neighbours(self, points: Tensor, index: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ Query = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
-    """Return (U, n) int64 indices of the n nearest other points of each point in `own`.
+    """Return (U, n) int32 indices of the n nearest other points of each point in `own`.
 
     If a scan has fewer than n other points, the farthest is repeated. A lone point is its own
     neighbour.
@@ -30,7 +30,7 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
         own: (U,) indices of the points whose neighbours are searched for.
         n: neighbours per point.
     """
-    nearest = np.empty((len(own), n), dtype=np.int64)
+    nearest = np.empty((len(own), n), dtype=np.int32)
     if not len(own):
         return nearest
 
@@ -79,7 +79,7 @@ def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
     def query(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # One neighbour more than needed shows whether the m-th has a tie.
         distances, nearest = tree.query(queries, k=m + 1)
-        return nearest[:, :m].astype(np.int64), distances[:, -1] == distances[:, -2]
+        return nearest[:, :m].astype(np.int32), distances[:, -1] == distances[:, -2]
 
     return query
 
@@ -91,7 +91,7 @@ def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
 
     def query(queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         _, nearest = tree.query(queries, k=np.arange(1, m + 1), workers=-1)
-        return np.asarray(nearest), np.zeros(len(queries), dtype=bool)
+        return np.asarray(nearest, dtype=np.int32), np.zeros(len(queries), dtype=bool)
 
     return query
 

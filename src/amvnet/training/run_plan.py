@@ -10,7 +10,7 @@ import numpy as np
 
 from amvnet.config.schema import JointTraining, NetworkTraining, Recipe
 from amvnet.data.datasets.select import TrainingScans
-from amvnet.data.taxonomy import TAXONOMIES
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.inference.score_files import ScorePair
@@ -110,6 +110,29 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
         sensor=init.sensor,
         taxonomy=taxonomy,  # type: ignore[arg-type]
     )
+
+
+def without_mean(recipe: Recipe, init: Weights | None, classes: Taxonomy, say: Say) -> Recipe:
+    """Return a recipe that keeps no share of initial weights if these have other classes.
+
+    Their last layers are new then, and of no use in a mean.
+
+    Args:
+        recipe: of the training.
+        init: weights to begin with.
+        classes: of the data.
+        say: told what is left out.
+    """
+    if init is None or init.taxonomy.classes == classes.classes:
+        return recipe
+
+    networks = {}
+    for name in ("rv", "bev"):
+        config = getattr(recipe.training, name)
+        if config.initial:
+            say(f"{name}: no mean with the initial weights, which have other classes")
+            networks[name] = dataclasses.replace(config, initial=0.0)
+    return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
 
 def check_batch(config: NetworkTraining | JointTraining, name: str, processes: int) -> None:

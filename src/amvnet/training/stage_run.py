@@ -338,25 +338,22 @@ class NetworkRun(ScanRun):
         return super().intensity
 
     def fit_options(self) -> FitOptions:
-        """Return how the stage is fitted.
+        """Return how the stage is fitted."""
+        return dataclasses.replace(super().fit_options(), initial=self.config.initial)
 
-        Raises:
-            InputError: if initial weights are to be kept, but there are none.
-        """
+    def fit(self) -> None:
+        # Before the scans are read for the class weights.
         if self.config.initial and self.parts[0] not in self.weights.parts:
             raise InputError(
                 f"training.{self.name}.initial: expected weights to begin with, found none; give "
                 "--init, or set it to 0"
             )
-        return dataclasses.replace(super().fit_options(), initial=self.config.initial)
 
-    def fit(self) -> None:
-        options = self.fit_options()  # refused before the scans are read for the class weights
         model = self.model()
         weights = self.class_weights() if self.config.class_weights else None
         score = getattr(model, NETWORKS[self.name].score)
         callbacks = [self.keep_weights(), self.pictures(score)]
-        fit(self._stage(model, weights), options, self.loaders(), callbacks)
+        fit(self._stage(model, weights), self.fit_options(), self.loaders(), callbacks)
 
     def trial(self, steps: int) -> Speed:
         """Take some steps, and return their speed; nothing is written."""
@@ -497,8 +494,15 @@ class HeadRun(StageRun):
         scans = self.plan.scans
         seen = [record for record in scans.train if record.sequence not in left_out]
         unseen = [record for record in scans.train if record.sequence in left_out]
-        # The scans that a fold scores say nothing about which of its epochs to use.
-        training = dataclasses.replace(self.plan.recipe.training, keep="last")
+        # The scans that a fold scores say nothing about which of its epochs to use. Its networks
+        # have no initial weights.
+        training = self.plan.recipe.training
+        training = dataclasses.replace(
+            training,
+            keep="last",
+            rv=dataclasses.replace(training.rv, initial=0.0),
+            bev=dataclasses.replace(training.bev, initial=0.0),
+        )
         plan = dataclasses.replace(
             self.plan,
             recipe=dataclasses.replace(self.plan.recipe, training=training),

@@ -74,7 +74,7 @@ def train(
     from amvnet.distributed import device_of
     from amvnet.training.fit import quiet_lightning
     from amvnet.training.run import Run
-    from amvnet.training.run_plan import RunOptions, RunPlan, sized_by_init
+    from amvnet.training.run_plan import RunOptions, RunPlan, sized_by_init, without_mean
     from amvnet.training.training_data import open_parts
     from amvnet.weights.file import load
 
@@ -83,6 +83,7 @@ def train(
     weights = None if init is None else load(init)
     recipe = sized_by_init(recipe, weights)
     dataset, parts = open_parts(data, taxonomy, recipe, out, weights)
+    recipe = without_mean(recipe, weights, dataset.taxonomy, say)
     scans = split_records(
         dataset, parse_names(train_sequences), parse_names(val_sequences), with_val
     )
