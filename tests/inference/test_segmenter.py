@@ -356,3 +356,27 @@ def test_every_exported_name_is_there() -> None:
     for name in amvnet.__all__:
         assert hasattr(amvnet, name)
     assert not hasattr(amvnet, "nothing")
+
+
+PEAK = """
+import sys, numpy as np
+from amvnet import Segmenter
+points = np.random.default_rng(0).normal(size=(int(sys.argv[2]), 4)).astype(np.float32) * 10
+points[:, 3] = 0.5
+Segmenter(sys.argv[1], keep_memory=True)(points)
+with open("/proc/self/status") as file:
+    status = dict(line.split(":", 1) for line in file)
+print(1024 * int(status["VmHWM"].split()[0]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
+def test_a_point_of_a_large_scan_needs_few_bytes(tmp_path: Path) -> None:
+    """Four tables of 19 scores and 15 neighbours alone are 364 bytes."""
+    weights = save(fresh_weights(), tmp_path / "w.safetensors")
+    peaks = []
+    for points in (1_200_000, 2_400_000):
+        command = [sys.executable, "-c", PEAK, str(weights), str(points)]
+        peaks.append(int(subprocess.run(command, check=True, capture_output=True).stdout))
+    assert (peaks[1] - peaks[0]) / 1_200_000 < 450
