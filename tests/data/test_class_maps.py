@@ -167,4 +167,6 @@ def test_mapped_predictions_score_as_their_own_ids_do(tmp_path: Path) -> None:
 
     coarse = f"evaluate {data} --predictions {tmp_path / 'coarse'}"
     assert "--mapped" in refusal(f"{coarse} --classes coarse")
+    missing = f"evaluate {data} --predictions {tmp_path / 'missing'} --classes coarse"
+    assert "--mapped" not in refusal(missing)
     assert "--classes" in refusal(f"{coarse} --mapped")

@@ -52,14 +52,32 @@ class MappedDataset(WrappedDataset):
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
         """Read a prediction in the classes of the dataset, and map it; or one that is mapped."""
         if self.is_prediction_mapped:
-            path, dtype = self._prediction_file(record, folder)
-            count = len(self.read(record, labels=False))
-            return read_prediction(path, dtype, count, self.taxonomy)
+            return self._read_mapped(record, folder)
         try:
             own_ids = self.dataset.read_prediction(record, folder)
-        except InputError as error:
-            raise InputError(f"{error}; if it has ids of the map, say --mapped") from None
+        except InputError:
+            if self._is_mapped(record, folder):
+                raise InputError(
+                    f"{Path(folder) / record.prediction}: expected the ids of "
+                    f"{self.dataset.taxonomy.name}, found those of {self.taxonomy.name}; "
+                    "say --mapped"
+                ) from None
+            raise
         return self._table[own_ids]
+
+    def _read_mapped(self, record: ScanRecord, folder: Path) -> np.ndarray:
+        """Read a prediction that has the ids of the map."""
+        path, dtype = self._prediction_file(record, folder)
+        count = len(self.read(record, labels=False))
+        return read_prediction(path, dtype, count, self.taxonomy)
+
+    def _is_mapped(self, record: ScanRecord, folder: Path) -> bool:
+        """Return whether a prediction can be read with the ids of the map."""
+        try:
+            self._read_mapped(record, folder)
+        except InputError:
+            return False
+        return True
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) mapped train ids as the raw ids of the map, in the dataset's layout."""
