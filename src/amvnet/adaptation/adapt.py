@@ -31,6 +31,7 @@ from amvnet.data.datasets.joined import Part, join
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.simulated import SCANS
 from amvnet.data.datasets.taught import Taught
+from amvnet.data.spacing import evenly_spaced
 from amvnet.distributed import device_of
 from amvnet.errors import InputError
 from amvnet.evaluation.top_view import TopView, draw_scan
@@ -139,9 +140,7 @@ class Adaptation:
         self.out = out
         self.options = options or AdaptOptions()
         self.weights = weights
-        most = recipe.training.adapt.scans
-        chosen = np.unique(np.linspace(0, len(scans) - 1, min(most, len(scans))).astype(int))
-        inputs = [scans[index] for index in chosen]
+        inputs = evenly_spaced(scans, recipe.training.adapt.scans)
         # Scans of files bring the rows of their points, which follow the sensor that saw them.
         is_adapted = are_adapted(inputs)
         kept = KeptScans(out / "scans", weights.taxonomy, len(inputs), False, is_adapted)
@@ -358,13 +357,12 @@ class Adaptation:
             segmenters[title] = segmenter.for_dataset(self.targets.kept)
 
         records = self.targets.kept.records()
-        indices = np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int)
-        for index in np.unique(indices):
-            scan = self.targets.kept.read(records[index])
+        named = list(zip(records, self.targets.scans, strict=True))
+        for record, source in evenly_spaced(named, PICTURES):
+            scan = self.targets.kept.read(record)
             labels = {title: segmenter(scan).labels for title, segmenter in segmenters.items()}
-            title = self.targets.scans[index].title
-            view = TopView(scan.points, self.weights.taxonomy, labels, title=title)
-            draw_scan(self.out / "pictures" / f"{records[index].name}.png", view)
+            view = TopView(scan.points, self.weights.taxonomy, labels, title=source.title)
+            draw_scan(self.out / "pictures" / f"{record.name}.png", view)
 
     def _told(self, look: Look) -> dict[str, dict[str, float | bool]]:
         """Return what is trusted of each class, for the report."""

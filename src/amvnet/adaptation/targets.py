@@ -11,6 +11,7 @@ from amvnet.adaptation.kept_scans import KeptScans
 from amvnet.adaptation.sensor import sensor_to_simulate
 from amvnet.data.datasets.simulated import SCANS, train_labels
 from amvnet.data.formats.cloud import Cloud
+from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.inputs import FileScan, InputScan
@@ -53,9 +54,7 @@ class Targets:
             InputError: if its simulation has other classes than the weights.
         """
         usual = simulated_sensor(self.weights.taxonomy)
-        records = self.kept.records()
-        indices = np.linspace(0, len(records) - 1, min(MEASURED, len(records))).astype(int)
-        some = [self.kept.read(records[index]) for index in indices]
+        some = [self.kept.read(record) for record in evenly_spaced(self.kept.records(), MEASURED)]
         return sensor_to_simulate(self._geometry(some[0]), some, usual)
 
     def _geometry(self, kept: Scan) -> SensorGeometry:

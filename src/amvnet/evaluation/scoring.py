@@ -13,6 +13,7 @@ import numpy as np
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import check_classes
+from amvnet.data.spacing import evenly_spaced
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
@@ -77,8 +78,7 @@ def evaluate(
         InputError: if a scan has no ground truth.
     """
     evaluation = Evaluation(dataset.taxonomy)
-    indices = np.linspace(0, len(records) - 1, min(PICTURES, len(records))).astype(int)
-    pictured = {records[index].name for index in indices}
+    pictured = {record.name for record in evenly_spaced(records, PICTURES)}
 
     def label(record: ScanRecord, scan: Scan) -> tuple[ScanRecord, Scan, MethodLabels]:
         return record, scan, labeller.label(record, scan)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.export.onnx_files import digest, quiet, strip, writer_errors
 from amvnet.inference.inputs import ScanOptions, adapter_for, open_inputs
@@ -107,9 +108,7 @@ def _read(text: str, segmenter: Segmenter) -> list[Scan]:
     """
     adapter = adapter_for(segmenter.weights)
     opened = open_inputs([text], ScanOptions(), segmenter.taxonomy, adapter)
-    count = len(opened.scans)
-    indices = np.linspace(0, count - 1, min(SCANS, count)).astype(int)
-    loaded = [opened.scans[index].load().scan for index in indices]
+    loaded = [opened_scan.load().scan for opened_scan in evenly_spaced(opened.scans, SCANS)]
 
     scans = [match_scan(scan, segmenter.intensity) for scan in loaded if scan.valid.any()]
     if not scans:

@@ -16,6 +16,7 @@ from torch.utils import data
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.own import OwnScans
+from amvnet.data.spacing import evenly_spaced
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -299,11 +300,10 @@ def sensor_record(
         records: the scans.
         intensity: what the intensities of the scans are brought to.
     """
-    indices = np.linspace(0, len(records) - 1, min(SAMPLED_SCANS, len(records))).astype(int)
     scans = []
-    for index in indices:
+    for sampled in evenly_spaced(records, SAMPLED_SCANS):
         with suppress(InputError):
-            scans.append(dataset.read(records[index], labels=False))
+            scans.append(dataset.read(sampled, labels=False))
 
     quantiles_of_scans = []
     for scan in scans:

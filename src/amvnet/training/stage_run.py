@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from amvnet.config.schema import JointTraining, NetworkTraining
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
@@ -200,13 +201,10 @@ class StageRun:
         Args:
             score: returns the (P, K) scores of a batch.
         """
-        val = self.plan.scans.val
-        indices = np.linspace(0, len(val) - 1, min(PICTURED_SCANS, len(val))).astype(int)
         dataset = self.plan.scans.dataset
         is_first = self.plan.options.processes.first
-        scans = []
-        if is_first:
-            scans = [match_scan(dataset.read(val[index]), self.intensity) for index in indices]
+        records = evenly_spaced(self.plan.scans.val, PICTURED_SCANS) if is_first else []
+        scans = [match_scan(dataset.read(record), self.intensity) for record in records]
         return Pictures(scans, dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
 
 

@@ -1,0 +1,19 @@
+"""Choose a few of many scans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+
+Item = TypeVar("Item")
+
+
+def evenly_spaced(items: Sequence[Item], most: int) -> list[Item]:
+    """Return at most `most` of the items, evenly spaced, with the first and the last among them.
+
+    Of fewer items, return all; if `most` is 1, return the first.
+    """
+    indices = np.linspace(0, len(items) - 1, min(most, len(items))).astype(int)
+    return [items[index] for index in indices]
