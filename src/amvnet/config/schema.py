@@ -488,8 +488,9 @@ class TrainingConfig(Checked):
     """Seed of the initial weights, the order of the scans and the augmentation."""
     workers: Annotated[int, Range(0)] = 0
     """Worker processes that read and augment scans; 0: none."""
-    precision: Literal["32-true", "bf16-mixed", "16-mixed", "64-true"] = "32-true"
-    """Lightning's precision of the forward and backward passes; 64 to compare trainings."""
+    precision: Literal["auto", "32-true", "bf16-mixed", "16-mixed", "64-true"] = "32-true"
+    """Lightning's precision of the forward and backward passes; auto: bf16-mixed on a device with
+    bfloat16 arithmetic, 32-true on others; 64 to compare trainings."""
     accelerator: str = "auto"
     """Lightning's accelerator: auto, cpu, gpu."""
     compile: bool = False

@@ -20,12 +20,12 @@ from amvnet.distributed import device_of, environment
 from amvnet.errors import InputError
 from amvnet.training.callbacks import AverageWeights, Bar, Curves, EpochLines, SeedBatches, Speed
 from amvnet.training.loggers import make_logger
+from amvnet.training.precision import DOUBLE, SINGLE, precision_of
 from amvnet.training.run_plan import RunOptions
 from amvnet.training.stages import Stage
 from amvnet.training.sync_batch_norm import synchronise_batch_norms
 
 LOGGED_EVERY = 10  # batches, of the loss
-DOUBLE = "64-true"
 LAST = "last.ckpt"  # what --resume continues from
 
 
@@ -82,7 +82,7 @@ def fit(
     on_cuda = device_of(options.training.accelerator) == "cuda"
     if options.run.processes.size > 1:
         synchronise_batch_norms(stage.trained, on_cuda)
-    if options.training.precision == DOUBLE:
+    if precision_of(options.training) == DOUBLE:
         stage.double()
     if options.training.compile:
         for net in stage.compilable:
@@ -104,6 +104,7 @@ def _trainer(options: FitOptions, loaders: Loaders, callbacks: Sequence[Callback
     training = options.training
     processes = options.run.processes
     folder = options.folder
+    precision = precision_of(training)
     is_trial = options.steps is not None
     bars = options.run.bars and processes.first
 
@@ -133,7 +134,7 @@ def _trainer(options: FitOptions, loaders: Loaders, callbacks: Sequence[Callback
         strategy=ddp if processes.size > 1 else "auto",
         plugins=[environment()],
         # Lightning's own way to double precision does not convert our batches.
-        precision="32-true" if training.precision == DOUBLE else training.precision,
+        precision=SINGLE if precision == DOUBLE else precision,
         max_epochs=options.epochs,
         max_steps=-1 if options.steps is None else options.steps,
         limit_val_batches=0 if loaders.val is None else None,

@@ -21,6 +21,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import CHANNELS
 from amvnet.scan import Scan
+from amvnet.training.precision import DOUBLE, SINGLE, precision_of
 
 # Bytes per parameter: the weight, its gradient and AdamW's two moments in float32.
 OPTIMIZED = 16
@@ -60,16 +61,16 @@ def step_memory(recipe: Recipe, name: str, scan: Scan, classes: int) -> StepMemo
         scan: a typical scan.
         classes: K.
     """
-    precision = recipe.training.precision
+    precision = precision_of(recipe.training)
     estimate = range_memory if name == "rv" else polar_memory
     activations, parameters = estimate(recipe.model, scan, classes, precision)
     # Weights of mixed precision stay in float32.
-    fixed = parameters * OPTIMIZED * (2 if precision == "64-true" else 1)
+    fixed = parameters * OPTIMIZED * (2 if precision == DOUBLE else 1)
     return StepMemory(activations, fixed)
 
 
 def range_memory(
-    model: ModelConfig, scan: Scan, classes: int, precision: str = "32-true"
+    model: ModelConfig, scan: Scan, classes: int, precision: str = SINGLE
 ) -> tuple[int, int]:
     """Return the bytes kept for the backward pass of a scan, and the number of parameters."""
     config = model.range_net
@@ -89,7 +90,7 @@ def range_memory(
 
 
 def polar_memory(
-    model: ModelConfig, scan: Scan, classes: int, precision: str = "32-true"
+    model: ModelConfig, scan: Scan, classes: int, precision: str = SINGLE
 ) -> tuple[int, int]:
     """Return the bytes kept for the backward pass of a scan, and the number of parameters."""
     grid = PolarView(model.polar_view).project(PointBatch.of([scan]))
@@ -128,7 +129,7 @@ def _kept_bytes(net: nn.Module, inputs: Any, precision: str) -> int:
     for parameter in net.parameters():
         storages.pop(parameter.untyped_storage()._cdata, None)
     total = sum(storage.nbytes() for storage in storages.values())
-    return total * 2 if precision == "64-true" else total
+    return total * 2 if precision == DOUBLE else total
 
 
 def _same(tensor: Tensor) -> Tensor:

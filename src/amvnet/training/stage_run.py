@@ -38,6 +38,7 @@ from amvnet.training.head_scores import NetworkScores, ScoreSource, score_source
 from amvnet.training.head_stage import HeadStage
 from amvnet.training.loaders import ScanSet, count_classes, make_loader, sensor_record
 from amvnet.training.losses import class_weights
+from amvnet.training.precision import SINGLE
 from amvnet.training.run_plan import RunPlan
 from amvnet.training.run_record import SETTINGS, check_begun, sequence_names, stage_settings
 from amvnet.training.stages import NetworkStage, PolarStage, RangeStage
@@ -446,7 +447,7 @@ class HeadRun(StageRun):
             )
 
         # The head multiplies so little that a lower precision would save nothing.
-        in_float32 = dataclasses.replace(training, precision="32-true")
+        in_float32 = dataclasses.replace(training, precision=SINGLE)
         fit_options = FitOptions(in_float32, self.folder, config.epochs, options)
         fit(stage, fit_options, Loaders(train_loader, val_loader), callbacks)
 
