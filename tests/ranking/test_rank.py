@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,7 +21,15 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking.clusters import CELL, cluster
-from amvnet.ranking.rank import Criterion, Doubts, find_clusters, find_doubts, rank
+from amvnet.ranking.rank import (
+    FEW,
+    Criterion,
+    Doubts,
+    find_clusters,
+    find_doubts,
+    order_to_label,
+    rank,
+)
 from amvnet.weights.file import save
 
 from fixtures.worlds import files, fresh_weights, make_streets, run_cli, without
@@ -207,19 +216,75 @@ def read_table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+def doubts_by_pair(clusters: list[dict[str, str]]) -> dict[str, Counter[tuple[str, str]]]:
+    """Return the doubt of each scan by the classes in both views, from the table of clusters."""
+    doubts: dict[str, Counter[tuple[str, str]]] = {}
+    for row in clusters:
+        pairs = doubts.setdefault(row["scan"], Counter())
+        pairs[row["rv"], row["bev"]] += float(row["score"]) * (int(row["points"]) + FEW)  # type: ignore[assignment]
+    return doubts
+
+
+def distance_of(first: Counter[tuple[str, str]], second: Counter[tuple[str, str]]) -> float:
+    """Return the share of the doubt that is of other pairs of classes."""
+    common = 0.0
+    for pair in first:
+        common += min(first[pair] / first.total(), second[pair] / second.total())
+    return 1 - common
+
+
 @pytest.mark.parametrize("by", ["disagreement", "labels"])
 def test_the_tables_are_in_order(world: Path, by: str) -> None:
-    clusters = read_table(world / f"{by}.csv")
-    scans = read_table(world / f"{by}-scans.csv")
+    tables = [read_table(world / f"{by}.csv")]
+    if by == "labels":
+        tables.append(read_table(world / "labels-scans.csv"))
 
-    assert len(clusters) > 20
-    assert len(scans) == 6
-    for table in (clusters, scans):
+    assert len(tables[0]) > 20
+    for table in tables:
         previous_score = float("inf")
         for number, row in enumerate(table, start=1):
             assert int(row["rank"]) == number
             assert float(row["score"]) <= previous_score
             previous_score = float(row["score"])
+
+
+def test_the_scans_to_label_are_doubtful_and_unlike_those_before(world: Path) -> None:
+    doubts = doubts_by_pair(read_table(world / "disagreement.csv"))
+    scans = read_table(world / "disagreement-scans.csv")
+
+    assert [int(row["rank"]) for row in scans] == [1, 2, 3, 4, 5, 6]
+    assert float(scans[0]["score"]) == max(float(row["score"]) for row in scans)
+    for position in range(1, len(scans)):
+        gains = []
+        for row in scans[position:]:
+            before = [doubts[other["scan"]] for other in scans[:position]]
+            distance = min(distance_of(doubts[row["scan"]], other) for other in before)
+            gains.append(float(row["score"]) * distance)
+        assert gains[0] == pytest.approx(max(gains), rel=0.01)
+
+
+def test_one_scan_of_each_street_comes_before_the_second_of_any() -> None:
+    rng = np.random.default_rng(0)
+    streets = rng.random((4, 30)) ** 8
+    by_kind = np.repeat(streets, 5, axis=0) * rng.uniform(0.9, 1.1, (20, 30))
+    doubts = np.repeat([0.4, 0.35, 0.3, 0.25], 5) + np.tile(np.arange(5), 4) / 1000
+
+    order = order_to_label(doubts, by_kind)
+
+    assert sorted(order) == list(range(20))
+    assert order[0] == 4
+    assert set(order[:4] // 5) == {0, 1, 2, 3}
+
+
+def test_copies_of_a_scan_come_last_and_scans_without_doubt_after_them() -> None:
+    by_kind = np.array([[1.0, 0], [1, 0], [0, 1], [0, 0], [2, 0]])
+    doubts = np.array([0.5, 0.4, 0.1, 0, 0.45])
+    assert order_to_label(doubts, by_kind).tolist() == [0, 2, 4, 1, 3]
+
+
+def test_no_scans_and_no_doubts_are_ordered_as_they_are() -> None:
+    assert order_to_label(np.zeros(0), np.zeros((0, 0))).tolist() == []
+    assert order_to_label(np.zeros(3), np.zeros((3, 0))).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize("by", ["disagreement", "labels"])

@@ -1,6 +1,7 @@
 """Rank points to look at: those on which the two views disagree, or both contradict the label.
 
-These points are grouped into clusters, and the most doubtful clusters come first.
+These points are grouped into clusters, and the most doubtful clusters come first. Of the scans to
+label next, the first ones are doubtful and unlike each other.
 """
 
 from __future__ import annotations
@@ -83,12 +84,12 @@ class Doubts:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The clusters and the S scans of a dataset, the most doubtful first.
+    """The clusters of a dataset, the most doubtful first, and its S scans.
 
     Attributes:
         records: (S,) scans, in the order of the dataset.
         clusters: (C,) rows of `ROW`.
-        scans: (S,) indices into `records`, the most doubtful scan first.
+        scans: (S,) indices into `records`, in the order in which to look at them.
         scores: (S,) mean doubt of the points of each scan in `scans`.
         sizes: (S,) number of points of each scan in `scans`.
     """
@@ -152,9 +153,13 @@ def rank(
     if by == "labels":
         clusters["score"] /= _frequencies(clusters["kind"]) ** COMMON
 
+    if by == "labels":
+        scan_order = np.argsort(-mean_doubts, kind="stable")
+    else:
+        scan_order = order_to_label(mean_doubts, _doubt_by_kind(clusters, len(records)))
+
     # A stable sort keeps equal scores in the dataset's order, on every machine.
     cluster_order = np.argsort(-clusters["score"], kind="stable")
-    scan_order = np.argsort(-mean_doubts, kind="stable")
     return Ranking(
         records,
         clusters=clusters[cluster_order],
@@ -162,6 +167,45 @@ def rank(
         scores=mean_doubts[scan_order],
         sizes=sizes[scan_order],
     )
+
+
+def order_to_label(doubts: np.ndarray, by_kind: np.ndarray) -> np.ndarray:
+    """Return the order in which to label scans, so that the first ones are doubtful and unlike.
+
+    The first scan is the most doubtful. Each next one has the largest product of its doubt and its
+    distance to the nearest scan before it: the share of the doubt that would have to be of another
+    kind to make the two alike. Without the distance, the first scans would be those of one street.
+
+    Args:
+        doubts: (S,) mean doubt of the points of each scan.
+        by_kind: (S, D) the doubt of each scan by its kind, in any unit.
+
+    Returns:
+        (S,) indices of the scans.
+    """
+    count = len(doubts)
+    totals = by_kind.sum(axis=1, keepdims=True)
+    shares = by_kind / np.maximum(totals, np.finfo(np.float32).tiny)
+
+    order = np.zeros(count, dtype=np.int64)
+    distance = np.ones(count)  # in [0, 1], to the nearest scan before
+    is_left = np.ones(count, dtype=bool)
+    for position in range(count):
+        gain = np.where(is_left, doubts * distance, -1)
+        # Of scans like those before, the most doubtful one comes first.
+        best = gain.argmax() if gain.max() > 0 else np.where(is_left, doubts, -1).argmax()
+        order[position] = best
+        is_left[best] = False
+        distance = np.minimum(distance, np.abs(shares - shares[best]).sum(axis=1) / 2)
+    return order
+
+
+def _doubt_by_kind(clusters: np.ndarray, scans: int) -> np.ndarray:
+    """Return the doubt of each scan by its kind, (S, D) for the D kinds that occur."""
+    kinds, kind = np.unique(clusters["kind"], return_inverse=True)
+    doubt = clusters["score"] * (clusters["points"] + FEW)
+    sums = np.bincount(clusters["scan"] * len(kinds) + kind, doubt, scans * len(kinds))
+    return sums.reshape(scans, len(kinds)).astype(np.float32)
 
 
 def find_doubts(scan: Scan, segmenter: Segmenter, by: Criterion) -> Doubts:
