@@ -17,7 +17,7 @@ from amvnet.training.loaders import EpochSampler
 from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.worlds import files, make_streets, run_cli, without, write_recipe
+from fixtures.worlds import NO_PICTURES, files, make_streets, run_cli, without, write_recipe
 
 # No DropBlock, as each process draws its own blocks. Double precision, as AdamW divides each
 # gradient by its size, which turns the rounding of a tiny gradient into a full step.
@@ -70,7 +70,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("world")
     data = make_streets(root / "data", scans=4)
     recipe = write_recipe(root / "recipe.yaml", model=MODEL, training=TRAINING)
-    assert run_cli("train", recipe, "--data", data, "--out", root / "run") == (0, "")
+    assert run_cli("train", recipe, "--data", data, "--out", root / "run", *NO_PICTURES) == (0, "")
 
     save(without(load(root / "run"), "point_head"), root / "networks.safetensors")
     return root
@@ -79,6 +79,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
     recipe = world / "recipe.yaml"
     arguments = ["train", recipe, "--data", world / "data", "--out", out, "--stage", stage]
+    arguments += NO_PICTURES
     if stage == "head":
         arguments += ["--init", world / "networks.safetensors"]
     return arguments
@@ -149,7 +150,8 @@ def test_processes_share_the_scans_of_predict_and_evaluate(world: Path, tmp_path
         out = tmp_path / name
         predicted = ["--out", out / "labels", "--scores", "--sequences", "00,08"]
         assert run("predict", data, *weights, *predicted) == 0
-        evaluated = ["--split", "all", "--json", out / "all.json", "--pictures", out / "pictures"]
+        written = ["--json", out / "all.json", "--pictures", out / "pictures"]
+        evaluated = ["--sequences", "08", *written]
         assert run("evaluate", data, *weights, *evaluated) == 0
 
     names = files(tmp_path / "one")

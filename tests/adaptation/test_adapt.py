@@ -26,7 +26,7 @@ from amvnet.training.losses import class_weights
 from amvnet.training.run import Run
 from amvnet.weights.file import load, save
 
-from fixtures.worlds import TRAINING, fake_drive, fresh_weights, make_streets, run_cli
+from fixtures.worlds import NO_PICTURES, TRAINING, fake_drive, fresh_weights, make_streets, run_cli
 
 
 @pytest.fixture(autouse=True)
@@ -61,6 +61,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     code, error = run_cli(
         *("train", root / "train.yaml", "--data", root / "data", "--out", root / "start"),
         *("--init", root / "fresh.safetensors"),
+        *NO_PICTURES,
     )
     assert code == 0, error
     return root

@@ -81,7 +81,10 @@ def run(words: list[str], folder: Path) -> None:
     assert process.returncode == 0, process.stderr
 
 
-@pytest.mark.parametrize(("page", "least"), [("README.md", 4), ("docs/training.md", 8)])
+@pytest.mark.parametrize(
+    ("page", "least"),
+    [("README.md", 4), pytest.param("docs/training.md", 8, marks=pytest.mark.slow)],
+)
 def test_the_commands_on_training_run(page: str, least: int, downloads: Path) -> None:
     count = 0
     for words in commands_of(page):

@@ -25,6 +25,7 @@ from amvnet.models.methods import arithmetic_mean, maximum
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.worlds import (
+    NO_PICTURES,
     files,
     fresh_weights,
     make_streets,
@@ -47,7 +48,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_recipe(root / "recipe.yaml")
     save(fresh_weights(), root / "weights.safetensors")
     options = f"--data {root}/data --out {root}/run --training.head.epochs 4"
-    succeed(f"train {root}/recipe.yaml {options}")
+    succeed(f"train {root}/recipe.yaml {options} {' '.join(NO_PICTURES)}")
     return root
 
 

@@ -19,6 +19,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import load, save
 
 from fixtures.worlds import (
+    NO_PICTURES,
     commands_of,
     files,
     fresh_weights,
@@ -253,7 +254,8 @@ def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) ->
 
 def train_head_arguments(world: Path, out: Path) -> list[Any]:
     recipe = world / "recipe.yaml"
-    return ["train", recipe, "--data", world / "data", "--stage", "head", "--out", out]
+    arguments = ["train", recipe, "--data", world / "data", "--stage", "head", "--out", out]
+    return [*arguments, *NO_PICTURES]
 
 
 def score_options(world: Path) -> list[Any]:

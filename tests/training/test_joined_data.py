@@ -20,7 +20,15 @@ from amvnet.errors import InputError
 from amvnet.training.run_plan import without_mean
 from amvnet.weights.file import load, save
 
-from fixtures.worlds import GOLDEN, fresh_weights, make_streets, refusal, run_cli, write_recipe
+from fixtures.worlds import (
+    GOLDEN,
+    NO_PICTURES,
+    fresh_weights,
+    make_streets,
+    refusal,
+    run_cli,
+    write_recipe,
+)
 
 
 def joined(tmp_path: Path, share: float | None, first: int = 4, second: int = 14) -> TrainingScans:
@@ -123,6 +131,7 @@ def arguments(world: Path, out: Path, b: str) -> list[object]:
     return [
         *("train", world / "recipe.yaml", "--init", world / "start.safetensors", "--out", out),
         *("--data", world / "a", "--data", b, "--train-sequences", "00", "--val-sequences", "08"),
+        *NO_PICTURES,
     ]
 
 

@@ -8,11 +8,12 @@ from typing import Any, get_args
 import pytest
 from matplotlib.figure import Figure
 
-from amvnet.training import loggers
+from amvnet.evaluation.top_view import TopView
+from amvnet.training import callbacks, loggers
 from amvnet.training.loggers import LIBRARIES, LoggerName, log_figure, make_logger
 from amvnet.training.run_plan import RunOptions
 
-from fixtures.worlds import fails, make_streets, refusal, write_recipe
+from fixtures.worlds import fails, make_streets, refusal, succeed, write_recipe
 
 
 @pytest.mark.parametrize("name", ["tensorboard", "csv"])
@@ -41,6 +42,21 @@ def test_a_missing_library_is_named_before_anything_is_trained(
     line = refusal(f"train {recipe} --data {data} --out {tmp_path / 'run'} --logger {name}")
     assert name in line
     assert not (tmp_path / "run").exists()
+
+
+def test_nothing_is_drawn_for_a_logger_without_pictures(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    drawn: list[TopView] = []
+    monkeypatch.setattr(callbacks, "scan_figure", lambda view: drawn.append(view) or Figure())
+    data = make_streets(tmp_path / "data")
+    recipe = write_recipe(tmp_path / "recipe.yaml")
+
+    options = f"--data {data} --stage rv --training.rv.epochs 1"
+    succeed(f"train {recipe} {options} --out {tmp_path / 'csv'} --logger csv")
+    assert not drawn
+    succeed(f"train {recipe} {options} --out {tmp_path / 'tensorboard'}")
+    assert len(drawn) == 2
 
 
 def test_pictures_go_to_loggers_that_take_them() -> None:

@@ -40,6 +40,7 @@ from fixtures.worlds import (
     BUILDING,
     CAR,
     GOLDEN,
+    NO_PICTURES,
     ROAD,
     SIDEWALK,
     fake_drive,
@@ -75,7 +76,8 @@ def train(world: Path, out: Path, *options: object) -> Weights:
 
 
 def train_arguments(world: Path, out: Path) -> list[object]:
-    return ["train", world / "recipe.yaml", "--data", world / "data", "--out", out]
+    arguments = ["train", world / "recipe.yaml", "--data", world / "data", "--out", out]
+    return [*arguments, *NO_PICTURES]
 
 
 def fail(*arguments: object) -> str:
@@ -114,7 +116,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(world: Path) -> Path:
     """Train all stages without interruption."""
-    train(world, world / "run")
+    train(world, world / "run", "--logger", "tensorboard")
     return world / "run"
 
 
@@ -733,7 +735,7 @@ def test_a_killed_run_resumes_to_the_same_weights(
     assert not differing(weights, load(run / stage / "last.safetensors"))
 
 
-@pytest.mark.parametrize("room", [1_000, 40_000])
+@pytest.mark.parametrize("room", [pytest.param(1_000, marks=pytest.mark.slow), 40_000])
 def test_a_full_disk_stops_with_one_line_and_the_last_good_weights(
     world: Path, tmp_path: Path, room: int
 ) -> None:

@@ -311,7 +311,7 @@ class Pictures(Callback):
     """Draws predictions of some validation scans, seen from above, for the logger.
 
     Args:
-        scans: with labels.
+        scans: with labels; none in a process that does not log.
         taxonomy: the classes and their colours.
         label: returns the predicted (P,) train ids of a batch of one scan.
     """
@@ -326,7 +326,7 @@ class Pictures(Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         interval = max((trainer.max_epochs or 1) // PICTURE_ROUNDS, 1)
         is_due = (trainer.current_epoch + 1) % interval == 0
-        if not (trainer.is_global_zero and is_due):
+        if not (self.scans and is_due):
             return
 
         with _weights_to_keep(trainer, pl_module) as part:

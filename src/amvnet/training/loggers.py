@@ -15,6 +15,7 @@ from amvnet.errors import InputError
 LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
 PROJECT = "amvnet"  # the project of Weights & Biases, and the experiment of MLflow
 LIBRARIES = ("wandb", "mlflow")  # loggers that need a library of the same name
+WITH_PICTURES = ("tensorboard", "wandb", "mlflow")
 
 
 def check_logger(name: LoggerName) -> None:

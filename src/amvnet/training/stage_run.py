@@ -37,6 +37,7 @@ from amvnet.training.head_points import PointDraw, PointGatherer, make_head_load
 from amvnet.training.head_scores import NetworkScores, ScoreSource, score_source, scorer_with_head
 from amvnet.training.head_stage import HeadStage
 from amvnet.training.loaders import ScanSet, count_classes, make_loader, sensor_record
+from amvnet.training.loggers import WITH_PICTURES
 from amvnet.training.losses import class_weights
 from amvnet.training.precision import SINGLE
 from amvnet.training.run_plan import RunPlan
@@ -203,8 +204,9 @@ class StageRun:
             score: returns the (P, K) scores of a batch.
         """
         dataset = self.plan.scans.dataset
-        is_first = self.plan.options.processes.first
-        records = evenly_spaced(self.plan.scans.val, PICTURED_SCANS) if is_first else []
+        options = self.plan.options
+        is_drawn = options.processes.first and options.logger in WITH_PICTURES
+        records = evenly_spaced(self.plan.scans.val, PICTURED_SCANS) if is_drawn else []
         scans = [match_scan(dataset.read(record), self.intensity) for record in records]
         return Pictures(scans, dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
 
