@@ -48,7 +48,12 @@ def test_nothing_is_drawn_for_a_logger_without_pictures(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     drawn: list[TopView] = []
-    monkeypatch.setattr(callbacks, "scan_figure", lambda view: drawn.append(view) or Figure())
+
+    def draw(view: TopView) -> Figure:
+        drawn.append(view)
+        return Figure()
+
+    monkeypatch.setattr(callbacks, "scan_figure", draw)
     data = make_streets(tmp_path / "data")
     recipe = write_recipe(tmp_path / "recipe.yaml")
 
