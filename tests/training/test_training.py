@@ -33,6 +33,7 @@ from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import PointGatherer
 from amvnet.training.loaders import count_classes
 from amvnet.training.run_plan import RunPlan
+from amvnet.training.stage_run import NetworkRun
 from amvnet.training.stages import NetworkStage
 from amvnet.weights.file import PARTS, Weights, load, save
 
@@ -453,6 +454,26 @@ def test_stages_one_by_one_equal_all_at_once(world: Path, run: Path, tmp_path: P
     for stage in PART_OF:
         weights = train(world, tmp_path / "run", "--stage", stage)
     assert not differing(weights, load(run))
+
+
+def test_two_stages_trained_at_the_same_time_are_both_kept(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other stage begins after this one and ends before it, as if by another process."""
+    save(fresh_weights(), tmp_path / "start.safetensors")
+    options = ["--init", tmp_path / "start.safetensors", "--training.rv.epochs", 1]
+    fit = NetworkRun.fit
+
+    def fit_beside(self: NetworkRun) -> None:
+        monkeypatch.setattr(NetworkRun, "fit", fit)
+        train(world, tmp_path / "run", "--stage", "rv", *options)
+        fit(self)
+
+    monkeypatch.setattr(NetworkRun, "fit", fit_beside)
+    weights = train(world, tmp_path / "run", "--stage", "bev", *options)
+    for stage in ("rv", "bev"):
+        trained = load(tmp_path / "run" / stage / "last.safetensors")
+        assert weights.digest(PART_OF[stage]) == trained.digest(PART_OF[stage])
 
 
 def test_folds_score_no_sequence_that_they_learnt_from(

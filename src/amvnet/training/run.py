@@ -75,7 +75,8 @@ class Run:
         for name in names:
             weights = self._stage(name, weights).train()
             if processes.first:
-                save(self._stage(JOINT, weights).finished_weights(), path)
+                finished = self._with_finished(weights)
+                save(self._stage(JOINT, finished).finished_weights(), path)
             processes.wait()
         return path
 
@@ -86,9 +87,7 @@ class Run:
         """
         plan = self.plan
         weights = Weights(plan.recipe.model, plan.scans.dataset.taxonomy, plan.recipe.sensor)
-        # A head for other models' scores is of no use to these networks.
-        names = list(STAGES) if plan.scores is None else ["head"]
-        for name in names:
+        for name in self._of_folder:
             part, _ = STAGES[name]
             if init is None or part not in init.parts:
                 continue
@@ -100,9 +99,22 @@ class Run:
                 weights = weights.replace_part(part, init)
             elif name in trained:
                 weights = weights.replace_part(part, self._for_classes(init, part))
-        for name in names:
-            weights = self._stage(name, weights).finished_weights()
 
+        return self._with_finished(weights)
+
+    @property
+    def _of_folder(self) -> Sequence[str]:
+        """Return the names of the stages that the folder can hold before the joint one."""
+        # A head for other models' scores is of no use to these networks.
+        return list(STAGES) if self.plan.scores is None else ["head"]
+
+    def _with_finished(self, weights: Weights) -> Weights:
+        """Return the weights with the parts of this folder's finished stages before the joint one.
+
+        Another process may have finished some of them while this one trained.
+        """
+        for name in self._of_folder:
+            weights = self._stage(name, weights).finished_weights()
         return weights
 
     def _check_joint(self, names: Sequence[str], weights: Weights) -> None:
