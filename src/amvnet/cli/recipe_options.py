@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import functools
 import inspect
+import sys
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, get_type_hints
@@ -127,11 +129,15 @@ def _to_text(value: Any) -> str:
 
 def field_texts(cls: type) -> dict[str, str]:
     """Return the line of documentation under each field of a dataclass."""
-    tree = ast.parse(inspect.getsource(cls))
-    body = tree.body[0].body  # type: ignore[attr-defined]
-
     texts: dict[str, str] = {}
-    for field, text in pairwise(body):
+    for field, text in pairwise(_class_bodies(cls.__module__)[cls.__name__]):
         if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
             texts[field.target.id] = text.value.value  # type: ignore[attr-defined,union-attr]
     return texts
+
+
+@functools.cache
+def _class_bodies(module: str) -> dict[str, list[ast.stmt]]:
+    """Return the statements of each class of a module, by name."""
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    return {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}
