@@ -470,7 +470,7 @@ class TrainingConfig(Checked):
 
     rv: NetworkTraining = NetworkTraining(epochs=160, batch=32, lr=4e-3)
     """The range-view network."""
-    bev: NetworkTraining = NetworkTraining(epochs=40, batch=8, lr=2e-3)
+    bev: NetworkTraining = NetworkTraining(epochs=40, batch=8, lr=2e-3, loss_over="voxels")
     """The bird's-eye-view network."""
     head: HeadTraining = HeadTraining()
     """The point head."""
