@@ -12,7 +12,7 @@ import yaml
 
 from amvnet.config.nested import from_dict, merge_trees, to_dict
 from amvnet.config.recipes import load_recipe, recipe_names
-from amvnet.config.schema import AssertionConfig, ModelConfig, Recipe
+from amvnet.config.schema import AssertionConfig, ModelConfig, PointHeadConfig, Recipe
 from amvnet.errors import InputError
 
 
@@ -48,6 +48,7 @@ def test_every_builtin_recipe_is_there() -> None:
     full_size = {"simulated"}
     for benchmark in ("semantickitti", "nuscenes"):
         full_size |= {benchmark, f"{benchmark}-polarnet", f"{benchmark}-no-rnn"}
+        full_size |= {f"{benchmark}-plus"}
     compact = {f"{name}-compact" for name in full_size} | {"simulated-hdl32e-compact"}
 
     assert set(recipe_names()) == full_size | compact | {"adapt", "finetune"}
@@ -94,6 +95,16 @@ def test_the_nuscenes_recipe_holds_the_papers_numbers() -> None:
 def test_a_recipes_stages_fit_each_other(name: str) -> None:
     net = load_recipe(name).model.range_net
     assert len(net.widths) == len(net.blocks) == len(net.height_strides)
+
+
+@pytest.mark.parametrize("benchmark", ["semantickitti", "nuscenes"])
+@pytest.mark.parametrize("size", ["", "-compact"])
+def test_the_pure_recipes_have_no_option_of_the_plus_recipes(benchmark: str, size: str) -> None:
+    pure = load_recipe(f"{benchmark}{size}").model
+    plus = load_recipe(f"{benchmark}-plus{size}").model
+    assert pure.point_head == PointHeadConfig()
+    assert plus.point_head.share == 0.5
+    assert dataclasses.replace(plus, point_head=pure.point_head) == pure
 
 
 def test_an_empty_tree_gives_the_defaults() -> None:

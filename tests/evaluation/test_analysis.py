@@ -21,7 +21,9 @@ from amvnet.evaluation.assertions import SHARES, rank_points
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
+from amvnet.inference.timing import Job, run_once
 from amvnet.models.methods import arithmetic_mean, maximum
+from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.worlds import (
@@ -154,7 +156,29 @@ def test_a_tau_above_those_that_are_swept_is_analyzed(
     assert metrics(evaluation.matrices["amvnet"][0], dataset.taxonomy) == expected
 
 
-def test_every_method_is_scored_as_by_the_segmenter(dataset: Dataset, weights: Weights) -> None:
+def with_matched_intensities(weights: Weights) -> Weights:
+    """Return weights that bring each scan's intensities to others, as simulated ones do."""
+    matched = {MATCHED: True, KEY: (np.linspace(0, 1, len(PROBABILITIES)) ** 3).tolist()}
+    records = {part: {**record, **matched} for part, record in weights.training.items()}
+    return replace(weights, training=records)
+
+
+def test_a_scan_is_timed_as_it_is_segmented(dataset: Dataset, weights: Weights) -> None:
+    scan = dataset.read(dataset.records(["08"])[0])
+    written: list[np.ndarray] = []
+    matched = Segmenter(with_matched_intensities(weights))
+    run_once(Job(matched, lambda: scan, written.append))
+
+    np.testing.assert_array_equal(written[0], matched(scan).labels)
+    assert (written[0] != Segmenter(weights)(scan).labels).any()
+
+
+@pytest.mark.parametrize("are_matched", [False, True])
+def test_every_method_is_scored_as_by_the_segmenter(
+    dataset: Dataset, weights: Weights, are_matched: bool
+) -> None:
+    if are_matched:
+        weights = with_matched_intensities(weights)
     matrices = analyze_08(dataset, weights).evaluation.matrices
     expected: dict[str, np.ndarray] = {}
     for method in matrices:

@@ -17,7 +17,6 @@ from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, exp
 from amvnet.models.amvnet import merge
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.methods import ENSEMBLES
-from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 
@@ -139,7 +138,7 @@ def _label(scan: Scan, segmenter: Segmenter) -> LabelledScan:
     """Label a scan by every method, and by the head for every point that a tau would ask."""
     # The steps of the method; the head settles every point that some tau makes uncertain.
     model = segmenter.model
-    batch = PointBatch.of([scan]).to(segmenter.device)
+    batch = segmenter.batch([scan])
     f, g = model.score(*model.project(batch))
     uncertain = model.compare(batch, f, g)
     # Bin b holds the similarities in (b, b + 1] / BINS.

@@ -16,7 +16,6 @@ from amvnet.evaluation.scoring import stream_labelled
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels
 from amvnet.models.amvnet import merge
 from amvnet.models.assertions import cosine_similarity, entropy, margin
-from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 
@@ -82,7 +81,7 @@ def compare_assertions(
 def _label(scan: Scan, segmenter: Segmenter) -> dict[tuple[str, float], np.ndarray]:
     """Return (N,) train ids of a scan, by assertion and share of uncertain points."""
     model = segmenter.model
-    batch = PointBatch.of([scan]).to(segmenter.device)
+    batch = segmenter.batch([scan])
     f, g = model.score(*model.project(batch))
 
     # The head is asked once, for all points that any assertion finds at the largest share.

@@ -163,7 +163,7 @@ class Segmenter:
         is_large = sum(map(len, checked)) >= LARGE
         memory = return_freed_memory() if self._keeps_memory and is_large else nullcontext()
         with self._machine.watch(uses_team), memory:
-            batch = self._batch(checked)
+            batch = self.batch(checked)
             labels, scores = _fetch(self._scores(batch))
 
         results = []
@@ -258,7 +258,7 @@ class Segmenter:
             (P, K) scores by method; and (P,) bool, the uncertain points, or None without two
             networks.
         """
-        return self._scores_by_method(self._batch([scan]), methods, self.weights.parts)
+        return self._scores_by_method(self.batch([scan]), methods, self.weights.parts)
 
     @torch.inference_mode()
     def _scores_by_method(
@@ -309,7 +309,14 @@ class Segmenter:
             return {"bev": model.score_polar_view(batch)}
         return {}
 
-    def _batch(self, scans: Sequence[Scan]) -> PointBatch:
+    def batch(self, scans: Sequence[Scan]) -> PointBatch:
+        """Return the valid points of some scans on the device, as the networks take them.
+
+        The intensities of each scan are matched to those of the training, if the weights say so.
+
+        Raises:
+            InputError: if more than a few intensities are out of range.
+        """
         if self._are_fractions:
             scans = [check_intensity(scan) for scan in scans]
         scans = [match_scan(scan, self.intensity) for scan in scans]

@@ -28,7 +28,6 @@ from amvnet.models.assertions import cosine_similarity
 from amvnet.models.layers import linear
 from amvnet.models.methods import geometric_mean
 from amvnet.models.streams import one_after_the_other
-from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.weights.file import PARTS, Weights, part_state
@@ -154,7 +153,7 @@ def run_once(job: Job) -> Timing:
     with clock("read"):
         scan = job.read()
     with clock("project"):
-        batch = PointBatch.of([scan]).to(device)
+        batch = job.segmenter.batch([scan])
 
     scores = model(batch)
 
@@ -237,7 +236,7 @@ def _flops(job: Job) -> dict[str, float]:
     """Return each network's floating-point operations; a multiply-add counts as two."""
     device = job.segmenter.device
     model = job.segmenter.weights.build().to(device)
-    batch = PointBatch.of([job.read()]).to(device)
+    batch = job.segmenter.batch([job.read()])
 
     counts = {}
     for name, score in (("RV", model.score_range_view), ("BEV", model.score_polar_view)):
