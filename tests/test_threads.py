@@ -6,17 +6,21 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import threading
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from amvnet.threads import BUSY, WAITING, BusyMachine
+from amvnet.inference.segmenter import Segmenter
+from amvnet.models import point_head, polar_net
+from amvnet.threads import BUSY, WAITING, BusyMachine, run_parts
 from amvnet.weights.file import save
 
-from fixtures.worlds import fresh_weights
+from fixtures.worlds import fresh_weights, street
 
 # Segments with two threads, and again in a forked pool.
 FORKING = """
@@ -119,3 +123,63 @@ def test_threads_that_do_not_spin_are_not_warned_of(
         warnings.simplefilter("error")
         for _ in range(5):
             machine.note(9, 1)
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize(("policy", "threads"), [("passive", 2), ("active", 1)])
+def test_parts_have_threads_of_their_own_if_threads_sleep(
+    policy: str, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    monkeypatch.setenv("OMP_WAIT_POLICY", policy)
+    both_run = threading.Barrier(threads, timeout=60)
+
+    def run(part: int) -> tuple[int, int, bool, int]:
+        both_run.wait()
+        thread = threading.get_ident()
+        return part, thread, torch.is_inference_mode_enabled(), torch.get_num_threads()
+
+    with torch.inference_mode():
+        results = run_parts(run, range(4))
+    assert [part for part, *_ in results] == [0, 1, 2, 3]
+    assert len({thread for _, thread, *_ in results}) == threads
+    assert all(is_inference for *_, is_inference, _ in results)
+    assert {count for *_, count in results} == {2 // threads}
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_part_that_fails_ends_the_computation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
+
+    def run(part: int) -> float:
+        return 1 / part
+
+    with torch.no_grad(), pytest.raises(ZeroDivisionError):
+        run_parts(run, [2, 1, 0, 3])
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_a_scan_is_segmented_alike_however_threads_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With many small parts; the number of threads may change the last bits."""
+    monkeypatch.setattr(point_head, "PART", 16)
+    monkeypatch.setattr(polar_net, "PART", 16)
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    points, _ = street(0)
+    segmenter = Segmenter(fresh_weights())
+
+    results = []
+    for policy in ("active", "passive"):
+        monkeypatch.setenv("OMP_WAIT_POLICY", policy)
+        results.append(segmenter(points))
+    assert results[0].uncertain.sum() > 100
+    np.testing.assert_allclose(results[0].scores, results[1].scores, atol=1e-5)

@@ -11,9 +11,11 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
+from typing import TypeVar
 
 # Threads sleep while they wait. GNU's and LLVM's OpenMP read the first, LLVM's and Intel's the last
 # one; GNU's reads the second instead of the first.
@@ -24,6 +26,9 @@ WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": None, "KMP_BLOCKTIME"
 BUSY = 1.4
 SLOW_CALLS = 2  # in succession: one may have waited for a disk
 SHORTEST = 0.05  # seconds; shorter calls are not judged, as a single time slice decides their ratio
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
 
 
 def wait_passively() -> None:
@@ -42,6 +47,39 @@ def wait_passively() -> None:
 def is_waiting_set() -> bool:
     """Return whether the environment says how threads wait."""
     return any(name in os.environ for name in WAITING)
+
+
+def do_threads_sleep() -> bool:
+    """Return whether the environment says that threads sleep while they wait."""
+    spins = os.environ.get("GOMP_SPINCOUNT", "0") != "0"
+    return os.environ.get("OMP_WAIT_POLICY", "").lower() == "passive" and not spins
+
+
+def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """Run the parts of a computation on a CPU; return their results in order.
+
+    A thread that sleeps has to be woken for its share of each operation. In a part of many short
+    operations this takes longer than the share, so that every thread takes whole parts instead.
+    Threads that spin need no waking, and would keep the processors from the threads of the parts.
+    """
+    import torch
+
+    threads = torch.get_num_threads()
+    if min(threads, len(parts)) < 2 or torch.is_grad_enabled() or not do_threads_sleep():
+        return [run(part) for part in parts]
+
+    # Both are settings of a thread.
+    is_inference = torch.is_inference_mode_enabled()
+
+    def run_alone(part: Part) -> Result:
+        with torch.no_grad(), torch.inference_mode(is_inference):
+            return run(part)
+
+    try:
+        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            return list(pool.map(run_alone, parts))
+    finally:
+        torch.set_num_threads(threads)  # the pool's threads changed it for the whole process
 
 
 @cache  # once per process

@@ -14,6 +14,7 @@ from amvnet.models.neighbour_pooling import build_pooling
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import occurring
+from amvnet.threads import run_parts
 
 POINT_VALUES = 4  # x, y, z, intensity
 LEAST = 1e-24  # product of two probabilities whose logarithm is still taken
@@ -67,9 +68,9 @@ class PointHead(nn.Module):
         assert isinstance(first, nn.Linear)
 
         encoded = first(table)  # (P, hidden[0]): W [f_k, g_k, x_k] of every point
-        part = PART if table.is_cpu else PART_ON_GPU
-        logits = []
-        for i, k in zip(uncertain.split(part), near.split(part), strict=True):
+
+        def score_part(part: tuple[Tensor, Tensor]) -> Tensor:
+            i, k = part
             point = table.index_select(0, i)
             shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
             rows = encoded.index_select(0, k.flatten()).unflatten(0, k.shape)
@@ -77,8 +78,13 @@ class PointHead(nn.Module):
 
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
             pooled = self.pool(point, rest(rows.flatten(0, 1)).unflatten(0, k.shape))
-            logits.append(self._classify(pooled, point))
-        return torch.cat(logits)
+            return self._classify(pooled, point)
+
+        size = PART if table.is_cpu else PART_ON_GPU
+        parts = list(zip(uncertain.split(size), near.split(size), strict=True))
+        if not table.is_cpu:
+            return torch.cat([score_part(part) for part in parts])
+        return torch.cat(run_parts(score_part, parts))
 
     def _classify(self, pooled: Tensor, point: Tensor) -> Tensor:
         """Return the (U, K) logits."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from amvnet.config.schema import PolarViewConfig
 from amvnet.models.views.points import PointBatch, occurring
+from amvnet.threads import run_parts
 
 FEATURES = 9  # offset from the voxel's centre (3), polar coordinates (3), x, y, intensity
 
@@ -52,17 +54,26 @@ class PolarGrid:
 
         The points of a small part stay in a CPU's cache. Use this only without gradients.
         """
-        pooled = None
-        for features, slot in zip(
-            self.features.split(part), self.seen_slot.split(part), strict=True
-        ):
-            encoded = encode(features)
-            if pooled is None:
-                pooled = encoded.new_full((len(self.seen), encoded.shape[1]), -torch.inf)
-            pooled.scatter_reduce_(0, slot[:, None].expand_as(encoded), encoded, "amax")
 
-        assert pooled is not None
-        return pooled
+        def pool_share(share: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+            pooled = None
+            for features, slot in share:
+                encoded = encode(features)
+                if pooled is None:
+                    pooled = encoded.new_full((len(self.seen), encoded.shape[1]), -torch.inf)
+                pooled.scatter_reduce_(0, slot[:, None].expand_as(encoded), encoded, "amax")
+
+            assert pooled is not None
+            return pooled
+
+        parts = list(zip(self.features.split(part), self.seen_slot.split(part), strict=True))
+        if not self.features.is_cpu:
+            return pool_share(parts)
+
+        # Every thread pools its share of the points.
+        size = math.ceil(len(parts) / torch.get_num_threads())
+        shares = [parts[start : start + size] for start in range(0, len(parts), size)]
+        return functools.reduce(torch.maximum, run_parts(pool_share, shares))
 
     def to_map(self, pillars: Tensor) -> Tensor:
         """Return the map (B, C, R, A) of the values (F, C) of the seen pillars; 0 elsewhere."""
