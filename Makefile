@@ -1,7 +1,7 @@
 # Everything runs in a virtual environment of its own, .venv.
 PYTHON ?= python3
 BIN := .venv/bin
-# A process for each processor, and one thread in each.
+# A process for each processor, and one thread in each. The tests of a file share what they make, so one process runs them.
 SPREAD := OMP_NUM_THREADS=1
 
 .PHONY: demo test test-slow bench lint format clean
@@ -10,10 +10,10 @@ demo: .venv/installed  ## simulate streets, segment, score and draw them
 	$(BIN)/amvnet demo --out demo
 
 test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 measures which lines they run
-	$(SPREAD) $(BIN)/python -m pytest -n auto $(if $(COVERAGE),--cov=amvnet --cov-report=term:skip-covered)
+	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile $(if $(COVERAGE),--cov=amvnet --cov-report=term:skip-covered)
 
 test-slow: .venv/installed  ## the tests that take minutes, too
-	$(SPREAD) $(BIN)/python -m pytest -n auto -m "slow or not slow"
+	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"
 
 bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN="--scan FILE" for a scan of yours
 	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,compile

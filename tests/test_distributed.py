@@ -85,7 +85,7 @@ def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
     return arguments
 
 
-@pytest.mark.parametrize("stage", ["rv", "bev", "head"])
+@pytest.mark.parametrize("stage", ["rv", pytest.param("bev", marks=pytest.mark.slow), "head"])
 def test_two_processes_train_the_weights_of_one(world: Path, tmp_path: Path, stage: str) -> None:
     result = torchrun(*train_arguments(world, tmp_path / "two", stage))
     assert result.returncode == 0, result.stderr

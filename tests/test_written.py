@@ -123,6 +123,7 @@ def test_export_keeps_to_it_before_it_exports(world: Path, tmp_path: Path) -> No
     assert files(tmp_path) == {DESCRIPTION}
 
 
+@pytest.mark.slow
 def test_export_replaces_its_own(world: Path, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     command = f"export --weights {world}/w.safetensors --out {tmp_path}"

@@ -99,6 +99,7 @@ def test_other_weights_have_another_export(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(set(folders)) == 3
 
 
+@pytest.mark.slow
 def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
