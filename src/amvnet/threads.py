@@ -64,8 +64,10 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     """
     import torch
 
+    if torch.compiler.is_compiling() or torch.is_grad_enabled() or not do_threads_sleep():
+        return [run(part) for part in parts]
     threads = torch.get_num_threads()
-    if min(threads, len(parts)) < 2 or torch.is_grad_enabled() or not do_threads_sleep():
+    if min(threads, len(parts)) < 2:
         return [run(part) for part in parts]
 
     # Both are settings of a thread.
