@@ -70,16 +70,34 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     if min(threads, len(parts)) < 2:
         return [run(part) for part in parts]
 
-    # Both are settings of a thread.
+    # All of these are settings of a thread.
     is_inference = torch.is_inference_mode_enabled()
+    is_mixed = torch.is_autocast_enabled("cpu")
+    precision = torch.get_autocast_dtype("cpu")
 
     def run_alone(part: Part) -> Result:
-        with torch.no_grad(), torch.inference_mode(is_inference):
+        with (
+            torch.no_grad(),
+            torch.inference_mode(is_inference),
+            torch.autocast("cpu", precision, enabled=is_mixed),
+        ):
             return run(part)
 
+    with thread_pool(threads, threads_each=1) as pool:
+        return list(pool.map(run_alone, parts))
+
+
+@contextmanager
+def thread_pool(workers: int, threads_each: int) -> Iterator[ThreadPoolExecutor]:
+    """Yield a pool of threads that compute with a number of torch's threads each."""
+    import torch
+
+    threads = torch.get_num_threads()
     try:
-        with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(run_alone, parts))
+        with ThreadPoolExecutor(
+            workers, initializer=torch.set_num_threads, initargs=(threads_each,)
+        ) as pool:
+            yield pool
     finally:
         torch.set_num_threads(threads)  # the pool's threads changed it for the whole process
 

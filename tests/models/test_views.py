@@ -287,6 +287,25 @@ def test_pool_is_the_maximum_over_each_pillar(random_scan: RandomScan) -> None:
         assert torch.equal(row, features[grid.pillar == pillar].amax(dim=0))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_the_gradient_of_pool_goes_to_the_largest_values_and_equal_ones_share_it(
+    random_scan: RandomScan, dtype: torch.dtype
+) -> None:
+    grid = project_to_grid(random_scan(400, 1), random_scan(300, 2))
+    # A few different values, so that many are equal
+    features = torch.randint(0, 3, (700, 3)).to(dtype).requires_grad_()
+    pooled = grid.pool(features)
+    factors = torch.randn_like(pooled)
+    (pooled * factors).sum().backward()
+
+    expected = torch.zeros_like(features)
+    for pillar, factor in zip(grid.occupied, factors, strict=True):
+        of_pillar = grid.pillar == pillar
+        is_largest = (features == features[of_pillar].amax(dim=0)) & of_pillar[:, None]
+        expected += is_largest * (factor / is_largest.sum(dim=0))
+    torch.testing.assert_close(features.grad, expected)
+
+
 @pytest.mark.parametrize("part", [1, 100, 1000])
 def test_pooling_by_parts_is_pooling_of_all(random_scan: RandomScan, part: int) -> None:
     grid = project_to_grid(random_scan(400, 1), random_scan(300, 2))

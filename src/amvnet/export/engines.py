@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
+from threading import Lock
 from typing import Any, get_args
 
 import torch
@@ -91,11 +92,10 @@ def _use_onnx(segmenter: Segmenter, engine: str, say: Say) -> None:
 
     parts = METHODS[segmenter.method].parts
     folder = exported(segmenter, SIMULATED if engine == "int8" else None, say)
-    threads = torch.get_num_threads()
     if "range_net" in parts:
-        _set_range_net(segmenter, OnnxGraph(folder / "range_net.onnx", threads))
+        _set_range_net(segmenter, OnnxGraph(folder / "range_net.onnx"))
     if "polar_net" in parts:
-        _polar_net(segmenter).run_unet = OnnxGraph(folder / "polar_map.onnx", threads)
+        _polar_net(segmenter).run_unet = OnnxGraph(folder / "polar_map.onnx")
 
 
 def _compiled(function: Runner, shape: tuple[int, ...], device: str) -> Any:
@@ -171,21 +171,26 @@ def exported(segmenter: Segmenter, int8: str | None = None, say: Say = say_nothi
 
 
 class OnnxGraph(nn.Module):
-    """An exported graph with one input (1, C, H, W) and one output; float32, without gradients."""
+    """An exported graph with one input (1, C, H, W) and one output; float32, without gradients.
 
-    def __init__(self, path: Path, threads: int) -> None:
+    It computes with as many threads as torch does in the thread that calls it.
+    """
+
+    def __init__(self, path: Path) -> None:
         super().__init__()
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        # Threads that wait for the next graph would take the processor from torch's.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        self.session = onnxruntime.InferenceSession(
-            str(path), options, providers=["CPUExecutionProvider"]
-        )
-        self.input = self.session.get_inputs()[0].name
+        self.path = path
+        self.sessions: dict[int, Any] = {}  # by number of threads
+        self.lock = Lock()
         self.process = os.getpid()
+        self.input = self.session().get_inputs()[0].name
+
+    def session(self) -> Any:
+        """Return ONNX Runtime's session with the number of threads of the calling thread."""
+        threads = torch.get_num_threads()
+        with self.lock:
+            if threads not in self.sessions:
+                self.sessions[threads] = _open_session(self.path, threads)
+        return self.sessions[threads]
 
     def forward(self, x: Tensor) -> Tensor:
         # The runtime's threads are not part of a forked process, which would wait for them forever.
@@ -199,4 +204,14 @@ class OnnxGraph(nn.Module):
                 f"expected one scan at a time for this engine, found {len(x)}; use the engine torch"
             )
         inputs = {self.input: x.contiguous().numpy()}
-        return torch.from_numpy(self.session.run(None, inputs)[0])
+        return torch.from_numpy(self.session().run(None, inputs)[0])
+
+
+def _open_session(path: Path, threads: int) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    # Threads that wait for the next graph would take the processor from torch's.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

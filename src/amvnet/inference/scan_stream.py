@@ -11,6 +11,8 @@ from typing import Any, TypeVar
 
 import torch
 
+from amvnet.threads import thread_pool
+
 AHEAD = 3  # scans that are read ahead of the computing, and that may wait to be written
 
 Record = TypeVar("Record")
@@ -99,12 +101,6 @@ def computing_threads(at_once: int) -> Iterator[Executor]:
         yield CallingThread()
         return
 
-    threads = torch.get_num_threads()
-    share = max(threads // at_once, 1)
-    try:
-        with ThreadPoolExecutor(
-            at_once, initializer=torch.set_num_threads, initargs=(share,)
-        ) as pool:
-            yield pool
-    finally:
-        torch.set_num_threads(threads)  # the pool's threads changed it for the whole process
+    share = max(torch.get_num_threads() // at_once, 1)
+    with thread_pool(at_once, threads_each=share) as pool:
+        yield pool

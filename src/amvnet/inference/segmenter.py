@@ -112,7 +112,7 @@ class Segmenter:
         """
         if self._at_once is not None:
             return self._at_once
-        if self.device != "cpu" or self.engine != "torch":
+        if self.device != "cpu" or self.engine == "compile":
             return 1
         return min(torch.get_num_threads(), MOST_AT_ONCE)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
+from amvnet.models.cpu_convolution import convolve
 from amvnet.models.layers import RingConv2d, upsample, wrap_width
 
 
@@ -22,8 +22,8 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     A convolution is linear, so that each map can be convolved alone and the results added. The
     upsampled map repeats each value s times along an axis, so that 3 taps see at most 2 different
     values: 2 taps on the coarse map with summed weights do the same, with another kernel for each
-    of the s positions within a coarse cell. This is half of the work. Training, exported and
-    compiled networks upsample.
+    of the s positions within a coarse cell. This is half of the work. Exported and compiled
+    networks upsample.
 
     Args:
         coarse: (B, C, h, w). If H or W is not a multiple of h or w, the map is upsampled.
@@ -31,11 +31,12 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     """
     scale = (fine.shape[2] // coarse.shape[2], fine.shape[3] // coarse.shape[3])
     is_multiple = fine.shape[2:] == (coarse.shape[2] * scale[0], coarse.shape[3] * scale[1])
-    if not is_multiple or torch.is_grad_enabled() or torch.compiler.is_compiling():
+    if not is_multiple or torch.compiler.is_compiling():
         return convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
 
     coarse_weight, fine_weight = convolution.weight.split([coarse.shape[1], fine.shape[1]], dim=1)
-    result = F.conv2d(wrap_width(fine, 1, 1), fine_weight, convolution.bias, padding=(1, 0))
+    wrapped = wrap_width(fine, 1, 1)
+    result = convolve(wrapped, fine_weight, convolution.bias, stride=(1, 1), padding=(1, 0))
     return result.add_(_convolve_upsampled(coarse, coarse_weight, scale))
 
 
@@ -54,7 +55,7 @@ def _convolve_upsampled(x: Tensor, weight: Tensor, scale: tuple[int, int]) -> Te
         column_taps = _taps(columns, weight)
         kernels = torch.einsum("pak,qbl,oikl->pqoiab", row_taps, column_taps, weight).flatten(0, 2)
 
-    output = F.conv2d(wrap_width(x, 1, 1), kernels, padding=(1, 0))
+    output = convolve(wrap_width(x, 1, 1), kernels, None, stride=(1, 1), padding=(1, 0))
     output = output.permute(0, 2, 3, 1)  # (B, h + 1, w + 1, s * s * C')
     b, h, w, _ = output.shape
 

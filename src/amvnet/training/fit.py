@@ -18,6 +18,7 @@ from torch.utils.data import DataLoader
 from amvnet.config.schema import TrainingConfig
 from amvnet.distributed import device_of, environment
 from amvnet.errors import InputError
+from amvnet.memory import keep_freed_memory
 from amvnet.training.callbacks import AverageWeights, Bar, Curves, EpochLines, SeedBatches, Speed
 from amvnet.training.loggers import make_logger
 from amvnet.training.precision import DOUBLE, SINGLE, precision_of
@@ -79,9 +80,11 @@ def fit(
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
     """
-    on_cuda = device_of(options.training.accelerator) == "cuda"
+    device = device_of(options.training.accelerator)
+    if device == "cpu":
+        keep_freed_memory()
     if options.run.processes.size > 1:
-        synchronise_batch_norms(stage.trained, on_cuda)
+        synchronise_batch_norms(stage.trained, on_cuda=device == "cuda")
     if precision_of(options.training) == DOUBLE:
         stage.double()
     if options.training.compile:

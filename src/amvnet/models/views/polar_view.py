@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -45,9 +46,9 @@ class PolarGrid:
 
     def pool(self, features: Tensor) -> Tensor:
         """Return the maximum (F, C) of the points' features (S, C) in each seen pillar."""
-        index = self.seen_slot[:, None].expand_as(features)
-        zeros = features.new_zeros(len(self.seen), features.shape[1])
-        return zeros.scatter_reduce(0, index, features, "amax", include_self=False)
+        if features.is_cpu and features.requires_grad and not torch.compiler.is_compiling():
+            return _PillarMaximum.apply(features, self.seen_slot, len(self.seen))
+        return _pillar_maximum(features, self.seen_slot, len(self.seen))
 
     def pool_by_parts(self, encode: Callable[[Tensor], Tensor], part: int) -> Tensor:
         """Return `pool(encode(self.features))`, computed for `part` points at a time.
@@ -94,6 +95,43 @@ class PolarGrid:
         vertical = self.shape[3]
         voxels = scores.unflatten(1, (vertical, scores.shape[1] // vertical)).flatten(0, 1)
         return voxels.index_select(0, self.slot * vertical + self.voxel)
+
+
+def _pillar_maximum(features: Tensor, slot: Tensor, pillars: int) -> Tensor:
+    """Return the maximum (F, C) of features (S, C), each row belonging to the pillar `slot`."""
+    zeros = features.new_zeros(pillars, features.shape[1])
+    index = slot[:, None].expand_as(features)
+    return zeros.scatter_reduce(0, index, features, "amax", include_self=False)
+
+
+class _PillarMaximum(torch.autograd.Function):
+    """`_pillar_maximum` with the same gradient, which takes a fraction of the time on a CPU.
+
+    Only the points that are the maximum of a channel have a gradient there. The gradient that
+    autograd derives passes over all points several times, which took a third of a training step.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, slot: Tensor, pillars: int) -> Tensor:
+        pooled = _pillar_maximum(features, slot, pillars)
+        ctx.save_for_backward(features, slot, pooled)
+        return pooled
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None]:
+        features, slot, pooled = ctx.saved_tensors
+        channels = features.shape[1]
+
+        # The largest values, as places in the flattened features and in the flattened maxima.
+        place = (features == pooled.index_select(0, slot)).flatten().nonzero()[:, 0]
+        maximum = slot[place // channels] * channels + place % channels
+
+        # Equal largest values share the gradient.
+        sharing = torch.bincount(maximum, minlength=pooled.numel())
+        values = (grads[0].flatten() / sharing)[maximum]
+        gradient = torch.zeros_like(features)
+        gradient.view(-1)[place] = values.to(features.dtype)
+        return gradient, None, None
 
 
 class PolarView:
