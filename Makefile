@@ -16,7 +16,7 @@ test-slow: .venv/installed  ## the tests that take minutes, too
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"
 
 bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN="--scan FILE" for a scan of yours
-	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,compile
+	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8,compile
 	$(BIN)/amvnet bench --recipe semantickitti $(SCAN)
 
 lint: .venv/installed

@@ -37,6 +37,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
 from amvnet.models.amvnet import AMVNet, step
 from amvnet.models.layers import upsample
+from amvnet.models.methods import ONNX_ENGINES
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.polar_view import PolarGrid
@@ -176,13 +177,13 @@ def build_salsanext(engine: str) -> tuple[nn.Module, torch.Tensor]:
     image = torch.randn(1, CHANNELS, HEIGHT, WIDTH).contiguous(memory_format=torch.channels_last)
     if engine == "compile":
         net = torch.compile(net)
-    if engine == "onnx":
+    if engine in ONNX_ENGINES:  # in float32 also next to int8
         path = cache_folder() / "salsanext.onnx"
         path.parent.mkdir(parents=True, exist_ok=True)
         torch.onnx.export(
             net, (image.contiguous(),), path, dynamo=True, external_data=False, verbose=False
         )
-        net = OnnxGraph(path, torch.get_num_threads())
+        net = OnnxGraph(path)
     return net, image
 
 

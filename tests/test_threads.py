@@ -14,9 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from amvnet.inference.segmenter import Segmenter
+from amvnet.inference.timing import Job, time_jobs
 from amvnet.models import point_head, polar_net
+from amvnet.scan import Scan
 from amvnet.threads import BUSY, WAITING, BusyMachine, run_parts
 from amvnet.weights.file import save
 
@@ -142,18 +145,34 @@ def test_parts_have_threads_of_their_own_if_threads_sleep(
     monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     both_run = threading.Barrier(threads, timeout=60)
 
-    def run(part: int) -> tuple[int, int, bool, int]:
+    def run(part: int) -> tuple[int, int, int, Tensor]:
         both_run.wait()
-        thread = threading.get_ident()
-        return part, thread, torch.is_inference_mode_enabled(), torch.get_num_threads()
+        product = torch.ones(1, 2) @ torch.ones(2, 1)
+        return part, threading.get_ident(), torch.get_num_threads(), product
 
-    with torch.inference_mode():
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
         results = run_parts(run, range(4))
     assert [part for part, *_ in results] == [0, 1, 2, 3]
     assert len({thread for _, thread, *_ in results}) == threads
-    assert all(is_inference for *_, is_inference, _ in results)
-    assert {count for *_, count in results} == {2 // threads}
+    assert {count for *_, count, _ in results} == {2 // threads}
+    assert all(product.is_inference() for *_, product in results)
+    assert {product.dtype for *_, product in results} == {torch.bfloat16}
     assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_operations_are_counted_alike_however_threads_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(polar_net, "PART", 16)
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    points, _ = street(0)
+
+    counts = []
+    for policy in ("active", "passive"):
+        monkeypatch.setenv("OMP_WAIT_POLICY", policy)
+        job = Job(Segmenter(fresh_weights()), lambda: Scan(points), write=lambda ids: None)
+        (report,) = time_jobs([job], runs=1)
+        counts.append([network["gflop"] for network in report["networks"].values()])
+    assert counts[0] == counts[1]
 
 
 @pytest.mark.usefixtures("two_threads")

@@ -15,8 +15,9 @@ from torch.nn import functional as F
 import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.export import engines, int8
-from amvnet.export.engines import cache_folder, exported, use_engine
-from amvnet.inference.segmenter import Segmenter, expand_to_scan
+from amvnet.export.engines import OnnxGraph, cache_folder, exported, use_engine
+from amvnet.inference.scan_stream import stream_scans
+from amvnet.inference.segmenter import MOST_AT_ONCE, Segmenter, expand_to_scan
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
 from amvnet.models.methods import MethodName
@@ -136,6 +137,24 @@ def test_onnx_runs_the_methods_of_one_network(method: MethodName) -> None:
     expected = segmenter(points).scores
     use_engine(segmenter, "onnx")
     np.testing.assert_allclose(segmenter(points).scores, expected, atol=1e-4)
+
+
+def test_onnx_segments_scans_in_parallel_with_one_thread_each() -> None:
+    pytest.importorskip("onnxruntime")
+    segmenter = Segmenter(fresh_weights())
+    use_engine(segmenter, "onnx")
+    assert segmenter.at_once == min(torch.get_num_threads(), MOST_AT_ONCE)
+
+    scans = [random_points(seed) for seed in range(6)]
+    expected = [segmenter(points).labels for points in scans]
+    results = stream_scans(scans, lambda points: points, lambda _, points: segmenter(points), 2)
+    for result, labels in zip(results, expected, strict=True):
+        assert (result.labels == labels).mean() >= 0.9999
+
+    graph = segmenter.model.range_net
+    assert isinstance(graph, OnnxGraph)
+    share = max(torch.get_num_threads() // 2, 1)
+    assert set(graph.sessions) == {torch.get_num_threads(), share}
 
 
 def test_onnx_takes_scans_one_by_one() -> None:

@@ -37,6 +37,7 @@ from amvnet.weights.file import Weights, load
 EXTRA = ("onnx", "onnxscript", "onnxruntime")
 OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it
 LARGEST_DIFFERENCE = 1e-4  # from torch: of probabilities, and of features by `_shares`
+LARGEST_WEIGHTS = 2**28  # bytes of a tensor of weights
 POINTS = 5000  # of the artificial scan that the graphs are traced and checked with
 # The graphs whose first axis may have any length, and the name of this axis.
 DYNAMIC = {
@@ -328,18 +329,19 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
         axes = tuple({0: axis} for _ in graph.inputs)
 
     with quiet("torch.onnx"), writer_errors(name, "torch.onnx", "torch and onnxscript"):
-        torch.onnx.export(
+        program = torch.onnx.export(
             graph.module,
             tuple(graph.inputs.values()),
-            path,
             input_names=list(graph.inputs),
             output_names=[graph.output],
             opset_version=OPSET,
             dynamo=True,
             dynamic_shapes=axes,
-            external_data=False,
             verbose=False,
         )
+        assert program is not None
+        _fold_weights(program.model)
+        program.save(path, external_data=False)
     strip(path)
 
     inputs, outputs, actual = _run(path, graph)
@@ -357,6 +359,14 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
         "outputs": outputs,
         "difference": difference,
     }
+
+
+def _fold_weights(model: Any) -> None:
+    """Compute the weights that are sums of others (`models.upsampled_conv`) once and for all."""
+    from onnxscript.optimizer import optimize
+
+    # By default, only small tensors count as constants.
+    optimize(model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:

@@ -231,11 +231,11 @@ def _spread(values: Sequence[float], unit: float) -> dict[str, float]:
     return {"median": median, "low": low, "high": high}
 
 
-@torch.inference_mode()
 def _flops(job: Job) -> dict[str, float]:
     """Return each network's floating-point operations; a multiply-add counts as two."""
     device = job.segmenter.device
-    model = job.segmenter.weights.build().to(device)
+    # A counter sees one thread only, and `run_parts` uses several unless gradients are enabled.
+    model = job.segmenter.weights.build().requires_grad_(False).to(device)
     batch = job.segmenter.batch([job.read()])
 
     counts = {}

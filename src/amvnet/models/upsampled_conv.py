@@ -22,8 +22,7 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     A convolution is linear, so that each map can be convolved alone and the results added. The
     upsampled map repeats each value s times along an axis, so that 3 taps see at most 2 different
     values: 2 taps on the coarse map with summed weights do the same, with another kernel for each
-    of the s positions within a coarse cell. This is half of the work. Exported and compiled
-    networks upsample.
+    of the s positions within a coarse cell. This is half of the work.
 
     Args:
         coarse: (B, C, h, w). If H or W is not a multiple of h or w, the map is upsampled.
@@ -31,10 +30,11 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     """
     scale = (fine.shape[2] // coarse.shape[2], fine.shape[3] // coarse.shape[3])
     is_multiple = fine.shape[2:] == (coarse.shape[2] * scale[0], coarse.shape[3] * scale[1])
-    if not is_multiple or torch.compiler.is_compiling():
+    if not is_multiple:
         return convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
 
-    coarse_weight, fine_weight = convolution.weight.split([coarse.shape[1], fine.shape[1]], dim=1)
+    coarse_weight = convolution.weight[:, : coarse.shape[1]]
+    fine_weight = convolution.weight[:, coarse.shape[1] :]
     wrapped = wrap_width(fine, 1, 1)
     result = convolve(wrapped, fine_weight, convolution.bias, stride=(1, 1), padding=(1, 0))
     return result.add_(_convolve_upsampled(coarse, coarse_weight, scale))

@@ -84,7 +84,7 @@ def fit(
     if device == "cpu":
         keep_freed_memory()
     if options.run.processes.size > 1:
-        synchronise_batch_norms(stage.trained, on_cuda=device == "cuda")
+        synchronise_batch_norms(stage.trained, cuda=device == "cuda")
     if precision_of(options.training) == DOUBLE:
         stage.double()
     if options.training.compile:

@@ -1,0 +1,114 @@
+"""Measure how many scans a second `predict` segments, next to the two networks alone.
+
+python benchmarks/many_scans.py FOLDER [--engines torch,int8] [--at-once 1,2] [--rounds N]
+
+FOLDER holds ten scan files or more, such as *.bin. The rate of `predict` is that of the label files
+after the first few, without the start of the program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+
+from amvnet.data.scan_files import read_scan
+from amvnet.export.engines import use_engine
+from amvnet.inference.scan_stream import stream_scans
+from amvnet.inference.segmenter import Segmenter
+
+WARM_UP = 4  # scans that do not count
+WEIGHTS = "sim-hdl64e"
+SLEEPING = {**os.environ, "OMP_WAIT_POLICY": "passive"}  # as the commands
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--engines", default="torch,int8")
+    parser.add_argument("--at-once", default="1,2")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--networks", action="store_true")  # in this process, for `networks_rate`
+    options = parser.parse_args()
+
+    paths = sorted(path for path in options.folder.iterdir() if path.is_file())
+    if options.networks:
+        print(json.dumps(time_networks(paths, options.engines, int(options.at_once))))
+        return
+
+    variants = list(product(options.engines.split(","), map(int, options.at_once.split(","))))
+    rows: defaultdict[tuple[str, int], list[tuple[float, float, int]]] = defaultdict(list)
+    for _ in range(options.rounds):
+        for engine, at_once in variants:
+            networks = networks_rate(options.folder, engine, at_once)
+            rows[engine, at_once].append((networks, *predict_rate(options.folder, engine, at_once)))
+
+    print(f"{len(paths)} scans; scans per second, medians of {options.rounds} rounds\n")
+    print("| engine | at once | networks alone | predict | share | peak memory, MiB |")
+    print("|---|---|---|---|---|---|")
+    for (engine, at_once), rounds in rows.items():
+        networks, predict, memory = np.median(rounds, axis=0)
+        share = np.median([row[1] / row[0] for row in rounds])
+        cells = f"{networks:.1f} | {predict:.1f} | {share:.2f} | {memory:.0f}"
+        print(f"| {engine} | {at_once} | {cells} |")
+
+
+def predict_rate(folder: Path, engine: str, at_once: int) -> tuple[float, int]:
+    """Return the scans per second of `amvnet predict`, and its peak memory in MiB."""
+    with TemporaryDirectory() as out:
+        command = [sys.executable, "-m", "amvnet", "predict", str(folder), "--weights", WEIGHTS]
+        command += ["--out", out, "--engine", engine, "--at-once", str(at_once)]
+        process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=SLEEPING
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        if status:
+            raise RuntimeError(f"expected predict to end well, found {status}: {command}")
+
+        written = sorted(path.stat().st_mtime for path in Path(out).glob("*.label"))
+    counted = written[WARM_UP:]
+    return (len(counted) - 1) / (counted[-1] - counted[0]), usage.ru_maxrss // 1024
+
+
+def networks_rate(folder: Path, engine: str, at_once: int) -> float:
+    """Return what `time_networks` does, measured in a process of its own."""
+    command = [sys.executable, __file__, str(folder), "--networks", "--engines", engine]
+    command += ["--at-once", str(at_once)]
+    output = subprocess.run(command, check=True, capture_output=True, text=True, env=SLEEPING)
+    return json.loads(output.stdout.splitlines()[-1])
+
+
+@torch.inference_mode()
+def time_networks(paths: list[Path], engine: str, at_once: int) -> float:
+    """Return how many scans per second the two networks score, once these are projected."""
+    segmenter = Segmenter(WEIGHTS, keep_memory=True)
+    use_engine(segmenter, engine)
+    model = segmenter.model
+    views = [model.project(segmenter.batch([read_scan(path)])) for path in paths]
+
+    def score(index: int, _: None) -> None:
+        with torch.inference_mode():
+            model.score(*views[index])
+
+    def score_all(indices: range) -> None:
+        for _ in stream_scans(indices, lambda _: None, score, at_once):
+            pass
+
+    score_all(range(WARM_UP))
+    started = time.perf_counter()
+    score_all(range(len(views)))
+    return len(views) / (time.perf_counter() - started)
+
+
+if __name__ == "__main__":
+    main()
