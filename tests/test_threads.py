@@ -9,6 +9,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -158,6 +159,37 @@ def test_parts_have_threads_of_their_own_if_threads_sleep(
     assert all(product.is_inference() for *_, product in results)
     assert {product.dtype for *_, product in results} == {torch.bfloat16}
     assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_fewer_parts_than_threads_share_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
+    torch.set_num_threads(4)
+
+    with torch.no_grad():
+        counts = run_parts(lambda part: torch.get_num_threads(), range(2))
+    assert counts == [2, 2]
+    assert torch.get_num_threads() == 4
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize(("policy", "is_parallel"), [("passive", True), ("active", False)])
+def test_the_networks_run_side_by_side_if_threads_sleep(
+    policy: str, is_parallel: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
+    monkeypatch.setenv("OMP_WAIT_POLICY", policy)
+    threads = {}
+
+    def note(name: str) -> AbstractContextManager[None]:
+        threads[name] = threading.get_ident()
+        return nullcontext()
+
+    segmenter = Segmenter(fresh_weights())
+    segmenter.model.watch = note
+    segmenter(street(0)[0])
+    assert (threads["RV"] != threads["BEV"]) == is_parallel
 
 
 @pytest.mark.usefixtures("two_threads")

@@ -59,7 +59,8 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     """Run the parts of a computation on a CPU; return their results in order.
 
     A thread that sleeps has to be woken for its share of each operation. In a part of many short
-    operations this takes longer than the share, so that every thread takes whole parts instead.
+    operations this takes longer than the share, so that every thread takes whole parts instead, or
+    if there are more threads than parts, a share of the threads takes each.
     Threads that spin need no waking, and would keep the processors from the threads of the parts.
     """
     import torch
@@ -83,7 +84,8 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
         ):
             return run(part)
 
-    with thread_pool(threads, threads_each=1) as pool:
+    workers = min(threads, len(parts))
+    with thread_pool(workers, threads_each=threads // workers) as pool:
         return list(pool.map(run_alone, parts))
 
 

@@ -30,7 +30,7 @@ from amvnet.models.methods import (
     TtaName,
 )
 from amvnet.models.precision import InPrecision, check_precision
-from amvnet.models.streams import TwoStreams
+from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import Voting
 from amvnet.scan import Scan
@@ -390,9 +390,8 @@ def _is_gpu(device: str) -> bool:
 
 
 def _set_up_networks(model: AMVNet, device: str, precision: Precision) -> None:
-    """Let the two networks compute in a precision, and on a GPU at the same time."""
-    if _is_gpu(device):
-        model.arrange = TwoStreams(device)
+    """Let the two networks compute in a precision, and at the same time if that is faster."""
+    model.arrange = TwoStreams(device) if _is_gpu(device) else side_by_side
     if precision != "float32" or _is_gpu(device):
         model.range_net = InPrecision(model.range_net, device, precision)
         model.polar_net = InPrecision(model.polar_net, device, precision)

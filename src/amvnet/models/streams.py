@@ -1,4 +1,4 @@
-"""How the two networks run: one after the other, or at the same time on two CUDA streams."""
+"""How the two networks run: one after the other, or at the same time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+
+from amvnet.threads import run_parts
 
 Score = Callable[[], Tensor]  # runs one network; returns (P, K)
 
@@ -21,6 +23,12 @@ def one_after_the_other(score_range: Score, score_polar: Score) -> tuple[Tensor,
     """Run the range view's network first, then the bird's-eye view's."""
     f = score_range()
     g = score_polar()
+    return f, g
+
+
+def side_by_side(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
+    """Run each network with half of a CPU's threads if threads sleep, else one after the other."""
+    f, g = run_parts(lambda score: score(), (score_range, score_polar))
     return f, g
 
 
