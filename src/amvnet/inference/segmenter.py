@@ -391,7 +391,10 @@ def _is_gpu(device: str) -> bool:
 
 def _set_up_networks(model: AMVNet, device: str, precision: Precision) -> None:
     """Let the two networks compute in a precision, and at the same time if that is faster."""
-    model.arrange = TwoStreams(device) if _is_gpu(device) else side_by_side
+    if _is_gpu(device):
+        model.arrange = TwoStreams(device)
+    elif device == "cpu":
+        model.arrange = side_by_side
     if precision != "float32" or _is_gpu(device):
         model.range_net = InPrecision(model.range_net, device, precision)
         model.polar_net = InPrecision(model.polar_net, device, precision)

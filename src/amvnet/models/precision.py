@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -29,7 +29,9 @@ class InPrecision(nn.Module):
     def forward(self, view: Any) -> Tensor:
         is_lower = self.precision != "float32"
         dtype = getattr(torch, self.precision) if is_lower else None
-        with _tf32_as_set(), torch.autocast(self.kind, dtype, enabled=is_lower):
+        # Of the whole process: on a CPU, several threads would set it back in the wrong order.
+        tf32 = tf32_as_set() if self.kind == "cuda" else nullcontext()
+        with tf32, torch.autocast(self.kind, dtype, enabled=is_lower):
             return self.net(view).float()
 
 
@@ -44,7 +46,7 @@ def check_precision(precision: str, device: str) -> None:
 
 
 @contextmanager
-def _tf32_as_set() -> Iterator[None]:
+def tf32_as_set() -> Iterator[None]:
     """Let convolutions and recurrent layers use TF32 only if matrix products may."""
     before = torch.backends.cudnn.allow_tf32
     torch.backends.cudnn.allow_tf32 = torch.get_float32_matmul_precision() != "highest"
