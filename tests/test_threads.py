@@ -130,7 +130,8 @@ def test_threads_that_do_not_spin_are_not_warned_of(
 
 
 @pytest.fixture
-def two_threads() -> Iterator[None]:
+def two_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -142,7 +143,6 @@ def two_threads() -> Iterator[None]:
 def test_parts_have_threads_of_their_own_if_threads_sleep(
     policy: str, threads: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
     monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     both_run = threading.Barrier(threads, timeout=60)
 
@@ -163,7 +163,6 @@ def test_parts_have_threads_of_their_own_if_threads_sleep(
 
 @pytest.mark.usefixtures("two_threads")
 def test_fewer_parts_than_threads_share_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
     monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
     torch.set_num_threads(4)
 
@@ -178,7 +177,6 @@ def test_fewer_parts_than_threads_share_them(monkeypatch: pytest.MonkeyPatch) ->
 def test_the_networks_run_side_by_side_if_threads_sleep(
     policy: str, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
     monkeypatch.setenv("OMP_WAIT_POLICY", policy)
     # Tiny networks could follow each other in one thread.
     all_run = threading.Barrier(at_once, timeout=60)
@@ -199,7 +197,6 @@ def test_the_networks_run_side_by_side_if_threads_sleep(
 @pytest.mark.usefixtures("two_threads")
 def test_operations_are_counted_alike_however_threads_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polar_net, "PART", 16)
-    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
     points, _ = street(0)
 
     counts = []
@@ -228,7 +225,6 @@ def test_a_scan_is_segmented_alike_however_threads_wait(monkeypatch: pytest.Monk
     """With many small parts; the number of threads may change the last bits."""
     monkeypatch.setattr(point_head, "PART", 16)
     monkeypatch.setattr(polar_net, "PART", 16)
-    monkeypatch.delenv("GOMP_SPINCOUNT", raising=False)
     points, _ = street(0)
     segmenter = Segmenter(fresh_weights())
 

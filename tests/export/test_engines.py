@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from torch import Tensor
 from torch.nn import functional as F
 
 import amvnet
@@ -23,6 +24,7 @@ from amvnet.models.layers import ConvBlock
 from amvnet.models.methods import MethodName
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
+from amvnet.models.streams import Score, one_after_the_other
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan, trained_intensity
@@ -167,6 +169,23 @@ def test_onnx_takes_scans_one_by_one() -> None:
 @pytest.mark.slow
 def test_compile_says_what_torch_says() -> None:
     check_equal(fresh_weights(), "compile")
+
+
+@pytest.mark.parametrize("is_side_by_side", [True, False])
+def test_compiled_networks_do_not_share_threads_and_keep_a_gpu_s_streams(
+    is_side_by_side: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engines, "_compiled", lambda function, shape, device: function)
+    segmenter = Segmenter(fresh_weights())
+
+    def streams(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
+        return score_range(), score_polar()
+
+    if not is_side_by_side:
+        segmenter.model.arrange = streams
+    use_engine(segmenter, "compile")
+    expected = one_after_the_other if is_side_by_side else streams
+    assert segmenter.model.arrange is expected
 
 
 def test_without_a_compiler_compile_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:

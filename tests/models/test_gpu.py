@@ -28,7 +28,7 @@ from amvnet.models.amvnet import merge
 from amvnet.models.methods import Precision
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
-from amvnet.models.precision import InPrecision, tf32_as_set
+from amvnet.models.precision import InPrecision
 from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.weights.file import save
@@ -294,15 +294,18 @@ def test_a_network_multiplies_in_its_precision_and_scores_in_float32(
 
 @pytest.mark.parametrize(("setting", "allowed"), [("highest", False), ("high", True)])
 def test_tf32_is_used_only_if_it_was_asked_for(setting: str, allowed: bool) -> None:
+    net = PrecisionProbe()
     before = torch.get_float32_matmul_precision()
     tf32_before = torch.backends.cudnn.allow_tf32
 
     torch.set_float32_matmul_precision(setting)
     try:
-        with tf32_as_set():
-            assert torch.backends.cudnn.allow_tf32 == allowed
+        # The settings are those for a GPU, also if the tensors are not on one.
+        InPrecision(net, "cuda", "float32")(torch.ones(2, 2))
     finally:
         torch.set_float32_matmul_precision(before)
+
+    assert net.tf32 == allowed
     assert torch.backends.cudnn.allow_tf32 == tf32_before
 
 

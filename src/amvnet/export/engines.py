@@ -20,7 +20,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS, ONNX_ENGINES, EngineName
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.precision import InPrecision
-from amvnet.models.streams import one_after_the_other
+from amvnet.models.streams import one_after_the_other, side_by_side
 from amvnet.models.views.range_view import CHANNELS
 from amvnet.onnx_runner import DESCRIPTION
 from amvnet.progress import Say, say_nothing
@@ -69,8 +69,9 @@ def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> str
 
 
 def _use_compile(segmenter: Segmenter) -> None:
-    # Compiled for the threads of this thread; another number would compile it again.
-    segmenter.model.arrange = one_after_the_other
+    # A network is compiled for a number of threads; another one would compile it again.
+    if segmenter.model.arrange is side_by_side:
+        segmenter.model.arrange = one_after_the_other
     parts = METHODS[segmenter.method].parts
     sizes = segmenter.weights.model
 

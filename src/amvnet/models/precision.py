@@ -30,7 +30,7 @@ class InPrecision(nn.Module):
         is_lower = self.precision != "float32"
         dtype = getattr(torch, self.precision) if is_lower else None
         # Of the whole process: on a CPU, several threads would set it back in the wrong order.
-        tf32 = tf32_as_set() if self.kind == "cuda" else nullcontext()
+        tf32 = _tf32_as_set() if self.kind == "cuda" else nullcontext()
         with tf32, torch.autocast(self.kind, dtype, enabled=is_lower):
             return self.net(view).float()
 
@@ -46,7 +46,7 @@ def check_precision(precision: str, device: str) -> None:
 
 
 @contextmanager
-def tf32_as_set() -> Iterator[None]:
+def _tf32_as_set() -> Iterator[None]:
     """Let convolutions and recurrent layers use TF32 only if matrix products may."""
     before = torch.backends.cudnn.allow_tf32
     torch.backends.cudnn.allow_tf32 = torch.get_float32_matmul_precision() != "highest"
