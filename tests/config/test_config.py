@@ -51,7 +51,7 @@ def test_every_builtin_recipe_is_there() -> None:
         full_size |= {f"{benchmark}-plus"}
     compact = {f"{name}-compact" for name in full_size} | {"simulated-hdl32e-compact"}
 
-    assert set(recipe_names()) == full_size | compact | {"adapt", "finetune"}
+    assert set(recipe_names()) == full_size | compact | {"finetune"}
 
 
 def test_the_semantickitti_recipe_holds_the_papers_numbers() -> None:

@@ -19,7 +19,7 @@ from amvnet.evaluation.analysis import analyze
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.scan_stream import AHEAD, stream_scans
 from amvnet.inference.segmenter import Segmenter
-from amvnet.ranking.rank import rank
+from amvnet.ranking.label_errors import rank
 from amvnet.viewing.frames import LabelSource, choose_frames
 from amvnet.weights.file import save
 
@@ -85,7 +85,7 @@ def _analyzed(dataset: Dataset, segmenter: Segmenter) -> Any:
 
 
 def _ranked(dataset: Dataset, segmenter: Segmenter) -> Any:
-    ranking = rank(dataset, dataset.records(["08"]), segmenter, "disagreement")
+    ranking = rank(dataset, dataset.records(["08"]), segmenter)
     return [ranking.clusters.tolist(), ranking.scans.tolist(), ranking.scores.tolist()]
 
 

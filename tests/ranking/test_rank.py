@@ -1,4 +1,4 @@
-"""What to label next, and which labels look wrong."""
+"""Which labels look wrong."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,15 +20,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking.clusters import CELL, cluster
-from amvnet.ranking.rank import (
-    FEW,
-    Criterion,
-    Doubts,
-    find_clusters,
-    find_doubts,
-    order_to_label,
-    rank,
-)
+from amvnet.ranking.label_errors import NEAR, Doubts, find_clusters, find_doubts, rank
 from amvnet.weights.file import save
 
 from fixtures.worlds import files, fresh_weights, make_streets, run_cli, without
@@ -113,16 +104,10 @@ def confident(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
     return share * np.eye(19)[ids - 1] + (1 - share) / 19
 
 
-def doubts_of(
-    points: np.ndarray, rv: np.ndarray, bev: np.ndarray, labels: np.ndarray | None = None
-) -> Doubts:
-    """Return the doubts about a scan for which the two views predict these ids.
-
-    The labels are doubted if they are given; without labels, it is the views' disagreement.
-    """
+def doubts_of(points: np.ndarray, rv: np.ndarray, bev: np.ndarray, labels: np.ndarray) -> Doubts:
+    """Return the doubts about the labels of a scan for which the two views predict these ids."""
     segmenter = FixedScores(confident(rv), confident(bev))
-    by: Criterion = "disagreement" if labels is None else "labels"
-    return find_doubts(Scan(points, labels), segmenter, by)
+    return find_doubts(Scan(points, labels), segmenter)
 
 
 def three_things() -> tuple[np.ndarray, np.ndarray]:
@@ -142,21 +127,41 @@ def three_things() -> tuple[np.ndarray, np.ndarray]:
 def test_the_vehicle_that_carries_the_sensor_is_not_doubted() -> None:
     points, thing = three_things()
     points[thing == 0, :3] *= (1, 0.1, 1)  # to half a metre from the sensor
-    doubts = doubts_of(points, rv=np.full(301, CAR), bev=np.full(301, PERSON))
+    labels = np.full(301, PERSON, np.uint8)
+    doubts = doubts_of(points, np.full(301, CAR), np.full(301, CAR), labels)
     _, cluster_ids = find_clusters(doubts)
 
     assert np.array_equal(cluster_ids >= 0, (thing == 1) | (thing == 2))
 
 
-def test_a_disagreement_is_one_cluster_at_its_place() -> None:
+def test_a_doubt_is_the_agreed_class_in_the_less_certain_view_over_the_label_in_either() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-20, 20, (500, 4)).astype(np.float32)
+    labels = rng.integers(0, 20, 500).astype(np.uint8)
+    f = rng.dirichlet(np.full(19, 0.1), 500)
+    g = 0.7 * f + 0.3 * rng.dirichlet(np.full(19, 0.1), 500)
+
+    doubts = find_doubts(Scan(points, labels), FixedScores(f, g))
+
+    for index, label in enumerate(labels):
+        agreed = np.argmax(f[index] * g[index])
+        expected = 0.0
+        if label > 0 and np.hypot(points[index, 0], points[index, 1]) >= NEAR:
+            of_label = max(f[index, label - 1], g[index, label - 1])
+            expected = max(min(f[index, agreed], g[index, agreed]) - of_label, 0)
+        assert doubts.doubt[index] == pytest.approx(expected, abs=1e-5)
+    assert 100 < np.count_nonzero(doubts.doubt) < 450
+
+
+def test_a_wrong_label_is_one_cluster_at_its_place() -> None:
     points, thing = three_things()
-    rv = np.where(thing == 1, CAR, ROAD)
-    bev = np.where(thing == 1, PERSON, ROAD)
-    rows, cluster_ids = find_clusters(doubts_of(points, rv, bev))
+    labels = np.full(301, ROAD, np.uint8)
+    ids = np.where(thing == 1, CAR, ROAD)
+    rows, cluster_ids = find_clusters(doubts_of(points, ids, ids, labels))
 
     assert len(rows) == 1
     assert np.array_equal(cluster_ids >= 0, thing == 1)
-    assert (rows["rv"], rows["bev"], rows["label"], rows["points"]) == (CAR, PERSON, 0, 100)
+    assert (rows["rv"], rows["bev"], rows["label"], rows["points"]) == (CAR, CAR, ROAD, 100)
     assert np.allclose(rows["xyz"], points[rows["point"], :3])
     assert np.linalg.norm(rows["xyz"] - points[thing == 1, :3].mean(axis=0)) < 0.5
 
@@ -197,7 +202,7 @@ def test_a_whole_thing_is_more_doubtful_than_the_edge_of_one_and_many_points_tha
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make a dataset, weights, and rankings by both criteria; nothing may change them."""
+    """Make a dataset, weights, and a ranking; nothing may change them."""
     root = tmp_path_factory.mktemp("world")
     make_streets(root / "data")
     save(WEIGHTS, root / "w.safetensors")
@@ -205,9 +210,8 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save(fresh_weights(NUSCENES), root / "nuscenes.safetensors")
 
     command = ("rank", root / "data", "--weights", root / "w.safetensors")
-    assert run_cli(*command, "--out", root / "disagreement.csv") == (0, "")
-    labels = ("--by", "labels", "--out", root / "labels.csv", "--pictures", root / "labels")
-    assert run_cli(*command, *labels) == (0, "")
+    outputs = ("--out", root / "labels.csv", "--pictures", root / "labels")
+    assert run_cli(*command, *outputs) == (0, "")
     return root
 
 
@@ -216,29 +220,8 @@ def read_table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def doubts_by_pair(clusters: list[dict[str, str]]) -> dict[str, Counter[tuple[str, str]]]:
-    """Return the doubt of each scan by the classes in both views, from the table of clusters."""
-    doubts: dict[str, Counter[tuple[str, str]]] = {}
-    for row in clusters:
-        pairs = doubts.setdefault(row["scan"], Counter())
-        pairs[row["rv"], row["bev"]] += float(row["score"]) * (int(row["points"]) + FEW)  # type: ignore[assignment]
-    return doubts
-
-
-def distance_of(first: Counter[tuple[str, str]], second: Counter[tuple[str, str]]) -> float:
-    """Return the share of the doubt that is of other pairs of classes."""
-    common = 0.0
-    for pair in first:
-        common += min(first[pair] / first.total(), second[pair] / second.total())
-    return 1 - common
-
-
-@pytest.mark.parametrize("by", ["disagreement", "labels"])
-def test_the_tables_are_in_order(world: Path, by: str) -> None:
-    tables = [read_table(world / f"{by}.csv")]
-    if by == "labels":
-        tables.append(read_table(world / "labels-scans.csv"))
-
+def test_the_tables_are_in_order(world: Path) -> None:
+    tables = [read_table(world / "labels.csv"), read_table(world / "labels-scans.csv")]
     assert len(tables[0]) > 20
     for table in tables:
         previous_score = float("inf")
@@ -248,48 +231,8 @@ def test_the_tables_are_in_order(world: Path, by: str) -> None:
             previous_score = float(row["score"])
 
 
-def test_the_scans_to_label_are_doubtful_and_unlike_those_before(world: Path) -> None:
-    doubts = doubts_by_pair(read_table(world / "disagreement.csv"))
-    scans = read_table(world / "disagreement-scans.csv")
-
-    assert [int(row["rank"]) for row in scans] == [1, 2, 3, 4, 5, 6]
-    assert float(scans[0]["score"]) == max(float(row["score"]) for row in scans)
-    for position in range(1, len(scans)):
-        gains = []
-        for row in scans[position:]:
-            before = [doubts[other["scan"]] for other in scans[:position]]
-            distance = min(distance_of(doubts[row["scan"]], other) for other in before)
-            gains.append(float(row["score"]) * distance)
-        assert gains[0] == pytest.approx(max(gains), rel=0.01)
-
-
-def test_one_scan_of_each_street_comes_before_the_second_of_any() -> None:
-    rng = np.random.default_rng(0)
-    streets = rng.random((4, 30)) ** 8
-    by_kind = np.repeat(streets, 5, axis=0) * rng.uniform(0.9, 1.1, (20, 30))
-    doubts = np.repeat([0.4, 0.35, 0.3, 0.25], 5) + np.tile(np.arange(5), 4) / 1000
-
-    order = order_to_label(doubts, by_kind)
-
-    assert sorted(order) == list(range(20))
-    assert order[0] == 4
-    assert set(order[:4] // 5) == {0, 1, 2, 3}
-
-
-def test_copies_of_a_scan_come_last_and_scans_without_doubt_after_them() -> None:
-    by_kind = np.array([[1.0, 0], [1, 0], [0, 1], [0, 0], [2, 0]])
-    doubts = np.array([0.5, 0.4, 0.1, 0, 0.45])
-    assert order_to_label(doubts, by_kind).tolist() == [0, 2, 4, 1, 3]
-
-
-def test_no_scans_and_no_doubts_are_ordered_as_they_are() -> None:
-    assert order_to_label(np.zeros(0), np.zeros((0, 0))).tolist() == []
-    assert order_to_label(np.zeros(3), np.zeros((3, 0))).tolist() == [0, 1, 2]
-
-
-@pytest.mark.parametrize("by", ["disagreement", "labels"])
-def test_the_tables_say_what_the_scans_hold(world: Path, by: str) -> None:
-    clusters = read_table(world / f"{by}.csv")
+def test_the_tables_say_what_the_scans_hold(world: Path) -> None:
+    clusters = read_table(world / "labels.csv")
     dataset = open_dataset(str(world / "data"))
     records = {record.name: record for record in dataset.records(dataset.sequences("all"))}
     names = ("", *SEMANTICKITTI.classes)
@@ -299,14 +242,10 @@ def test_the_tables_say_what_the_scans_hold(world: Path, by: str) -> None:
         point = int(row["point"])
         xyz = (float(row["x"]), float(row["y"]), float(row["z"]))
         assert np.allclose(xyz, scan.points[point, :3], atol=0.006)
-        assert row["label"] == names[scan.labels[point]]
-        if by == "disagreement":
-            assert row["rv"] != row["bev"]
-        else:
-            assert row["label"]
+        assert row["label"] == names[scan.labels[point]] != ""
 
     scan_names = [row["scan"] for row in clusters]
-    for row in read_table(world / f"{by}-scans.csv"):
+    for row in read_table(world / "labels-scans.csv"):
         assert int(row["clusters"]) == scan_names.count(row["scan"])
 
 
@@ -317,21 +256,14 @@ def test_the_first_twelve_clusters_are_drawn(world: Path) -> None:
     assert max(pictures) == "12.png"
 
 
-def test_scans_without_labels_are_ranked_alike(world: Path, tmp_path: Path) -> None:
+def test_scans_without_labels_are_refused(world: Path, tmp_path: Path) -> None:
     shutil.copytree(world / "data", tmp_path / "data")
     for folder in (tmp_path / "data/sequences").iterdir():
         shutil.rmtree(folder / "labels")
     options = ("--weights", world / "w.safetensors", "--out", tmp_path / "next.csv")
-    command = ("rank", tmp_path / "data", *options)
 
-    assert run_cli(*command) == (0, "")
+    code, error = run_cli("rank", tmp_path / "data", *options)
 
-    expected = read_table(world / "disagreement.csv")
-    for row in expected:
-        row["label"] = ""
-    assert read_table(tmp_path / "next.csv") == expected
-
-    code, error = run_cli(*command, "--by", "labels")
     assert code == 2
     assert error.count("\n") == 1
     assert "labels" in error
@@ -366,7 +298,7 @@ def test_each_scan_is_read_only_in_its_turn(world: Path, monkeypatch: pytest.Mon
         events.append(done)
 
     monkeypatch.setattr(type(dataset), "read", recorded_read)
-    rank(dataset, dataset.records(["00", "01"]), Segmenter(WEIGHTS), "labels", progress)
+    rank(dataset, dataset.records(["00", "01"]), Segmenter(WEIGHTS), progress)
 
     assert events.count("read") == 4
     assert [event for event in events if event != "read"] == [0, 1, 2, 3, 4]
@@ -387,7 +319,7 @@ def test_every_command_of_the_page_runs_and_finds_most(
     for block in re.findall(r"```bash\n(.*?)```", page, re.S):
         commands += block.splitlines()
 
-    assert len(commands) == 5
+    assert len(commands) == 4
 
     for command in commands:
         words = shlex.split(command.replace("--sequences 10 --scans 2", "--sequences 3 --scans 1"))

@@ -1,19 +1,19 @@
-"""Training on several datasets, from weights, and with scans without labels."""
+"""Training on several datasets, and from weights."""
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 
-from amvnet.adaptation.kept_scans import KeptScans
 from amvnet.config.recipes import load_recipe
-from amvnet.config.schema import AdaptConfig
 from amvnet.data.datasets.joined import MixedRecord, Part, join, split_share
 from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
@@ -97,9 +97,13 @@ def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: P
 def test_scans_that_are_adapted_are_not_mixed_with_others(tmp_path: Path) -> None:
     """The rows of their points are given in some of the scans only."""
     scans = joined(tmp_path, None)
-    adapted = KeptScans(tmp_path, scans.dataset.taxonomy, 1, labelled=True, is_adapted=True)
+    np.save(tmp_path / "scan.npy", np.ones((5, 4), np.float32))
+    classes = {name: number for number, name in enumerate(SEMANTICKITTI.classes, start=1)}
+    description = {"classes": classes, "scans": "*.npy"}
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
+    own = replace(open_own(tmp_path / "own.yaml"), is_adapted=True)
     with pytest.raises(InputError, match="found both"):
-        join(scans, [Part(adapted, adapted.records())])
+        join(scans, [Part(own, own.records(own.sequences("all")))])
 
 
 def test_a_share_follows_the_last_at_sign(tmp_path: Path) -> None:
@@ -122,7 +126,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_recipe(root / "recipe.yaml", "finetune")
     tree = yaml.safe_load((root / "recipe.yaml").read_text())
     del tree["model"]
-    tree["training"]["adapt"] = {"points": 1, "lowest_confidence": 0.0}
     (root / "recipe.yaml").write_text(yaml.safe_dump(tree))
     return root
 
@@ -183,23 +186,13 @@ def test_a_fine_tuning_needs_weights(world: Path, tmp_path: Path) -> None:
     assert "--init" in refusal(f"train finetune --data {world / 'a'} --out {tmp_path / 'run'}")
 
 
-def test_scans_without_labels_need_a_teacher_which_labels_only_these(
-    world: Path, tmp_path: Path
-) -> None:
-    call = arguments(world, tmp_path / "run", str(world / "b"))
-    code, error = run_cli(*call)
+def test_scans_without_labels_are_refused(world: Path, tmp_path: Path) -> None:
+    code, error = run_cli(*arguments(world, tmp_path / "run", str(world / "b")))
     assert code == 2
     assert error.count("\n") == 1
-
-    call[call.index(tmp_path / "run")] = tmp_path / "taught"
-    code, error = run_cli(*call, "--teacher", world / "start.safetensors")
-    assert code == 0, error
-    labelled = [path.name for path in (tmp_path / "taught/teacher").rglob("*.npy")]
-    assert labelled == ["000001.npy"]
 
 
 def test_the_recipe_mixes_half_of_an_epoch() -> None:
     recipe = load_recipe("finetune")
     assert recipe.from_init
     assert recipe.training.others == 0.5
-    assert recipe.training.adapt == AdaptConfig()

@@ -11,7 +11,6 @@ from typing import Any
 
 from amvnet import __version__
 from amvnet.cli.commands.ablate import ablate
-from amvnet.cli.commands.adapt import adapt
 from amvnet.cli.commands.analyze import analyze
 from amvnet.cli.commands.bench import bench
 from amvnet.cli.commands.demo import demo
@@ -46,7 +45,6 @@ VERBS: dict[str, Command] = {
     "demo": Command(demo, {}),
     "simulate": Command(simulate, {"out": {"metavar": "OUT", "type": Path}}),
     "train": Command(train, _RECIPE),
-    "adapt": Command(adapt, _INPUTS),
     "predict": Command(predict, _INPUTS),
     "evaluate": Command(evaluate, _DATA),
     "submit": Command(submit, _DATA),
@@ -65,12 +63,11 @@ USAGE = f"""usage: amvnet VERB ...
   demo       simulate, segment, score, draw: the first thing to run
   simulate   write labelled scans of simulated streets
   train      train the networks and the point head
-  adapt      adapt weights to your scans, without labels
   predict    segment scans
   evaluate   score weights or predictions by the official formulas
   submit     pack or check predictions for a benchmark's server
   fuse       fuse the scores of any two models
-  rank       what to label next, and which labels look wrong
+  rank       which scans to look at next: those whose labels look wrong
   analyze    the paper's figures, sweeps and tables
   ablate     the paper's ablation of the range-view network
   export     the networks as ONNX, for C++ and TensorRT

@@ -443,28 +443,6 @@ class JointTraining(Checked):
 
 
 @dataclass(frozen=True)
-class AdaptConfig(Checked):
-    """Pseudo-labels for scans without labels, and the rounds of `amvnet adapt`; all open."""
-
-    quantile: Share = 0.5
-    """A class is trusted from this quantile of its confidence where both networks agree."""
-    highest_confidence: Share = 0.9
-    """A larger confidence than this is not asked for."""
-    lowest_confidence: Share = 0.7
-    """A class whose quantile is lower cannot be told, and gets no pseudo-labels."""
-    points: Count = 200
-    """A class with fewer trusted points cannot be told either."""
-    rounds: Count = 1
-    """Rounds of labelling by the teacher and learning from it."""
-    agreement: Share = 0.8
-    """End before a round after which less of what was trusted at the start still stands."""
-    scans: Count = 400
-    """Most scans to adapt to, drawn evenly from all."""
-    streets: Count = 20
-    """Simulated streets, of six scans each, that are mixed in."""
-
-
-@dataclass(frozen=True)
 class TrainingConfig(Checked):
     """The stages of training."""
 
@@ -476,8 +454,6 @@ class TrainingConfig(Checked):
     """The point head."""
     joint: JointTraining = JointTraining()
     """Both networks and the head together; a stage that only --stage joint trains."""
-    adapt: AdaptConfig = AdaptConfig()
-    """Pseudo-labels, and the rounds of `amvnet adapt`."""
     augment: AugmentConfig = AugmentConfig()
     """Augmentation of the points."""
     keep: Literal["best", "last"] = "last"

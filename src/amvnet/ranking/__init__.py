@@ -1,1 +1,1 @@
-"""Which scans to look at next."""
+"""Which scans to look at next: those whose labels look wrong."""

@@ -196,16 +196,6 @@ class ScanAdapter:
         values = {key: getattr(lasers, key) for key in KEYS} | {"height": height}
         return {key: value for key, value in values.items() if value is not None}
 
-    def geometry(self, source: str) -> SensorGeometry:
-        """Return the sensor of a source, as its first scans were measured and as it is known."""
-        recording = self._recordings.get(source)
-        if recording is None or recording.median is None:
-            return _override(SensorGeometry(), self.sensor)
-        median = recording.median
-        return _override(
-            dataclasses.replace(median.lasers, height=median.frame.height), self.sensor
-        )
-
     def _measurement(self, cloud: Cloud, recording: _Recording) -> tuple[bool, _Measurement]:
         """Return the median of the first scans if this scan is like them, else measure it.
 

@@ -6,8 +6,6 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from amvnet.config.schema import JointTraining, NetworkTraining, Recipe
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
@@ -56,8 +54,6 @@ class RunPlan:
         options: how it runs.
         scores: two other models' scores of the scans; the head is trained on them instead of on
             those of the networks. None without other models.
-        class_weights: (K,) weights of the classes in the loss; None computes them from the training
-            scans.
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, or the recipe is for
@@ -69,7 +65,6 @@ class RunPlan:
     out: Path
     options: RunOptions = RunOptions()
     scores: ScorePair | None = None
-    class_weights: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         size = self.options.processes.size

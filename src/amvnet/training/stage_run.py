@@ -177,8 +177,6 @@ class StageRun:
 
     def class_weights(self) -> np.ndarray:
         """Return the (K,) weights of the classes in the loss (section 4.2 of the paper)."""
-        if self.plan.class_weights is not None:
-            return self.plan.class_weights
         counts = count_classes(
             self.plan.scans.dataset,
             self.plan.scans.train,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import Split, make_segmenter, parse_names
@@ -14,7 +13,6 @@ def rank(
     data: str,
     weights: str,
     out: Path,
-    by: Literal["disagreement", "labels"] = "disagreement",
     split: Split = "all",
     sequences: str | None = None,
     pictures: Path | None = None,
@@ -24,14 +22,12 @@ def rank(
     at_once: int | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Rank clusters of points, and scans, to look at next: to label them, or to check their labels.
+    """Rank clusters of points, and scans, whose labels both views contradict, to check them.
 
     Args:
-        data: the dataset.
+        data: the dataset, with labels.
         weights: a weights file with both networks, or the name of a built-in one.
         out: the table of the clusters, FILE.csv; that of the scans is FILE-scans.csv.
-        by: what is doubted: disagreement of the two views (what to label next), or labels that both
-            contradict.
         split: the official split.
         sequences: sequences or scenes instead, separated by commas.
         pictures: folder for drawings of the first clusters from above.
@@ -45,11 +41,12 @@ def rank(
         overwrite: replace files that amvnet did not write, too.
     """
     from amvnet.data.datasets.base import choose_records
+    from amvnet.data.datasets.select import labelled_records
     from amvnet.files import make_folder
     from amvnet.inference.inputs import open_for_weights
+    from amvnet.ranking.label_errors import rank as rank_records
+    from amvnet.ranking.label_errors import scans_path, write_ranking
     from amvnet.ranking.pictures import draw, possible_files
-    from amvnet.ranking.rank import rank as rank_records
-    from amvnet.ranking.rank import scans_path, write_ranking
     from amvnet.weights.file import load
     from amvnet.written import protecting
 
@@ -63,13 +60,14 @@ def rank(
     with protecting(files, overwrite):
         loaded = load(weights)
         dataset = open_for_weights(data, loaded)
-        records = choose_records(dataset, parse_names(sequences), split)
+        chosen = choose_records(dataset, parse_names(sequences), split)
+        records = labelled_records(dataset, chosen)
         segmenter = make_segmenter(loaded, device, engine, precision, at_once)
 
         with progress("scoring") as step:
-            ranking = rank_records(dataset, records, segmenter, by, step)
+            ranking = rank_records(dataset, records, segmenter, step)
         scans = write_ranking(ranking, dataset.taxonomy, out)
         say(f"{len(ranking.clusters)} clusters in {out}, {len(records)} scans in {scans}")
         if pictures is not None:
-            drawn = draw(ranking, dataset, segmenter, by, pictures)
+            drawn = draw(ranking, dataset, segmenter, pictures)
             say(f"{len(drawn)} pictures in {pictures}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from amvnet.cli.console import on_terminal, progress, say
+from amvnet.cli.console import on_terminal, say
 from amvnet.cli.options import (
     describe_records,
     join_processes,
@@ -20,7 +20,6 @@ def train(
     out: Path,
     stage: Literal["rv", "bev", "head", "joint", "all"] = "all",
     init: str | None = None,
-    teacher: str | None = None,
     resume: bool = False,
     train_sequences: str | None = None,
     val_sequences: str | None = None,
@@ -49,8 +48,6 @@ def train(
             ones together.
         init: weights to begin with; parts that are not trained are taken from them. Of weights for
             other classes, all layers but the last ones are taken.
-        teacher: weights that label the training scans without labels; without it, such scans are
-            refused.
         resume: continue an earlier run in the folder.
         train_sequences: sequences or scenes, separated by commas, to train on; default: the
             official split.
@@ -68,7 +65,6 @@ def train(
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.
     """
-    from amvnet.adaptation.teacher import Labeller, teacher_of
     from amvnet.data.datasets.joined import join
     from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of
@@ -87,11 +83,6 @@ def train(
     scans = split_records(
         dataset, parse_names(train_sequences), parse_names(val_sequences), with_val
     )
-    if teacher is not None:
-        segmenter = teacher_of(load(teacher))
-        with progress("labelling by the teacher") as step:
-            labeller = Labeller(segmenter, recipe.training.adapt, out / "teacher", step, say)
-            scans, parts = labeller.label(scans, parts)
     scans = join(scans, parts)
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
     scores = parse_scores(scores_a, scores_b, key_a, key_b, logits)

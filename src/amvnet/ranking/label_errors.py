@@ -1,7 +1,6 @@
-"""Rank points to look at: those on which the two views disagree, or both contradict the label.
+"""Rank labelled points that may be labelled wrongly: both views contradict their labels.
 
-These points are grouped into clusters, and the most doubtful clusters come first. Of the scans to
-label next, the first ones are doubtful and unlike each other.
+These points are grouped into clusters, and the most doubtful clusters come first.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,12 +21,9 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmenter import Segmenter, check_scan, expand_to_scan
-from amvnet.models.assertions import cosine_similarity
 from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan
-
-Criterion = Literal["disagreement", "labels"]
 
 # Metres: points nearer to the sensor than this belong to its vehicle and are never doubted.
 NEAR = 1.5
@@ -66,11 +62,10 @@ class Doubts:
         doubt: (N,) float32 in [0, 1]; 0 for points that are not doubted.
         rv: (N,) train ids predicted by the range view.
         bev: (N,) train ids predicted by the bird's-eye view.
-        label: (N,) train ids of the labels; 0 if there are none.
-        kind: (N,) the two classes that contradict each other, as one number. All points of a
-            cluster have the same kind.
-        whole: (N,) number of points of the labelled thing to which each point belongs; None if
-            the ranking is not of labels.
+        label: (N,) train ids of the labels.
+        kind: (N,) the label and the class that both views agree on, as one number. All points of
+            a cluster have the same kind.
+        whole: (N,) number of points of the labelled thing to which each point belongs.
     """
 
     xyz: np.ndarray
@@ -79,7 +74,7 @@ class Doubts:
     bev: np.ndarray
     label: np.ndarray
     kind: np.ndarray
-    whole: np.ndarray | None = None
+    whole: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -89,7 +84,7 @@ class Ranking:
     Attributes:
         records: (S,) scans, in the order of the dataset.
         clusters: (C,) rows of `ROW`.
-        scans: (S,) indices into `records`, in the order in which to look at them.
+        scans: (S,) indices into `records`, the most doubtful first.
         scores: (S,) mean doubt of the points of each scan in `scans`.
         sizes: (S,) number of points of each scan in `scans`.
     """
@@ -105,10 +100,9 @@ def rank(
     dataset: Dataset,
     records: Sequence[ScanRecord],
     segmenter: Segmenter,
-    by: Criterion,
     progress: Progress = no_progress,
 ) -> Ranking:
-    """Rank the doubtful clusters of some scans.
+    """Rank the doubtful clusters of some labelled scans, and the scans.
 
     A few scans are in memory at a time, and 35 bytes for each cluster.
 
@@ -116,15 +110,12 @@ def rank(
         dataset: the dataset that has the scans.
         records: the scans.
         segmenter: the two networks.
-        by: `disagreement` finds points to label next: the two views disagree on them; labels are
-            not needed. `labels` finds points that may be labelled wrongly: both views contradict
-            their labels.
         progress: called at the start and after each scan, with the number of scans done and in
             all.
 
     Raises:
-        InputError: if the weights lack a network or do not have the dataset's classes, or if
-            `by` is `labels` and a scan has none.
+        InputError: if the weights lack a network or do not have the dataset's classes, or a scan
+            has no labels.
     """
     check_classes(dataset, segmenter.taxonomy)
     segmenter = segmenter.for_dataset(dataset)
@@ -136,7 +127,7 @@ def rank(
     sizes = np.zeros(len(records), dtype=np.int64)
 
     def rank_scan(record: ScanRecord, scan: Scan) -> tuple[np.ndarray, float, int]:
-        doubts = find_doubts(check_scan(scan), segmenter, by)
+        doubts = find_doubts(check_scan(scan), segmenter)
         rows, _ = find_clusters(doubts)
         return rows, doubts.doubt.mean(), len(doubts.doubt)
 
@@ -150,15 +141,10 @@ def rank(
         progress(index + 1, len(records))
 
     clusters = np.concatenate(rows_by_scan)
-    if by == "labels":
-        clusters["score"] /= _frequencies(clusters["kind"]) ** COMMON
-
-    if by == "labels":
-        scan_order = np.argsort(-mean_doubts, kind="stable")
-    else:
-        scan_order = order_to_label(mean_doubts, _doubt_by_kind(clusters, len(records)))
+    clusters["score"] /= _frequencies(clusters["kind"]) ** COMMON
 
     # A stable sort keeps equal scores in the dataset's order, on every machine.
+    scan_order = np.argsort(-mean_doubts, kind="stable")
     cluster_order = np.argsort(-clusters["score"], kind="stable")
     return Ranking(
         records,
@@ -169,78 +155,33 @@ def rank(
     )
 
 
-def order_to_label(doubts: np.ndarray, by_kind: np.ndarray) -> np.ndarray:
-    """Return the order in which to label scans, so that the first ones are doubtful and unlike.
-
-    The first scan is the most doubtful. Each next one has the largest product of its doubt and its
-    distance to the nearest scan before it: the share of the doubt that would have to be of another
-    kind to make the two alike. Without the distance, the first scans would be those of one street.
-
-    Args:
-        doubts: (S,) mean doubt of the points of each scan.
-        by_kind: (S, D) the doubt of each scan by its kind, in any unit.
-
-    Returns:
-        (S,) indices of the scans.
-    """
-    count = len(doubts)
-    totals = by_kind.sum(axis=1, keepdims=True)
-    shares = by_kind / np.maximum(totals, np.finfo(np.float32).tiny)
-
-    order = np.zeros(count, dtype=np.int64)
-    distance = np.ones(count)  # in [0, 1], to the nearest scan before
-    is_left = np.ones(count, dtype=bool)
-    for position in range(count):
-        gain = np.where(is_left, doubts * distance, -1)
-        # Of scans like those before, the most doubtful one comes first.
-        best = gain.argmax() if gain.max() > 0 else np.where(is_left, doubts, -1).argmax()
-        order[position] = best
-        is_left[best] = False
-        distance = np.minimum(distance, np.abs(shares - shares[best]).sum(axis=1) / 2)
-    return order
-
-
-def _doubt_by_kind(clusters: np.ndarray, scans: int) -> np.ndarray:
-    """Return the doubt of each scan by its kind, (S, D) for the D kinds that occur."""
-    kinds, kind = np.unique(clusters["kind"], return_inverse=True)
-    doubt = clusters["score"] * (clusters["points"] + FEW)
-    sums = np.bincount(clusters["scan"] * len(kinds) + kind, doubt, scans * len(kinds))
-    return sums.reshape(scans, len(kinds)).astype(np.float32)
-
-
-def find_doubts(scan: Scan, segmenter: Segmenter, by: Criterion) -> Doubts:
-    """Return how doubtful each point of a scan is.
+def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
+    """Return how doubtful the label of each point of a scan is.
 
     Raises:
-        InputError: if `by` is `labels` and the scan has none.
+        InputError: if the scan has no labels.
     """
-    if by == "labels" and scan.labels is None:
+    label = scan.labels
+    if label is None:
         raise InputError(
             f"{scan.name}: expected labels to check, found none; choose sequences with labels"
         )
 
-    scores, uncertain = segmenter.scores_by_method(scan, ("rv", "bev"))
-    assert uncertain is not None
-
+    scores, _ = segmenter.scores_by_method(scan, ("rv", "bev"))
     f = scores["rv"]  # (P, K) class probabilities of the P valid points
     g = scores["bev"]  # (P, K)
     valid = scan.valid
     rv = _predicted_ids(f, valid)
     bev = _predicted_ids(g, valid)
-    label = np.zeros(len(scan), dtype=np.uint8) if scan.labels is None else scan.labels
 
     xyz = scan.points[:, :3]
     distance = np.hypot(xyz[valid, 0], xyz[valid, 1])
     off_vehicle = torch.from_numpy(distance >= NEAR).to(f.device)  # (P,)
 
-    if by == "disagreement":
-        disagreement = (1 - cosine_similarity(f, g)).clamp(0, 1)
-        doubt = expand_to_scan(disagreement * (uncertain & off_vehicle), valid)
-        return Doubts(xyz, doubt, rv, bev, label, kind=_pair(rv, bev))
-
     contradiction, agreed_ids = _contradiction(f, g, torch.from_numpy(label[valid]).to(f.device))
     doubt = expand_to_scan(contradiction * off_vehicle, valid)
-    kind = _pair(label, expand_to_scan(agreed_ids, valid))
+    # One number for each pair of train ids.
+    kind = label.astype(np.int64) * 256 + expand_to_scan(agreed_ids, valid)
     whole = _thing_sizes(xyz, label, valid)
     return Doubts(xyz, doubt, rv, bev, label, kind=kind, whole=whole)
 
@@ -304,7 +245,7 @@ def find_clusters(doubts: Doubts) -> tuple[np.ndarray, np.ndarray]:
     middle = doubted[_middle_points(doubts.xyz[doubted], group, sizes)]
     total_doubt = np.bincount(group, doubts.doubt[doubted])
     # A cluster that is a whole labelled thing counts more than one at the edge of a thing.
-    share = 1.0 if doubts.whole is None else sizes / doubts.whole[middle]
+    share = sizes / doubts.whole[middle]
 
     rows = np.zeros(len(sizes), dtype=ROW)
     rows["score"] = share * total_doubt / (sizes + FEW)
@@ -333,11 +274,6 @@ def _most_common(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
     return table.argmax(axis=1)
-
-
-def _pair(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return each pair of train ids as one number."""
-    return first.astype(np.int64) * 256 + second
 
 
 def _frequencies(kind: np.ndarray) -> np.ndarray:

@@ -1,1 +1,0 @@
-"""Adaptation to scans without labels: what two views agree on teaches both."""
