@@ -23,7 +23,7 @@ from amvnet.data.datasets.predictions import read_prediction
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import make_folder
+from amvnet.files import inside, make_folder
 from amvnet.scan import Scan
 from amvnet.simulation import SENSORS, SimulatedScan, drive_street
 from amvnet.simulation.layouts import nuscenes_indices, semantickitti_ids
@@ -134,7 +134,7 @@ class SimulatedStreets:
         """Write (N,) train ids as raw ids (uint32)."""
         count = len(self.read(record, labels=False))
         ids = files.check_count(ids, record.points_path, count)
-        return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids))
+        return files.write_labels(inside(folder, record.prediction), self.taxonomy.to_raw(ids))
 
     @property
     def _is_nuscenes(self) -> bool:
