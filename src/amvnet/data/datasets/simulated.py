@@ -35,8 +35,8 @@ VAL_STREETS = 6
 FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
-# A training uses a street in this many epochs, then that whose number is `STREET_STEP` higher.
-EPOCHS_PER_STREET = 3
+# An epoch of a training takes the streets whose numbers are this much higher than those of the epoch
+# before: more streets help, more scans of the same streets do not (docs/log/training.md).
 STREET_STEP = 1000
 
 SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
@@ -105,7 +105,7 @@ class SimulatedStreets:
         if number >= FIRST_VAL_STREET:
             return record
 
-        shift = epoch // EPOCHS_PER_STREET * STREET_STEP
+        shift = epoch * STREET_STEP
         index = int(record.points_path.name)
         return self._record((number + shift) % FIRST_VAL_STREET, index)
 
