@@ -35,8 +35,8 @@ VAL_STREETS = 6
 FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
-# An epoch of a training takes the streets whose numbers are this much higher than those of the epoch
-# before: more streets help, more scans of the same streets do not (docs/log/training.md).
+# An epoch of a training takes the streets whose numbers are this much higher than those of the one
+# before: other streets help, more scans of the same streets do not (docs/log/training.md).
 STREET_STEP = 1000
 
 SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
