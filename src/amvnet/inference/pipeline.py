@@ -23,7 +23,7 @@ from amvnet.files import atomic_write, inside
 from amvnet.inference.inputs import InputScan, LabelFormat, Labels, LoadedScan
 from amvnet.inference.journal import Journal
 from amvnet.inference.scan_stream import AHEAD, stream_groups
-from amvnet.inference.segmenter import Segmentation
+from amvnet.inference.segmentation import Segmentation
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.written import WrittenFiles
