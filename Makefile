@@ -10,7 +10,7 @@ demo: .venv/installed  ## simulate streets, segment, score and draw them
 	$(BIN)/amvnet demo --out demo
 
 test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 measures which lines they run
-	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile $(if $(COVERAGE),--cov=amvnet --cov-report=term:skip-covered)
+	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile $(if $(COVERAGE),--cov=amvnet --cov=lidarstreets --cov-report=term:skip-covered)
 
 test-slow: .venv/installed  ## the tests that take minutes, too
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"

@@ -27,8 +27,8 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 from rich.table import Table
 
-from amvnet.simulation import simulate
 from amvnet.threads import WAITING
+from lidarstreets import simulate
 
 WARM_UP = 2  # calls that are not counted
 WEIGHTS = "sim-hdl64e"

@@ -42,9 +42,9 @@ from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.simulation import simulate
 from amvnet.training.stages import NetworkStage, PolarStage, RangeStage
 from amvnet.weights.file import Weights, part_state
+from lidarstreets import simulate
 
 CLASSES = SEMANTICKITTI.size
 TINY = ModelConfig(

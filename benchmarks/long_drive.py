@@ -13,7 +13,7 @@ import sys
 import time
 from pathlib import Path
 
-from amvnet.simulation import simulate
+from lidarstreets import simulate
 
 KILLED_AT = (0.3, 0.6)  # shares of the scans
 

@@ -20,8 +20,8 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.inputs import adapter_for
 from amvnet.inference.segmenter import Segmenter
-from amvnet.simulation import simulate
-from amvnet.simulation.sensing.sensors import HDL64E, SENSORS, LidarModel
+from lidarstreets import simulate
+from lidarstreets.sensing.sensors import HDL64E, SENSORS, LidarModel
 
 SEED = 78
 VLP32C = (

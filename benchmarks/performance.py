@@ -41,7 +41,7 @@ from amvnet.models.methods import ONNX_ENGINES
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.polar_view import PolarGrid
-from amvnet.simulation import simulate
+from lidarstreets import simulate
 
 HEIGHT = 64  # of the range image that SalsaNext is timed on
 WIDTH = 2048

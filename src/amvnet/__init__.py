@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from amvnet import onnx_runner as onnx_runner
     from amvnet import weights as weights
+    from amvnet.data.datasets.simulated import simulate
     from amvnet.errors import InputError
     from amvnet.inference.fusion import fuse
     from amvnet.inference.read import read, read_all
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from amvnet.inference.segmenter import Segmenter
     from amvnet.models.methods import MethodName, Precision, TtaName
     from amvnet.scan import Scan
-    from amvnet.simulation import simulate
     from amvnet.weights.file import Weights
     from amvnet.weights.push import push
 
@@ -51,7 +51,7 @@ _MODULES = {
     "push": "amvnet.weights.push",
     "read": "amvnet.inference.read",
     "read_all": "amvnet.inference.read",
-    "simulate": "amvnet.simulation",
+    "simulate": "amvnet.data.datasets.simulated",
 }
 _SUBMODULES = ("onnx_runner", "weights")
 

@@ -18,8 +18,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.export import engines, int8
 from amvnet.export.engines import OnnxGraph, cache_folder, exported, use_engine
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmentation import expand_to_scan
-from amvnet.inference.segmenter import MOST_AT_ONCE, Segmenter
+from amvnet.inference.segmenter import MOST_AT_ONCE, Segmenter, expand_to_scan
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
 from amvnet.models.methods import MethodName
@@ -29,8 +28,8 @@ from amvnet.models.streams import Score, one_after_the_other
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan, trained_intensity
-from amvnet.simulation import simulate
 from amvnet.weights.file import Weights, load
+from lidarstreets import simulate
 
 from fixtures.worlds import fails, files, fresh_weights
 

@@ -32,8 +32,8 @@ from amvnet.sensors.lidars import (
     rotation_from_degrees,
 )
 from amvnet.sensors.measure import measure
-from amvnet.simulation.sensing.sensors import HDL32E, HDL64E
 from amvnet.weights.file import save
+from lidarstreets.sensing.sensors import HDL32E, HDL64E
 
 from fixtures.scan_writers import pcd_bytes, write_bag1
 from fixtures.sensors import LASERS, place

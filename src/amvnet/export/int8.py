@@ -37,7 +37,7 @@ def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
     """
     if text != SIMULATED:
         return _read(text, segmenter)
-    from amvnet.simulation import SENSORS, simulate
+    from amvnet.data.datasets.simulated import SENSORS, simulate
 
     sensor = segmenter.weights.sensor
     if sensor not in SENSORS:

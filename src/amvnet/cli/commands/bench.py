@@ -45,11 +45,11 @@ def bench(
     """
     from amvnet.cli.tables import timing_table
     from amvnet.config.recipes import load_recipe
+    from amvnet.data.datasets.simulated import simulate
     from amvnet.export.engines import use_engine
     from amvnet.files import atomic_write
     from amvnet.inference.segmenter import Segmenter
     from amvnet.inference.timing import UNCERTAIN, time_jobs, untrained
-    from amvnet.simulation import simulate
 
     timed_weights = weights if recipe is None else untrained(load_recipe(recipe))
     if recipe is not None and uncertain is None:

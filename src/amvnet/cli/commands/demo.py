@@ -22,11 +22,11 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
         weights: a weights file, or the name of a built-in one.
     """
     from amvnet.data.datasets.semantickitti import SemanticKitti
+    from amvnet.data.datasets.simulated import simulate
     from amvnet.evaluation.scoring import evaluate, label_by_weights
     from amvnet.inference.pipeline import OutputOptions
     from amvnet.inference.predict import predict
     from amvnet.inference.segmenter import Segmenter
-    from amvnet.simulation import simulate
 
     segmenter = Segmenter(weights, keep_memory=True)
     data = out / "data"

@@ -28,7 +28,7 @@ def simulate(
         first_sequence: number of the first sequence.
         processes: sequences that are simulated at the same time; default: one per processor.
     """
-    from amvnet.simulation import simulate as simulate_streets
+    from amvnet.data.datasets.simulated import simulate as simulate_streets
 
     with progress("simulating") as step:
         simulate_streets(

@@ -8,10 +8,9 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.own import OwnScans, is_description, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
-from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.data.datasets.simulated import SENSORS, SimulatedStreets
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
-from amvnet.simulation import SENSORS
 
 Reader = type[SemanticKitti] | type[NuScenes]
 

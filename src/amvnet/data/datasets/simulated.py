@@ -3,45 +3,63 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import os
 import shutil
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, ParamSpec
 
 import numpy as np
 
-from amvnet import simulation
 from amvnet.data import scan_files as files
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.predictions import read_prediction
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
-from amvnet.errors import InputError
-from amvnet.files import inside, make_folder
+from amvnet.errors import InputError, one_line_errors
+from amvnet.files import make_folder
 from amvnet.scan import Scan
-from amvnet.simulation import SENSORS, SimulatedScan, drive_street
-from amvnet.simulation.layouts import nuscenes_indices, semantickitti_ids
-from amvnet.simulation.materials import NUSCENES_CATEGORIES
+from lidarstreets import SimulationError, drive_street
+from lidarstreets import simulate as simulate_streets
 
+# The classes of the files that each sensor of the simulator writes.
+SENSORS = {"hdl64e": SEMANTICKITTI, "hdl32e": NUSCENES}
 SCANS = 6  # of a street
 TRAIN_STREETS = {"hdl64e": 140, "hdl32e": 84}
 VAL_STREETS = 6
 FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
-# An epoch of a training takes the streets whose numbers are this much higher than those of the one
-# before: other streets help, more scans of the same streets do not (docs/log/training.md).
+# A training uses a street in this many epochs, then that whose number is `STREET_STEP` higher.
+EPOCHS_PER_STREET = 3
 STREET_STEP = 1000
 
 SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
 CACHE_BYTES = 25 * 10**9
 ABANDONED = 3600  # seconds after which an unfinished street is that of a killed process
+
+
+P = ParamSpec("P")
+
+
+def _with_input_errors(simulate: Callable[P, Path]) -> Callable[P, Path]:
+    """Return the simulator's function, but with errors as `InputError`."""
+
+    @wraps(simulate)
+    def wrapped(*arguments: P.args, **options: P.kwargs) -> Path:
+        with one_line_errors(str, only=(SimulationError,)):
+            return simulate(*arguments, **options)
+
+    return wrapped
+
+
+simulate = _with_input_errors(simulate_streets)
 
 
 @dataclass(frozen=True)
@@ -68,7 +86,7 @@ class SimulatedStreets:
     @property
     def taxonomy(self) -> Taxonomy:
         """The classes of the benchmark that uses the sensor."""
-        return NUSCENES if self._is_nuscenes else SEMANTICKITTI
+        return SENSORS[self.sensor]
 
     @property
     def spec(self) -> str:
@@ -105,7 +123,7 @@ class SimulatedStreets:
         if number >= FIRST_VAL_STREET:
             return record
 
-        shift = epoch * STREET_STEP
+        shift = epoch // EPOCHS_PER_STREET * STREET_STEP
         index = int(record.points_path.name)
         return self._record((number + shift) % FIRST_VAL_STREET, index)
 
@@ -134,11 +152,11 @@ class SimulatedStreets:
         """Write (N,) train ids as raw ids (uint32)."""
         count = len(self.read(record, labels=False))
         ids = files.check_count(ids, record.points_path, count)
-        return files.write_labels(inside(folder, record.prediction), self.taxonomy.to_raw(ids))
+        return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids))
 
     @property
     def _is_nuscenes(self) -> bool:
-        return SENSORS[self.sensor].layout == "nuscenes"
+        return self.taxonomy is NUSCENES
 
     def _number(self, sequence: str) -> int:
         if not sequence.isdecimal() or int(sequence) > LAST_STREET:
@@ -186,32 +204,27 @@ class SimulatedStreets:
         part = street.with_name(f".{uuid.uuid4().hex}.part")
         make_folder(part)
         try:
-            seed = np.random.SeedSequence((SEED, number))
-            for index, scan in enumerate(drive_street(SENSORS[self.sensor], SCANS, seed)):
-                self._write(part / _name(index), scan)
+            for index, scan in enumerate(self._drive(number)):
+                _write(part / _name(index), scan)
             _put(part, street)
         finally:
             shutil.rmtree(part, ignore_errors=True)
 
         _make_room(self.root, street)
 
-    def _write(self, folder: Path, scan: SimulatedScan) -> None:
-        """Write a scan as reading the files of `amvnet simulate` would return it."""
-        folder.mkdir()
-        points = scan.points
-        if self._is_nuscenes:
-            points = _as_nuscenes(points)
-            np.save(folder / "ring.npy", scan.ring)
-
-        np.save(folder / "points.npy", points.astype(np.float32))
-        np.save(folder / "labels.npy", train_labels(scan.labels, self.taxonomy))
-
-
-def train_labels(labels: np.ndarray, taxonomy: Taxonomy) -> np.ndarray:
-    """Return the (N,) uint8 train ids of simulated labels in one of the benchmarks' taxonomies."""
-    if taxonomy.classes == NUSCENES.classes:
-        return _nuscenes_train_ids()[nuscenes_indices(labels)]
-    return taxonomy.to_train(semantickitti_ids(labels))
+    def _drive(self, number: int) -> Iterator[Scan]:
+        """Yield the scans of a street as reading the files of `amvnet simulate` returns them."""
+        seed = np.random.SeedSequence((SEED, number))
+        with one_line_errors(str, only=(SimulationError,)):
+            for scan in drive_street(self.sensor, SCANS, seed):
+                if self._is_nuscenes:
+                    indices, categories = scan.nuscenes_categories()
+                    train_ids = [NUSCENES.raw_to_train[category] for category in categories]
+                    labels = np.array(train_ids, dtype=np.uint8)[indices]
+                    yield Scan(_as_nuscenes(scan.points), labels, scan.ring)
+                else:
+                    labels = SEMANTICKITTI.to_train(scan.semantickitti_ids())
+                    yield Scan(scan.points, labels)
 
 
 def _name(number: int) -> str:
@@ -222,26 +235,25 @@ def _name(number: int) -> str:
 def _simulator() -> str:
     """Return a digest of the simulator's code: another simulator makes other streets."""
     digest = hashlib.sha256()
-    for path in sorted(Path(simulation.__file__).parent.rglob("*.py")):
+    for path in sorted(Path(inspect.getfile(drive_street)).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 
 
-@cache
-def _nuscenes_train_ids() -> np.ndarray:
-    """Return (256,) uint8 train ids by the index of nuScenes' category; 0 for noise."""
-    table = np.zeros(256, dtype=np.uint8)
-    for label, category in NUSCENES_CATEGORIES.items():
-        index = nuscenes_indices(np.array([label], dtype=np.uint32))
-        table[index] = NUSCENES.raw_to_train[category]
-    return table
+def _write(folder: Path, scan: Scan) -> None:
+    """Write a labelled scan as arrays."""
+    folder.mkdir()
+    arrays = {"points": scan.points, "labels": scan.labels, "ring": scan.ring}
+    for name, array in arrays.items():
+        if array is not None:
+            np.save(folder / f"{name}.npy", array)
 
 
 def _as_nuscenes(points: np.ndarray) -> np.ndarray:
     """Return points with nuScenes' axes (x right, y forward), and intensities in steps of 1/255."""
     x, y, z, intensity = points.T
     steps = np.round(intensity * FULL_INTENSITY)
-    return np.column_stack([-y, x, z, steps / FULL_INTENSITY])
+    return np.column_stack([-y, x, z, steps / FULL_INTENSITY]).astype(np.float32)
 
 
 def _put(part: Path, street: Path) -> None:

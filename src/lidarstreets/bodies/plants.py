@@ -1,0 +1,266 @@
+"""Meshes of plants without a stem: hedges, bushes, undergrowth, reeds, crops and creepers.
+
+Banks and rows of plants lie along x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarstreets.materials import Label, Surface
+from lidarstreets.mesh import Mesh, join, part
+from lidarstreets.solids import box, hull, leaning, loft, tube
+
+# Sections of hedges and banks of leaves: corners (y, z) for a width and a height of 1,
+# counter-clockwise seen from +x.
+SECTIONS = {
+    "box": ((0.5, 0), (0.5, 1), (-0.5, 1), (-0.5, 0)),
+    "dome": ((0.5, 0), (0.5, 0.6), (0.28, 0.97), (-0.28, 0.97), (-0.5, 0.6), (-0.5, 0)),
+    "cone": ((0.5, 0), (0.42, 0.35), (0.1, 1), (-0.1, 1), (-0.42, 0.35), (-0.5, 0)),
+    "wedge": ((0.5, 0), (0.36, 1), (-0.36, 1), (-0.5, 0)),
+    "bulge": (
+        (0.3, 0),
+        (0.5, 0.3),
+        (0.48, 0.65),
+        (0.2, 1),
+        (-0.2, 1),
+        (-0.48, 0.65),
+        (-0.5, 0.3),
+        (-0.3, 0),
+    ),
+}
+# Metres by which plants reach below the ground, so that a slope leaves no gap.
+FOOT = 0.3
+
+
+def foliage(
+    hulls: list[np.ndarray],
+    depth: float,
+    tint: float = 0.0,
+    surface: Surface = Surface.LEAF,
+) -> Mesh:
+    """Return clumps of leaves that pulses enter by `depth` metres on average."""
+    return part(hulls, surface, Label.VEGETATION, depth, tint=tint)
+
+
+def bank(
+    rng: np.random.Generator,
+    length: float,
+    section: str,
+    size: tuple[float, float],
+    uneven: float,
+    step: float,
+) -> np.ndarray:
+    """Return the (T, 3, 3) triangles of a closed bank of leaves along x.
+
+    Args:
+        rng: draws the unevenness.
+        length: metres.
+        section: one of `SECTIONS`.
+        size: width and height in metres.
+        uneven: standard deviation of the corners in metres.
+        step: metres between two rings of corners.
+    """
+    width, height = size
+    corners = np.array(SECTIONS[section]) * (width, height)
+    count = max(2, round(length / step) + 1)
+
+    rings = np.empty((count, len(corners), 3))
+    rings[..., 0] = np.linspace(-length / 2, length / 2, count)[:, None]
+    rings[..., 1:] = corners
+
+    swell = 1 + rng.normal(scale=uneven / height, size=count)
+    rings[..., 2] *= np.clip(swell, 0.4, 1.7)[:, None]
+    # A limit, so that the two sides never cross.
+    limit = 0.2 * min(width, height)
+    rings += np.clip(rng.normal(scale=uneven, size=rings.shape), -limit, limit)
+    rings[:, (0, -1), 2] = -FOOT
+    return loft(rings)
+
+
+@dataclass(frozen=True)
+class Hedge:
+    """A kind of hedge, the same along a boundary; lengths are in metres.
+
+    Attributes:
+        section: one of `SECTIONS`.
+        width, height: of the section.
+        depth: as in `Mesh`.
+        uneven: how far the surface is off the section.
+        tint: as in `Mesh`.
+    """
+
+    section: str
+    width: float
+    height: float
+    depth: float
+    uneven: float
+    tint: float
+
+    def segment(self, rng: np.random.Generator, length: float) -> Mesh:
+        """Return a piece of the hedge, `length` metres along x."""
+        size = (self.width, self.height)
+        leaves = bank(rng, length + 0.05, self.section, size, self.uneven, step=1.3)
+        return foliage([leaves], self.depth, self.tint + rng.normal(scale=0.3))
+
+
+def draw_hedge(rng: np.random.Generator, height: float) -> Hedge:
+    """Draw a kind of hedge: neatly clipped, or grown wild."""
+    is_clipped = rng.random() < 0.7
+    sections = ("box", "wedge", "dome", "cone") if is_clipped else ("dome", "bulge", "cone")
+    return Hedge(
+        section=sections[rng.integers(len(sections))],
+        width=float(rng.uniform(0.3, 1.2) if is_clipped else rng.uniform(0.8, 1.8)),
+        height=height,
+        depth=float(rng.uniform(0.008, 0.06) if is_clipped else rng.uniform(0.03, 0.3)),
+        uneven=float(rng.uniform(0.005, 0.05) if is_clipped else rng.uniform(0.05, 0.2)),
+        tint=float(rng.normal(scale=0.7)),
+    )
+
+
+def hedge(rng: np.random.Generator, length: float, height: float) -> Mesh:
+    """Return a hedge of a random kind."""
+    return draw_hedge(rng, height).segment(rng, length)
+
+
+def bush(rng: np.random.Generator, radius: float) -> Mesh:
+    """Return a bush, from knee-high to taller than a person: dense, or thin down to bare twigs."""
+    height = radius * rng.uniform(0.7, 1.6)
+    kind = rng.random()
+
+    if kind < 0.15:
+        return join([_sticks(rng, radius, 1.7 * height), _ball(rng, radius, height, 0.9)])
+    if kind < 0.33:
+        return _ball(rng, radius, height, rng.uniform(0.15, 0.9))
+    if kind < 0.5:
+        clipped = hull(rng, (0, 0, height), (radius, radius, height), square=0.6, fine=False)
+        return foliage([clipped], rng.uniform(0.01, 0.04))
+
+    return _ball(rng, radius, height, rng.uniform(0.02, 0.15))
+
+
+def _ball(rng: np.random.Generator, radius: float, height: float, depth: float) -> Mesh:
+    radii = (radius, radius * rng.uniform(0.7, 1.3), height)
+    clump = hull(rng, (0, 0, height * rng.uniform(0.6, 0.9)), radii, fine=radius > 1)
+    return foliage([clump], depth, rng.normal(scale=0.5))
+
+
+def _sticks(rng: np.random.Generator, radius: float, height: float) -> Mesh:
+    """Return thin stems that spread upwards from one root."""
+    stems = []
+    for _ in range(int(rng.integers(4, 10))):
+        x, y = rng.normal(scale=radius * 0.6, size=2)
+        foot = (x * 0.15, y * 0.15, -0.1)
+        tip = (x, y, height * rng.uniform(0.6, 1.1))
+        stems.append(tube(foot, tip, 0.015, 0.008, sides=3, closed=False))
+    return part(stems, Surface.BARK, Label.VEGETATION)
+
+
+def tall_grass(rng: np.random.Generator, length: float) -> Mesh:
+    """Return a strip of weeds, tall grass or reeds, which is labelled vegetation."""
+    is_reed = rng.random() < 0.2
+    height = rng.uniform(1.2, 2.4) if is_reed else rng.uniform(0.2, 0.9)
+    size = (rng.uniform(0.5, 2.2), height)
+    blades = bank(rng, length + 0.3, "dome", size, 0.15 * height, step=0.8)
+    return foliage([blades], rng.uniform(0.06, 0.5), rng.normal(scale=0.5))
+
+
+def turf(
+    rng: np.random.Generator, size: tuple[float, float], height: float, tint: float = 0.0
+) -> Mesh:
+    """Return a patch of uncut grass or stubble on the ground, which is labelled terrain.
+
+    Pulses that arrive at a low angle end in it at very different ranges.
+    """
+    blades = box((size[0], size[1], height + FOOT), (0, 0, -FOOT))
+    return part([blades], Surface.GRASS, Label.TERRAIN, rng.uniform(0.3, 1.6), tint=tint)
+
+
+def thicket(rng: np.random.Generator, length: float, height: float) -> Mesh:
+    """Return a strip of undergrowth of a random kind; see `draw_thicket`."""
+    return draw_thicket(rng).segment(rng, length, height)
+
+
+@dataclass(frozen=True)
+class Thicket:
+    """A kind of undergrowth or wood edge; lengths are in metres.
+
+    Attributes:
+        section: one of `SECTIONS`.
+        width: smallest and largest.
+        depth: as in `Mesh`; from nearly solid to so thin that most pulses pass.
+        uneven: how far the surface is off the section, as a share of the height.
+        stems: trunks per metre that are seen through the leaves.
+        tint: as in `Mesh`.
+    """
+
+    section: str
+    width: tuple[float, float]
+    depth: float
+    uneven: float
+    stems: float
+    tint: float
+
+    def segment(self, rng: np.random.Generator, length: float, height: float) -> Mesh:
+        """Return a piece, `length` metres along x."""
+        size = (rng.uniform(*self.width), height)
+        uneven = self.uneven * min(height, 4.0)
+        leaves = [bank(rng, length + 0.6, self.section, size, uneven, step=1.0)]
+        if rng.random() < 0.4:
+            x = rng.uniform(-length / 3, length / 3)
+            radii = (1.0, size[0] * 0.6, height * 0.4)
+            leaves.append(hull(rng, (x, 0, height * 0.6), radii, fine=False))
+
+        stems = [np.zeros((0, 3, 3))]
+        for _ in range(rng.poisson(self.stems * length)):
+            x = rng.uniform(-length / 2, length / 2)
+            y = rng.uniform(-0.5, 0.5) * size[0]
+            lean_x, lean_y = rng.normal(scale=0.06 * height, size=2)
+            tip = (x + lean_x, y + lean_y, height)
+            stems.append(tube((x, y, -FOOT), tip, rng.uniform(0.03, 0.12), 0.03, 5, closed=False))
+
+        trunks = part(stems, Surface.BARK, Label.TRUNK)
+        return join([trunks, foliage(leaves, self.depth, self.tint + rng.normal(scale=0.3))])
+
+
+def draw_thicket(rng: np.random.Generator) -> Thicket:
+    """Draw a kind of undergrowth: a dense green wall, a wild bank or a thin wood edge."""
+    tint = float(rng.normal(scale=0.8))
+    kind = rng.random()
+    if kind < 0.5:
+        depth = rng.uniform(0.012, 0.1)
+        return Thicket("dome", (1.2, 3.0), depth, rng.uniform(0.01, 0.05), stems=0.0, tint=tint)
+    if kind < 0.82:
+        depth = rng.uniform(0.04, 0.3)
+        return Thicket("bulge", (1.0, 3.0), depth, rng.uniform(0.04, 0.12), stems=0.05, tint=tint)
+    depth = rng.uniform(0.4, 1.8)
+    return Thicket("bulge", (2.0, 6.0), depth, rng.uniform(0.06, 0.15), stems=0.25, tint=tint)
+
+
+def ivy(rng: np.random.Generator, length: float, height: float) -> Mesh:
+    """Return creepers that cover a wall at y = 0 from the side of -y."""
+    leaves = bank(rng, length, "bulge", (0.35, height), 0.04, step=0.8)
+    return foliage([leaves], rng.uniform(0.03, 0.12), rng.normal(scale=0.5))
+
+
+def crop_row(rng: np.random.Generator, length: float, height: float) -> Mesh:
+    """Return a row of maize, vines or berries."""
+    size = (rng.uniform(0.4, 0.8), height)
+    leaves = bank(rng, length, "bulge", size, 0.06, step=1.0)
+    return foliage([leaves], rng.uniform(0.08, 0.4), rng.normal(scale=0.3))
+
+
+def flower_bed(rng: np.random.Generator, length: float) -> Mesh:
+    """Return a low bed of flowers or a ground cover."""
+    size = (rng.uniform(0.5, 2.0), rng.uniform(0.15, 0.5))
+    leaves = bank(rng, length, "dome", size, 0.05, step=0.7)
+    return foliage([leaves], rng.uniform(0.03, 0.15), rng.normal(scale=0.7))
+
+
+def leaf_heap(rng: np.random.Generator) -> Mesh:
+    """Return a heap of cut branches and leaves."""
+    radii = (rng.uniform(0.5, 1.6), rng.uniform(0.5, 1.2), rng.uniform(0.3, 0.9))
+    heap = leaning(hull(rng, (0, 0, 0), radii, fine=False), rng.normal(scale=0.2), 0)
+    return foliage([heap], rng.uniform(0.05, 0.3), surface=Surface.TWIG)

@@ -1,0 +1,89 @@
+"""Meshes of buses and trams."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarstreets.bodies.vehicles.parts import draw_paint, glass, lamps, plates, wheels
+from lidarstreets.materials import Label, Surface
+from lidarstreets.mesh import Mesh, join, part, place
+from lidarstreets.solids import box, copies
+
+
+def bus(rng: np.random.Generator) -> Mesh:
+    """Return a minibus, a city bus, a coach or an articulated bus."""
+    width = rng.uniform(2.3, 2.55)
+    height = rng.uniform(2.7, 3.3) if rng.random() < 0.8 else rng.uniform(3.3, 4.0)
+
+    kind = rng.random()
+    if kind < 0.2:
+        length = rng.uniform(6.0, 8.5)
+        return _section(rng, length, width * 0.92, min(height, 2.9), (-0.28, 0.3))
+    if kind < 0.85:
+        return _section(rng, rng.uniform(9.5, 13.5), width, height, (-0.26, 0.30))
+
+    front = _section(rng, 9.5, width, 3.0, (-0.15, 0.22))
+    rear = _section(rng, 7.5, width, 3.0, (-0.1,))
+    bellows = part([box((1.2, width * 0.9, 2.5), (-0.6, 0, 0.4))], Surface.RUBBER, Label.BUS)
+    bend = rng.normal(scale=0.1)
+    return join([place(front, x=4.75), bellows, place(rear, x=-4.75, yaw=bend)])
+
+
+def tram(rng: np.random.Generator) -> Mesh:
+    """Return a tram of two to four sections, which the benchmark counts like a bus."""
+    width = rng.uniform(2.2, 2.65)
+    length = rng.uniform(6, 9)
+    sections = int(rng.integers(2, 5))
+
+    pieces = []
+    for index in range(sections):
+        section = _section(rng, length, width, 3.4, ())
+        pieces.append(place(section, x=(index - (sections - 1) / 2) * (length + 0.8)))
+    total = sections * (length + 0.8)
+    bogie_x = np.linspace(-total / 2 + 2, total / 2 - 2, sections + 1)
+    bogies = copies(box((2.2, 1.9, 0.5), (0, 0, 0.02)), x=bogie_x)
+    bellows_x = (np.arange(1, sections) - sections / 2) * (length + 0.8)
+    bellows = copies(box((0.9, width * 0.9, 2.8), (0, 0, 0.45)), x=bellows_x)
+    return join([*pieces, part([bogies, bellows], Surface.RUBBER, Label.BUS)])
+
+
+def _section(
+    rng: np.random.Generator, length: float, width: float, height: float, axles: tuple[float, ...]
+) -> Mesh:
+    """Return one stiff section of a bus with a band of windows; axles are shares of its length."""
+    half = length / 2
+    sill = rng.uniform(0.9, 1.5)
+    lintel = height - rng.uniform(0.3, 0.6)
+    floor = rng.uniform(0.2, 0.4)
+
+    lower = box((length, width, sill - floor), (0, 0, floor))
+    upper = box((length, width, height - lintel), (0, 0, lintel), top=(0.98, 0.92))
+    post_x = np.linspace(-half + 0.1, half - 0.1, int(length / 1.6) + 1)
+    posts = copies(box((0.14, width, lintel - sill)), x=post_x, z=sill)
+    windows = box((length * 0.985, width * 0.98, lintel - sill - 0.02), (0, 0, sill + 0.01))
+
+    seat_x = np.arange(-half + 1, half - 1.5, 0.85)
+    seats = copies(box((0.12, 0.9, 0.75)), x=seat_x[:, None], y=[-0.65, 0.65], z=sill - 0.45)
+    machinery = box((length * rng.uniform(0.2, 0.5), width * 0.7, 0.3), (-length * 0.1, 0, height))
+
+    painted = [lower, upper, posts]
+    if rng.random() < 0.6:
+        painted.append(machinery)
+
+    return join(
+        [
+            part(painted, draw_paint(rng, 0.75), Label.BUS),
+            glass([windows], Label.BUS, bool(rng.random() < 0.5)),
+            part([seats], Surface.CLOTH, Label.BUS),
+            plates(half, floor + 0.3, Label.BUS),
+            lamps(half, width, floor + 0.3, Label.BUS),
+            _bus_wheels(axles, length, width),
+        ]
+    )
+
+
+def _bus_wheels(axles: tuple[float, ...], length: float, width: float) -> Mesh:
+    if not axles:
+        return part([np.zeros((0, 3, 3))], Surface.RUBBER, Label.BUS)
+
+    return wheels(Label.BUS, [axle * length for axle in axles], width, 0.48, 0.3)

@@ -1,0 +1,79 @@
+"""Parts that several kinds of vehicles share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidarstreets.materials import Label, Surface
+from lidarstreets.mesh import Mesh, part
+from lidarstreets.solids import box, copies, tube
+
+# Metres: mean distance that a pulse travels behind clear glass until dirt or a reflection ends it.
+CLEAR_GLASS = 4.0
+
+
+def draw_paint(rng: np.random.Generator, light: float) -> Surface:
+    """Draw a paint; `light` is the chance that it is bright."""
+    return Surface.LIGHT_PAINT if rng.random() < light else Surface.DARK_PAINT
+
+
+def wheels(
+    label: Label,
+    axles: Sequence[float],
+    width: float,
+    radius: float,
+    thickness: float = 0.22,
+) -> Mesh:
+    """Return two wheels per axle.
+
+    Args:
+        label: class of the vehicle.
+        axles: x of each axle in metres.
+        width: outer distance between the wheels in metres.
+        radius: of the wheels in metres.
+        thickness: of the wheels in metres.
+    """
+    tyres = []
+    for x in axles:
+        for side in (-1, 1):
+            inside = (x, side * (width / 2 - thickness), radius)
+            outside = (x, side * (width / 2 + 0.01), radius)
+            tyres.append(tube(inside, outside, radius))
+    return part(tyres, Surface.RUBBER, label)
+
+
+def glass(solids: Sequence[np.ndarray], label: Label, clear: bool) -> Mesh:
+    """Return convex panes or cabins of glass; pulses pass through clear glass only."""
+    if not clear:
+        return part(solids, Surface.GLASS, label)
+
+    outward = [facing_outwards(solid) for solid in solids]
+    return part(outward, Surface.GLASS, label, depth=CLEAR_GLASS)
+
+
+def facing_outwards(solid: np.ndarray) -> np.ndarray:
+    """Return a convex solid, (T, 3, 3), with corners counter-clockwise seen from outside."""
+    sides = np.diff(solid, axis=1)
+    normals = np.cross(sides[:, 0], sides[:, 1])
+    middle = solid.reshape(-1, 3).mean(axis=0)
+    inward = np.einsum("ti,ti->t", solid.mean(axis=1) - middle, normals) < 0
+
+    turned = solid.copy()
+    turned[inward] = solid[inward][:, ::-1]
+    return turned
+
+
+def plates(half: float, z: float, label: Label) -> Mesh:
+    """Return bright number plates `half` metres in front of and behind the middle of a vehicle."""
+    both = copies(box((0.03, 0.5, 0.11)), x=[-(half + 0.01), half + 0.01], z=z)
+    return part([both], Surface.PLATE, label)
+
+
+def lamps(half: float, width: float, z: float, label: Label) -> Mesh:
+    """Return the lamps at the four corners of a vehicle, which reflect towards the sensor."""
+    lamp = box((0.05, 0.22, 0.11))
+    x = [[-(half - 0.01)], [half - 0.02]]
+    four = copies(lamp, x=x, y=[-(width / 2 - 0.2), width / 2 - 0.2], z=z)
+    return part([four], Surface.SIGN_FACE, label)

@@ -1,0 +1,212 @@
+"""Meshes of trucks: a chassis, a cab, and what it carries."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarstreets.bodies.vehicles.parts import draw_paint, glass, lamps, plates, wheels
+from lidarstreets.bodies.vehicles.truck_loads import (
+    LOADS,
+    Load,
+    box_load,
+    flatbed,
+    tanker,
+    tipper,
+)
+from lidarstreets.chance import weighted_choice
+from lidarstreets.materials import Label, Surface
+from lidarstreets.mesh import Mesh, join, part
+from lidarstreets.solids import box, copies, prism
+
+# Shares of semi-trailers and of motor homes among the trucks.
+SEMI_TRAILERS = 0.10
+CAMPERS = 0.12
+
+
+def truck(rng: np.random.Generator) -> Mesh:
+    """Return a truck of any kind, from a small box truck to a semi-trailer."""
+    kind = rng.random()
+    if kind < SEMI_TRAILERS:
+        return _semi_trailer(rng)
+    if kind < SEMI_TRAILERS + CAMPERS:
+        return _camper(rng)
+
+    length = rng.uniform(5.2, 7.0) if rng.random() < 0.45 else rng.uniform(7.0, 11.0)
+    is_light = length < 7.0
+    width = rng.uniform(1.95, 2.3) if is_light else rng.uniform(2.3, 2.55)
+    cab_length = rng.uniform(1.5, 2.3)
+    cab_height = rng.uniform(2.1, 2.6) if is_light else rng.uniform(2.5, 3.3)
+    half = length / 2
+
+    load = Load(
+        rear=-half,
+        front=half - cab_length - rng.uniform(0.1, 0.6),
+        width=width,
+        floor=rng.uniform(0.8, 1.2),
+        top=rng.uniform(2.3, 3.0) if is_light else rng.uniform(2.8, 3.9),
+    )
+    radius = 0.38 if is_light else rng.uniform(0.45, 0.53)
+
+    return join(
+        [
+            cab(rng, half, cab_length, width * rng.uniform(0.92, 1.0), cab_height),
+            _chassis(rng, length, width, load.floor, radius),
+            *weighted_choice(rng, LOADS)(rng, load),
+        ]
+    )
+
+
+def cab(rng: np.random.Generator, nose: float, length: float, width: float, height: float) -> Mesh:
+    """Return the cab of a truck whose front end is at x = `nose`; lengths are in metres."""
+    floor = rng.uniform(0.35, 0.7)
+    sill = floor + (height - floor) * rng.uniform(0.42, 0.55)
+    rear = nose - length
+    slant = rng.uniform(0.02, 0.3)
+
+    bonnet = rng.uniform(0.3, 0.9) if rng.random() < 0.2 else 0.0
+    front = nose - bonnet
+    lower = [
+        (rear, floor),
+        (nose, floor),
+        (nose, sill - 0.05),
+        (nose - bonnet - 0.02, sill),
+        (rear, sill),
+    ]
+
+    # The upper part: a box of glass between a roof, a back and two posts on each side.
+    window = box(
+        (front - rear - 0.04, width * 0.96, height - sill - 0.3),
+        ((front + rear) / 2, 0, sill + 0.01),
+        top=(1 - slant / length, 0.95),
+        shift=-slant / 2,
+    )
+    roof_length = front - rear - slant
+    roof = box(
+        (roof_length, width * 0.95, 0.3), (rear + roof_length / 2, 0, height - 0.3), top=(0.9, 0.9)
+    )
+    back = box((0.08, width * 0.95, height - sill - 0.1), (rear + 0.04, 0, sill))
+    posts = copies(
+        box((0.12, 0.1, height - sill - 0.2), shift=-slant / 2),
+        x=[[front - 0.1], [front - 1.0]],
+        y=[-width * 0.46, width * 0.46],
+        z=sill,
+    )
+
+    mirrors = copies(
+        box((0.1, 0.22, 0.5)), x=front - 0.1, y=[-width / 2 - 0.18, width / 2 + 0.18], z=sill
+    )
+    bumper = box((0.12, width, 0.3), (nose, 0, floor - 0.08))
+
+    seats = box((0.3, width * 0.7, 0.9), (rear + 0.4, 0, sill - 0.4))
+    headlamps = copies(
+        box((0.04, 0.35, 0.18)), x=nose + 0.06, y=[-width * 0.38, width * 0.38], z=floor + 0.2
+    )
+
+    # A spoiler on the roof, and two warning lights.
+    painted = [prism(lower, width), roof, back, posts]
+    if rng.random() < 0.25:
+        size = (0.9, width * 0.85, rng.uniform(0.3, 0.7))
+        painted.append(box(size, (rear + 0.5, 0, height - 0.05), top=(0.3, 0.9), shift=-0.2))
+    if rng.random() < 0.15:
+        painted.append(copies(box((0.2, 0.3, 0.14)), x=front - 0.6, y=[-0.5, 0.5], z=height))
+
+    return join(
+        [
+            part(painted, draw_paint(rng, 0.7), Label.TRUCK),
+            glass([window], Label.TRUCK, bool(rng.random() < 0.5)),
+            part([seats], Surface.CLOTH, Label.TRUCK),
+            part([mirrors, bumper], Surface.PLASTIC, Label.TRUCK),
+            part([headlamps], Surface.SIGN_FACE, Label.TRUCK),
+        ]
+    )
+
+
+def _chassis(
+    rng: np.random.Generator, length: float, width: float, floor: float, radius: float
+) -> Mesh:
+    """Return frame, wheels, tanks and guards; pulses pass under the load between them."""
+    half = length / 2
+    rails = copies(box((length - 0.3, 0.12, 0.25), (-0.1, 0, floor - 0.27)), y=[-0.4, 0.4])
+    axles = [half - rng.uniform(1.0, 1.5), -half + rng.uniform(1.2, 2.0)]
+    if length > 8 and rng.random() < 0.6:
+        axles.append(axles[1] + 2.4 * radius + 0.1)
+
+    metal = [rails]
+    tank_x = rng.uniform(-0.5, half * 0.3)
+    if rng.random() < 0.7:
+        tank = box((rng.uniform(0.6, 1.3), 0.5, 0.5), (tank_x, 0, 0.42))
+        metal.append(copies(tank, y=[-(width / 2 - 0.3), width / 2 - 0.3]))
+    if rng.random() < 0.4:
+        guard = box((length * 0.35, 0.04, 0.1), (0, 0, 0))
+        metal.append(copies(guard, y=[[-width / 2], [width / 2]], z=[0.45, 0.75]))
+    tail_bar = box((0.1, width * 0.9, 0.14), (-half + 0.1, 0, 0.5))
+    metal.append(tail_bar)
+
+    return join(
+        [
+            part(metal, Surface.METAL, Label.TRUCK),
+            wheels(Label.TRUCK, axles, width, radius, 0.3),
+            plates(half, 0.62, Label.TRUCK),
+            lamps(half, width, floor - 0.25, Label.TRUCK),
+        ]
+    )
+
+
+def _semi_trailer(rng: np.random.Generator) -> Mesh:
+    """Return a tractor unit with a trailer of 10 to 13.6 m."""
+    length = rng.uniform(12.0, 16.5)
+    width = 2.5
+    half = length / 2
+    load = Load(-half, half - 2.9, width, rng.uniform(1.1, 1.3), rng.uniform(3.5, 4.0))
+    maker = weighted_choice(rng, {box_load: 0.65, flatbed: 0.12, tanker: 0.13, tipper: 0.10})
+
+    rails = copies(
+        box((load.length, 0.14, 0.3), (load.middle, 0, load.floor - 0.32)), y=[-0.5, 0.5]
+    )
+    legs = copies(box((0.12, 0.12, 0.6)), x=half - 5.5, y=[-0.7, 0.7], z=0.45)
+    unit = box((5.6, 0.9, 0.3), (half - 2.9, 0, 0.65))
+    axles = [half - 1.4, half - 4.9, -half + 1.6, -half + 2.9, -half + 4.2]
+
+    return join(
+        [
+            cab(rng, half, rng.uniform(1.9, 2.4), width * 0.98, rng.uniform(3.0, 3.8)),
+            part([rails, legs, unit], Surface.METAL, Label.TRUCK),
+            wheels(Label.TRUCK, axles, width, 0.5, 0.35),
+            plates(half, 0.6, Label.TRUCK),
+            lamps(half, width, 0.8, Label.TRUCK),
+            *maker(rng, load),
+        ]
+    )
+
+
+def _camper(rng: np.random.Generator) -> Mesh:
+    """Return a motor home: a van's cab and a living box, often with an alcove over the cab."""
+    length = rng.uniform(5.4, 7.5)
+    width = rng.uniform(2.0, 2.35)
+    height = rng.uniform(2.6, 3.2)
+    half = length / 2
+    door = half - rng.uniform(1.5, 2.0)
+    belt = 1.2
+
+    nose = [(door, 0.3), (half, 0.3), (half, 0.8), (half - 0.7, belt), (door, belt)]
+    screen = [(door, belt + 0.01), (half - 0.7, belt + 0.01), (door + 0.3, 2.05), (door, 2.05)]
+    living = box(
+        (door + half, width, height - 0.35), ((door - half) / 2, 0, 0.35), top=(0.99, 0.97)
+    )
+    white = [prism(nose, width * 0.92), living]
+    if rng.random() < 0.5:
+        alcove = [(door, 2.05), (door + 0.4, 2.05), (door + 1.1, 2.35), (door, height)]
+        white.append(prism(alcove, width))
+    panes = copies(box((0.9, width + 0.03, 0.5)), x=[-half * 0.5, half * 0.15], z=1.4)
+    awning = box((length * 0.5, 0.12, 0.12), (-0.3, -width / 2, height - 0.3))
+
+    return join(
+        [
+            part([*white, awning], Surface.LIGHT_PAINT, Label.TRUCK),
+            glass([prism(screen, width * 0.88)], Label.TRUCK, bool(rng.random() < 0.5)),
+            part([panes], Surface.GLASS, Label.TRUCK),
+            wheels(Label.TRUCK, (-half * 0.5, half * 0.7), width, 0.34),
+            plates(half, 0.55, Label.TRUCK),
+            lamps(half, width, 0.7, Label.TRUCK),
+        ]
+    )

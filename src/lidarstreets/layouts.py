@@ -1,0 +1,353 @@
+"""Writes simulated scans in the layouts of SemanticKITTI and nuScenes-lidarseg."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import threading
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarstreets.errors import SimulationError
+from lidarstreets.materials import MOVING, NUSCENES_CATEGORIES, SEMANTICKITTI_IDS
+
+Row = dict[str, Any]
+CLASS_MASK = np.uint32(0xFFFF)
+
+# From the LiDAR's axes (forward, left, up) to a camera's (right, down, forward), for calib.txt.
+_TO_CAMERA = np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]])
+# The matrix of a camera that does not exist; readers of calib.txt expect four.
+_CAMERA = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+# The LiDAR of nuScenes looks to the right: x is right, y is forward.
+_TO_NUSCENES = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+VERSION = "v1.0-trainval"
+TABLES = (
+    "attribute",
+    "calibrated_sensor",
+    "category",
+    "ego_pose",
+    "instance",
+    "lidarseg",
+    "log",
+    "map",
+    "sample",
+    "sample_annotation",
+    "sample_data",
+    "scene",
+    "sensor",
+    "visibility",
+)
+# Microseconds: time of the first scan of scene 0, and between the first scans of two scenes.
+START = 1_600_000_000_000_000
+SCENE_STEP = 1_000_000_000
+
+WRITING = threading.Lock()  # held while a file is written
+
+_CATEGORIES = ("noise", *sorted(set(NUSCENES_CATEGORIES.values())))
+
+
+@dataclass(frozen=True)
+class SimulatedScan:
+    """One scan in memory.
+
+    Attributes:
+        points: (N, 4) float32 x, y, z in metres and intensity in [0, 1], in the sensor's frame,
+            whose x is forward.
+        labels: (N,) uint32 ids of `Label` or `MOVING`, with the instance id in the upper 16 bits;
+            0 for a lost return.
+        ring: (N,) uint8 index of the laser, 0 = lowest.
+        pose: (4, 4) from the sensor's frame to the sequence's.
+        time: seconds since the beginning of the sequence.
+    """
+
+    points: np.ndarray
+    labels: np.ndarray
+    ring: np.ndarray
+    pose: np.ndarray
+    time: float
+
+    def semantickitti_ids(self) -> np.ndarray:
+        """Return the (N,) uint32 raw labels of SemanticKITTI, with instances."""
+        table = np.arange(2**16, dtype=np.uint32)
+        for label, raw in SEMANTICKITTI_IDS.items():
+            table[label] = raw
+        return table[self.labels & CLASS_MASK] | self.labels & ~CLASS_MASK
+
+    def nuscenes_categories(self) -> tuple[np.ndarray, tuple[str, ...]]:
+        """Return the (N,) uint8 index of each point's category, and the names of all categories.
+
+        Lost returns are noise.
+        """
+        table = np.zeros(2**16, dtype=np.uint8)
+        for label, category in NUSCENES_CATEGORIES.items():
+            table[label] = _CATEGORIES.index(category)
+        for label, moving in MOVING.items():
+            table[moving] = table[label]
+        return table[self.labels & CLASS_MASK], _CATEGORIES
+
+
+@dataclass
+class SemanticKittiLayout:
+    """OUT/sequences/XX with velodyne, labels, poses.txt, calib.txt and times.txt."""
+
+    out: Path
+    number: int
+    poses: list[np.ndarray] = field(default_factory=list)
+    times: list[float] = field(default_factory=list)
+
+    @property
+    def folder(self) -> Path:
+        return self.out / "sequences" / f"{self.number:02d}"
+
+    def write_scan(self, index: int, scan: SimulatedScan) -> None:
+        """Write one scan and its labels."""
+        labels = scan.semantickitti_ids()
+        write_whole(
+            self.folder / "velodyne" / f"{index:06d}.bin", scan.points.astype("<f4").tobytes()
+        )
+        write_whole(self.folder / "labels" / f"{index:06d}.label", labels.astype("<u4").tobytes())
+        self.poses.append(scan.pose)
+        self.times.append(scan.time)
+
+    def finish(self) -> Row:
+        """Write poses.txt (in the camera's frame), calib.txt and times.txt, as KITTI's odometry."""
+        from_camera = np.linalg.inv(_TO_CAMERA)
+        poses = [_matrix_text(_TO_CAMERA @ pose @ from_camera) for pose in self.poses]
+        cameras = [f"P{i}: {_matrix_text(_CAMERA)}" for i in range(4)]
+        times = [f"{time:e}" for time in self.times]
+
+        _write_lines(self.folder / "poses.txt", poses)
+        _write_lines(self.folder / "calib.txt", [*cameras, f"Tr: {_matrix_text(_TO_CAMERA)}"])
+        _write_lines(self.folder / "times.txt", times)
+        return {}
+
+    @staticmethod
+    def complete(out: Path, sequences: list[Row]) -> None:
+        """Do nothing: no file is about all sequences."""
+
+
+@dataclass
+class NuScenesLayout:
+    """OUT/samples and OUT/lidarseg, and one scene in the tables of OUT/v1.0-trainval."""
+
+    out: Path
+    number: int
+    rows: list[Row] = field(default_factory=list)
+
+    @property
+    def name(self) -> str:
+        return f"simulated-{self.number:04d}"
+
+    def write_scan(self, index: int, scan: SimulatedScan) -> None:
+        """Write one scan and its labels, and keep what the tables need of it."""
+        token = _token(self.name, "sample_data", index)
+        time = START + self.number * SCENE_STEP + round(scan.time * 1e6)
+        points_path = f"samples/LIDAR_TOP/{self.name}__LIDAR_TOP__{time}.pcd.bin"
+        labels_path = f"lidarseg/{VERSION}/{token}_lidarseg.bin"
+
+        xyz = scan.points[:, :3] @ _TO_NUSCENES.T
+        columns = np.column_stack([xyz, np.round(scan.points[:, 3] * 255), scan.ring])
+        write_whole(self.out / points_path, columns.astype("<f4").tobytes())
+        categories, _ = scan.nuscenes_categories()
+        write_whole(self.out / labels_path, categories.tobytes())
+        self.rows.append(
+            {
+                "token": token,
+                "time": time,
+                "file": points_path,
+                "labels": labels_path,
+                "pose": scan.pose.tolist(),
+            }
+        )
+
+    def finish(self) -> Row:
+        """Return the name and the scans of the scene."""
+        return {"scene": self.name, "scans": self.rows}
+
+    @staticmethod
+    def complete(out: Path, sequences: list[Row]) -> None:
+        """Write the tables of all scenes, and an empty map."""
+        tables: dict[str, list[Row]] = {name: [] for name in TABLES}
+        _add_shared_rows(tables)
+        for sequence in sequences:
+            _add_scene(tables, sequence)
+
+        _write_empty_map(out / "maps" / "simulated.png")
+        for name, rows in tables.items():
+            write_whole(out / VERSION / f"{name}.json", json.dumps(rows, indent=0).encode())
+
+
+LAYOUTS: Mapping[str, type[SemanticKittiLayout] | type[NuScenesLayout]] = {
+    "semantickitti": SemanticKittiLayout,
+    "nuscenes": NuScenesLayout,
+}
+
+
+def _add_shared_rows(tables: dict[str, list[Row]]) -> None:
+    """Add the rows that all scenes share: categories, the LiDAR, the log and the map."""
+    for index, name in enumerate(_CATEGORIES):
+        token = _token("category", index)
+        tables["category"].append({"token": token, "name": name, "description": "", "index": index})
+
+    tables["sensor"].append(
+        {"token": _token("sensor"), "channel": "LIDAR_TOP", "modality": "lidar"}
+    )
+
+    half = float(np.sqrt(0.5))
+    tables["calibrated_sensor"].append(
+        {
+            "token": _token("calibrated_sensor"),
+            "sensor_token": _token("sensor"),
+            "translation": [0.0, 0.0, 0.0],
+            "rotation": [half, 0.0, 0.0, -half],
+            "camera_intrinsic": [],
+        }
+    )
+
+    tables["log"].append(
+        {
+            "token": _token("log"),
+            "logfile": "simulated",
+            "vehicle": "simulated",
+            "date_captured": "2020-09-13",
+            "location": "simulated",
+        }
+    )
+    tables["map"].append(
+        {
+            "token": _token("map"),
+            "log_tokens": [_token("log")],
+            "category": "semantic_prior",
+            "filename": "maps/simulated.png",
+        }
+    )
+
+
+def _add_scene(tables: dict[str, list[Row]], sequence: Row) -> None:
+    """Add the rows of one scene: it, its samples, their scans, poses and labels."""
+    name = sequence["scene"]
+    scans = sequence["scans"]
+    scene = _token(name)
+    samples = [_token(name, "sample", index) for index in range(len(scans))]
+    tables["scene"].append(
+        {
+            "token": scene,
+            "log_token": _token("log"),
+            "nbr_samples": len(scans),
+            "name": name,
+            "first_sample_token": samples[0],
+            "last_sample_token": samples[-1],
+            "description": "simulated street",
+        }
+    )
+
+    sample_links = _links(samples)
+    scan_links = _links([scan["token"] for scan in scans])
+
+    for index, scan in enumerate(scans):
+        token = scan["token"]
+        time = scan["time"]
+        pose = np.array(scan["pose"])
+
+        tables["sample"].append(
+            {
+                "token": samples[index],
+                "timestamp": time,
+                "scene_token": scene,
+                **sample_links[index],
+            }
+        )
+        tables["sample_data"].append(
+            {
+                "token": token,
+                "sample_token": samples[index],
+                "ego_pose_token": token,
+                "calibrated_sensor_token": _token("calibrated_sensor"),
+                "timestamp": time,
+                "fileformat": "pcd",
+                "is_key_frame": True,
+                "height": 0,
+                "width": 0,
+                "filename": scan["file"],
+                **scan_links[index],
+            }
+        )
+        tables["ego_pose"].append(
+            {
+                "token": token,
+                "timestamp": time,
+                "rotation": _quaternion(pose[:3, :3]),
+                "translation": pose[:3, 3].tolist(),
+            }
+        )
+        tables["lidarseg"].append(
+            {"token": token, "sample_data_token": token, "filename": scan["labels"]}
+        )
+
+
+def _links(tokens: list[str]) -> list[Row]:
+    """Return the tokens of the previous and the next row for each row; "" at the ends."""
+    previous = ["", *tokens[:-1]]
+    following = [*tokens[1:], ""]
+    return [{"prev": a, "next": b} for a, b in zip(previous, following, strict=True)]
+
+
+def _quaternion(rotation: np.ndarray) -> list[float]:
+    """Return w, x, y, z of a rotation matrix."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return [float(w), float(x), float(y), float(z)]
+
+
+def _token(*parts: object) -> str:
+    text = "/".join(map(str, parts))
+    return hashlib.md5(text.encode(), usedforsecurity=False).hexdigest()
+
+
+def _matrix_text(matrix: np.ndarray) -> str:
+    """Return the first three rows of a matrix as KITTI writes them."""
+    return " ".join(f"{value:e}" for value in matrix[:3].ravel())
+
+
+def _write_empty_map(path: Path) -> None:
+    """Write the picture of a map that nuScenes' tools require."""
+    from matplotlib.image import imsave
+
+    picture = BytesIO()
+    imsave(picture, np.zeros((8, 8, 3), dtype=np.uint8), format="png")
+    write_whole(path, picture.getvalue())
+
+
+def _write_lines(path: Path, lines: list[str]) -> None:
+    write_whole(path, "".join(f"{line}\n" for line in lines).encode())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file that appears whole or not at all, and its folder if there is none.
+
+    Raises:
+        SimulationError: if there may be no such file.
+    """
+    part = path.with_name(f".{uuid.uuid4().hex}.part{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with WRITING:
+            try:
+                part.write_bytes(content)
+                os.replace(part, path)
+            finally:
+                part.unlink(missing_ok=True)
+    except (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
+        raise SimulationError(
+            f"{path}: expected a file that can be written, found {error.strerror}; "
+            "give another folder"
+        ) from None

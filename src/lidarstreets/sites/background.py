@@ -1,0 +1,130 @@
+"""Closes off the view: behind the plots, at the ends of a street and along its side roads."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarstreets.bodies import buildings, plants, trees
+from lidarstreets.mesh import Mesh
+from lidarstreets.sites.boundaries import SEGMENT, draw_boundary
+from lidarstreets.sites.land import plant_thickets
+from lidarstreets.sites.plot import Plot
+from lidarstreets.sites.site import Site
+from lidarstreets.streets.plans import SideRoad
+from lidarstreets.streets.styles import width_of
+
+# Metres between the trees, houses and copses of the second row, along the street.
+BACKGROUND_STEP = 14.0
+# Kinds of streets with houses behind the plots and along side roads.
+BUILT_UP = ("residential", "urban", "living", "avenue")
+
+
+def fill_background(site: Site, side: int) -> None:
+    """Put a second row of trees and houses behind the plots, which closes off the view."""
+    rng = site.rng
+    ground = site.ground
+    front = ground.front(side)
+    has_houses = ground.style.kind in BUILT_UP
+    # Some streets have a free view.
+    density = rng.choice([1.0, 0.6, 0.2], p=[0.6, 0.25, 0.15])
+
+    for x in np.arange(rng.uniform(0, 10), ground.length, BACKGROUND_STEP):
+        if rng.random() > density:
+            continue
+
+        t = side * (front + rng.uniform(32, 45))
+        if rng.random() < 0.45:
+            plot = Plot(site, side, x, BACKGROUND_STEP)
+            plant_thickets(plot, front + rng.uniform(24, 34))
+
+        if rng.random() < 0.35 and has_houses:
+            _put_background_house(site, x, t)
+        else:
+            site.put(trees.random_tree(rng, rng.uniform(6, 14), fine=False), x, t)
+
+        copse_t = side * (front + rng.uniform(42, 66))
+        copse = trees.copse(rng, BACKGROUND_STEP, rng.uniform(5, 12))
+        site.put(copse, x, copse_t, margin=10.0)
+
+
+def _put_background_house(site: Site, x: float, t: float) -> None:
+    rng = site.rng
+
+    width = rng.uniform(9, 16)
+    depth = rng.uniform(8, 12)
+    height = rng.uniform(*site.ground.style.storeys)
+
+    house = buildings.building(rng, width, depth, height, flat=rng.random() < 0.2)
+    site.put(house, x, t, rng.normal(scale=0.3), margin=6.0)
+
+
+def close_ends(site: Site) -> None:
+    """Put a hedge, a fence, a wall or a house behind the end of a street."""
+    rng = site.rng
+    ground = site.ground
+
+    for x, outwards in ((ground.plan.start, -1), (ground.plan.end, 1)):
+        if not np.isfinite(x):
+            continue
+
+        reach = max(ground.front(-1), ground.front(1))
+        if rng.random() < 0.4:
+            house = buildings.building(
+                rng, 2 * reach, 9.0, rng.uniform(*ground.style.storeys), flat=False
+            )
+            away = rng.uniform(9, 18)
+            site.put(house, x + outwards * away, 0.0, np.pi / 2, margin=5.0)
+            continue
+
+        is_wild = rng.random() < 0.33
+        layer, _ = draw_boundary(rng).layers[0]
+        for t in np.arange(-reach, reach, SEGMENT):
+            if is_wild:
+                segment = plants.bush(rng, rng.uniform(0.8, 1.8))
+            else:
+                segment = layer.segment(rng, SEGMENT)
+            site.put(segment, x + outwards * rng.uniform(1.5, 2.0), t + 1.2, np.pi / 2)
+
+
+def line_side_road(site: Site, road: SideRoad, side: int) -> None:
+    """Put hedges, walls, fences, trees and houses along one side of a side road."""
+    rng = site.rng
+    ground = site.ground
+    if ground.style.kind == "motorway":
+        return
+
+    edge = road.width / 2 + width_of(road.strips)
+    first = ground.front(road.side) + rng.uniform(1, 5)
+    last = min(road.length, first + rng.uniform(6, 22))
+
+    if rng.random() < 0.75:
+        layer, _ = draw_boundary(rng).layers[0]
+        for along in np.arange(first, last, SEGMENT):
+            _put_along(site, road, layer.segment(rng, SEGMENT), along, side * (edge + 0.4))
+
+    has_houses = ground.style.kind in BUILT_UP
+
+    for along in np.arange(first + 5, last + 10, rng.uniform(10, 20)):
+        width = rng.uniform(7, 12)
+        depth = rng.uniform(7, 11)
+        across = side * (edge + depth / 2 + rng.uniform(0.5, 6.0))
+        if has_houses and rng.random() < 0.5:
+            storeys = rng.uniform(*ground.style.storeys)
+            house = buildings.building(rng, width, depth, storeys, flat=rng.random() < 0.2)
+            _put_along(site, road, house, along + width / 2, across, reach=width / 2)
+        else:
+            _put_along(site, road, trees.random_tree(rng, rng.uniform(4, 9)), along, across)
+
+
+def _put_along(
+    site: Site, road: SideRoad, mesh: Mesh, along: float, across: float, reach: float = 1.0
+) -> None:
+    """Put a body next to a side road, unless the street or another road is within its reach."""
+    ground = site.ground
+    px, py, yaw = road.pose_at(along, across)
+    x = np.array([px])
+    y = np.array([py])
+    _, t = ground.street_coordinates(x, y)
+    is_clear = abs(t[0]) > ground.front(road.side) + reach
+    if is_clear and ground.distance_from_crossings(x, y)[0] > reach:
+        site.put_at(mesh, px, py, yaw)

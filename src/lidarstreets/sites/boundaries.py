@@ -1,0 +1,116 @@
+"""Hedges, walls and fences along the borders of plots and along streets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarstreets.bodies.fence_shapes import gate
+from lidarstreets.bodies.fences import Fence, draw_fence
+from lidarstreets.bodies.plants import Hedge, draw_hedge
+from lidarstreets.sites.plot import Plot
+
+# Metres: length of a segment of a boundary, and width of the drive to a garage.
+SEGMENT = 2.5
+DRIVE_WIDTH = 3.0
+# Chances that a boundary is a hedge, and that a fence has a hedge in front of or behind it.
+HEDGE = 0.62
+FENCE_AND_HEDGE = 0.14
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """One kind of boundary: a fence, a hedge, or both, one behind the other.
+
+    Attributes:
+        layers: each fence or hedge, and its distance from the line of the boundary in metres.
+        missing: share of the segments that are not there.
+    """
+
+    layers: tuple[tuple[Fence | Hedge, float], ...]
+    missing: float
+
+
+def draw_boundary(rng: np.random.Generator, kinds: dict[str, float] | None = None) -> Boundary:
+    """Draw a kind of boundary.
+
+    Args:
+        rng: draws it.
+        kinds: shares of the fences, as for `draw_fence`; only fences are drawn if it is given.
+    """
+    missing = float(rng.choice([0.0, 0.03, 0.2], p=[0.6, 0.3, 0.1]))
+    hedge_height = float(rng.uniform(0.4, 1.4) if rng.random() < 0.4 else rng.uniform(1.2, 3.0))
+    if kinds is None and rng.random() < HEDGE:
+        return Boundary(((draw_hedge(rng, hedge_height), 0.0),), missing)
+
+    fence = draw_fence(rng, kinds)
+    if rng.random() < FENCE_AND_HEDGE:
+        hedge = draw_hedge(rng, hedge_height)
+        offset = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.8))
+        return Boundary(((fence, 0.0), (hedge, offset)), missing)
+    return Boundary(((fence, 0.0),), missing)
+
+
+def line_up(
+    plot: Plot,
+    boundary: Boundary,
+    start: tuple[float, float],
+    end: tuple[float, float],
+    gap: tuple[float, float] | None = None,
+) -> None:
+    """Put the segments of a boundary in a straight line.
+
+    Args:
+        plot: gives the side of the street.
+        boundary: the kind of the boundary.
+        start, end: x along the street and distance from its middle line.
+        gap: x from and to of a drive that no segment closes off.
+    """
+    rng = plot.rng
+    line = np.array(end) - np.array(start)
+    length = float(np.linalg.norm(line))
+    if length < 1:
+        return
+
+    count = max(1, round(length / SEGMENT))
+    piece = length / count
+    yaw = np.arctan2(plot.side * line[1], line[0])
+
+    for index in range(count):
+        x, distance = np.array(start) + (index + 0.5) / count * line
+        closes_gap = gap is not None and gap[0] - piece / 2 < x < gap[1] + piece / 2
+        if closes_gap or rng.random() < boundary.missing:
+            continue
+
+        for layer, offset in boundary.layers:
+            segment = layer.segment(rng, piece)
+            plot.put_as_is(segment, x, distance + offset, yaw, margin=1.5)
+
+
+def enclose(plot: Plot, drive_x: float | None, depth: float) -> None:
+    """Put boundaries around a plot: along its front, at a side and perhaps at the back.
+
+    Args:
+        plot: the plot.
+        drive_x: where a drive begins that crosses the front, if there is one.
+        depth: metres from the front of the plot to its back.
+    """
+    rng = plot.rng
+    boundary = draw_boundary(rng)
+    front = plot.front + rng.choice([0.15, 0.5, 1.0, 2.5], p=[0.4, 0.4, 0.12, 0.08])
+    back = plot.front + depth
+
+    gap = None
+    if drive_x is not None:
+        gap = (drive_x, drive_x + DRIVE_WIDTH)
+        if rng.random() < 0.12:
+            closed = gate(rng, DRIVE_WIDTH, rng.uniform(0.8, 2.0))
+            plot.put(closed, drive_x + DRIVE_WIDTH / 2, front, margin=1.5)
+    line_up(plot, boundary, (plot.x, front), (plot.end, front), gap)
+
+    sides = boundary if rng.random() < 0.6 else draw_boundary(rng)
+    if rng.random() < 0.5:
+        line_up(plot, sides, (plot.x, front), (plot.x + rng.normal(scale=0.5), back))
+    if rng.random() < 0.3:
+        line_up(plot, sides, (plot.x, back), (plot.end, back))

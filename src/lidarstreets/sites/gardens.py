@@ -1,0 +1,151 @@
+"""Fills plots with houses: single ones in gardens, and rows along the sidewalk."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lidarstreets.bodies import buildings, clutter, furniture, plants, trees, vehicles
+from lidarstreets.materials import Label
+from lidarstreets.sites.boundaries import DRIVE_WIDTH, draw_boundary, enclose, line_up
+from lidarstreets.sites.land import plant_bushes, plant_thickets
+from lidarstreets.sites.plot import Plot
+
+
+def fill_house(plot: Plot) -> None:
+    """Put a house in a garden, with a drive and perhaps a hedge, wall or fence around it."""
+    rng = plot.rng
+    style = plot.style
+
+    width = plot.width * rng.uniform(0.45, 0.75)
+    depth = rng.uniform(8, 12)
+    setback = rng.uniform(*style.setback)
+    x = plot.middle + rng.uniform(-1, 1)
+
+    house = buildings.building(
+        rng, width, depth, height=rng.uniform(*style.storeys), flat=rng.random() < 0.15
+    )
+    turn = rng.normal(scale=0.03) if rng.random() < 0.8 else rng.uniform(-0.5, 0.5)
+    middle = plot.front + setback + depth / 2
+    plot.put(house, x, middle, plot.facing + turn, margin=width * 0.5)
+
+    drive_x = plot.x + 0.3 if rng.random() < 0.5 else plot.end - 3.3
+    _add_drive(plot, drive_x, setback + 5.0)
+    if rng.random() < 0.75 * style.fenced:
+        enclose(plot, drive_x, setback + rng.uniform(4, 20))
+    if rng.random() < 0.5:
+        plot.put(clutter.steps(rng), x, plot.front + setback, plot.facing)
+
+    _plant_garden(plot, setback)
+    _furnish(plot, setback)
+
+
+def _plant_garden(plot: Plot, depth: float) -> None:
+    """Plant bushes, trees and perhaps thickets in a front garden."""
+    rng = plot.rng
+    green = plot.style.green
+
+    plant_bushes(plot, rng.poisson(4.0 * green), depth)
+
+    for _ in range(rng.poisson(0.6 * green)):
+        distance = plot.front + rng.uniform(0.6, depth + 1)
+        tree = trees.random_tree(rng, rng.uniform(3, 9))
+        plot.put(tree, plot.random_x(), distance)
+
+    if rng.random() < 0.25 * green:
+        overgrown = replace(plot, width=plot.width * 0.7)
+        plant_thickets(overgrown, plot.front + rng.uniform(1.8, 3.0))
+    if rng.random() < 0.25:
+        bed = plants.flower_bed(rng, plot.width * rng.uniform(0.2, 0.5))
+        plot.put(bed, plot.middle, plot.front + rng.uniform(0.8, 3), margin=plot.width * 0.3)
+    if rng.random() < 0.2:
+        # Bushes or narrow trees in front of the house.
+        for x in np.arange(plot.x + plot.width * 0.3, plot.end - plot.width * 0.3, 1.4):
+            bush = plants.bush(rng, 0.6) if rng.random() < 0.7 else trees.column(rng, 2.0)
+            plot.put(bush, x, plot.front + depth - 0.5)
+
+
+def _furnish(plot: Plot, setback: float) -> None:
+    """Put bins, sheds, greenhouses and garden furniture on a plot."""
+    rng = plot.rng
+    front = plot.front
+
+    for _ in range(rng.poisson(1.0)):
+        distance = front + rng.uniform(0.3, setback + 1)
+        plot.put(clutter.yard_clutter(rng), plot.random_x(), distance, rng.uniform(0, np.pi))
+    for _ in range(rng.poisson(0.7)):
+        distance = front + rng.uniform(0.4, 1.5)
+        plot.put(clutter.clutter(rng), plot.random_x(), distance, plot.facing)
+    if rng.random() < 0.15:
+        plot.put(buildings.shed(rng), plot.x + 2, front + setback + rng.uniform(0, 10), margin=4)
+    if rng.random() < 0.05:
+        plot.put(buildings.greenhouse(rng), plot.end - 3, front + setback + 6, margin=5)
+    if rng.random() < 0.1:
+        gravel = (front, front + rng.uniform(1, setback + 1))
+        plot.pave((plot.x, plot.end), gravel, Label.OTHER_GROUND)
+
+
+def _add_drive(plot: Plot, x: float, depth: float) -> None:
+    """Pave a way to a garage, sometimes with a car on it."""
+    rng = plot.rng
+    front = plot.front
+
+    label = Label.PARKING if rng.random() < 0.2 else Label.SIDEWALK
+    plot.pave((x, x + DRIVE_WIDTH), (front, front + depth), label)
+
+    middle = x + DRIVE_WIDTH / 2
+    if rng.random() < 0.4:
+        car = vehicles.car(rng)
+        distance = front + min(3.0, depth / 2)
+        plot.put(car, middle, distance, plot.side * np.pi / 2, thing=True, margin=3.0)
+    if rng.random() < 0.4:
+        plot.put(buildings.shed(rng), middle, front + depth + 3.0, plot.facing, margin=4.0)
+
+
+def fill_row(plot: Plot) -> None:
+    """Put a house that fills the width of the plot, with a paved front."""
+    rng = plot.rng
+    style = plot.style
+    front = plot.front
+
+    setback = rng.uniform(*style.setback)
+    depth = rng.uniform(9, 14)
+
+    # Some rows step back from house to house, others are one long wall.
+    houses = int(rng.choice([1, 2, 3], p=[0.6, 0.2, 0.2]))
+    height = rng.uniform(*style.storeys)
+    is_flat = rng.random() < 0.4
+    width = plot.width / houses
+
+    for index in range(houses):
+        house = buildings.building(rng, width, depth, height + rng.normal(scale=0.5), is_flat)
+        x = plot.x + (index + 0.5) * width
+        step = rng.normal(scale=0.5) if houses > 1 else 0.0
+        distance = front + max(setback + step, 0.2) + depth / 2
+        plot.put(house, x, distance, plot.facing, margin=width * 0.5)
+
+    label = Label.SIDEWALK if rng.random() < 0.75 else Label.OTHER_GROUND
+    plot.pave((plot.x, plot.end), (front, front + setback + 0.5), label)
+    if setback > 1.2 and rng.random() < 0.4 * style.fenced:
+        line_up(plot, draw_boundary(rng), (plot.x, front + 0.2), (plot.end, front + 0.2))
+    if rng.random() < 0.4:
+        _park_two_wheelers(plot)
+    for _ in range(rng.poisson(1.8)):
+        distance = front + rng.uniform(-0.3, max(setback, 0.3))
+        plot.put(clutter.clutter(rng), plot.random_x(), distance, plot.facing)
+    if rng.random() < 0.12:
+        for x in np.arange(plot.x, plot.end, rng.uniform(1.2, 2.5)):
+            plot.put(furniture.post(rng), x, front - 0.2)
+
+
+def _park_two_wheelers(plot: Plot) -> None:
+    """Put up to three bicycles or motorcycles side by side at the front of a plot."""
+    rng = plot.rng
+
+    make = vehicles.bicycle if rng.random() < 0.75 else vehicles.motorcycle
+    for index in range(int(rng.integers(1, 4))):
+        two_wheeler = make(rng)
+        x = plot.x + plot.width * 0.3 + 0.6 * index
+        yaw = np.pi / 2 + rng.normal(scale=0.1)
+        plot.put(two_wheeler, x, plot.front - 0.4, yaw, thing=True)

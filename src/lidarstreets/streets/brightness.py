@@ -1,0 +1,59 @@
+"""How bright the ground of one street is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarstreets.materials import GROUND_SURFACES, REFLECTIONS, Label
+
+# Median reflectivities of asphalt and of other pavements, measured on KITTI's scans.
+ASPHALT = 0.28
+PAVEMENT = 0.34
+# Metres along and across the street: cells within which the surface has been repaired or not.
+CELL = (7.0, 1.6)
+# Cells in each direction before they repeat.
+CELLS = 64
+# Metres: radius of a manhole, which lies in the middle of its cell.
+MANHOLE = 0.33
+
+
+class GroundBrightness:
+    """The tints of the ground of one street, as in `Mesh`."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._tints = 0.9 * rng.standard_normal(256)  # by class id
+        wanted = {Label.ROAD: rng.lognormal(np.log(ASPHALT), 0.17)}
+        if rng.random() < 0.12:
+            wanted[Label.ROAD] = rng.uniform(0.33, 0.44)  # concrete or cobbles
+
+        # Half of the sidewalks, lots and paved verges are asphalt or as bright as it.
+        for label in (Label.SIDEWALK, Label.PARKING, Label.OTHER_GROUND):
+            if rng.random() < 0.5:
+                wanted[label] = wanted[Label.ROAD] * rng.lognormal(0, 0.06)
+            else:
+                wanted[label] = rng.lognormal(np.log(PAVEMENT), 0.2)
+
+        for label, reflectivity in wanted.items():
+            reflection = REFLECTIONS[GROUND_SURFACES[label]]
+            ratio = np.log(reflectivity / reflection.reflectivity)
+            self._tints[label] = ratio / reflection.shade
+
+        # Random numbers for the repairs of the road and its manholes.
+        self._cells = rng.random((CELLS, CELLS))
+
+    def terrain_tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
+        """Return the tint at positions x, y of classes `label`, without repairs: all (N,)."""
+        pattern = np.sin(0.21 * x + 1.3 * np.sin(0.13 * y))
+        return self._tints[label] + 0.8 * pattern * np.sin(0.33 * y + 0.05 * x)
+
+    def repairs(self, along: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return what repairs and manholes add to the tint at street coordinates: all (N,)."""
+        length, width = CELL
+        rows = (along // length).astype(int) % CELLS
+        columns = (t // width).astype(int) % CELLS
+        chance = self._cells[rows, columns]
+
+        change = np.where(chance < 0.06, -2.5, 0.0) + np.where(chance > 0.96, 2.0, 0.0)
+        from_middle = np.hypot(along % length - length / 2, t % width - width / 2)
+        is_manhole = (from_middle < MANHOLE) & (chance % 0.1 < 0.02)
+        return change - np.where(is_manhole, 4.0, 0.0)

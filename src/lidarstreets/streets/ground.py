@@ -1,0 +1,275 @@
+"""The ground of one street: its height, class and brightness at any position."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarstreets.materials import Label, Surface
+from lidarstreets.mesh import Mesh, part
+from lidarstreets.streets.brightness import GroundBrightness
+from lidarstreets.streets.markings import is_painted
+from lidarstreets.streets.middle_line import MiddleLine, draw_bends
+from lidarstreets.streets.places import Places, is_bay, locate
+from lidarstreets.streets.planning import Planner
+from lidarstreets.streets.plans import strip_at
+from lidarstreets.streets.relief import Relief
+from lidarstreets.streets.styles import Strip, Style, width_of
+
+# Metres: spacing of the two grids of the ground, and how far from the middle line they reach.
+FINE_STEP = 0.62
+FINE_REACH = 32.0
+COARSE_STEP = 4.0
+COARSE_REACH = 110.0
+# Metres by which the coarse grid is lower, so that the fine one covers it.
+COARSE_DROP = 0.3
+# Metres by which the grids go on beyond the ends of the land.
+OVERHANG = 10.0
+# Metres on either side of a kerb over which its height changes.
+KERB_RAMP = 0.03
+# Rise over run from the edge of a road to its crown.
+CROWN_SLOPE = 0.02
+# Metres: height of an island over the road.
+ISLAND_HEIGHT = 0.14
+# Metres along the street from the top of a hump to its foot.
+HUMP_REACH = 1.8
+# Height of the kerb at a drive, as a share of its height elsewhere, and metres along the street
+# over which it changes.
+DRIVE_KERB = 0.2
+DRIVE_RAMP = 0.8
+# Metres: vehicles leave their lane this far before the ring of a roundabout.
+SWERVE = 8.0
+
+
+@dataclass(frozen=True)
+class Patch:
+    """A rectangle of other ground off the road, in street coordinates.
+
+    Attributes:
+        x: from and to, along the street.
+        t: from and to, across the street.
+        label: class of the ground.
+    """
+
+    x: tuple[float, float]
+    t: tuple[float, float]
+    label: Label
+
+
+class Ground(MiddleLine):
+    """Height and class of the ground of one street at any position.
+
+    The methods take and return arrays of one shape unless they say otherwise; lengths are in
+    metres.
+
+    Args:
+        style: the numbers of the street.
+        length: of the land along x.
+        rng: draws the plan and the relief.
+        course: from and to, the x between which the sensor drives; all of the street if None.
+    """
+
+    def __init__(
+        self,
+        style: Style,
+        length: float,
+        rng: np.random.Generator,
+        course: tuple[float, float] | None = None,
+    ) -> None:
+        super().__init__(draw_bends(style, rng))
+        self.style = style
+        self.length = length
+        self.patches: list[Patch] = []
+        # Stretches (side, from, to) along the street that no plot may use.
+        self.reserved: list[tuple[int, float, float]] = []
+
+        self._relief = Relief(style, rng)
+        self.plan = Planner(style, self, length, course or (0.0, length), rng).draw()
+        # Distance along the street from drive to drive, where the kerb is lowered, and their width.
+        self._drive_period = rng.uniform(9, 30)
+        self._drive_width = rng.uniform(1.5, 4.0)
+        self._brightness = GroundBrightness(rng)
+
+    def lane_pose(self, x: float, t: float) -> tuple[float, float, float]:
+        """Return (x, y, yaw) of a vehicle in the lane at t, which goes round a roundabout."""
+        step = 0.5
+        swerve = self._swerve(x, t)
+        px, py, yaw = self.pose_at(x, swerve)
+        return px, py, yaw + float(np.arctan((self._swerve(x + step, t) - swerve) / step))
+
+    def _swerve(self, x: float, t: float) -> float:
+        """Return t of a lane next to a roundabout."""
+        if self.plan.roundabout is None:
+            return t
+
+        roundabout = self.plan.roundabout
+        share = min(abs(x - roundabout.street_x) / (roundabout.radius + SWERVE), 1.0)
+        weight = np.cos(0.5 * np.pi * share) ** 1.5
+        side = 1 if t >= 0 else -1
+        return float(t + weight * (side * roundabout.ring - t))
+
+    def distance_from_crossings(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the distance from the nearest side road or roundabout; negative on it."""
+        nearest = np.full(np.shape(x), np.inf)
+        for crossing in self.plan.crossings:
+            nearest = np.minimum(nearest, crossing.distance(x, y))
+        if self.plan.roundabout:
+            nearest = np.minimum(nearest, self.plan.roundabout.distance(x, y))
+        return nearest
+
+    def is_street(self, x: float, margin: float = 0.0) -> bool:
+        """Return whether the street passes x, `margin` metres or more from its ends."""
+        return self.plan.start + margin < x < self.plan.end - margin
+
+    def front(self, side: int) -> float:
+        """Return |t| where the plots of one side (-1 right, 1 left) begin."""
+        return self.kerb_t(side) + width_of(self.style.strips[int(side > 0)])
+
+    def kerb_t(self, side: int) -> float:
+        """Return |t| of the kerb of one side, away from side roads."""
+        return self.style.road / 2 + self.style.parking[int(side > 0)]
+
+    def is_bay(self, x: float) -> bool:
+        """Return whether the parking lanes are not interrupted by an island at x."""
+        return bool(is_bay(np.array([x]), self.style.parking_period)[0])
+
+    def height(self, x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
+        """Return the height of the ground at positions x, y."""
+        x = np.asarray(x, dtype=float)
+        y = np.asarray(y, dtype=float)
+        return self._height(x, y, locate(self, self.plan, x, y))
+
+    def _height(self, x: np.ndarray, y: np.ndarray, places: Places) -> np.ndarray:
+        """Return the height at positions x, y, which lie at `places` in the street."""
+        style = self.style
+        z = self._relief.hills(x, y)
+
+        # The crown of the road, its humps, and the islands on it.
+        z = z - CROWN_SLOPE * np.minimum(np.abs(places.t), style.road / 2)
+        for hump_x, hump_height in self.plan.humps:
+            bump = np.clip(1 - ((places.x - hump_x) / HUMP_REACH) ** 2, 0, 1)
+            z = z + np.where(places.road < 0, hump_height * bump, 0)
+        z = z + ISLAND_HEIGHT * _ramp(-places.island)
+
+        # The kerb is lower at drives.
+        from_drive = (places.x + 0.3 * self._drive_period) % self._drive_period
+        beyond_drive = np.clip((from_drive - self._drive_width) / DRIVE_RAMP, 0, 1)
+        kerb = style.kerb * (DRIVE_KERB + (1 - DRIVE_KERB) * beyond_drive)
+
+        for strips, is_here in self._profiles(places):
+            rise = np.zeros(np.shape(x))
+            edge = 0.0
+            level = 0.0
+            for strip in strips:
+                next_level = 1.0 if strip.raised else 0.0
+                if next_level != level:
+                    rise = rise + (next_level - level) * _ramp(places.kerb - edge)
+                level = next_level
+                edge += strip.width
+            z = z + np.where(is_here, kerb * rise, 0)
+
+        # Along side roads, the land begins as far from the kerb as along the street.
+        right = width_of(style.strips[0])
+        left = width_of(style.strips[1])
+        pavement = right + (left - right) * np.clip(0.5 + places.t / 4, 0, 1)
+        return z + self._relief.beyond(places.kerb - pavement, places.t, places.x, x, y)
+
+    def _profiles(self, places: Places) -> list[tuple[tuple[Strip, ...], np.ndarray]]:
+        """Return the strips of each road, and whether it is the nearest one of each place."""
+        is_street = places.branch < 0
+        profiles = [
+            (self.style.strips[0], is_street & (places.t < 0)),
+            (self.style.strips[1], is_street & (places.t >= 0)),
+        ]
+        for index, crossing in enumerate(self.plan.crossings):
+            profiles.append((crossing.strips, places.branch == index))
+        return profiles
+
+    def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the class ids of the ground at positions x, y, (N,) each: (N,) uint16."""
+        places = locate(self, self.plan, x, y)
+
+        # From the plots to the road: each step may overwrite those before it.
+        label = np.full(np.shape(x), Label.TERRAIN, dtype=np.uint16)
+        off = np.zeros(np.shape(x))
+        for strips, is_here in self._profiles(places):
+            rows = np.flatnonzero(is_here)
+            label[rows], off[rows] = strip_at(strips, places.kerb[rows], Label.TERRAIN)
+
+        plots = np.flatnonzero(off >= 0)
+        plot_x = places.x[plots]
+        plot_t = places.t[plots]
+
+        for patch in self.patches:
+            inside = (plot_x > patch.x[0]) & (plot_x < patch.x[1])
+            inside &= (plot_t > patch.t[0]) & (plot_t < patch.t[1])
+            label[plots[inside]] = patch.label
+
+        label[(places.kerb < 0) & (places.road >= 0)] = Label.PARKING
+        on_road = places.road < 0
+        label[on_road] = Label.ROAD
+        if self.style.painted:
+            label[on_road & is_painted(self.plan, places)] = Label.LANE_MARKING
+
+        for island in self.plan.islands:
+            label[island.distance(places.x, places.t) < 0] = island.label
+        if self.plan.roundabout:
+            on_island = self.plan.roundabout.island_distance(x, y) < 0
+            label[on_island] = self.plan.roundabout.label
+        return label
+
+    def tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
+        """Return the tint of the ground, as in `Mesh`; it varies from place to place."""
+        tint = self._brightness.terrain_tint(x, y, label)
+        is_paved = label != Label.TERRAIN
+        along, t = self.street_coordinates(x[is_paved], y[is_paved])
+        tint[is_paved] += self._brightness.repairs(along, t)
+        return tint
+
+    def mesh(self) -> Mesh:
+        """Return the ground as triangles of class 0: a fine grid over a coarse one."""
+        fine = self._grid(FINE_STEP, FINE_REACH, 0.0)
+        coarse = self._grid(COARSE_STEP, COARSE_REACH, COARSE_DROP)
+        return part([fine, coarse], Surface.GRASS, 0)
+
+    def _grid(self, step: float, reach: float, drop: float) -> np.ndarray:
+        """Return the (T, 3, 3) triangles of a square grid up to `reach` from the middle line."""
+        xs = np.arange(-OVERHANG, self.length + OVERHANG, step)
+        lowest_y = self.middle(xs).min() - reach
+        highest_y = self.middle(xs).max() + reach
+        x, y = np.meshgrid(xs, np.arange(lowest_y, highest_y, step), indexing="ij")
+
+        places = locate(self, self.plan, x, y)
+        z = self._height(x, y, places)
+        if not drop:
+            self._sharpen(x, y, z, places)
+        corners = np.stack([x, y, z - drop], axis=-1).astype(np.float32)
+        within = np.abs(places.t[:-1, :-1]) < reach
+
+        a = corners[:-1, :-1][within]
+        b = corners[1:, :-1][within]
+        c = corners[1:, 1:][within]
+        d = corners[:-1, 1:][within]
+        return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+    def _sharpen(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, places: Places) -> None:
+        """Move the corners next to a kerb to its two edges, so that it is steep."""
+        edge = np.where(np.abs(places.kerb) < np.abs(places.island), places.kerb, places.island)
+        slope_x = np.zeros_like(edge)
+        slope_y = np.zeros_like(edge)
+        slope_x[1:-1] = (edge[2:] - edge[:-2]) / (2 * FINE_STEP)
+        slope_y[:, 1:-1] = (edge[:, 2:] - edge[:, :-2]) / (2 * FINE_STEP)
+
+        # Corners between two edges, where the distance has no clear direction, stay.
+        square = slope_x**2 + slope_y**2
+        near = (np.abs(edge) < 0.8 * FINE_STEP) & (square > 0.8) & (square < 1.2)
+        target = np.where(edge[near] < 0, -KERB_RAMP, KERB_RAMP) - edge[near]
+        x[near] += target * slope_x[near] / square[near]
+        y[near] += target * slope_y[near] / square[near]
+        z[near] = self.height(x[near], y[near])
+
+
+def _ramp(distance: np.ndarray) -> np.ndarray:
+    """Return 0 on the road, 1 behind the kerb, and a steep line over the kerb itself."""
+    return np.clip((distance + KERB_RAMP) / (2 * KERB_RAMP), 0, 1)

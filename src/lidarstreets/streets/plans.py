@@ -1,0 +1,201 @@
+"""The plan of a street: side roads, roundabouts and islands, each as a distance from its edge."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidarstreets.materials import Label
+from lidarstreets.streets.styles import Strip, Style, width_of
+
+# A bent side road goes on straight once its direction has changed by about this tangent.
+LARGEST_TURN = 0.9
+
+
+@dataclass(frozen=True)
+class SideRoad:
+    """A road that leaves the street on one side.
+
+    Attributes:
+        x, y: where its middle line meets that of the street, metres.
+        street_x: the same place along the street.
+        yaw: its direction there, away from the street, radians.
+        side: the side on which it leaves the street, -1 right and 1 left.
+        width: metres.
+        bend: curvature in 1 / metres, positive to the left.
+        length: metres from the middle line of the street to its end; may be infinite.
+        turning: radius of the circle at its end; 0 if there is none.
+        corner: radius of the kerb at the junction, metres.
+        strips: what lies along both of its kerbs.
+    """
+
+    x: float
+    y: float
+    street_x: float
+    yaw: float
+    side: int
+    width: float
+    bend: float = 0.0
+    length: float = np.inf
+    turning: float = 0.0
+    corner: float = 4.0
+    strips: tuple[Strip, ...] = ()
+
+    def coordinates(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return distances along the road and to the left of its middle line."""
+        cos = np.cos(self.yaw)
+        sin = np.sin(self.yaw)
+        along = (x - self.x) * cos + (y - self.y) * sin
+        across = (y - self.y) * cos - (x - self.x) * sin
+
+        if self.bend:
+            bent = np.clip(along, 0, LARGEST_TURN / abs(self.bend))
+            tangent = self.bend * bent
+            middle = 0.5 * tangent * bent + tangent * (along - bent)
+            across = (across - middle) / np.sqrt(1 + tangent**2)
+        return along, across
+
+    def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the distance from the edge of the road; negative on it."""
+        along, across = self.coordinates(x, y)
+        distance = np.maximum(np.abs(across) - self.width / 2, -along)
+        if np.isfinite(self.length):
+            distance = np.maximum(distance, along - self.length)
+        if self.turning:
+            circle = np.hypot(along - self.length, across) - self.turning
+            distance = np.minimum(distance, circle)
+        return distance
+
+    def pose_at(self, along: float, across: float) -> tuple[float, float, float]:
+        """Return (x, y, yaw) of a place on the road; yaw is away from the street."""
+        bent = min(along, LARGEST_TURN / abs(self.bend)) if self.bend else along
+        tangent = self.bend * bent
+        middle = 0.5 * tangent * bent + tangent * (along - bent)
+        turn = float(np.arctan(tangent))
+
+        forward = along - across * np.sin(turn)
+        left = middle + across * np.cos(turn)
+        x = self.x + forward * np.cos(self.yaw) - left * np.sin(self.yaw)
+        y = self.y + forward * np.sin(self.yaw) + left * np.cos(self.yaw)
+        return float(x), float(y), self.yaw + turn
+
+
+@dataclass(frozen=True)
+class Roundabout:
+    """A roundabout on the middle line of the street.
+
+    Attributes:
+        x, y: its centre, metres.
+        street_x: the same place along the street.
+        radius: outer radius of the ring.
+        island: radius of the island in its middle.
+        label: class of the island.
+    """
+
+    x: float
+    y: float
+    street_x: float
+    radius: float
+    island: float
+    label: Label
+
+    @property
+    def ring(self) -> float:
+        """Radius on which vehicles drive."""
+        return (self.radius + self.island) / 2
+
+    def distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the distance from the outer edge of the ring; negative within it."""
+        return np.hypot(x - self.x, y - self.y) - self.radius
+
+    def island_distance(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the distance from the edge of the island; negative on it."""
+        return np.hypot(x - self.x, y - self.y) - self.island
+
+
+@dataclass(frozen=True)
+class Island:
+    """A raised rectangle with round ends on the road, in street coordinates.
+
+    Attributes:
+        x: from and to, along the street.
+        t: from and to, across the street.
+        label: class of its surface.
+    """
+
+    x: tuple[float, float]
+    t: tuple[float, float]
+    label: Label
+
+    def distance(self, along: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Return the distance from its edge; negative on it."""
+        radius = min(self.x[1] - self.x[0], self.t[1] - self.t[0]) / 2
+        half_x = (self.x[1] - self.x[0]) / 2 - radius
+        half_t = (self.t[1] - self.t[0]) / 2 - radius
+
+        outside_x = np.maximum(np.abs(along - sum(self.x) / 2) - half_x, 0)
+        outside_t = np.maximum(np.abs(t - sum(self.t) / 2) - half_t, 0)
+        return np.hypot(outside_x, outside_t) - radius
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The plan of one street; lengths are in metres.
+
+    Attributes:
+        style: the numbers of the street.
+        start, end: x where the street begins and ends; infinite if it does so out of sight.
+        roundabout: None if there is none.
+        crossings: the side roads.
+        islands: in the middle of the road.
+        humps: (H, 2) x and height of the humps of the road.
+        crosswalks: x from and to of each zebra crossing.
+    """
+
+    style: Style
+    start: float
+    end: float
+    roundabout: Roundabout | None
+    crossings: tuple[SideRoad, ...]
+    islands: tuple[Island, ...]
+    humps: np.ndarray
+    crosswalks: tuple[tuple[float, float], ...]
+
+
+def rounded_union(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+    """Return the distance from the union of two areas whose inner corners are rounded.
+
+    Args:
+        a, b: distances from the edges of the two areas, negative on them.
+        radius: of the corners, metres.
+    """
+    inside_a = np.maximum(radius - a, 0)
+    inside_b = np.maximum(radius - b, 0)
+    corner = radius - np.hypot(inside_a, inside_b)
+    nearest = np.minimum(a, b)
+    is_corner = (a > 0) & (b > 0) & (nearest < radius)
+    return np.where(is_corner, corner, nearest)
+
+
+def strip_at(
+    strips: Sequence[Strip], kerb: np.ndarray, beyond: Label
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return class and distance beyond the strips at distances from the kerb.
+
+    Args:
+        strips: from the kerb outwards.
+        kerb: (N,) distances, negative on the road.
+        beyond: class of the ground behind the strips.
+
+    Returns:
+        (N,) uint16 class ids; (N,) distances from the outer edge of the last strip.
+    """
+    label = np.full(np.shape(kerb), beyond, dtype=np.uint16)
+    outer = width_of(strips)
+    edge = outer
+    for strip in reversed(strips):
+        label[kerb < edge] = strip.label
+        edge -= strip.width
+    return label, kerb - outer

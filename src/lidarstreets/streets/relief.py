@@ -1,0 +1,81 @@
+"""The relief of the land that a street lies in."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidarstreets.streets.styles import Style
+
+# Metres behind the pavement beyond which the land no longer rises.
+FARTHEST_RISE = 30.0
+# Steepest mean slope of a street and across it: rise over run.
+STEEPEST = 0.12
+
+
+class Relief:
+    """Hills, banks and bumps; the methods take and return arrays of one shape."""
+
+    def __init__(self, style: Style, rng: np.random.Generator) -> None:
+        self._banks = style.bank
+        slopes = rng.normal(scale=0.03, size=2) if rng.random() < 0.6 else np.zeros(2)
+        self._slope = np.clip(slopes * np.array([1.0, 0.4]), -STEEPEST, STEEPEST)
+
+        # Hills: amplitude, wave vector and phase of three waves, from long to short.
+        wavelengths = np.array([rng.uniform(200, 400), rng.uniform(80, 160), rng.uniform(25, 60)])
+        amplitudes = np.array([1.2, 0.4, 0.07]) * rng.uniform(0.1, 1.4, size=3)
+        direction = rng.uniform(0, np.pi, size=3)
+        wave_x = 2 * np.pi / wavelengths * np.cos(direction)
+        wave_y = 2 * np.pi / wavelengths * np.sin(direction)
+        self._hills = np.column_stack([amplitudes, wave_x, wave_y, direction * 5])
+
+        # Bumps: amplitude, wave vector and phase, from 14 m to 1.3 m long.
+        count = 6
+        wavelengths = np.geomspace(14, 1.3, count) * rng.uniform(0.8, 1.2, size=count)
+        amplitudes = rng.lognormal(np.log(0.035), 0.55) * np.geomspace(1.8, 0.5, count)
+        direction = rng.uniform(0, np.pi, size=count)
+        wave_x = 2 * np.pi / wavelengths * np.cos(direction)
+        wave_y = 2 * np.pi / wavelengths * np.sin(direction)
+        phase = rng.uniform(0, 2 * np.pi, size=count)
+        self._bumps = np.column_stack([amplitudes, wave_x, wave_y, phase])
+        self._modulation = rng.uniform(0, 2 * np.pi, size=4)
+
+    def hills(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Return the height of the land as far as roads follow it."""
+        z = self._slope[0] * x + self._slope[1] * np.clip(y, -60, 60)
+        return z + _waves(self._hills, x, y)
+
+    def beyond(
+        self, off: np.ndarray, t: np.ndarray, along: np.ndarray, x: np.ndarray, y: np.ndarray
+    ) -> np.ndarray:
+        """Return the height over the hills at distances behind the pavement.
+
+        Args:
+            off: distance from the pavement in metres; 0 and less on it.
+            t, along: street coordinates.
+            x, y: places.
+        """
+        off = np.clip(off, 0, FARTHEST_RISE)
+        z = np.zeros(np.shape(off))
+
+        for side, bank in enumerate(self._banks):
+            # The two sides meet on the road, or behind its end.
+            weight = np.clip(0.5 + (t if side else -t) / 4, 0, 1)
+            # Along the street, the bank is between a third of its height and all of it.
+            share = 0.67 + 0.33 * np.sin(0.03 * along + self._modulation[side])
+            step = np.clip((off - bank.start) / bank.width, 0, 1)
+            rise = bank.rise * share * step * step * (3 - 2 * step)
+            trench = bank.ditch * np.exp(-(((off - 1.6) / 0.7) ** 2)) * np.clip(off / 0.3, 0, 1)
+            z = z + weight * (bank.slope * off + rise - trench)
+
+        # Some places are smooth, others rough.
+        patchy = np.sin(0.11 * x + self._modulation[2]) * np.sin(0.13 * y + self._modulation[3])
+        bumps = _waves(self._bumps, x, y) * (1 + 0.8 * patchy)
+        return z + np.clip(off / 1.5, 0, 1) * bumps
+
+
+def _waves(waves: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the sum of waves, rows of amplitude, wave vector (x, y) and phase."""
+    z = np.zeros(np.shape(x))
+    for amplitude, wave_x, wave_y, phase in waves:
+        z = z + amplitude * np.sin(wave_x * x + wave_y * y + phase)
+    return z

@@ -1,0 +1,209 @@
+"""Write simulated sequences on several processes, and continue where a call was stopped."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidarstreets.drive import drive_street
+from lidarstreets.errors import SimulationError
+from lidarstreets.layouts import LAYOUTS, WRITING, write_whole
+from lidarstreets.sensing.lidar import require_embree, take_one_thread
+from lidarstreets.sensing.sensors import SENSORS, sensor_of
+
+Progress = Callable[[int, int], None]  # scans written, scans in all
+# Environment variables that set the number of threads of the numerical libraries.
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# Folder with a file for each complete sequence: its settings, and what the layout keeps of it.
+MARKERS = ".simulation"
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """One sequence to write."""
+
+    out: Path
+    sensor: str
+    number: int
+    scans: int
+    seed: int
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The settings that, with its number, determine the bytes of the sequence."""
+        return {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
+
+    @property
+    def marker(self) -> Path:
+        """The file that exists once the sequence is complete."""
+        return self.out / MARKERS / f"{self.number:04d}.json"
+
+
+def simulate(
+    out: Path | str,
+    *,
+    sensor: str = "hdl64e",
+    sequences: int = 1,
+    scans: int = 10,
+    seed: int = 0,
+    first_sequence: int = 0,
+    processes: int = 1,
+    progress: Progress = lambda done, total: None,
+) -> Path:
+    """Write labelled scans of procedural streets.
+
+    The same seed gives the same bytes on any number of processes. Sequences that an earlier call
+    has completed are kept.
+
+    Args:
+        out: folder to write to, in the layout of SemanticKITTI (HDL-64E) or nuScenes-lidarseg
+            (HDL-32E).
+        sensor: name of a sensor in `SENSORS`.
+        sequences: number of sequences; each is another street.
+        scans: number of scans in each sequence.
+        seed: seed of all randomness.
+        first_sequence: number of the first sequence.
+        processes: number of sequences that are simulated in parallel; a script that asks for more
+            than one needs Python's `if __name__ == "__main__"`.
+        progress: called with the number of scans written and the number in all.
+
+    Returns:
+        The folder `out`.
+
+    Raises:
+        SimulationError: if the sensor is unknown, a number is too small, embreex is missing, or the
+            folder holds a sequence with other settings.
+    """
+    layout = LAYOUTS[sensor_of(sensor).layout]
+    _check_at_least(1, sequences=sequences, scans=scans, processes=processes)
+    _check_at_least(0, seed=seed, first_sequence=first_sequence)
+    require_embree()
+
+    out = Path(out)
+    numbers = range(first_sequence, first_sequence + sequences)
+    wanted = [Sequence(out, sensor, number, scans, seed) for number in numbers]
+    missing = [sequence for sequence in wanted if not _is_complete(sequence)]
+    done = scans * (len(wanted) - len(missing))
+    for written in _write_sequences(missing, min(processes, len(missing))):
+        done += written
+        progress(done, scans * sequences)
+
+    # The layout's tables cover all sequences in the folder, those of earlier calls too.
+    markers = sorted((out / MARKERS).glob("*.json"))
+    rows = [json.loads(path.read_text())["rows"] for path in markers]
+    layout.complete(out, rows)
+    return out
+
+
+def _is_complete(sequence: Sequence) -> bool:
+    """Return whether an earlier call has completed a sequence.
+
+    Raises:
+        SimulationError: if it has other settings.
+    """
+    if not sequence.marker.is_file():
+        return False
+
+    settings = json.loads(sequence.marker.read_text())
+    del settings["rows"]
+    if settings != sequence.settings:
+        raise SimulationError(
+            f"{sequence.out}: expected sequence {sequence.number} with {sequence.settings}, "
+            f"found it with {settings}; choose another folder"
+        )
+    return True
+
+
+def _write_sequences(sequences: list[Sequence], processes: int) -> Iterator[int]:
+    """Write sequences; yield the number of scans each time that some are written."""
+    if processes <= 1:
+        for sequence in sequences:
+            yield from _write(sequence)
+        return
+
+    # Spawned, as a fork of a process that has computed with torch may hang.
+    context = multiprocessing.get_context("spawn")
+    lifeline, parents_end = context.Pipe(duplex=False)
+    with ProcessPoolExecutor(processes, context, _start_worker, (lifeline,)) as pool:
+        try:
+            with _inherited_by_workers():
+                jobs = [pool.submit(_write_all, sequence) for sequence in sequences]
+            for job in as_completed(jobs):
+                yield job.result()
+        except BaseException:
+            parents_end.close()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+@contextmanager
+def _inherited_by_workers() -> Iterator[None]:
+    """Let processes started in this context compute with one thread and leave signals alone.
+
+    Ctrl-C reaches all processes of a terminal. Workers end with their parent, see `_start_worker`.
+    """
+    variables = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        for name, value in variables.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+def _start_worker(lifeline: Connection) -> None:
+    """Prepare a process of the pool: one thread, and an end as soon as its parent wants or dies.
+
+    Args:
+        lifeline: a pipe whose other end is closed by the parent, or by the system if it is killed.
+    """
+
+    def watch() -> None:
+        lifeline.poll(None)
+        with WRITING:  # no file stays half-written
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+    take_one_thread()
+
+
+def _write_all(sequence: Sequence) -> int:
+    return sum(_write(sequence))
+
+
+def _write(sequence: Sequence) -> Iterator[int]:
+    """Write one sequence; yield 1 after each scan."""
+    model = SENSORS[sequence.sensor]
+    layout = LAYOUTS[model.layout](sequence.out, sequence.number)
+    seed = np.random.SeedSequence((sequence.seed, sequence.number))
+    for index, scan in enumerate(drive_street(model, sequence.scans, seed)):
+        layout.write_scan(index, scan)
+        yield 1
+
+    rows = layout.finish()
+    marker = json.dumps({**sequence.settings, "rows": rows})
+    write_whole(sequence.marker, marker.encode())
+
+
+def _check_at_least(least: int, **numbers: int) -> None:
+    for name, value in numbers.items():
+        if value < least:
+            raise SimulationError(
+                f"simulate: expected {name} of {least} or more, found {value}; give a larger number"
+            )

@@ -1,0 +1,252 @@
+"""The simulated LiDAR: scenes whose scans can be worked out by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarstreets import SENSORS
+from lidarstreets.materials import REFLECTIONS, Label, Surface
+from lidarstreets.mesh import Mesh, join, part, place, with_random_tint
+from lidarstreets.sensing.sensors import LidarModel
+from lidarstreets.solids import box, hull
+
+pytest.importorskip("embreex")
+from lidarstreets.sensing.lidar import RayScene, trace
+from lidarstreets.sensing.returns import laser_gains, receive
+
+HDL64E = SENSORS["hdl64e"]
+# A sensor without noise, losses or motion; the tests turn on what they need.
+EXACT = replace(
+    HDL64E,
+    range_noise=0.0,
+    drop=0.0,
+    mixed=0.0,
+    gain_spread=0.0,
+    decimals=6,
+    rotation_period=0.0,
+)
+
+Points = tuple[np.ndarray, np.ndarray]
+
+
+class PlainRoad:
+    """Ground that is road everywhere."""
+
+    def label(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.full(len(x), Label.ROAD, dtype=np.uint16)
+
+    def tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
+        return np.zeros(len(x), dtype=np.float32)
+
+
+def scan_mesh(
+    mesh: Mesh,
+    sensor: LidarModel = EXACT,
+    pose: np.ndarray | None = None,
+    speed: float = 0.0,
+    seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points, labels and rings of one scan of a mesh."""
+    if pose is None:
+        pose = np.eye(4)
+    rng = np.random.default_rng(seed)
+    hits = trace([RayScene(mesh)], sensor, pose, PlainRoad(), rng, speed=speed)
+    return receive(hits, sensor, laser_gains(sensor, rng), rng)
+
+
+def wall(x: float, y: tuple[float, float] = (-30, 30)) -> Mesh:
+    """Return a wall across the sensor's x axis, 20 m high."""
+    right, left = y
+    lower = [[x, right, -10], [x, left, -10], [x, left, 10]]
+    upper = [[x, right, -10], [x, left, 10], [x, right, 10]]
+    return part([np.array([lower, upper])], Surface.PLASTER, Label.BUILDING)
+
+
+def slab(start: float, end: float, depth: float) -> Mesh:
+    """Return foliage from one x to another, 30 m wide and 20 m high, its skin facing outwards."""
+    middle = ((start + end) / 2, 0, 0)
+    triangles = box((end - start, 30, 20), (middle[0], 0, -10))
+    edges = np.diff(triangles, axis=1)
+    normals = np.cross(edges[:, 0], edges[:, 1])
+    inward = np.einsum("ti,ti->t", normals, triangles.mean(axis=1) - middle) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return part([triangles], Surface.LEAF, Label.VEGETATION, depth)
+
+
+@pytest.fixture(scope="module")
+def ground() -> Points:
+    """Points and rings of a plane below the sensor."""
+    far = 500.0
+    right = [[-far, -far, 0], [far, -far, 0], [far, far, 0]]
+    left = [[-far, -far, 0], [far, far, 0], [-far, far, 0]]
+    plane = part([np.array([right, left])], Surface.GRASS, 0)
+    pose = np.eye(4)
+    pose[:3, 3] = (3.0, -2.0, HDL64E.height)
+
+    points, labels, ring = scan_mesh(plane, replace(HDL64E, rotation_period=0.0), pose)
+    assert (labels == Label.ROAD).all()
+    return points, ring
+
+
+def test_flat_ground_has_the_ranges_of_the_textbook(ground: Points) -> None:
+    points, ring = ground
+    distance = np.linalg.norm(points[:, :3].astype(float), axis=1)
+    elevation = np.array(HDL64E.elevations)[::-1][ring]
+    error = distance - HDL64E.height / np.sin(np.radians(-elevation))
+    assert abs(error.mean()) < 0.001
+    assert error.std() == pytest.approx(HDL64E.range_noise, rel=0.05)
+
+
+def test_every_point_lies_on_its_beam_and_beams_are_in_firing_order(ground: Points) -> None:
+    points, ring = ground
+    beams = np.array(HDL64E.elevations)
+    assert len(beams) == 64
+    assert (np.diff(beams) < 0).all()
+
+    distance = np.linalg.norm(points[:, :3].astype(float), axis=1)
+    elevation = np.degrees(np.arcsin(points[:, 2] / distance))
+    assert np.abs(elevation - beams[::-1][ring]).max() < 0.01
+
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0])) % 360
+    ring_step = np.diff(ring.astype(int))
+    assert (ring_step <= 0).all()
+    assert (np.diff(azimuth)[ring_step == 0] > 0).all()
+
+
+def test_the_car_hides_what_is_behind_its_parts(ground: Points) -> None:
+    x, y, z = ground[0][:, :3].T
+    azimuth = np.degrees(np.arctan2(y, x))
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    behind = np.abs(azimuth) > 170
+    assert elevation[behind].min() > -18.5
+    assert elevation[~behind].min() < -23
+
+
+@pytest.mark.parametrize(("mixed", "smallest", "largest"), [(0.0, 0, 0), (0.5, 11, np.inf)])
+def test_some_returns_at_edges_lie_in_between(mixed: float, smallest: int, largest: int) -> None:
+    walls = join([wall(10, (1, 9)), wall(12, (-9, 9))])
+    points, _, _ = scan_mesh(walls, replace(EXACT, mixed=mixed))
+    between = np.count_nonzero((points[:, 0] > 10.05) & (points[:, 0] < 11.95))
+    assert smallest <= between <= largest
+
+
+@pytest.mark.parametrize("depth", [0.05, 0.5])
+def test_pulses_end_in_foliage_after_the_mean_depth(depth: float) -> None:
+    """In thick foliage the depths are exponential: mean and deviation are the free path."""
+    points, labels, _ = scan_mesh(slab(15, 40, depth))
+    ahead = points[np.abs(points[:, 1] / points[:, 0]) < 0.2, :3].astype(float)
+    length = np.linalg.norm(ahead, axis=1) * (1 - 15 / ahead[:, 0])
+    assert (labels == Label.VEGETATION).all()
+    assert length.min() > -1e-4
+    assert length.mean() == pytest.approx(depth, rel=0.05)
+    assert length.std() == pytest.approx(depth, rel=0.1)
+
+
+def share_through(scene: Mesh) -> float:
+    """Return the share of the pulses ahead that pass some foliage and hit the wall behind it."""
+    points, labels, _ = scan_mesh(scene)
+    ahead = np.abs(points[:, 1] / points[:, 0]) < 0.15
+    return float((labels[ahead] == Label.BUILDING).mean())
+
+
+def test_overlapping_clumps_are_one() -> None:
+    """Their union is 4 m deep, not the 2 m at which the first of them ends."""
+    scene = join([slab(14, 16, 1), slab(15, 18, 1), wall(22)])
+    assert share_through(scene) == pytest.approx(np.exp(-4), rel=0.2)
+
+
+def test_many_clumps_can_be_passed() -> None:
+    clumps = [slab(10 + 2 * i, 11 + 2 * i, 100.0) for i in range(5)]
+    assert share_through(join([*clumps, wall(22)])) == pytest.approx(np.exp(-5 / 100), rel=0.05)
+
+
+def test_some_pulses_pass_a_thin_crown() -> None:
+    """Their share is that of exponential free paths: exp(-thickness / depth)."""
+    scene = join([slab(14.5, 15.5, 0.5), wall(20)])
+    # A leaf reflects less than the wall and is lost a little more often.
+    assert share_through(scene) == pytest.approx(np.exp(-1 / 0.5), rel=0.12)
+
+    points, labels, _ = scan_mesh(scene)
+    is_near_axis = np.abs(points[:, 1]) < 5
+    assert np.abs(points[labels == Label.BUILDING, 0] - 20).max() < 0.01
+    assert points[(labels == Label.VEGETATION) & is_near_axis, 0].max() < 15.51
+
+
+def test_a_hull_is_closed_and_faces_outwards() -> None:
+    centre = (1, 2, 3)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        triangles = hull(rng, centre, (2, 1, 4), taper=0.7, square=0.6)
+
+        edges = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)]).round(6) + 0.0
+        forward = {edge.tobytes() for edge in edges}
+        backward = {edge.tobytes() for edge in edges[:, ::-1]}
+        assert forward == backward  # each edge is passed once in each direction
+
+        sides = np.diff(triangles, axis=1)
+        normals = np.cross(sides[:, 0], sides[:, 1])
+        outward = np.einsum("ti,ti->t", triangles[:, 0] - centre, normals)
+        assert (outward > 0).mean() > 0.99  # a bump of a thin tip may hang over
+
+
+@pytest.mark.parametrize("counter_clockwise", [True, False])
+@pytest.mark.parametrize("corrected", [True, False])
+def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(
+    corrected: bool, counter_clockwise: bool
+) -> None:
+    """A rotation is centred on ahead: the sensor looks left a quarter of it later, or earlier."""
+    sensor = replace(
+        EXACT,
+        rotation_period=0.1,
+        motion_corrected=corrected,
+        counter_clockwise=counter_clockwise,
+    )
+    left_wall = replace(wall(10), triangles=wall(10).triangles[..., [1, 0, 2]])
+    pole = part([box((0.2, 0.2, 20), (0, 10, -10))], Surface.METAL, Label.POLE)
+    scene = join([place(left_wall, 0, 5, 0, 0), wall(20), pole])
+    points, labels, _ = scan_mesh(scene, sensor, speed=20.0)
+
+    pole_x = points[labels == Label.POLE, 0].mean()
+    moved = 20 * 0.025 * (1 if counter_clockwise else -1)  # metres, when it looks to the left
+    assert pole_x == pytest.approx(0.0 if corrected else -moved, abs=0.05)
+
+    ahead = points[(labels == Label.BUILDING) & (np.abs(points[:, 1]) < 0.2)]
+    np.testing.assert_allclose(ahead[:, 0], 20, atol=0.02)
+
+
+def test_a_body_has_one_brightness_and_bodies_differ() -> None:
+    rng = np.random.default_rng(1)
+    rights = range(-8, 8)  # y of the right edges of 16 walls, 1 m wide each
+    panels = [with_random_tint(wall(15, (y, y + 1)), rng) for y in rights]
+    points, _, _ = scan_mesh(join(panels))
+
+    medians = []
+    deviations = []
+    for y in rights:
+        inside = (points[:, 1] > y + 0.1) & (points[:, 1] < y + 0.9)
+        intensity = points[inside, 3]
+        medians.append(np.median(intensity))
+        deviations.append(np.median(np.abs(intensity - medians[-1])))
+
+    assert np.std(medians) > 2 * np.mean(deviations)
+    shade = REFLECTIONS[Surface.PLASTER].shade
+    assert 0.5 * shade < np.log(medians).std() < 1.7 * shade
+
+
+def test_far_grazing_ground_is_darker(ground: Points) -> None:
+    points, _ = ground
+    distance = np.linalg.norm(points[:, :2], axis=1)
+    near = np.median(points[np.abs(distance - 8) < 0.2 * 8, 3])
+    far = np.median(points[np.abs(distance - 40) < 0.2 * 40, 3])
+    assert far < 0.6 * near
+
+
+def test_gains_differ_between_lasers() -> None:
+    gains = laser_gains(HDL64E, np.random.default_rng(0))
+    assert gains.shape == (64,)
+    assert 0.05 < gains.std() < 0.3
+    assert gains.min() >= 0.3
+    assert (laser_gains(EXACT, np.random.default_rng(0)) == 1).all()

@@ -1,0 +1,40 @@
+"""The simulator and the package that uses it know little of each other."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import amvnet
+import lidarstreets
+
+SHARED = {"SimulationError", "drive_street", "simulate"}  # what amvnet may use of lidarstreets
+
+
+def imports(package: Path) -> Iterator[tuple[str, list[str]]]:
+    """Yield each imported module of a package's files, and the names that are taken from it."""
+    for path in package.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                yield node.module or "", [alias.name for alias in node.names]
+            elif isinstance(node, ast.Import):
+                for alias in node.names:
+                    yield alias.name, []
+
+
+def test_the_simulator_imports_nothing_of_amvnet() -> None:
+    modules = {module.partition(".")[0] for module, _ in imports(Path(lidarstreets.__path__[0]))}
+    assert "numpy" in modules
+    assert "amvnet" not in modules
+
+
+def test_amvnet_imports_three_names_of_the_simulator() -> None:
+    names: set[str] = set()
+    for module, imported in imports(Path(amvnet.__path__[0])):
+        if module.partition(".")[0] == "lidarstreets":
+            assert module == "lidarstreets"
+            assert imported
+            names.update(imported)
+    assert names == SHARED
+    assert set(lidarstreets.__all__) >= SHARED

@@ -1,0 +1,234 @@
+"""Simulated datasets: equal on any number of processes, resumed after a stop, read as real ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amvnet.data.datasets.open import open_dataset
+from lidarstreets import SimulationError, simulate, writing
+
+pytest.importorskip("embreex")
+
+LINUX = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs Linux's /proc")
+SCENES = ("simulated-0000", "simulated-0001")
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of each file below a folder."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(folder)): sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture(scope="module")
+def nuscenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes of three scans each."""
+    folder = tmp_path_factory.mktemp("nuscenes")
+    return simulate(folder, sensor="hdl32e", sequences=2, scans=3, seed=2)
+
+
+def table(folder: Path, name: str) -> list[dict[str, Any]]:
+    """Return the rows of one of nuScenes' tables."""
+    return json.loads((folder / "v1.0-trainval" / f"{name}.json").read_text())
+
+
+def test_two_processes_write_the_same_bytes_as_one(nuscenes: Path, tmp_path: Path) -> None:
+    again = simulate(tmp_path, sensor="hdl32e", sequences=2, scans=3, seed=2, processes=2)
+    assert digests(again) == digests(nuscenes)
+
+
+def test_a_stopped_simulation_continues_to_the_same_bytes(nuscenes: Path, tmp_path: Path) -> None:
+    def stop_after_four_scans(done: int, total: int) -> None:
+        if done == 4:
+            raise KeyboardInterrupt
+
+    settings: dict[str, Any] = {"sensor": "hdl32e", "sequences": 2, "scans": 3, "seed": 2}
+    with pytest.raises(KeyboardInterrupt):
+        simulate(tmp_path, **settings, progress=stop_after_four_scans)
+
+    counts: list[int] = []
+    simulate(tmp_path, **settings, progress=lambda done, total: counts.append(done))
+    assert counts == [4, 5, 6]  # the first scene was complete
+    assert digests(tmp_path) == digests(nuscenes)
+
+
+def run_on_two_processes(out: Path) -> subprocess.Popen[bytes]:
+    """Start a long simulation, as the leader of a group of processes; return once it writes."""
+    command = [sys.executable, "-m", "lidarstreets", str(out)]
+    options = ["--sequences", "2", "--scans", "1000", "--processes", "2"]
+    parent = subprocess.Popen([*command, *options], stderr=subprocess.PIPE, start_new_session=True)
+    deadline = time.monotonic() + 60
+    while len(list((out / "sequences").glob("*/labels/000001.label"))) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return parent
+
+
+def workers_of(parent: subprocess.Popen[bytes]) -> list[Path]:
+    """Return the folders in /proc of the processes that simulate."""
+    children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+    processes = [Path(f"/proc/{child}") for child in children]
+    return [process for process in processes if b"spawn_main" in (process / "cmdline").read_bytes()]
+
+
+@LINUX
+def test_no_process_outlives_one_that_was_killed(tmp_path: Path) -> None:
+    with run_on_two_processes(tmp_path) as parent:
+        workers = workers_of(parent)
+        assert len(workers) == 2
+        parent.kill()
+
+    deadline = time.monotonic() + 10
+    while any(map(is_running, workers)) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not any(map(is_running, workers))
+    assert not list(tmp_path.rglob("*.part*"))
+
+
+@LINUX
+def test_each_process_computes_with_one_thread(tmp_path: Path) -> None:
+    """A second thread of each waits for the parent to end. Embree would start one a processor."""
+    with run_on_two_processes(tmp_path) as parent:
+        threads = [len(list((worker / "task").iterdir())) for worker in workers_of(parent)]
+        parent.kill()
+    assert threads == [2, 2]
+
+
+@LINUX
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_to_all_processes_stops_them_at_once_and_leaves_whole_files(
+    number: signal.Signals, code: int, tmp_path: Path
+) -> None:
+    with run_on_two_processes(tmp_path) as parent:
+        workers = workers_of(parent)
+        os.killpg(parent.pid, number)
+        start = time.monotonic()
+        _, complaint = parent.communicate(timeout=30)
+
+    assert time.monotonic() - start < 5  # within one if no other process takes the processors
+    assert parent.returncode == code
+    assert complaint.count(b"\n") == (number == signal.SIGINT)
+    assert not any(map(is_running, workers))
+    for folder in (tmp_path / "sequences").iterdir():
+        for path in folder.rglob("*.*"):
+            assert path.suffix == ".bin" or path.with_suffix(".label").is_file()
+    assert not list(tmp_path.rglob("*.part*"))
+
+
+def is_running(process: Path) -> bool:
+    """Return whether a process exists and is no zombie."""
+    try:
+        stat = (process / "stat").read_text()
+    except OSError:
+        return False
+    return stat.rsplit(")", 1)[1].split()[0] != "Z"
+
+
+def test_a_complete_simulation_is_not_written_again(
+    nuscenes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writing, "drive_street", lambda *_: pytest.fail("simulated again"))
+    before = digests(nuscenes)
+    simulate(nuscenes, sensor="hdl32e", sequences=2, scans=3, seed=2)
+    assert digests(nuscenes) == before
+
+
+@pytest.mark.parametrize("other", [{"seed": 3}, {"scans": 4}, {"sensor": "hdl64e"}])
+def test_a_folder_with_other_settings_is_refused(nuscenes: Path, other: dict[str, Any]) -> None:
+    settings: dict[str, Any] = {"sensor": "hdl32e", "scans": 3, "seed": 2} | other
+    with pytest.raises(SimulationError, match="another folder") as caught:
+        simulate(nuscenes, **settings)
+    assert str(nuscenes) in str(caught.value)
+
+
+def test_simulated_nuscenes_is_read_as_the_real_one(nuscenes: Path) -> None:
+    dataset = open_dataset(f"nuscenes:{nuscenes}")
+    assert dataset.sequences("all") == SCENES
+    classes: set[int] = set()
+    for record in dataset.records(SCENES):
+        scan = dataset.read(record)
+        assert scan.ring is not None
+        assert scan.labels is not None
+        classes |= set(scan.labels.tolist())
+        assert (np.bincount(scan.ring) == 1084).all()  # a point for each shot, as in nuScenes
+
+        is_lost = np.linalg.norm(scan.points[:, :3], axis=1) < 1
+        assert (scan.labels[is_lost] == 0).all()
+
+        x, y, z = scan.points[:, :3].T
+        elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+        error = np.abs(elevation - (-30.66 + scan.ring * 4 / 3))[~is_lost]
+        assert np.median(error) < 0.5  # the device of each drive is a little off
+        assert error.max() < 2.5  # correcting the motion of the sensor moves points off their beams
+
+    # Car, driveable surface, sidewalk, terrain, manmade, vegetation.
+    assert classes >= {4, 11, 13, 14, 15, 16}
+
+
+def test_simulated_nuscenes_drives_forward_along_y(nuscenes: Path) -> None:
+    """The LiDAR looks to the right: its x is right, its y is forward; poses have x forward."""
+    rotation = np.array(table(nuscenes, "calibrated_sensor")[0]["rotation"])
+    np.testing.assert_allclose(rotation, [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)])
+    first, second = (row["translation"] for row in table(nuscenes, "ego_pose")[:2])
+    np.testing.assert_allclose(first, 0, atol=1e-9)
+    assert 7 < second[0] < 9
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "target"),
+    [
+        ("sample", "scene_token", "scene"),
+        ("sample_data", "sample_token", "sample"),
+        ("sample_data", "ego_pose_token", "ego_pose"),
+        ("sample_data", "calibrated_sensor_token", "calibrated_sensor"),
+        ("calibrated_sensor", "sensor_token", "sensor"),
+        ("lidarseg", "sample_data_token", "sample_data"),
+        ("scene", "log_token", "log"),
+        ("scene", "first_sample_token", "sample"),
+        ("scene", "last_sample_token", "sample"),
+    ],
+)
+def test_every_token_leads_to_a_row(nuscenes: Path, name: str, key: str, target: str) -> None:
+    tokens = [row["token"] for row in table(nuscenes, target)]
+    references = {row[key] for row in table(nuscenes, name)}
+    assert len(set(tokens)) == len(tokens)
+    assert references
+    assert references <= set(tokens)
+
+
+@pytest.mark.parametrize(("name", "links"), [("sample", 6), ("sample_data", 6)])
+def test_scans_are_linked_in_the_order_of_time(nuscenes: Path, name: str, links: int) -> None:
+    rows = {row["token"]: row for row in table(nuscenes, name)}
+    assert len(rows) == links
+    firsts = [row for row in rows.values() if not row["prev"]]
+    assert len(firsts) == len(SCENES)
+    for first in firsts:
+        chain = [first]
+        while chain[-1]["next"]:
+            chain.append(rows[chain[-1]["next"]])
+            assert chain[-1]["prev"] == chain[-2]["token"]
+
+        times = [link["timestamp"] for link in chain]
+        assert len(chain) == 3
+        assert times == sorted(times)
+
+
+def test_the_files_that_the_tables_name_are_there(nuscenes: Path) -> None:
+    for name in ("sample_data", "lidarseg", "map"):
+        for row in table(nuscenes, name):
+            assert (nuscenes / row["filename"]).is_file()
+
+    for row in table(nuscenes, "lidarseg"):
+        labels = np.fromfile(nuscenes / row["filename"], np.uint8)
+        assert len(labels) == 32 * 1084
+        assert labels.max() < len(table(nuscenes, "category"))
