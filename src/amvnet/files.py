@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import os
+import re
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
 
 LARGEST_YAML = 50_000  # bytes; PyYAML takes a second for as many
 DEEPEST_YAML = 50  # levels
 PARTS = f".{'[0-9a-f]' * 32}.part*"  # names of files that `atomic_write` has not finished
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # characters that names of files must not have
+LONGEST_NAME = 255  # bytes, in most file systems
+LONGEST_ENDING = 20  # characters, of the names of unfinished files
 
 
 @contextmanager
@@ -23,24 +27,114 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path to write to, and rename it to `path` if the block succeeds.
 
     The temporary file lies in the same folder, which is made if necessary, and keeps the ending of
-    `path`. It is removed if the block raises.
+    `path`. It is removed if the block raises. The file gets the mode of the umask, also if a
+    library writes private files.
+
+    The content is on the disk before the file has its name: a power cut leaves the old file or the
+    new one, whole. It may lose the last files on file systems that do not write folders on request,
+    and whatever is written without this function, such as the last lines of a journal.
+
+    If the name of the file is made from data, join it to the folder by `inside`.
 
     Raises:
         InputError: if the folder cannot be made or the file cannot be written.
     """
     path = Path(path)
     make_folder(path.parent)
-    part = path.with_name(f".{uuid.uuid4().hex}.part{path.suffix}")
+    ending = path.suffix if len(path.suffix) <= LONGEST_ENDING else ""
+    part = path.with_name(f".{uuid.uuid4().hex}.part{ending}")
 
     try:
+        part.touch()
+        mode = part.stat().st_mode
         yield part
-        os.replace(part, path)
+        if part.stat().st_mode != mode:
+            part.chmod(mode)
+        publish(part, path)
     except (PermissionError, IsADirectoryError) as error:
         raise InputError(
             f"{path}: expected a file that can be written, found {error.strerror}; give another"
         ) from None
+    except OSError as error:
+        if error.filename == str(part):
+            error.filename = str(path)
+        raise
     finally:
         part.unlink(missing_ok=True)
+
+
+def publish(part: Path, path: Path) -> None:
+    """Give a finished file its name, in the same file system, after its content is on the disk."""
+    with part.open("rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(part, path)
+    if not hasattr(os, "O_DIRECTORY"):  # Windows
+        return
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):  # some network file systems refuse it
+            os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def inside(folder: Path | str, name: Path | str) -> Path:
+    """Return the path of an output file whose name is made from data, such as a token of a table.
+
+    Call it each time that a file is written: what it checks may change on the disk.
+
+    Args:
+        folder: the output folder, which may be a link itself.
+        name: the path of the file, relative to the folder.
+
+    Raises:
+        InputError: if the file would lie outside the folder, because its name is absolute, has `..`
+            or leads through a link, or if its name has control characters or is too long.
+    """
+    folder = Path(folder)
+    name = Path(name)
+    fault = _fault_of(name)
+    if fault is not None:
+        raise InputError(
+            f"{folder}: expected names of output files inside it, found {fault} in "
+            f"{shown(str(name))}; rename the scan"
+        )
+
+    for parent in list(name.parents)[:-1]:
+        if (folder / parent).is_symlink():
+            raise InputError(
+                f"{folder / parent}: expected a folder for output files, found a link; remove it "
+                "or change --out"
+            )
+    return folder / name
+
+
+def _fault_of(name: Path) -> str | None:
+    """Return why no output file may have a name, relative to its folder; None if it may."""
+    if name.anchor or ".." in name.parts or not name.name:
+        return "a path that leads elsewhere"
+    if CONTROL.search(str(name)):
+        return "control characters"
+    try:
+        longest = max(len(os.fsencode(part)) for part in name.parts)
+    except UnicodeEncodeError:
+        return "characters that no file name can have"
+    return f"more than {LONGEST_NAME} bytes" if longest > LONGEST_NAME else None
+
+
+def checked_token(text: Any) -> str:
+    """Return a token of a table that becomes the name of a file.
+
+    Raises:
+        InputError: if it is not one plain name.
+    """
+    is_name = isinstance(text, str) and text.isprintable() and text not in ("", ".", "..")
+    if not is_name or set(text) & set("/\\"):
+        raise InputError(
+            "expected tokens without separators and control characters, "
+            f"found {shown(text)}; correct the table"
+        )
+    return text
 
 
 def make_folder(path: Path) -> None:

@@ -18,7 +18,8 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.export import engines, int8
 from amvnet.export.engines import OnnxGraph, cache_folder, exported, use_engine
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmenter import MOST_AT_ONCE, Segmenter, expand_to_scan
+from amvnet.inference.segmentation import expand_to_scan
+from amvnet.inference.segmenter import MOST_AT_ONCE, Segmenter
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
 from amvnet.models.methods import MethodName

@@ -9,6 +9,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+import torch
 
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
@@ -214,6 +215,27 @@ def test_by_method_equals_each_method(segmenter: Segmenter) -> None:
         assert np.array_equal(labels[method], labels_by(method, points))
     assert uncertain is not None
     assert np.array_equal(uncertain, segmenter(points).uncertain)
+
+
+def test_a_method_includes_those_that_need_no_more_than_its_networks() -> None:
+    expected = {
+        "ensemble": ["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble"],
+        "rv": ["rv", "rv-knn"],
+        "bev": ["bev"],
+    }
+    for method, names in expected.items():
+        segmenter = Segmenter(WEIGHTS, method=method)  # type: ignore[arg-type]
+        labels, _ = segmenter.labels_by_method(Scan(POINTS), METHOD_NAMES)
+        assert list(labels) == names
+        for name in names:
+            assert np.array_equal(labels[name], labels_by(name))  # type: ignore[arg-type]
+
+
+def test_prediction_runs_the_model_as_it_is(segmenter: Segmenter, result: Segmentation) -> None:
+    with torch.inference_mode():
+        scores = segmenter.model(segmenter.batch([Scan(POINTS)]))
+    assert np.array_equal(result.scores, scores.merged.numpy())
+    assert np.array_equal(result.uncertain, scores.uncertain.numpy())
 
 
 @pytest.mark.parametrize(("method", "other"), [("rv", "polar_net"), ("bev", "range_net")])

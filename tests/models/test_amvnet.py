@@ -17,7 +17,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.schema import AssertionConfig, ModelConfig, PointHeadConfig
 from amvnet.models import amvnet as amvnet_module
 from amvnet.models import point_head as point_head_module
-from amvnet.models.amvnet import build_amvnet, merge
+from amvnet.models.amvnet import LateFusion, build_amvnet
 from amvnet.models.assertions import (
     DifferentLabels,
     Disagreement,
@@ -328,11 +328,12 @@ def test_merging_takes_the_heads_scores_for_uncertain_points_only() -> None:
     f, g, points, _ = random_scores(20)
     uncertain = points[:, 0] > 0
     h = torch.rand(20, K)
-    merged = merge(f, g, uncertain, h[uncertain])
+    fusion = LateFusion(Disagreement(), None)
+    merged = fusion.merge(f, g, uncertain, h[uncertain])
 
     for i, from_head in enumerate(uncertain.tolist()):
         assert torch.equal(merged[i], h[i] if from_head else geometric_mean(f, g)[i])
-    assert torch.equal(merge(f, g, uncertain, None), geometric_mean(f, g))
+    assert torch.equal(fusion.merge(f, g, uncertain, None), geometric_mean(f, g))
 
 
 class Constant(nn.Module):

@@ -24,7 +24,8 @@ from amvnet.inference.journal import Journal
 from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.predict import NetworkSegmentation
 from amvnet.models import neighbours_gpu as block_search
-from amvnet.models.amvnet import merge
+from amvnet.models.amvnet import LateFusion
+from amvnet.models.assertions import Disagreement
 from amvnet.models.methods import Precision
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
@@ -252,6 +253,7 @@ def test_the_merge_of_a_gpu_is_that_of_a_cpu(monkeypatch: pytest.MonkeyPatch) ->
     h = torch.rand(10, 4)
     uncertain = torch.arange(30) % 3 == 1
     nothing = torch.zeros(30, dtype=torch.bool)
+    merge = LateFusion(Disagreement(), None).merge
     some_refined = merge(f, g, uncertain, h)
     none_refined = merge(f, g, nothing, h[:0])
 

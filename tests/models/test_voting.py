@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from amvnet.config.schema import RangeViewConfig
-from amvnet.inference.test_time import TURNS
+from amvnet.inference.symmetries import TURNS
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.models.voting import Voting

@@ -8,14 +8,12 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from amvnet import Scan, Segmenter
+from amvnet import Scan, Segmentation, Segmenter
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
@@ -86,17 +84,13 @@ class FixedScores(Segmenter):
 
     def __init__(self, rv: np.ndarray, bev: np.ndarray) -> None:
         super().__init__(WEIGHTS)
-        self.rv = torch.from_numpy(rv.astype(np.float32))
-        self.bev = torch.from_numpy(bev.astype(np.float32))
+        self.rv = rv.astype(np.float32)
+        self.bev = bev.astype(np.float32)
 
-    def scores_by_method(
-        self, scan: Scan, methods: Sequence[str] = ()
-    ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        valid = torch.from_numpy(scan.valid)
-        f = self.rv[valid]
-        g = self.bev[valid]
-        points = torch.from_numpy(scan.points[scan.valid])
-        return {"rv": f, "bev": g}, self.model.assertion(f, g, points)
+    def __call__(self, points: np.ndarray | Scan | Path | str) -> Segmentation:
+        labels = self.rv.argmax(axis=1) + 1
+        uncertain = np.zeros(len(labels), bool)
+        return Segmentation(labels, uncertain, scores=self.rv, rv=self.rv, bev=self.bev)
 
 
 def confident(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
@@ -271,7 +265,7 @@ def test_scans_without_labels_are_refused(world: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("weights", "word"),
-    [("rv", "both networks"), ("nuscenes", "classes"), ("none", "weights file")],
+    [("rv", "polar_net"), ("nuscenes", "classes"), ("none", "weights file")],
 )
 def test_wrong_input_is_one_line_and_leaves_nothing(
     world: Path, tmp_path: Path, weights: str, word: str

@@ -6,7 +6,6 @@ the bag at the end.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +18,7 @@ from amvnet.data.formats.cloud import Message
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, Origin, encode_labels
 from amvnet.data.label_files import LabelledPoints
 from amvnet.errors import InputError
-from amvnet.files import atomic_write, make_folder
+from amvnet.files import atomic_write, inside, make_folder, publish
 
 Kind = Literal["bag", "mcap"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -44,8 +43,7 @@ def bag_path(name: str, kind: str) -> Path:
         name: of the scan, such as `drive/000012`.
         kind: one of `KINDS`.
     """
-    scans = Path(name).parent
-    return scans.with_name(f"{scans.name}.{kind}")
+    return Path(f"{Path(name).parent}.{kind}")
 
 
 def part_path(name: str, kind: str) -> Path:
@@ -72,7 +70,7 @@ def write_part(
     serialise = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
     data = np.frombuffer(serialise(values, CLOUD_TYPE), np.uint8)
 
-    path = folder / part_path(name, kind)
+    path = inside(folder, part_path(name, kind))
     with atomic_write(path) as part:
         np.savez(part, time=message.time, topic=message.topic + SUFFIX, data=data)
     return path
@@ -101,10 +99,10 @@ def join_parts(folder: Path, names: Sequence[str], kind: str) -> list[Path]:
     for path, all_parts in parts_by_bag.items():
         parts = list(filter(Path.is_file, all_parts))
         if parts:
-            _write_bag(folder / path, parts, kind)
+            _write_bag(inside(folder, path), parts, kind)
             written.append(path)
         if parts == all_parts:
-            shutil.rmtree(folder / _parts(path))
+            shutil.rmtree(inside(folder, _parts(path)))
     return written
 
 
@@ -133,7 +131,7 @@ def _write_bag(path: Path, parts: Sequence[Path], kind: str) -> None:
         else:
             _write_messages(Writer2(bag, version=9, storage_plugin=StoragePlugin.MCAP), parts, kind)
             (bag,) = bag.glob("*.mcap")
-        os.replace(bag, path)
+        publish(bag, path)
 
 
 def _write_messages(writer: Any, parts: Sequence[Path], kind: str) -> None:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.evaluation.scoring import stream_labelled
-from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
-from amvnet.models.amvnet import merge
+from amvnet.inference.segmentation import expand_labels, expand_to_scan
+from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.models.assertions import Disagreement, cosine_similarity
 from amvnet.models.methods import ENSEMBLES
 from amvnet.progress import Progress, no_progress
@@ -136,29 +138,34 @@ class LabelledScan:
 @torch.inference_mode()
 def _label(scan: Scan, segmenter: Segmenter) -> LabelledScan:
     """Label a scan by every method, and by the head for every point that a tau would ask."""
-    # The steps of the method; the head settles every point that some tau makes uncertain.
-    model = segmenter.model
+    own = segmenter.model.assertion
+
+    def is_asked(f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
+        return (_bins(f, g) < SWEPT) | own(f, g, points)
+
+    model = copy.copy(segmenter.model)
+    model.assertion = is_asked
     batch = segmenter.batch([scan])
-    f, g = model.score(*model.project(batch))
-    uncertain = model.compare(batch, f, g)
-    # Bin b holds the similarities in (b, b + 1] / BINS.
-    similarity = cosine_similarity(f, g)
-    bin_of_valid = (similarity * BINS).ceil().long().clamp(1, BINS) - 1
-    asked = (bin_of_valid < SWEPT) | uncertain
-    h = model.refine(batch, f, g, asked)
-    assert h is not None
+    scores = model(batch)
 
     # Every method's labels, and the head's wherever it was asked.
-    scores = {"rv": f, "bev": g}
+    f = scores.rv
+    g = scores.bev
+    ids = {"rv": expand_labels(f, scan.valid), "bev": expand_labels(g, scan.valid)}
     for name, ensemble in ENSEMBLES.items():
-        scores[name] = ensemble(f, g)
-    scores["amvnet"] = merge(f, g, uncertain, h[uncertain[asked]])
-    ids = {name: expand_labels(values, scan.valid) for name, values in scores.items()}
-    head = expand_labels(merge(f, g, asked, h), scan.valid)
+        ids[name] = expand_labels(ensemble(f, g), scan.valid)
+    head = expand_labels(scores.merged, scan.valid)
+    uncertain = expand_to_scan(own(f, g, batch.points), scan.valid)
+    ids["amvnet"] = np.where(uncertain, head, ids["ensemble"])
 
     # Points that no network has seen count as agreed on, with id 0, whatever tau is.
-    bins = np.where(scan.valid, expand_to_scan(bin_of_valid, scan.valid), BINS - 1)
-    return LabelledScan(scan, ids, head, expand_to_scan(uncertain, scan.valid), bins)
+    bins = np.where(scan.valid, expand_to_scan(_bins(f, g), scan.valid), BINS - 1)
+    return LabelledScan(scan, ids, head, uncertain, bins)
+
+
+def _bins(f: Tensor, g: Tensor) -> Tensor:
+    """Return the (P,) bins of the similarities: bin b holds those in (b, b + 1] / BINS."""
+    return (cosine_similarity(f, g) * BINS).ceil().long().clamp(1, BINS) - 1
 
 
 def _count(analysis: Analysis, labelled: LabelledScan) -> None:

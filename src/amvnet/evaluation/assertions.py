@@ -13,8 +13,8 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.evaluation.analysis import Swept
 from amvnet.evaluation.metrics import confusion
 from amvnet.evaluation.scoring import stream_labelled
-from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels
-from amvnet.models.amvnet import merge
+from amvnet.inference.segmentation import expand_labels
+from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.models.assertions import cosine_similarity, entropy, margin
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
@@ -96,7 +96,7 @@ def _label(scan: Scan, segmenter: Segmenter) -> dict[tuple[str, float], np.ndarr
     for name, rank in ranks.items():
         for share in SHARES:
             uncertain = rank < round(share * len(f))
-            merged = merge(f, g, uncertain, h[uncertain[asked]])
+            merged = model.merge(f, g, uncertain, h[uncertain[asked]])
             ids[name, share] = expand_labels(merged, scan.valid)
     return ids
 

@@ -18,6 +18,7 @@ from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import TopView, draw_scan
+from amvnet.files import inside
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.models.methods import PAPER_METHODS
@@ -97,7 +98,7 @@ def evaluate(
                 uncertain=labels.uncertain,
                 title=record.name,
             )
-            draw_scan(pictures / f"{record.name.replace('/', '_')}.png", view)
+            draw_scan(inside(pictures, f"{record.name.replace('/', '_')}.png"), view)
 
     return sum(processes.gather(evaluation), Evaluation(dataset.taxonomy))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import shutil
 import uuid
 from collections.abc import Callable, Sequence
@@ -21,7 +20,7 @@ from amvnet.config.nested import to_dict
 from amvnet.errors import InputError
 from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, strip, writer_errors
-from amvnet.files import atomic_write, make_folder
+from amvnet.files import atomic_write, make_folder, publish
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import widest_method
@@ -125,7 +124,7 @@ def export(
         # An interruption must not leave the old description with new graphs.
         (out / DESCRIPTION).unlink(missing_ok=True)
         for name in description["graphs"]:
-            os.replace(temporary / f"{name}.onnx", out / f"{name}.onnx")
+            publish(temporary / f"{name}.onnx", out / f"{name}.onnx")
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

@@ -12,7 +12,8 @@ from amvnet.inference.fusion import Fusion
 from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline
 from amvnet.inference.score_files import ScorePair
-from amvnet.inference.segmenter import Segmentation, check_scan
+from amvnet.inference.segmentation import Segmentation
+from amvnet.inference.segmenter import check_scan
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import ScanAdapter

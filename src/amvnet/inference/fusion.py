@@ -11,7 +11,8 @@ import torch
 from amvnet.config.schema import AssertionConfig
 from amvnet.errors import InputError
 from amvnet.inference.score_files import SURE, check_probabilities
-from amvnet.inference.segmenter import Segmentation, check_scan, to_segmentation
+from amvnet.inference.segmentation import Segmentation, to_segmentation
+from amvnet.inference.segmenter import check_scan
 from amvnet.models.amvnet import LateFusion, Scores
 from amvnet.models.assertions import Disagreement, build_assertion
 from amvnet.models.head_ensemble import HeadEnsemble

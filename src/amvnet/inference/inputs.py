@@ -20,6 +20,7 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.label_files import KINDS, label_points, read_scan_labels, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import inside
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.adapt import MEASURED, ScanAdapter
@@ -343,7 +344,7 @@ class FileScan:
             points = label_points(file_xyz, labels.ids, form.taxonomy, labels.uncertain)
             return label_bags.write_part(out, self.scan.name, form.kind, message, points)
         return write_scan_labels(
-            out / self.scan.name,
+            inside(out, self.scan.name),
             form.kind,
             file_xyz,
             labels.ids,

@@ -19,11 +19,11 @@ from amvnet.data.label_files import check_kind, write_uncertain
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError, SomeBroken
-from amvnet.files import atomic_write
+from amvnet.files import atomic_write, inside
 from amvnet.inference.inputs import InputScan, LabelFormat, Labels, LoadedScan
 from amvnet.inference.journal import Journal
 from amvnet.inference.scan_stream import AHEAD, stream_groups
-from amvnet.inference.segmenter import Segmentation
+from amvnet.inference.segmentation import Segmentation
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.written import WrittenFiles
@@ -202,11 +202,13 @@ class Pipeline:
             SomeBroken: at the end, if some of several scans are broken.
         """
         processes = self.execution.processes
+        paths = list(chain.from_iterable(map(self.output.paths_of, self.scans)))
+        for path in paths:
+            inside(self.output.folder, path)
         _check_names(self.scans)
         for scan in self.scans:
             _check_folder(scan, self.output)
 
-        paths = list(chain.from_iterable(map(self.output.paths_of, self.scans)))
         written = WrittenFiles(self.output.folder)
         if not self.output.overwrite:
             written.check(paths)
@@ -311,7 +313,7 @@ class Pipeline:
         """Write the files of a scan, the labels last: where they are, the others are too."""
         result = segmented.result
         folder = self.output.folder
-        scores_path = folder / segmented.scan.scores_path
+        scores_path = inside(folder, segmented.scan.scores_path)
 
         if self.output.scores:
             write_scores(scores_path, result)

@@ -25,7 +25,8 @@ from amvnet.inference.inputs import (
     open_inputs,
 )
 from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
-from amvnet.inference.segmenter import Segmentation, Segmenter
+from amvnet.inference.segmentation import Segmentation
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan

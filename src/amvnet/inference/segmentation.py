@@ -8,12 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from amvnet.data.label_files import KINDS, write_scan_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.certainty import Verdict, uncertain_share
+from amvnet.models.amvnet import Scores
 from amvnet.scan import Scan
 
 NAMED = 3  # classes in the short description of a result
@@ -197,3 +200,70 @@ class Segmentation:
                 "found one of the late fusion alone; use its labels"
             )
         return self.origin
+
+
+def to_segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
+    """Return the result for all points of a scan, given the scores of its valid points."""
+    labels, fetched = fetch(scores)
+    return unpack(valid, labels, fetched, slice(None))
+
+
+def fetch(scores: Scores) -> tuple[Tensor, Scores]:
+    """Return the labels (P,) and the scores, in CPU memory; wait for a GPU only once."""
+    on_gpu = scores.merged.is_cuda
+
+    def copy(values: Tensor) -> Tensor:
+        return values.to("cpu", non_blocking=on_gpu)  # into pinned memory if from a GPU
+
+    labels = copy(label_ids(scores.merged))
+    fetched = Scores(
+        merged=copy(scores.merged),
+        uncertain=copy(scores.uncertain),
+        rv=None if scores.rv is None else copy(scores.rv),
+        bev=None if scores.bev is None else copy(scores.bev),
+    )
+    if on_gpu:
+        torch.cuda.current_stream(scores.merged.device).synchronize()
+    return labels, fetched
+
+
+def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> Segmentation:
+    """Return the result for one scan of a batch.
+
+    Args:
+        valid: (N,) bool, the valid points of the scan.
+        labels: (P,) of the valid points of all scans.
+        scores: of the valid points of all scans.
+        points: the place of the scan's valid points among them.
+    """
+    return Segmentation(
+        labels=expand_to_scan(labels[points], valid),
+        uncertain=expand_to_scan(scores.uncertain[points], valid),
+        scores=expand_to_scan(scores.merged[points], valid),
+        rv=None if scores.rv is None else expand_to_scan(scores.rv[points], valid),
+        bev=None if scores.bev is None else expand_to_scan(scores.bev[points], valid),
+    )
+
+
+def expand_to_scan(values: Tensor, valid: np.ndarray) -> np.ndarray:
+    """Return (N, ...) values of all points, given (P, ...) of the valid ones; others are 0."""
+    valid_values = values.cpu().numpy()
+    if valid.all():
+        return valid_values
+    expanded = np.zeros((len(valid), *valid_values.shape[1:]), dtype=valid_values.dtype)
+    expanded[valid] = valid_values
+    return expanded
+
+
+def expand_labels(scores: Tensor, valid: np.ndarray) -> np.ndarray:
+    """Return (N,) uint8 train ids, 0 for points that are not valid, given (P, K) scores."""
+    return expand_to_scan(label_ids(scores), valid)
+
+
+def label_ids(scores: Tensor) -> Tensor:
+    """Return (P,) uint8 train ids 1..K: the first column of (P, K) with the largest score."""
+    if scores.is_cpu:  # NumPy takes half of torch's time
+        best = torch.from_numpy(scores.numpy().argmax(axis=1))
+    else:
+        best = scores.argmax(dim=1)
+    return (best + 1).to(torch.uint8)

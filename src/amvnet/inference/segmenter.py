@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +16,15 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
-from amvnet.inference.segmentation import Origin, Segmentation
-from amvnet.inference.test_time import SYMMETRIES, average
+from amvnet.inference.segmentation import (
+    Origin,
+    Segmentation,
+    expand_labels,
+    expand_to_scan,
+    fetch,
+    unpack,
+)
+from amvnet.inference.symmetries import SYMMETRIES, Score, average
 from amvnet.memory import keep_freed_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.layers import fold_batch_norms
@@ -104,6 +111,11 @@ class Segmenter:
         fold_batch_norms(self.model)
         _set_up_networks(self.model, device, precision)
 
+        method_used = METHODS[method]
+        if method_used.ensemble is not None:
+            self.model.ensemble = method_used.ensemble
+            self.model.point_head = None
+
     @property
     def at_once(self) -> int:
         """Scans to segment at the same time, each with its share of torch's threads.
@@ -164,11 +176,11 @@ class Segmenter:
         memory = return_freed_memory() if self._keeps_memory and is_large else nullcontext()
         with self._machine.watch(uses_team), memory:
             batch = self.batch(checked)
-            labels, scores = _fetch(self._scores(batch))
+            labels, scores = fetch(self._run(batch))
 
         results = []
         for scan, points in zip(checked, batch.slices(), strict=True):
-            result = _segmentation(scan.valid, labels, scores, points)
+            result = unpack(scan.valid, labels, scores, points)
             origin = Origin(scan, self.taxonomy, self.method, self.weights.usual_uncertain)
             results.append(replace(result, origin=origin))
         return results
@@ -231,83 +243,69 @@ class Segmenter:
     def labels_by_method(
         self, scan: Scan, methods: Sequence[str] = PAPER_METHODS
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-        """Label the N points of a scan by each method that the weights have the parts for.
+        """Label the N points of a scan by this segmenter's method and by those that it includes.
+
+        AMVNet includes the ensembles and each network alone; an ensemble includes the other
+        ensembles and each network alone. The networks run once.
 
         Returns:
-            (N,) train ids by method; and (N,) bool, the uncertain points, or None without two
-            networks.
+            (N,) train ids by method, of those among `methods` that are included; and (N,) bool,
+            the uncertain points, or None without two networks.
         """
-        scores, uncertain = self.scores_by_method(scan, methods)
+        batch = self.batch([scan])
+        scores = self._run(batch)
         labels = {}
         for name in methods:
-            if name in scores:
-                labels[name] = expand_labels(scores[name], scan.valid)
+            values = self._scores_of(name, scores, batch)
+            if values is not None:
+                labels[name] = expand_labels(values, scan.valid)
 
-        if uncertain is None:
+        if not METHODS[self.method].has_two_networks:
             return labels, None
-        return labels, expand_to_scan(uncertain, scan.valid)
-
-    def scores_by_method(
-        self, scan: Scan, methods: Sequence[str] = PAPER_METHODS
-    ) -> tuple[dict[str, Tensor], Tensor | None]:
-        """Score the P valid points of a scan by each method that the weights have the parts for.
-
-        Every network that the weights have is scored too, as `rv` and `bev`.
-
-        Returns:
-            (P, K) scores by method; and (P,) bool, the uncertain points, or None without two
-            networks.
-        """
-        return self._scores_by_method(self.batch([scan]), methods, self.weights.parts)
+        return labels, expand_to_scan(scores.uncertain, scan.valid)
 
     @torch.inference_mode()
-    def _scores_by_method(
-        self, batch: PointBatch, methods: Collection[str], parts: Collection[str]
-    ) -> tuple[dict[str, Tensor], Tensor | None]:
-        """Run the networks among `parts`, and of the other steps only those that the methods need.
-
-        Returns:
-            As `scores_by_method`.
-        """
+    def _run(self, batch: PointBatch) -> Scores:
+        """Score the points of a batch by the method of this segmenter."""
         model = self.model
-        scores = self._network_scores(batch, parts)
-        if "rv-knn" in methods and "rv" in scores:
-            image = model.range_view.project(batch)
-            scores["rv-knn"] = Voting()(scores["rv"], batch, image)
-        if "rv" not in scores or "bev" not in scores:
-            return scores, None
+        if self.method == "bev":
+            (g,) = self._average(lambda turned: (model.score_polar_view(turned),), batch)
+            return Scores(g, _nowhere(g), rv=None, bev=g)
+        if not METHODS[self.method].has_two_networks:
+            (f,) = self._average(lambda turned: (model.score_range_view(turned),), batch)
+            y = self._vote(f, batch) if self.method == "rv-knn" else f
+            return Scores(y, _nowhere(y), rv=f, bev=None)
 
-        f = scores["rv"]
-        g = scores["bev"]
-        uncertain = model.compare(batch, f, g)
-        for name in methods:
-            ensemble = METHODS[name].ensemble
-            if ensemble is not None:
-                scores[name] = ensemble(f, g)
-
-        if "amvnet" in methods and "point_head" in parts:
-            h = model.refine(batch, f, g, uncertain)
-            scores["amvnet"] = model.merge(f, g, uncertain, h)
-        return scores, uncertain
-
-    def _network_scores(self, batch: PointBatch, parts: Collection[str]) -> dict[str, Tensor]:
-        """Return the (P, K) class probabilities by each network among `parts`: `rv`, `bev`."""
         if self.tta is None:
-            return self._scores_of_one_pass(batch, parts)
-        symmetries = SYMMETRIES[self.tta]
-        return average(lambda changed: self._scores_of_one_pass(changed, parts), batch, symmetries)
+            return model(batch)
+        f, g = self._average(lambda turned: model.score(*model.project(turned)), batch)
+        return model.fuse(batch, f, g)
 
-    def _scores_of_one_pass(self, batch: PointBatch, parts: Collection[str]) -> dict[str, Tensor]:
-        """Return what `_network_scores` does, without test-time augmentation."""
-        model = self.model
-        if "range_net" in parts and "polar_net" in parts:
-            f, g = model.score(*model.project(batch))
-            return {"rv": f, "bev": g}
-        if "range_net" in parts:
-            return {"rv": model.score_range_view(batch)}
-        if "polar_net" in parts:
-            return {"bev": model.score_polar_view(batch)}
-        return {}
+    def _average(self, score: Score, batch: PointBatch) -> tuple[Tensor, ...]:
+        """Return class probabilities, with test-time augmentation as means over symmetries."""
+        return score(batch) if self.tta is None else average(score, batch, SYMMETRIES[self.tta])
+
+    @torch.inference_mode()
+    def _scores_of(self, name: str, scores: Scores, batch: PointBatch) -> Tensor | None:
+        """Return the scores (P, K) by a method; None if this segmenter's does not include it."""
+        f = scores.rv
+        g = scores.bev
+        ensemble = METHODS[name].ensemble
+        if name == self.method:
+            return scores.merged
+        if name == "rv":
+            return f
+        if name == "bev":
+            return g
+        if name == "rv-knn" and f is not None:
+            return self._vote(f, batch)
+        if ensemble is not None and f is not None and g is not None:
+            return ensemble(f, g)
+        return None
+
+    def _vote(self, f: Tensor, batch: PointBatch) -> Tensor:
+        """Return the shares of votes (P, K) of neighbours in the range image."""
+        return Voting()(f, batch, self.model.range_view.project(batch))
 
     def batch(self, scans: Sequence[Scan]) -> PointBatch:
         """Return the valid points of some scans on the device, as the networks take them.
@@ -324,14 +322,6 @@ class Segmenter:
         if _is_gpu(self.device):
             batch = batch.pin_memory()
         return batch.to(self.device)
-
-    def _scores(self, batch: PointBatch) -> Scores:
-        """Return the scores by the method of this segmenter."""
-        parts = METHODS[self.method].parts
-        scores, uncertain = self._scores_by_method(batch, (self.method,), parts)
-        if uncertain is None:
-            uncertain = torch.zeros(len(batch.points), dtype=torch.bool, device=self.device)
-        return Scores(scores[self.method], uncertain, scores.get("rv"), scores.get("bev"))
 
 
 def check_scan(points: np.ndarray | Scan) -> Scan:
@@ -400,68 +390,6 @@ def _set_up_networks(model: AMVNet, device: str, precision: Precision) -> None:
         model.polar_net = InPrecision(model.polar_net, device, precision)
 
 
-def to_segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
-    """Return the result for all points of a scan, given the scores of its valid points."""
-    labels, fetched = _fetch(scores)
-    return _segmentation(valid, labels, fetched, slice(None))
-
-
-def _fetch(scores: Scores) -> tuple[Tensor, Scores]:
-    """Return the labels (P,) and the scores, in CPU memory; wait for a GPU only once."""
-    on_gpu = scores.merged.is_cuda
-
-    def fetch(values: Tensor) -> Tensor:
-        return values.to("cpu", non_blocking=on_gpu)  # into pinned memory if from a GPU
-
-    labels = fetch(label_ids(scores.merged))
-    fetched = Scores(
-        merged=fetch(scores.merged),
-        uncertain=fetch(scores.uncertain),
-        rv=None if scores.rv is None else fetch(scores.rv),
-        bev=None if scores.bev is None else fetch(scores.bev),
-    )
-    if on_gpu:
-        torch.cuda.current_stream(scores.merged.device).synchronize()
-    return labels, fetched
-
-
-def _segmentation(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> Segmentation:
-    """Return the result for one scan of a batch.
-
-    Args:
-        valid: (N,) bool, the valid points of the scan.
-        labels: (P,) of the valid points of all scans.
-        scores: of the valid points of all scans.
-        points: the place of the scan's valid points among them.
-    """
-    return Segmentation(
-        labels=expand_to_scan(labels[points], valid),
-        uncertain=expand_to_scan(scores.uncertain[points], valid),
-        scores=expand_to_scan(scores.merged[points], valid),
-        rv=None if scores.rv is None else expand_to_scan(scores.rv[points], valid),
-        bev=None if scores.bev is None else expand_to_scan(scores.bev[points], valid),
-    )
-
-
-def expand_to_scan(values: Tensor, valid: np.ndarray) -> np.ndarray:
-    """Return (N, ...) values of all points, given (P, ...) of the valid ones; others are 0."""
-    valid_values = values.cpu().numpy()
-    if valid.all():
-        return valid_values
-    expanded = np.zeros((len(valid), *valid_values.shape[1:]), dtype=valid_values.dtype)
-    expanded[valid] = valid_values
-    return expanded
-
-
-def expand_labels(scores: Tensor, valid: np.ndarray) -> np.ndarray:
-    """Return (N,) uint8 train ids, 0 for points that are not valid, given (P, K) scores."""
-    return expand_to_scan(label_ids(scores), valid)
-
-
-def label_ids(scores: Tensor) -> Tensor:
-    """Return (P,) uint8 train ids 1..K: the first column of (P, K) with the largest score."""
-    if scores.is_cpu:  # NumPy takes half of torch's time
-        best = torch.from_numpy(scores.numpy().argmax(axis=1))
-    else:
-        best = scores.argmax(dim=1)
-    return (best + 1).to(torch.uint8)
+def _nowhere(scores: Tensor) -> Tensor:
+    """Return (P,) uncertain points of a single network: none."""
+    return torch.zeros(len(scores), dtype=torch.bool, device=scores.device)

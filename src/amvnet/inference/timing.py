@@ -21,7 +21,8 @@ from torch.utils.flop_counter import FlopCounterMode
 from amvnet.config.schema import Recipe
 from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.errors import InputError
-from amvnet.inference.segmenter import Segmenter, label_ids
+from amvnet.inference.segmentation import label_ids
+from amvnet.inference.segmenter import Segmenter
 from amvnet.memory import peak_memory
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertions import cosine_similarity

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from amvnet.config.schema import ModelConfig
 from amvnet.models.assertions import Assertion, build_assertion
 from amvnet.models.head_ensemble import Head, build_head
-from amvnet.models.methods import geometric_mean
+from amvnet.models.methods import Ensemble, geometric_mean
 from amvnet.models.point_head import (
     nearest_neighbours,
     point_table,
@@ -37,8 +37,8 @@ class Scores:
     """Class probabilities of P points.
 
     Attributes:
-        merged: (P, K) y, by AMVNet or the method that was asked for.
-        uncertain: (P,) bool, the points that the point head classifies.
+        merged: (P, K) y, by AMVNet or another method.
+        uncertain: (P,) bool, the points on which the two networks disagree.
         rv: (P, K) f, by the range view's network; None if it did not run.
         bev: (P, K) g, by the bird's-eye view's network; None if it did not run.
     """
@@ -76,6 +76,7 @@ class LateFusion(nn.Module):
         point_head: classifies the uncertain points; None for the ensemble of the two networks.
 
     Attributes:
+        ensemble: combines f and g for the certain points, by the geometric mean as in the paper.
         watch: returns the context in which a step runs, to time the steps; does nothing by default.
     """
 
@@ -83,13 +84,15 @@ class LateFusion(nn.Module):
         super().__init__()
         self.assertion = assertion
         self.point_head = point_head
+        self.ensemble: Ensemble = geometric_mean
         self.watch: Watch = unwatched
 
     def fuse(self, batch: PointBatch, f: Tensor, g: Tensor) -> Scores:
         """Return the fusion of f and g: (P, K) class probabilities."""
         uncertain = self.compare(batch, f, g)
         h = self.refine(batch, f, g, uncertain)
-        return Scores(self.merge(f, g, uncertain, h), uncertain, f, g)
+        y = self.merge(f, g, uncertain, h)
+        return Scores(y, uncertain, f, g)
 
     @step("compare")
     def compare(self, batch: PointBatch, f: Tensor, g: Tensor) -> Tensor:
@@ -140,8 +143,9 @@ class LateFusion(nn.Module):
 
     @step("merge")
     def merge(self, f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
-        """Return `merge(f, g, uncertain, h)`, as a step."""
-        return merge(f, g, uncertain, h)
+        """Return y: (P, K), h for the uncertain points and the ensemble for the others."""
+        y = self.ensemble(f, g)
+        return y if h is None else replace_uncertain(y, uncertain, h)
 
 
 class AMVNet(LateFusion):
@@ -174,10 +178,7 @@ class AMVNet(LateFusion):
         """Return the class probabilities of the points of a batch of scans."""
         image, grid = self.project(batch)
         f, g = self.score(image, grid)
-        uncertain = self.compare(batch, f, g)
-        h = self.refine(batch, f, g, uncertain)
-        y = self.merge(f, g, uncertain, h)
-        return Scores(y, uncertain, f, g)
+        return self.fuse(batch, f, g)
 
     @step("project")
     def project(self, batch: PointBatch) -> tuple[RangeImage, PolarGrid]:
@@ -205,21 +206,14 @@ class AMVNet(LateFusion):
         return self.score_polar(self.polar_view.project(batch))
 
 
-def merge(f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
-    """Return y: h for the uncertain points, the geometric mean of f and g for the others.
+def replace_uncertain(y: Tensor, uncertain: Tensor, h: Tensor) -> Tensor:
+    """Return y (P, K) with the rows h (U, K) of the uncertain points; on a CPU y is changed.
 
     Args:
-        f: (P, K) class probabilities.
-        g: (P, K) class probabilities.
+        y: (P, K) class probabilities.
         uncertain: (P,) bool, with U uncertain points.
-        h: (U, K) class probabilities of these, in order; None for the geometric mean everywhere.
-
-    Returns:
-        (P, K).
+        h: (U, K) class probabilities of these, in order.
     """
-    y = geometric_mean(f, g)
-    if h is None:
-        return y
     if y.is_cpu:
         return y.index_put_((uncertain,), h)
 

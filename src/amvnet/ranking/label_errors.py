@@ -20,7 +20,8 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmenter import Segmenter, check_scan, expand_to_scan
+from amvnet.inference.segmentation import expand_to_scan
+from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan
@@ -167,18 +168,20 @@ def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
             f"{scan.name}: expected labels to check, found none; choose sequences with labels"
         )
 
-    scores, _ = segmenter.scores_by_method(scan, ("rv", "bev"))
-    f = scores["rv"]  # (P, K) class probabilities of the P valid points
-    g = scores["bev"]  # (P, K)
     valid = scan.valid
+    result = segmenter(scan)
+    assert result.rv is not None
+    assert result.bev is not None
+    f = torch.from_numpy(result.rv[valid])  # (P, K) class probabilities of the P valid points
+    g = torch.from_numpy(result.bev[valid])  # (P, K)
     rv = _predicted_ids(f, valid)
     bev = _predicted_ids(g, valid)
 
     xyz = scan.points[:, :3]
     distance = np.hypot(xyz[valid, 0], xyz[valid, 1])
-    off_vehicle = torch.from_numpy(distance >= NEAR).to(f.device)  # (P,)
+    off_vehicle = torch.from_numpy(distance >= NEAR)  # (P,)
 
-    contradiction, agreed_ids = _contradiction(f, g, torch.from_numpy(label[valid]).to(f.device))
+    contradiction, agreed_ids = _contradiction(f, g, torch.from_numpy(label[valid]))
     doubt = expand_to_scan(contradiction * off_vehicle, valid)
     # One number for each pair of train ids.
     kind = label.astype(np.int64) * 256 + expand_to_scan(agreed_ids, valid)

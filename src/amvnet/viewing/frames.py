@@ -15,11 +15,11 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.inputs import InputScan, LoadedScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmentation import Origin, Segmentation
-from amvnet.inference.segmenter import Segmenter, check_scan, expand_labels, expand_to_scan
+from amvnet.inference.segmentation import Origin, Segmentation, expand_labels, expand_to_scan
+from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.models.assertions import cosine_similarity
+from amvnet.models.methods import geometric_mean
 from amvnet.progress import Progress, Say, no_progress, say_nothing
-from amvnet.scan import Scan
 from amvnet.sensors.adapt import ScanAdapter
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.plain import PlainAdapter
@@ -146,7 +146,9 @@ class Frames:
         if segmenter is not None:
             if scan_input.is_adapted:
                 segmenter = segmenter.by_ring()
-            frame = _segmented(frame, scan, segmenter)
+            result = segmenter(scan)
+            assert result.origin is not None
+            frame = replace(frame_of(result, result.origin), name=frame.name)
         return frame
 
 
@@ -200,36 +202,26 @@ def choose_frames(
 
 
 def frame_of(result: Segmentation, origin: Origin) -> Frame:
-    """Return the frame of a scan that was segmented: its labels, and those of each network."""
-    scan = origin.scan
-    rv = result.rv
-    bev = result.bev
-    labels = {}
-    for name, scores in (("rv", rv), ("bev", bev)):
-        if scores is not None:
-            labels[name] = expand_labels(torch.from_numpy(scores[scan.valid]), scan.valid)
-    labels[origin.method] = result.labels
+    """Return the frame of a scan that was segmented.
 
+    It has the labels of the result, of each network, and of the ensemble if there are two.
+    """
+    scan = origin.scan
+    valid = torch.from_numpy(scan.valid)
+    probabilities = {}
+    for name, values in (("rv", result.rv), ("bev", result.bev)):
+        if values is not None:
+            probabilities[name] = torch.from_numpy(values)[valid]  # (P, K)
+    has_two = len(probabilities) == 2
+    if has_two:
+        probabilities["ensemble"] = geometric_mean(probabilities["rv"], probabilities["bev"])
+
+    labels = {name: expand_labels(values, scan.valid) for name, values in probabilities.items()}
+    labels[origin.method] = result.labels
     frame = Frame(Path(scan.name).name or "scan", scan.points, scan.valid, scan.labels, labels)
-    if rv is None or bev is None:
+    if not has_two:
         return frame
 
-    similarity = cosine_similarity(torch.from_numpy(rv), torch.from_numpy(bev))
-    disagreement = (1 - similarity).clamp(0, 1).numpy() * scan.valid
+    similarity = cosine_similarity(probabilities["rv"], probabilities["bev"])
+    disagreement = expand_to_scan((1 - similarity).clamp(0, 1), scan.valid)
     return replace(frame, uncertain=result.uncertain, disagreement=disagreement)
-
-
-def _segmented(frame: Frame, scan: Scan, segmenter: Segmenter) -> Frame:
-    """Return a frame with labels by each of the paper's methods that the weights have parts for."""
-    scores, uncertain = segmenter.scores_by_method(scan)
-    labels = {name: expand_labels(values, scan.valid) for name, values in scores.items()}
-    if uncertain is None:
-        return replace(frame, labels=labels)
-
-    disagreement = (1 - cosine_similarity(scores["rv"], scores["bev"])).clamp(0, 1)
-    return replace(
-        frame,
-        labels=labels,
-        uncertain=expand_to_scan(uncertain, scan.valid),
-        disagreement=expand_to_scan(disagreement, scan.valid),
-    )

@@ -17,7 +17,7 @@ from amvnet.cli.options import (
     parse_names,
 )
 from amvnet.errors import InputError
-from amvnet.models.methods import EngineName, Precision, TtaName
+from amvnet.models.methods import EngineName, Precision, TtaName, widest_method
 
 if TYPE_CHECKING:
     from amvnet.data.taxonomy import Taxonomy
@@ -91,10 +91,19 @@ def evaluate(
         opened = open_data(data, taxonomy) if has_own else None
         dataset = map_classes(open_for_weights(data, loaded, opened), class_map)
         records = labelled_records(dataset, choose_records(dataset, names, split))
+        method_names = parse_methods(methods)
+        # The head runs only if AMVNet is among the methods.
+        parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in method_names]
         segmenter = make_segmenter(
-            loaded, processes.device(device), engine, precision, at_once, tta=tta
+            loaded,
+            processes.device(device),
+            engine,
+            precision,
+            at_once,
+            method=widest_method(parts),
+            tta=tta,
         )
-        labeller = label_by_weights(dataset, segmenter, parse_methods(methods), class_map)
+        labeller = label_by_weights(dataset, segmenter, method_names, class_map)
     elif predictions is not None and weights is None:
         if tta is not None:
             raise InputError("--tta: expected --weights, found --predictions; leave --tta out")

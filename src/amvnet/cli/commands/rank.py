@@ -62,7 +62,7 @@ def rank(
         dataset = open_for_weights(data, loaded)
         chosen = choose_records(dataset, parse_names(sequences), split)
         records = labelled_records(dataset, chosen)
-        segmenter = make_segmenter(loaded, device, engine, precision, at_once)
+        segmenter = make_segmenter(loaded, device, engine, precision, at_once, method="ensemble")
 
         with progress("scoring") as step:
             ranking = rank_records(dataset, records, segmenter, step)

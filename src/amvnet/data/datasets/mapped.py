@@ -15,6 +15,7 @@ from amvnet.data.datasets.predictions import read_prediction
 from amvnet.data.datasets.wrapped import WrappedDataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import inside
 from amvnet.scan import Scan
 
 
@@ -81,7 +82,8 @@ class MappedDataset(WrappedDataset):
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) mapped train ids as the raw ids of the map, in the dataset's layout."""
-        path, dtype = self._prediction_file(record, folder)
+        _, dtype = self._prediction_file(record, folder)
+        path = inside(folder, record.prediction)
         return files.write_labels(path, self.taxonomy.to_raw(ids), dtype)
 
     def _prediction_file(self, record: ScanRecord, folder: Path) -> tuple[Path, type[np.integer]]:

@@ -15,6 +15,7 @@ from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.predictions import read_prediction
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import checked_token, inside
 from amvnet.scan import Scan
 
 CHANNEL = "LIDAR_TOP"
@@ -184,7 +185,7 @@ class NuScenes:
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) train ids as raw ids (uint8)."""
         ids = files.check_count(ids, record.points_path, self._count_points(record))
-        path = Path(folder) / record.prediction
+        path = inside(folder, record.prediction)
         return files.write_labels(path, self.taxonomy.to_raw(ids), np.uint8)
 
     def _find_version(self, version: str | None) -> str:
@@ -315,7 +316,7 @@ class NuScenes:
 
     def _record(self, row: Row, scene: str) -> ScanRecord:
         """Return the scan of a row of sample_data."""
-        token = row["token"]
+        token = checked_token(row["token"])
         labels_path = None
         if token in self._label_files:
             labels_path = self.root / self._label_files[token]

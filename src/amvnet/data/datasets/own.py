@@ -22,7 +22,7 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.raw_labels import read_label_field, read_label_file
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, Taxonomy
 from amvnet.errors import InputError, shown
-from amvnet.files import read_yaml
+from amvnet.files import inside, read_yaml
 from amvnet.scan import Scan
 
 ENDINGS = (".yaml", ".yml")
@@ -161,7 +161,7 @@ class OwnScans:
 
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) train ids as raw ids (uint32)."""
-        return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids))
+        return files.write_labels(inside(folder, record.prediction), self.taxonomy.to_raw(ids))
 
     def recordings(self) -> dict[str, list[NamedScan]]:
         """Return the scans of each recording, in order: those of one folder and ending."""

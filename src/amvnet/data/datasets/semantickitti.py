@@ -14,6 +14,7 @@ from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.predictions import read_prediction
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import inside
 from amvnet.scan import Scan
 
 
@@ -101,7 +102,7 @@ class SemanticKitti:
     def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
         """Write (N,) train ids as raw ids (uint32)."""
         ids = files.check_count(ids, record.points_path, self._count_points(record))
-        return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids))
+        return files.write_labels(inside(folder, record.prediction), self.taxonomy.to_raw(ids))
 
     @property
     def _folder(self) -> Path:

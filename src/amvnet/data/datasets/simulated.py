@@ -23,7 +23,7 @@ from amvnet.data.datasets.predictions import read_prediction
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError, one_line_errors
-from amvnet.files import make_folder
+from amvnet.files import inside, make_folder
 from amvnet.scan import Scan
 from lidarstreets import SimulationError, drive_street
 from lidarstreets import simulate as simulate_streets
@@ -36,8 +36,8 @@ VAL_STREETS = 6
 FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
-# A training uses a street in this many epochs, then that whose number is `STREET_STEP` higher.
-EPOCHS_PER_STREET = 3
+# An epoch of a training takes the streets whose numbers are this much higher than those of the one
+# before: other streets help, more scans of the same streets do not (docs/log/training.md).
 STREET_STEP = 1000
 
 SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
@@ -123,7 +123,7 @@ class SimulatedStreets:
         if number >= FIRST_VAL_STREET:
             return record
 
-        shift = epoch // EPOCHS_PER_STREET * STREET_STEP
+        shift = epoch * STREET_STEP
         index = int(record.points_path.name)
         return self._record((number + shift) % FIRST_VAL_STREET, index)
 
@@ -152,7 +152,7 @@ class SimulatedStreets:
         """Write (N,) train ids as raw ids (uint32)."""
         count = len(self.read(record, labels=False))
         ids = files.check_count(ids, record.points_path, count)
-        return files.write_labels(Path(folder) / record.prediction, self.taxonomy.to_raw(ids))
+        return files.write_labels(inside(folder, record.prediction), self.taxonomy.to_raw(ids))
 
     @property
     def _is_nuscenes(self) -> bool:

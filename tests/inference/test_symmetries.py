@@ -15,7 +15,7 @@ import torch
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter
 from amvnet.config.schema import AssertionConfig
-from amvnet.inference.test_time import IDENTITY, SYMMETRIES, Symmetry, average
+from amvnet.inference.symmetries import IDENTITY, SYMMETRIES, Symmetry, average
 from amvnet.models.methods import TtaName
 from amvnet.models.views.points import PointBatch
 from amvnet.weights.file import save
@@ -130,16 +130,15 @@ def test_the_scan_as_it_is_alone_changes_no_bit() -> None:
     model = Segmenter(WEIGHTS).model
     batch = PointBatch.of([Scan(POINTS), Scan(POINTS[:100])])
 
-    def score(batch: PointBatch) -> dict[str, torch.Tensor]:
-        f, g = model.score(*model.project(batch))
-        return {"rv": f, "bev": g}
+    def score(batch: PointBatch) -> tuple[torch.Tensor, ...]:
+        scores: tuple[torch.Tensor, ...] = model.score(*model.project(batch))
+        return scores
 
     with torch.inference_mode():
         expected = score(batch)
         actual = average(score, batch, [IDENTITY])
-    assert list(actual) == list(expected)
-    for name, values in expected.items():
-        assert torch.equal(actual[name], values)
+    for before, after in zip(expected, actual, strict=True):
+        assert torch.equal(before, after)
 
 
 def matrix(symmetry: Symmetry) -> tuple[tuple[float, ...], ...]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from amvnet.models.methods import TtaName
 from amvnet.models.views.points import PointBatch
 
-Score = Callable[[PointBatch], dict[str, Tensor]]  # (P, K) class probabilities by network
+Score = Callable[[PointBatch], tuple[Tensor, ...]]  # (P, K) class probabilities of each network
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ SYMMETRIES: dict[TtaName, tuple[Symmetry, ...]] = {
 }
 
 
-def average(score: Score, batch: PointBatch, symmetries: Sequence[Symmetry]) -> dict[str, Tensor]:
-    """Return the means of class probabilities over some symmetries of a batch of scans.
+def average(score: Score, batch: PointBatch, symmetries: Sequence[Symmetry]) -> tuple[Tensor, ...]:
+    """Return the means of each network's class probabilities over symmetries of some scans.
 
     Args:
         score: scores the points of a batch.
@@ -68,7 +68,6 @@ def average(score: Score, batch: PointBatch, symmetries: Sequence[Symmetry]) -> 
     first, *others = symmetries
     sums = score(first(batch))
     for symmetry in others:
-        for name, probabilities in score(symmetry(batch)).items():
-            sums[name] = sums[name] + probabilities
+        sums = tuple(map(torch.add, sums, score(symmetry(batch))))
 
-    return {name: total / len(symmetries) for name, total in sums.items()}
+    return tuple(total / len(symmetries) for total in sums)

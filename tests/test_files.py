@@ -1,0 +1,327 @@
+"""Output files: whole, on the disk, with the umask's mode, and never outside the output folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from amvnet import files
+from amvnet.data.class_maps import class_map
+from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.mapped import MappedDataset
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.formats.cloud import Cloud, Message
+from amvnet.data.formats.detect import NamedScan
+from amvnet.data.taxonomy import NUSCENES
+from amvnet.errors import InputError
+from amvnet.files import atomic_write
+from amvnet.inference.inputs import (
+    DatasetScan,
+    FileReader,
+    FileScan,
+    InputScan,
+    LabelFormat,
+    Labels,
+)
+from amvnet.inference.pipeline import OutputOptions, Pipeline
+from amvnet.inference.segmenter import Segmentation
+from amvnet.scan import Scan
+from amvnet.weights.file import save
+
+from fixtures.datasets import MAKERS, make_nuscenes
+from fixtures.worlds import fails, fresh_weights, refusal, run_cli, street
+
+COUNT = 7  # points of a scan
+PRECIOUS = b"hours of work"
+VICTIMS = ("precious_lidarseg.bin", "precious.label", "precious.npy", "precious.npz", "precious")
+
+# Names that data may have. The output folder is BASE/out, and the victims are in BASE/victim.
+REFUSED = (
+    "../victim/precious",
+    "../../../victim/precious",
+    "a/../../victim/precious",
+    "BASE/victim/precious",
+    "a/../b",
+    "a\nb",
+    "\x1b[2J",
+    "\x00",
+    "\x9b1m",
+    "x" * 256,
+    "ä" * 200,
+    "\ud800",
+    "linked/precious",
+    "a/linked/precious",
+)
+ODD = ("", ".", "..", "/", "a/..", "a\\..\\precious", "C:\\precious", "linked", "\udcff")
+NAMES = st.sampled_from([*REFUSED, *ODD]) | st.text(max_size=8) | st.text("./\\a", max_size=8)
+LINKS = st.sampled_from(
+    ["sequences", "sequences/08", "lidarseg", "lidarseg/mini_val", "a", "linked", "a/linked"]
+)
+
+
+@contextmanager
+def surroundings(
+    *links: str, make: Callable[[Path], object] = lambda folder: None
+) -> Iterator[Path]:
+    """Yield a folder with victims and an output folder; only the latter may change in the block.
+
+    Args:
+        links: paths in the output folder that link to the folder of the victims.
+        make: makes the data, given their folder.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        base = Path(name)
+        (base / "victim").mkdir()
+        for victim in VICTIMS:
+            (base / "victim" / victim).write_bytes(PRECIOUS)
+        for link in links:
+            path = base / "out" / link
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.symlink_to(base / "victim")
+        make(base / "data")
+
+        before = contents_outside(base)
+        yield base
+        assert contents_outside(base) == before
+
+
+def contents_outside(base: Path) -> dict[str, bytes | None]:
+    """Return the contents of all files outside the output folder; None for folders."""
+    contents: dict[str, bytes | None] = {}
+    for folder, folders, names in os.walk(base):
+        if Path(folder) == base:
+            folders[:] = [name for name in folders if name != "out"]
+        contents[folder] = None
+        for name in names:
+            path = Path(folder) / name
+            contents[str(path)] = path.read_bytes()
+    return contents
+
+
+def label(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+    """Return labels without a network."""
+    results = []
+    for scan in scans:
+        scores = np.full((len(scan), 16), 1 / 16, np.float32)
+        ids = np.ones(len(scan), np.uint8)
+        results.append(Segmentation(ids, ids == 0, scores, rv=scores, bev=scores))
+    return results
+
+
+def write(base: Path, scans: Sequence[InputScan], kind: str = "label") -> None:
+    """Write labels, scores and uncertain points of scans, as predict and fuse do."""
+    output = OutputOptions(base / "out", kind, scores=True, uncertain=True, overwrite=True)
+    Pipeline(scans, label, output, NUSCENES).run({})
+
+
+def some_cloud() -> Cloud:
+    xyz = np.arange(3.0 * COUNT).reshape(COUNT, 3)
+    return Cloud(xyz, np.zeros(COUNT), message=Message("/lidar", 0, 0, "lidar"))
+
+
+def named(name: str) -> InputScan:
+    """Return a scan file with a name."""
+    return FileScan(NamedScan(name, "source", Path("scan.bin"), some_cloud), FileReader(None))
+
+
+def set_token(root: Path, token: str) -> None:
+    """Replace the token of the first scan in the tables of nuScenes."""
+    path = root / "v1.0-mini/sample_data.json"
+    rows = json.loads(path.read_text())
+    for row in rows:
+        if row["token"] == "scene-0103-9":
+            row["token"] = token
+    path.write_text(json.dumps(rows))
+
+
+def with_token(token: str) -> Callable[[Path], None]:
+    """Return what makes a small nuScenes of which one scan has a token."""
+
+    def make(root: Path) -> None:
+        make_nuscenes(root)
+        set_token(root, token.replace("BASE", str(root.parent)))
+
+    return make
+
+
+# ---- nothing outside the output folder
+
+
+@settings(deadline=None, max_examples=150)
+@given(name=NAMES, kind=st.sampled_from(["label", "npy", "ply", "mcap"]), link=LINKS)
+def test_names_of_scans_write_nothing_elsewhere(name: str, kind: str, link: str) -> None:
+    with surroundings(link) as base:
+        name = name.replace("BASE", str(base)) + ("/000000" if kind == "mcap" else "")
+        scan = named(name)
+        with suppress(InputError):
+            write(base, [scan], kind)
+        with suppress(InputError):  # the names are checked once more when a file is written
+            form = LabelFormat(kind, NUSCENES)
+            labels = Labels(np.ones(COUNT, np.uint8))
+            scan.write_labels(base / "out", form, labels, scan.load().file_xyz)
+
+
+@settings(deadline=None, max_examples=100)
+@given(token=NAMES, link=LINKS, is_mapped=st.booleans())
+def test_tokens_write_nothing_elsewhere(token: str, link: str, is_mapped: bool) -> None:
+    with surroundings(link, make=with_token(token)) as base, suppress(InputError):
+        dataset: Dataset = open_dataset(f"nuscenes:{base}/data")
+        if is_mapped:
+            dataset = MappedDataset(dataset, class_map("coarse"))
+        records = dataset.records(dataset.sequences("all"))
+        write(base, [DatasetScan(dataset, record) for record in records])
+
+
+@settings(deadline=None, max_examples=100)
+@given(name=NAMES, link=LINKS, benchmark=st.sampled_from(list(MAKERS)))
+def test_records_write_nothing_elsewhere(name: str, link: str, benchmark: str) -> None:
+    with surroundings(link, make=MAKERS[benchmark]) as base:
+        dataset = open_dataset(f"{benchmark}:{base}/data")
+        first = dataset.records(dataset.sequences("all"))[0]
+        record = replace(first, prediction=name.replace("BASE", str(base)))
+        ids = np.ones(len(dataset.read(record)), np.uint8)
+        with suppress(InputError):
+            dataset.write_prediction(record, base / "out", ids)
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_hostile_name_is_refused_before_anything_is_written(name: str) -> None:
+    with surroundings("linked", "a/linked") as base:
+        before = sorted((base / "out").rglob("*"))
+        scans = [named("good"), named(name.replace("BASE", str(base)))]
+        fails(partial(write, base, scans), base / "out")
+        assert sorted((base / "out").rglob("*")) == before
+
+
+def test_a_file_that_is_a_link_is_replaced_and_not_followed() -> None:
+    with surroundings("good.label", "good.npz") as base:
+        write(base, [named("good")])
+        assert not (base / "out/good.label").is_symlink()
+        assert np.fromfile(base / "out/good.label", np.uint32).shape == (COUNT,)
+
+
+def test_an_output_folder_may_be_a_link() -> None:
+    with surroundings() as base:
+        (base / "out/real").mkdir(parents=True)
+        (base / "out/link").symlink_to(base / "out/real")
+        Pipeline([named("a/b")], label, OutputOptions(base / "out/link"), NUSCENES).run({})
+        assert (base / "out/real/a/b.label").is_file()
+
+
+VERBS = (
+    "predict nuscenes:{base}/data --weights {weights} --out {base}/out --scores",
+    "fuse nuscenes:{base}/data --scores-a {base} --scores-b {base} --out {base}/out",
+    "submit nuscenes:{base}/data --predictions {base} --split val --out {base}/out/a.zip",
+    "evaluate nuscenes:{base}/data --predictions {base}/victim --pictures {base}/out",
+    "rank nuscenes:{base}/data --weights {weights} --out {base}/out/r.csv --pictures {base}/out",
+    "view nuscenes:{base}/data --weights {weights} --html {base}/out/page.html",
+    "train nuscenes-compact --data nuscenes:{base}/data --out {base}/out",
+)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save(fresh_weights(NUSCENES), tmp_path_factory.mktemp("weights") / "w.safetensors")
+
+
+@pytest.mark.parametrize("verb", VERBS, ids=lambda verb: verb.split()[0])
+def test_every_verb_refuses_a_token_that_is_a_path(verb: str, weights: Path) -> None:
+    with surroundings(make=with_token("../../../victim/precious")) as base:
+        line = refusal(verb.format(base=base, weights=weights))
+        assert "'../../../victim/precious'" in line
+
+
+@pytest.mark.parametrize("verb", VERBS[:2], ids=lambda verb: verb.split()[0])
+def test_a_linked_folder_of_the_output_is_refused(verb: str, weights: Path) -> None:
+    with surroundings("lidarseg", make=with_token("precious")) as base:
+        for token in ("precious", "scene-0103-8", "scene-0061-9", "scene-0061-8"):
+            scores = base / f"out/scores/lidarseg/mini_val/{token}_lidarseg.npy"
+            scores.parent.mkdir(parents=True, exist_ok=True)
+            np.save(scores, np.ones((COUNT, 16)))
+        command = verb.replace("{base} ", "{base}/out/scores ")
+        line = refusal(f"{command.format(base=base, weights=weights)} --split mini_val")
+        assert "found a link" in line
+
+
+# ---- one file
+
+
+@pytest.fixture(params=[0o022, 0o077, 0o002])
+def umask(request: pytest.FixtureRequest) -> Iterator[int]:
+    earlier = os.umask(request.param)
+    yield request.param
+    os.umask(earlier)
+
+
+def test_every_file_has_the_mode_of_the_umask(umask: int, tmp_path: Path) -> None:
+    save(fresh_weights(), tmp_path / "w.safetensors")  # safetensors writes private files
+    street(0)[0].tofile(tmp_path / "a.bin")
+    code, error = run_cli("predict", tmp_path / "a.bin", "--weights", tmp_path / "w.safetensors",
+                          "--out", tmp_path / "out", "--scores", "--uncertain")  # fmt: skip
+    assert (code, error) == (0, "")
+
+    paths = [path for path in tmp_path.rglob("*") if path.is_file()]
+    assert len(paths) == 6
+    assert {stat.S_IMODE(path.stat().st_mode) for path in paths} == {0o666 & ~umask}
+
+
+def test_the_content_is_on_the_disk_before_the_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    calls: list[tuple[str, Any]] = []
+
+    def record(name: str) -> Callable[..., None]:
+        real = getattr(os, name)
+
+        def call(first: Any, *others: Any) -> None:
+            inode = os.fstat(first).st_ino if name == "fsync" else Path(first).stat().st_ino
+            calls.append((name, inode))
+            real(first, *others)
+
+        return call
+
+    for name in ("fsync", "replace"):
+        monkeypatch.setattr(files.os, name, record(name))
+    with atomic_write(tmp_path / "a.txt") as part:
+        part.write_text("a")
+
+    inode = (tmp_path / "a.txt").stat().st_ino
+    folder = tmp_path.stat().st_ino
+    assert calls == [("fsync", inode), ("replace", inode), ("fsync", folder)]
+
+
+def test_a_block_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_bytes(PRECIOUS)
+    with suppress(KeyboardInterrupt), atomic_write(path) as part:
+        part.write_text("half")
+        raise KeyboardInterrupt
+    assert path.read_bytes() == PRECIOUS
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["a" * 255, "a." + "b" * 253])
+def test_the_longest_names_can_be_written(name: str, tmp_path: Path) -> None:
+    with atomic_write(tmp_path / name) as part:
+        part.write_bytes(b"")
+    assert (tmp_path / name).is_file()
+
+
+def test_an_error_of_the_disk_names_the_file_and_not_its_temporary_name(tmp_path: Path) -> None:
+    path = tmp_path / ("a" * 256)
+    with pytest.raises(OSError, match="too long") as caught, atomic_write(path):
+        pass
+    assert caught.value.filename == str(path)
