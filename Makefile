@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A process for each processor, and one thread in each. The tests of a file share what they make, so one process runs them.
 SPREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow bench lint format clean
+.PHONY: demo test test-slow bench docs lint format clean
 
 demo: .venv/installed  ## simulate streets, segment, score and draw them
 	$(BIN)/amvnet demo --out demo
@@ -18,6 +18,9 @@ test-slow: .venv/installed  ## the tests that take minutes, too
 bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN="--scan FILE" for a scan of yours
 	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8,compile
 	$(BIN)/amvnet bench --recipe semantickitti $(SCAN)
+
+docs: .venv/docs  ## the site of docs/, in site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: .venv/installed
 	$(BIN)/ruff check src ros2 docker tests benchmarks docs
@@ -35,5 +38,9 @@ format: .venv/installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[simulate,formats,export,test]"
 	touch $@
 
+.venv/docs: .venv/installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	touch $@
+
 clean:
-	rm -rf .venv demo
+	rm -rf .venv demo site

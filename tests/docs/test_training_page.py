@@ -12,9 +12,17 @@ from zipfile import ZipFile
 import pytest
 
 from amvnet.config.recipes import recipe_names
-from amvnet.weights.file import load
+from amvnet.weights.file import load, save
 
-from fixtures.worlds import GOLDEN, commands_of, files, make_streets, run_cli, write_recipe
+from fixtures.worlds import (
+    GOLDEN,
+    commands_of,
+    files,
+    fresh_weights,
+    make_streets,
+    run_cli,
+    write_recipe,
+)
 
 TEST = tuple(str(sequence) for sequence in range(11, 22))
 
@@ -98,3 +106,17 @@ def test_the_commands_on_training_run(page: str, least: int, downloads: Path) ->
         assert (downloads / "entry.zip").stat().st_size
         assert "sequences/11/predictions/000000.label" in files(downloads / "entry")
         assert (downloads / "runs/kitti/figures/methods.md").is_file()
+
+
+def test_the_commands_on_fine_tuning_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_streets(tmp_path / "data/kitti/dataset", ("00", "08"))
+    make_streets(tmp_path / "mine", ("00", "01", "02"), scans=1)
+    save(fresh_weights(), tmp_path / "sim-hdl64e")
+    write_recipe(tmp_path / "finetune.tiny.yaml", "finetune", training=ONE_EPOCH)
+
+    commands = commands_of("docs/finetuning.md")
+    assert len(commands) == 3
+    for words in commands:
+        run([word.replace("sim-hdl64e", "./sim-hdl64e") for word in words], tmp_path)
+    assert load("runs/finetuned").parts == ("range_net", "polar_net", "point_head")

@@ -94,7 +94,8 @@ def fuse(
 
     Args:
         points: (N, 4) x, y, z in metres and intensity in [0, 1].
-        f, g: (N, K) class probabilities of the two models.
+        f: (N, K) class probabilities of one model.
+        g: (N, K) class probabilities of the other model.
         head: a trained point head, or weights that hold one; None gives the ensemble.
         tau: points whose scores have a cosine similarity of at most this are uncertain; by default
             the threshold that the weights were trained with, or the paper's without weights.

@@ -1,0 +1,44 @@
+"""Write the help of every verb into the page on the command line, when MkDocs builds the site."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from contextlib import redirect_stdout, suppress
+from typing import Any
+
+from amvnet.cli.main import main
+
+PAGE = "command_line.md"
+PLACE = "<!-- the help of every verb -->"
+WIDTH = 100  # columns
+
+
+def help_of(*words: str) -> str:
+    """Return what `amvnet WORDS --help` prints."""
+    os.environ["COLUMNS"] = str(WIDTH)
+    printed = io.StringIO()
+    with redirect_stdout(printed), suppress(SystemExit):
+        main([*words, "--help"])
+    return printed.getvalue().strip()
+
+
+def verbs() -> list[str]:
+    """Return the verbs in the order in which `amvnet --help` lists them."""
+    return re.findall(r"(?m)^  (\w+)  ", help_of())
+
+
+def reference() -> str:
+    """Return a section with the help of each verb, in Markdown."""
+    sections = []
+    for verb in verbs():
+        sections.append(f"## amvnet {verb}\n\n```text\n{help_of(verb)}\n```")
+    return "\n\n".join(sections)
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Fill in the reference; MkDocs calls this for each page."""
+    if page.file.src_uri != PAGE:
+        return markdown
+    return markdown.replace(PLACE, reference())
