@@ -37,7 +37,7 @@ from amvnet.data.scan_files import read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import build_amvnet
-from amvnet.models.assertions import Disagreement, cosine_similarity
+from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import PointBatch

@@ -143,9 +143,9 @@ submit city32 --sequences simulated-0000 --predictions labels/32/amvnet --use-ex
 # Training
 train kitti.yaml --data city64 --out runs/kitti --train-sequences 00,01 --val-sequences 02
 train nuscenes.yaml --data city32 --out runs/folds --training.head.folds 2 --training.workers 1
-train kitti.yaml --data city64 --out runs/entropy --stage head --init runs/kitti \
+train kitti.yaml --data city64 --out runs/tau --stage head --init runs/kitti \
     --train-sequences 00,01 --val-sequences 02 --training.head.class_weights true \
-    --model.assertion.name entropy --model.assertion.threshold 1.5
+    --model.assertion.threshold 0.8
 train kitti.yaml --data city64 --out runs/scores --stage head --with-val \
     --scores-a labels/64/amvnet --scores-b labels/64/amvnet --key-a rv --key-b bev
 ablate nuscenes.yaml --data city32 --out runs/ablation --training.rv.epochs 1

@@ -98,20 +98,6 @@ def test_two_processes_train_the_weights_of_one(world: Path, tmp_path: Path, sta
     assert result.stdout.count("epoch 2/") == 1  # only one of them prints
 
 
-def test_two_processes_train_all_parts_together_like_one(world: Path, tmp_path: Path) -> None:
-    options = ["--init", world / "run", "--training.joint.batch", 4]
-    options += ["--training.joint.points", 10_000]  # all, as each process draws its own
-    assert one_process(*train_arguments(world, tmp_path / "one", "joint"), *options) == 0
-    result = torchrun(*train_arguments(world, tmp_path / "two", "joint"), *options)
-    assert result.returncode == 0, result.stderr
-
-    weights = load(tmp_path / "two")
-    expected = load(tmp_path / "one")
-    assert largest_difference(weights, expected) < 1e-5
-    for part, metrics in expected.metrics.items():
-        assert weights.metrics[part] == pytest.approx(metrics)
-
-
 def test_processes_that_slurm_has_started_find_each_other(world: Path, tmp_path: Path) -> None:
     job = {
         "SLURM_JOB_ID": "4711",

@@ -298,27 +298,10 @@ def pool(pillar: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 def disagree(assertion: AssertionConfig, f: np.ndarray, g: np.ndarray) -> np.ndarray:
     """Return (P,) bool: True if a point is uncertain by the networks' probabilities f, g (P, K)."""
-    verdicts = [_asserts(name, limit, f, g) for name, limit in assertion.for_prediction().terms]
-    combine = np.any if assertion.combine == "any" else np.all
-    uncertain: np.ndarray = combine(verdicts, axis=0)
-    return uncertain
-
-
-def _asserts(name: str, threshold: float, f: np.ndarray, g: np.ndarray) -> np.ndarray:
-    """Return (P,) bool: the points that one assertion, as in `models/assertions.py`, finds."""
-    if name == "labels":
-        return f.argmax(axis=1) != g.argmax(axis=1)
-
-    mean = (f + g) / 2
-    if name == "entropy":
-        return -(mean * np.log(np.maximum(mean, TINY))).sum(axis=1) >= threshold
-    if name == "margin":
-        second, first = np.partition(mean, (-2, -1), axis=1)[:, -2:].T
-        return first - second <= threshold
-
     squared_lengths = (f * f).sum(axis=1) * (g * g).sum(axis=1)
     similarity = (f * g).sum(axis=1) / np.sqrt(np.maximum(squared_lengths, TINY))
-    return np.minimum(similarity, 1) <= threshold
+    uncertain: np.ndarray = np.minimum(similarity, 1) <= assertion.threshold
+    return uncertain
 
 
 def softmax(scores: np.ndarray) -> np.ndarray:

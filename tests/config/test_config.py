@@ -12,7 +12,7 @@ import yaml
 
 from amvnet.config.nested import from_dict, merge_trees, to_dict
 from amvnet.config.recipes import load_recipe, recipe_names
-from amvnet.config.schema import AssertionConfig, ModelConfig, PointHeadConfig, Recipe
+from amvnet.config.schema import ModelConfig, PointHeadConfig, Recipe
 from amvnet.errors import InputError
 
 
@@ -67,7 +67,7 @@ def test_the_semantickitti_recipe_holds_the_papers_numbers() -> None:
     assert (grid.radial, grid.angular, grid.vertical) == (480, 360, 32)
     assert (grid.radius_max, grid.z_min, grid.z_max) == (50.0, -3.0, 1.5)
 
-    assert recipe.model.assertion.terms == (("disagreement", 0.85),)
+    assert recipe.model.assertion.threshold == 0.85
     assert recipe.model.point_head.neighbours == 15
 
     training = recipe.training
@@ -259,17 +259,35 @@ def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(
         load_recipe(write_recipe(tmp_path, text))
 
 
-def test_an_assertion_brings_its_own_threshold_unless_one_is_given() -> None:
-    tree: dict[str, Any] = {"name": "entropy"}
-    assert from_dict(AssertionConfig, tree).terms == (("entropy", 0.7),)
-    tree["threshold"] = 1
-    assert from_dict(AssertionConfig, tree).terms == (("entropy", 1.0),)
-    tree |= {"threshold": None, "others": ["margin", "labels"]}
-    config = from_dict(AssertionConfig, tree)
-    assert [name for name, _ in config.terms] == ["entropy", "margin", "labels"]
-    assert config.describe() == "entropy at 0.7 or margin at 0.3 or different labels"
-    assert from_dict(AssertionConfig, to_dict(config)) == config
+def test_what_earlier_versions_wrote_is_read_if_it_asks_for_nothing_else() -> None:
+    """The model and the training of weights and recipes of commit 0ab4d2a, but for the defaults."""
+    earlier = {
+        "model": {
+            "assertion": {
+                "name": "disagreement",
+                "threshold": None,
+                "others": [],
+                "other_thresholds": [],
+                "combine": "any",
+            },
+            "point_head": {"pooling": "max", "heads": 1},
+        },
+        "training": {"joint": {"batch": 2, "ema": 0.99}, "adapt": {"rounds": 1}},
+    }
+    assert from_dict(Recipe, earlier) == Recipe()
 
-    tree["other_thresholds"] = [0.1]
-    with pytest.raises(InputError, match="other_thresholds"):
-        from_dict(AssertionConfig, tree)
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("assertion name", "entropy"),
+        ("assertion others", ["margin"]),
+        ("assertion other_thresholds", [0.1]),
+        ("point_head pooling", "attention"),
+        ("point_head heads", 2),
+    ],
+)
+def test_what_was_removed_is_refused_by_its_name(field: str, value: Any) -> None:
+    part, name = field.split()
+    with pytest.raises(InputError, match=f"{part}: {name}: expected .* found .* was removed"):
+        from_dict(ModelConfig, {part: {name: value}})

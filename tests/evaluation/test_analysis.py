@@ -17,7 +17,6 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation import analysis
 from amvnet.evaluation.analysis import BINS, SWEPT, Analysis, analyze
-from amvnet.evaluation.assertions import SHARES, rank_points
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
@@ -70,7 +69,7 @@ def with_assertion(weights: Weights, assertion: AssertionConfig) -> Weights:
 
 
 def with_tau(weights: Weights, tau: float) -> Weights:
-    return with_assertion(weights, AssertionConfig("disagreement", tau))
+    return with_assertion(weights, AssertionConfig(tau))
 
 
 def analyze_08(dataset: Dataset, weights: Weights) -> Analysis:
@@ -137,8 +136,7 @@ def test_points_that_no_network_sees_count_as_evaluate_counts_them(
     assert evaluation.points == expected.points
     assert evaluation.uncertain == expected.uncertain
 
-    ((_, tau),) = weights.model.assertion.terms
-    swept = analyzed.sweep()[round(tau * BINS)]
+    swept = analyzed.sweep()[round(weights.model.assertion.threshold * BINS)]
     assert swept.uncertain == pytest.approx(expected.uncertain / expected.points, abs=0.005)
 
 
@@ -277,53 +275,18 @@ def test_taus_are_swept_with_heads_of_their_own(world: Path) -> None:
     assert fewer < all_points == 100
     few = load(out / "taus/0.9/weights.safetensors")
     many = load(out / "taus/1.0/weights.safetensors")
-    assert few.model.assertion.terms == (("disagreement", 0.9),)
-    assert many.model.assertion.terms == (("disagreement", 1.0),)
+    assert few.model.assertion.threshold == 0.9
+    assert many.model.assertion.threshold == 1.0
     assert few.digest("point_head") != many.digest("point_head")
     assert few.digest("range_net") == many.digest("range_net")
 
 
-def test_assertions_are_compared_at_equal_shares(world: Path) -> None:
-    out = world / "compared"
-    succeed(f"analyze {world}/data --weights {world}/weights.safetensors --out {out} --assertions")
-    names = column(out / "assertions.csv", "assertion")
-    assert len(names) == 6 * len(SHARES)
-    assert column(out / "assertions.csv", "uncertain %")[: len(SHARES)] == [
-        "5.0",
-        "10.0",
-        "20.0",
-        "30.0",
-    ]
-
-
-def test_a_union_ranks_a_point_by_the_assertion_that_finds_it_first() -> None:
-    generator = torch.Generator().manual_seed(0)
-    f = (3 * torch.randn(500, 5, generator=generator)).softmax(1)
-    g = (3 * torch.randn(500, 5, generator=generator)).softmax(1)
-    ranks = rank_points(f, g)
-    for rank in ranks.values():
-        assert sorted(rank.tolist()) == list(range(500))
-
-    def found(name: str, count: int) -> set[int]:
-        return set((ranks[name] < count).nonzero()[:, 0].tolist())
-
-    first = found("disagreement", 50)
-    second = found("entropy", 50)
-    assert found("disagreement or entropy", len(first | second)) == first | second
-    assert found("disagreement and entropy", len(first & second)) == first & second
-    different = f.argmax(1) != g.argmax(1)
-    assert found("labels", int(different.sum())) == set(different.nonzero()[:, 0].tolist())
-
-
 def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     save(without(fresh_weights(), "point_head"), world / "headless.safetensors")
-    entropy = with_assertion(fresh_weights(), AssertionConfig("entropy", 0.7))
-    save(entropy, world / "entropy.safetensors")
 
     recipe = f"--recipe {world}/recipe.yaml"
     cases = [
         ("headless", "", "point_head"),
-        ("entropy", "", "disagreement"),
         ("weights", "--neighbours 3", "--recipe"),
         ("weights", "--taus 0.5", "--recipe"),
         ("weights", f"--taus 0.5,2 {recipe}", "0.5,2"),

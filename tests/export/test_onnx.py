@@ -140,20 +140,6 @@ def test_other_methods_say_what_torch_says(
     assert (expected.uncertain == actual.uncertain).mean() >= 0.9999
 
 
-def test_an_ensemble_of_attention_heads_says_what_torch_says(tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime")
-    weights = fresh_weights(head={"pooling": "attention", "heads": 2})
-    onnx_export.export(weights, tmp_path)
-
-    scan = make_scan(5)
-    expected = Segmenter(weights)(scan)
-    actual = OnnxSegmenter(tmp_path)(scan.points)
-    same = expected.uncertain == actual.uncertain
-    assert expected.uncertain.any()
-    assert same.mean() >= 0.9999
-    assert np.abs(expected.scores - actual.scores)[same].max() <= 1e-4
-
-
 def test_matched_intensities_are_in_the_description(exported: Exports, folder: Path) -> None:
     quantiles = QUANTILES["hdl64e"]
     records = {part: {MATCHED: True, KEY: list(quantiles)} for part in BOTH_NETWORKS}

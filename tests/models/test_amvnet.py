@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import permutations
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,18 +15,11 @@ import torch
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from amvnet.config.schema import AssertionConfig, ModelConfig, PointHeadConfig
+from amvnet.config.schema import PointHeadConfig
 from amvnet.models import amvnet as amvnet_module
 from amvnet.models import point_head as point_head_module
-from amvnet.models.amvnet import LateFusion, build_amvnet
-from amvnet.models.assertions import (
-    DifferentLabels,
-    Disagreement,
-    HighEntropy,
-    HighLoss,
-    SmallMargin,
-    build_assertion,
-)
+from amvnet.models.amvnet import LateFusion
+from amvnet.models.assertion import Disagreement
 from amvnet.models.layers import fold_batch_norms
 from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
 from amvnet.models.point_head import (
@@ -54,12 +48,8 @@ def test_the_papers_point_head_has_18500_parameters_and_costs_one_gmac_for_10000
     assert counter.get_total_flops() / 2 == pytest.approx(1e9, rel=0.05)
 
 
-HEADS = pytest.mark.parametrize("kind", [{}, {"pooling": "attention"}, {"heads": 3}])
-
-
-@HEADS
-def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order(kind: Any) -> None:
-    head = trained_head(replace(TINY.point_head, **kind), K)
+def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order() -> None:
+    head = trained_head(TINY.point_head, K)
     point = torch.randn(5, 2 * K + 4)
     rows = torch.randn(5, 3, 2 * K + 4)
     expected = head(point, rows)
@@ -74,10 +64,9 @@ def test_the_point_head_depends_on_its_neighbours_but_not_on_their_order(kind: A
     assert (head(point + 1, rows) != expected).any(dim=1).all()
 
 
-@HEADS
-def test_folded_batch_norms_change_no_output_of_the_point_head(kind: Any) -> None:
+def test_folded_batch_norms_change_no_output_of_the_point_head() -> None:
     torch.manual_seed(0)
-    head = trained_head(replace(TINY.point_head, **kind), K)
+    head = trained_head(TINY.point_head, K)
     point = torch.randn(20, 2 * K + 4)
     rows = torch.randn(20, 3, 2 * K + 4)
     head.train()(point, rows)  # changes the norms' initial statistics
@@ -218,99 +207,22 @@ def test_at_the_threshold_a_point_is_uncertain() -> None:
     points = torch.zeros(2, 4)
 
     assert Disagreement(0.0)(f, f.flip(0), points).all()
-    assert HighEntropy(0.0)(f, f, points).all()
-    assert HighLoss(0.0)(f, f, points, torch.tensor([1, 2])).all()
 
 
-def test_entropy_equals_a_loop_of_its_formula() -> None:
+def test_another_assertion_can_be_written_as_the_page_shows() -> None:
+    page = Path(__file__).parents[2] / "docs/options.md"
+    (example,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    scope: dict[str, Any] = {}
+    exec(example, scope)
+
     f, g, points, _ = random_scores()
     expected = []
     for i in range(len(f)):
-        entropy = 0.0
-        for k in range(K):
-            mean = (f[i, k].item() + g[i, k].item()) / 2
-            entropy -= mean * math.log(mean)
-        expected.append(entropy >= 0.9)
-
-    assert HighEntropy(0.9)(f, g, points).tolist() == expected
+        mean = [(f[i, k].item() + g[i, k].item()) / 2 for k in range(K)]
+        expected.append(-sum(p * math.log(p) for p in mean) >= 0.9)
+    assert scope["HighEntropy"](0.9)(f, g, points).tolist() == expected
     assert set(expected) == {False, True}
-
-
-def test_loss_equals_a_loop_of_its_formula_and_leaves_unlabelled_points_certain() -> None:
-    f, g, points, labels = random_scores()
-    expected = []
-    for i, label in enumerate(labels.tolist()):
-        lower = min(f[i, label - 1].item(), g[i, label - 1].item())
-        expected.append(label > 0 and -math.log(lower) >= 0.9)
-
-    assert HighLoss(0.9)(f, g, points, labels.to(torch.uint8)).tolist() == expected
-    assert set(expected) == {False, True}
-
-
-def test_the_loss_assertion_without_labels_raises() -> None:
-    f, g, points, _ = random_scores()
-    with pytest.raises(ValueError, match="labels"):
-        HighLoss()(f, g, points)
-
-
-def test_assertions_stay_finite_at_certainty() -> None:
-    f = torch.eye(3)
-    points = torch.zeros(3, 4)
-    assert not HighEntropy(0.1)(f, f, points).any()
-    assert HighLoss(0.1)(f, f.roll(1, 0), points, torch.tensor([1, 2, 3])).all()
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("disagreement", Disagreement),
-        ("entropy", HighEntropy),
-        ("margin", SmallMargin),
-        ("loss", HighLoss),
-    ],
-)
-def test_a_configuration_names_its_assertion(name: Any, kind: Callable[..., object]) -> None:
-    assert build_assertion(AssertionConfig(name, 0.3), labels=True) == kind(0.3)
-    assert build_assertion(AssertionConfig(name), labels=True) == kind()
-
-
-def test_margin_and_labels_equal_a_loop_of_their_formulas() -> None:
-    f, g, points, _ = random_scores()
-    small = []
-    different = []
-    for i in range(len(f)):
-        mean = sorted((f[i, k].item() + g[i, k].item()) / 2 for k in range(K))
-        small.append(mean[-1] - mean[-2] <= 0.2)
-        different.append(int(f[i].argmax()) != int(g[i].argmax()))
-
-    assert SmallMargin(0.2)(f, g, points).tolist() == small
-    assert DifferentLabels()(f, g, points).tolist() == different
-    assert set(small) == set(different) == {False, True}
-
-
-def test_a_union_is_the_union_and_an_intersection_the_intersection() -> None:
-    f, g, points, _ = random_scores()
-    single = [
-        build_assertion(AssertionConfig("disagreement", 0.8))(f, g, points),
-        build_assertion(AssertionConfig("entropy", 1.0))(f, g, points),
-        build_assertion(AssertionConfig("labels"))(f, g, points),
-    ]
-    config = AssertionConfig("disagreement", 0.8, ("entropy", "labels"), (1.0, 0.0))
-    union = build_assertion(config)(f, g, points)
-    common = build_assertion(replace(config, combine="all"))(f, g, points)
-    for i in range(len(f)):
-        assert bool(union[i]) == any(bool(verdict[i]) for verdict in single)
-        assert bool(common[i]) == all(bool(verdict[i]) for verdict in single)
-    assert 0 < common.sum() < union.sum() < len(f)
-
-
-def test_without_labels_the_loss_is_left_out_of_an_assertion() -> None:
-    assert build_assertion(AssertionConfig("loss", 2.0)) == Disagreement(0.85)
-    assert build_assertion(AssertionConfig("loss", 2.0, ("entropy",))) == HighEntropy(0.7)
-
-    f, g, points, _ = random_scores()
-    model = build_amvnet(ModelConfig(assertion=AssertionConfig("loss")), K)
-    assert torch.equal(model.assertion(f, g, points), Disagreement()(f, g, points))
+    assert scope["segmenter"].model.assertion == scope["HighEntropy"](0.7)
 
 
 def test_the_ensembles_equal_their_formulas() -> None:
@@ -363,13 +275,12 @@ def test_agreement_leaves_the_scores_alone(random_scan: RandomScan) -> None:
     assert model(PointBatch.of([random_scan(30)])).uncertain.all()
 
 
-@HEADS
 @pytest.mark.parametrize("uncertain", [0, 1, 2500])
 @pytest.mark.parametrize("folded", [False, True])
 def test_scoring_points_from_the_table_equals_scoring_their_features(
-    uncertain: int, folded: bool, kind: Any
+    uncertain: int, folded: bool
 ) -> None:
-    head = trained_head(PointHeadConfig(**kind), 19)
+    head = trained_head(PointHeadConfig(), 19)
     if folded:
         fold_batch_norms(head)
 

@@ -25,7 +25,7 @@ from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pi
 from amvnet.inference.predict import NetworkSegmentation
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import LateFusion
-from amvnet.models.assertions import Disagreement
+from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import Precision
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks

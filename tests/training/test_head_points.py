@@ -39,34 +39,6 @@ def test_balanced_draws_have_all_classes_equally_often() -> None:
         np.testing.assert_allclose(counts / 6000, expected, atol=0.03)
 
 
-def test_each_head_of_an_ensemble_has_its_own_draw_and_the_first_that_of_a_single_head() -> None:
-    single = PointSampler(PointDraw(1000, drawn=200), batch=50, seed=0, shuffle=True)
-    ensemble = PointSampler(PointDraw(1000, drawn=200, heads=3), batch=50, seed=0, shuffle=True)
-    assert len(ensemble) == len(single)
-
-    by_head: list[list[int]] = [[], [], []]
-    for batch in ensemble:
-        for points, part in zip(by_head, np.split(batch, 3), strict=True):
-            points.extend(part.tolist())
-    assert by_head[0] == epoch(single, 0)
-    for points in by_head:
-        assert len(set(points)) == 200
-    assert len(set(by_head[1]) & set(by_head[2])) < 100
-
-    shares = []
-    for rank in range(2):
-        share = PointSampler(ensemble.draw, 50, 0, True, Processes(rank, 2))
-        shares.append([np.split(batch, 3) for batch in share])
-    for batch, first, second in zip(ensemble, *shares, strict=True):
-        for whole, *parts in zip(np.split(batch, 3), first, second, strict=True):
-            assert sorted(whole) == sorted(np.concatenate(parts))
-
-
-def test_points_to_validate_with_come_once_whatever_the_heads() -> None:
-    sampler = PointSampler(PointDraw(1000, heads=3), batch=300, seed=0, shuffle=False)
-    assert epoch(sampler, 0) == list(range(1000))
-
-
 def test_processes_share_each_batch_of_the_drawn_points() -> None:
     draw = PointDraw(1000, drawn=200)
     alone = PointSampler(draw, batch=50, seed=0, shuffle=True)

@@ -20,12 +20,9 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from amvnet.config.recipes import load_recipe, recipe_names
-from amvnet.config.schema import AssertionConfig
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.errors import InputError
-from amvnet.inference.segmenter import Segmenter
-from amvnet.models.head_ensemble import heads_of
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
 from amvnet.training import run as training_run
@@ -50,7 +47,6 @@ from fixtures.worlds import (
     label_map,
     make_streets,
     run_cli,
-    without,
     write_recipe,
 )
 
@@ -629,54 +625,19 @@ def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
     assert max(column(tmp_path / "run", "head", "val/acc")) > 0.5
 
 
-def test_the_head_learns_where_the_loss_is_high(
+def test_a_new_head_is_trained_on_the_networks_of_weights_with_another_one(
     world: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assertion = ("--model.assertion.name", "loss", "--model.assertion.threshold", 0.5)
-    weights = train(world, tmp_path / "run", "--stage", "head", "--init", run, *assertion)
-    assert weights.model.assertion.name == "loss"
-    assert differing(load(run), weights) == {"point_head"}
-
-    # A prediction has no labels: it asks the head where the networks disagree, and says so.
-    capsys.readouterr()
-    options = ("--weights", tmp_path / "run", "--out", tmp_path / "out", "--sequences", "08")
-    assert run_cli("predict", world / "data", *options) == (0, "")
-    assert "disagreement at 0.85" in capsys.readouterr().out
-    by_disagreement = replace(weights.model, assertion=AssertionConfig("disagreement", 0.85))
-    expected = Segmenter(replace(weights, model=by_disagreement))
-    scan = world / "data/sequences/08/velodyne/000000.bin"
-    assert np.array_equal(Segmenter(weights)(scan).uncertain, expected(scan).uncertain)
-
-    # So do the points that the head is validated with: the metric is that of a prediction.
-    share = weights.usual_uncertain
-    shares = [Segmenter(weights)(path) for path in sorted(scan.parent.iterdir())]
-    uncertain = np.concatenate([result.uncertain for result in shares])
-    labels = sorted((world / "data/sequences/08/labels").iterdir())
-    labelled = np.concatenate([np.fromfile(path, np.uint32) for path in labels]) > 0
-    assert share == pytest.approx(uncertain[labelled].mean(), abs=1e-3)
-
-
-def test_an_ensemble_of_attention_heads_is_trained_in_one_stage_on_the_networks_of_any_weights(
-    world: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    head = ("--model.point_head.heads", 2, "--model.point_head.pooling", "attention")
-    options = ("--stage", "head", "--init", run, *head)
+    options = ("--stage", "head", "--init", run, "--model.point_head.fc", 12)
     weights = train(world, tmp_path / "run", *options)
     assert "head: new, as that of the initial weights has other sizes" in capsys.readouterr().out
-    assert weights.model.point_head.heads == 2
-    assert weights.model.point_head.pooling == "attention"
-    for part in ("range_net", "polar_net"):
-        assert weights.digest(part) == load(run).digest(part)
-
-    first, second = [head.state_dict() for head in heads_of(weights.build_head())]
-    for name in ("fc.1.weight", "pool.query.weight"):
-        assert not torch.equal(first[name], second[name])
+    assert weights.model.point_head.fc == 12
+    assert differing(load(run), weights) == {"point_head"}
 
     # A finished stage is not trained again; one of another head is refused.
-    again = train(world, tmp_path / "run", *options, "--resume")
-    assert not differing(weights, again)
+    assert not differing(weights, train(world, tmp_path / "run", *options, "--resume"))
     arguments = (*train_arguments(world, tmp_path / "run"), "--stage", "head", "--resume")
-    assert "point_head.heads" in fail(*arguments, "--model.point_head.heads", 3)
+    assert "point_head.fc" in fail(*arguments, "--model.point_head.fc", 16)
 
 
 @pytest.mark.parametrize("stage", ["rv", "bev"])
@@ -917,113 +878,3 @@ for _ in range(100):
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert result.returncode == 0
-
-
-JOINT = ("--stage", "joint")
-
-
-@pytest.fixture(scope="module")
-def joint(world: Path, run: Path) -> Path:
-    """Fine-tune all parts of the run together, in a copy of its folder."""
-    shutil.copytree(run, world / "joint")
-    train(world, world / "joint", *JOINT)
-    return world / "joint"
-
-
-def test_the_stage_joint_goes_on_with_all_parts_but_the_statistics_of_batch_norms(
-    run: Path, joint: Path
-) -> None:
-    before = load(run)
-    after = load(joint)
-    assert differing(before, after) == set(PARTS)
-    for name, tensor in before.tensors.items():
-        if "running" in name or "num_batches" in name:
-            assert torch.equal(tensor, after.tensors[name]), name
-
-    for part in PARTS:
-        assert after.training[part]["joint"]["epochs"] == 2
-        assert after.training[part]["sequences"] == ["00", "01"]
-    assert after.usual_uncertain != before.usual_uncertain
-
-
-def test_the_metrics_of_the_stage_joint_are_those_of_each_part(
-    world: Path, joint: Path, tmp_path: Path
-) -> None:
-    report = tmp_path / "report.json"
-    options = ("--weights", joint, "--methods", "rv,bev,amvnet", "--json", report)
-    assert run_cli("evaluate", world / "data", *options)[0] == 0
-    methods = json.loads(report.read_text())["methods"]
-
-    weights = load(joint)
-    for part, method in {"range_net": "rv", "polar_net": "bev", "point_head": "amvnet"}.items():
-        miou = methods[method]["miou"]
-        assert weights.metrics[part]["val/miou"] == pytest.approx(miou, abs=2e-3)
-        assert weights.metrics[part]["val/acc"] == pytest.approx(methods[method]["accuracy"], 5e-3)
-    assert column(joint, "joint", "val/miou")[-1] == weights.metrics["point_head"]["val/miou"]
-
-
-def test_the_loss_of_the_stage_joint_is_the_weighted_sum_of_the_three(
-    world: Path, run: Path, tmp_path: Path
-) -> None:
-    weights = {"rv": 0.5, "bev": 2.0, "head": 3.0}
-    options: list[object] = [*JOINT, "--init", run]
-    for name, value in weights.items():
-        options += [f"--training.joint.{name}_loss", value]
-    train(world, tmp_path, *options)
-
-    total = np.array(column(tmp_path, "joint", "train/loss"))
-    parts = [w * np.array(column(tmp_path, "joint", f"train/{n}")) for n, w in weights.items()]
-    assert total == pytest.approx(np.sum(parts, axis=0), rel=1e-4)
-
-
-def test_a_stage_joint_with_init_or_interrupted_ends_with_the_same_weights(
-    world: Path, run: Path, joint: Path, tmp_path: Path
-) -> None:
-    options = (*JOINT, "--init", run)
-    train_interrupted("joint", 1, world, tmp_path, *options)
-    assert not differing(train(world, tmp_path, *options, "--resume"), load(joint))
-    # Once more, now that it is finished.
-    assert not differing(train(world, tmp_path, *options, "--resume"), load(joint))
-
-
-def test_after_the_stage_joint_the_other_stages_are_over(
-    world: Path, run: Path, joint: Path, tmp_path: Path
-) -> None:
-    expected = load(joint)
-    assert not differing(train(world, joint, "--resume"), expected)
-    assert not differing(train(world, joint, *JOINT, "--resume"), expected)
-
-    shutil.copytree(joint / "joint", tmp_path / "joint")
-    error = fail(*train_arguments(world, tmp_path), "--stage", "rv", "--resume")
-    assert "before the stage joint" in error
-
-
-@pytest.mark.parametrize("precision", ["bf16-mixed", "64-true"])
-def test_the_stage_joint_averages_weights_and_works_in_other_precisions(
-    world: Path, run: Path, tmp_path: Path, precision: str
-) -> None:
-    options = ("--training.precision", precision, "--training.joint.ema", 0.5)
-    weights = train(world, tmp_path, *JOINT, "--init", run, *options)
-    last = load(tmp_path / "joint/last.safetensors")
-    assert not differing(weights, last)
-    assert differing(weights, load(run)) == set(PARTS)
-
-
-def test_the_stage_joint_refuses_what_it_cannot_train(
-    world: Path, run: Path, joint: Path, tmp_path: Path
-) -> None:
-    arguments = [*train_arguments(world, tmp_path / "run"), *JOINT]
-    assert "found no range_net" in fail(*arguments)
-    save(without(load(run), "point_head"), tmp_path / "networks.safetensors")
-    assert "found no point_head" in fail(*arguments, "--init", tmp_path / "networks.safetensors")
-    scores = ("--scores-a", tmp_path, "--scores-b", tmp_path)
-    assert "--stage head" in fail(*arguments, "--init", run, *scores)
-    assert "recipe's sizes" in fail(*arguments, "--init", run, "--model.range_net.decoder", 24)
-    assert "dry run" in fail(*arguments, "--init", run, "--dry-run")
-
-    # Neither other weights nor other values go on with it.
-    arguments = [*train_arguments(world, tmp_path), *JOINT, "--resume"]
-    shutil.copytree(joint / "joint", tmp_path / "joint")
-    save(fresh_weights(), tmp_path / "others.safetensors")
-    assert "parts.range_net" in fail(*arguments, "--init", tmp_path / "others.safetensors")
-    assert "joint.lr" in fail(*arguments, "--init", run, "--training.joint.lr", 0.5)

@@ -97,22 +97,6 @@ def test_the_description_can_be_read_without_this_package(weights: Weights, path
     assert description["metrics"] == weights.metrics
 
 
-def test_weights_of_a_version_that_knew_one_kind_of_head_segment_as_before(
-    weights: Weights, path: Path
-) -> None:
-    with safe_open(path, "pt") as file:
-        description = json.loads(file.metadata()["amvnet"])
-    for name in ("pooling", "heads"):
-        del description["model"]["point_head"][name]
-    older = path.with_name("older.safetensors")
-    save_file(dict(weights.tensors), older, metadata={"amvnet": json.dumps(description)})
-
-    assert load(older).model == weights.model
-    expected = segment(weights)
-    assert expected.uncertain.any()
-    assert np.array_equal(segment(str(older)).scores, expected.scores)
-
-
 def test_half_precision_halves_the_size_and_hardly_changes_the_scores(
     weights: Weights, path: Path, tmp_path: Path
 ) -> None:

@@ -98,7 +98,6 @@ SIZES = (
     "point_head neighbours",
     "point_head hidden 0",
     "point_head fc",
-    "point_head heads",
 )
 NUMBERS = (
     "range_view fov_up",
@@ -125,8 +124,8 @@ MODEL: dict[str, tuple[str, Any]] = {
     "widths in widths": ("range_net widths", [[4], [4]]),
     "large image": ("range_view", {"height": 16384, "width": 16384}),
     "large grid": ("polar_view", {"radial": 16384, "angular": 16384}),
-    "many large heads": ("point_head", {"heads": 16, "hidden": [8192] * 12}),
-    "another pooling": ("point_head pooling", "mean"),
+    "many large layers": ("point_head", {"hidden": [8192] * 12}),
+    "removed pooling": ("point_head pooling", "mean"),
     "long text as a size": ("range_net stem", "9" * 1_000_000),
     "long key": ("range_net", {"k" * 1_000_000: 1}),
 }

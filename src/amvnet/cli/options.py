@@ -105,20 +105,10 @@ def make_segmenter(
 
     chosen = method or widest_method(weights.parts)
     segmenter = Segmenter(weights, device, chosen, precision, keep_memory=True, tta=tta)
-    if chosen == "amvnet":
-        say_assertion(weights)
     if at_once is not None:
         segmenter.at_once = at_once
     use_engine(segmenter, engine, say)
     return segmenter
-
-
-def say_assertion(weights: Weights) -> None:
-    """Say which assertion stands in for one that needs labels, if there is one."""
-    assertion = weights.model.assertion
-    if assertion.needs_labels:
-        used = assertion.for_prediction().describe()
-        say(f"uncertain points by {used}: {assertion.describe()}, of the training, needs labels")
 
 
 def describe_records(records: Sequence[ScanRecord]) -> str:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Annotated, Any, get_args, get_type_hints
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
 from amvnet.errors import InputError, shown
 
@@ -43,9 +44,19 @@ NotNegative = Annotated[float, Range(0)]
 Positive = Annotated[float, Range(0, open=True)]
 Share = Annotated[float, Range(0, 1)]
 
+# Values by field that earlier versions wrote, and that ask for nothing else than what is done now.
+# None: any value.
+Obsolete = Mapping[str, Sequence[Any] | None]
+
 
 class Checked:
-    """A base class of dataclasses whose numbers must be finite and in their `Range`."""
+    """A base class of dataclasses whose numbers must be finite and in their `Range`.
+
+    Attributes:
+        obsolete: values that files of earlier versions may still name; they are skipped.
+    """
+
+    obsolete: ClassVar[Obsolete] = {}
 
     def __post_init__(self) -> None:
         """Check every number.
@@ -53,8 +64,10 @@ class Checked:
         Raises:
             InputError: if a number is not finite or out of its range; the message names the first.
         """
-        for name, kind in get_type_hints(type(self), include_extras=True).items():
+        kinds = get_type_hints(type(self), include_extras=True)
+        for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
             value = getattr(self, name)
+            kind = kinds[name]
             if isinstance(value, tuple):
                 self.check(
                     holds=len(value) <= MOST_ITEMS,

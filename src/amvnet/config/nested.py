@@ -72,9 +72,19 @@ def to_dict(config: Any) -> dict[str, Any]:
 def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
     """Return a copy of a dataclass with the values of a tree in the fields that it names."""
     field_types = get_type_hints(type(default))
+    field_types.pop("obsolete", None)  # of the class, no field
+    obsolete = getattr(default, "obsolete", {})
 
     changes = {}
     for key, value in tree.items():
+        accepted = obsolete.get(key, ())
+        if accepted is None or value in accepted:
+            continue
+        if key not in field_types and accepted:
+            raise InputError(
+                f"{where}: {key}: expected {' or '.join(map(str, accepted))}, "
+                f"found {shown(value)}, which was removed; use the version that wrote it"
+            )
         if key not in field_types:
             raise InputError(
                 f"{where}: expected one of {', '.join(field_types)}, found {shown(key)}"
@@ -112,9 +122,6 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
         item_kind = get_args(kind)[0]
         example = default[0] if default else _example(item_kind)
         return tuple(_convert(example, item, item_kind, where) for item in value)
-
-    if kind == float | None:
-        return None if value is None else _convert_float(0.0, value, where)
 
     choices = get_args(kind)  # the values of a Literal; empty for any other type
     if choices:

@@ -7,25 +7,12 @@ user's own) states only what differs from them. "Open" marks what the paper does
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Literal
 
-from amvnet.config.bounds import Checked, Count, NotNegative, Positive, Range, Share
+from amvnet.config.bounds import Checked, Count, NotNegative, Obsolete, Positive, Range, Share
 
-StageName = Literal["rv", "bev", "head", "joint"]
-AssertionName = Literal["disagreement", "entropy", "margin", "labels", "loss"]
-
-# From where on an assertion calls a point uncertain, unless a recipe says otherwise: the paper's
-# tau; nats; the difference of two probabilities; nothing (labels differ or do not); nats. All but
-# tau are open.
-THRESHOLDS: dict[str, float] = {
-    "disagreement": 0.85,
-    "entropy": 0.7,
-    "margin": 0.3,
-    "labels": 0.0,
-    "loss": 0.7,
-}
-NEEDS_LABELS = "loss"  # the assertion that only training can use
+StageName = Literal["rv", "bev", "head"]
 
 # Upper limits, far above any use: a weights file or a recipe of a stranger cannot fill the memory.
 MOST_CHANNELS = 8192
@@ -176,65 +163,16 @@ class PolarNetConfig(Checked):
 class AssertionConfig(Checked):
     """The assertion that decides which points are uncertain (section 3.2 of the paper)."""
 
-    name: AssertionName = "disagreement"
-    """Low cosine similarity, high entropy, small margin, different labels, or high loss."""
-    threshold: float | None = None
-    """tau: the largest similarity (margin: largest; entropy, loss: least, nats); or its own."""
-    others: tuple[AssertionName, ...] = ()
-    """Further assertions, to combine with the first."""
-    other_thresholds: tuple[float, ...] = ()
-    """Their thresholds, one for each; none: their own."""
-    combine: Literal["any", "all"] = "any"
-    """Uncertain are the points of any of the assertions (their union), or those of all."""
+    threshold: Annotated[float, Range(-1, 1)] = 0.85
+    """tau: the largest cosine similarity of the two networks' scores of an uncertain point."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-
-        thresholds = len(self.other_thresholds)
-        self.check(
-            holds=thresholds in (0, len(self.others)),
-            expected=f"as many other_thresholds as others ({len(self.others)}), or none",
-            found=str(thresholds),
-        )
-
-    @property
-    def terms(self) -> tuple[tuple[AssertionName, float], ...]:
-        """The assertions to combine, each with its threshold."""
-        threshold = THRESHOLDS[self.name] if self.threshold is None else self.threshold
-        defaults = tuple(THRESHOLDS[name] for name in self.others)
-        thresholds = (threshold, *(self.other_thresholds or defaults))
-        return tuple(zip((self.name, *self.others), thresholds, strict=True))
-
-    @property
-    def needs_labels(self) -> bool:
-        """Whether one of the assertions needs labels."""
-        return NEEDS_LABELS in (self.name, *self.others)
-
-    def for_prediction(self) -> AssertionConfig:
-        """Return the configuration without what needs labels, and with every threshold.
-
-        If nothing is left, the result is the paper's assertion.
-        """
-        terms = [term for term in self.terms if term[0] != NEEDS_LABELS]
-        if not terms:
-            return AssertionConfig().for_prediction()
-
-        names = [name for name, _ in terms]
-        thresholds = [threshold for _, threshold in terms]
-        return replace(
-            self,
-            name=names[0],
-            threshold=thresholds[0],
-            others=tuple(names[1:]),
-            other_thresholds=tuple(thresholds[1:]),
-        )
-
-    def describe(self) -> str:
-        """Return a text such as "disagreement at 0.85 or entropy at 0.7"."""
-        texts = []
-        for name, threshold in self.terms:
-            texts.append("different labels" if name == "labels" else f"{name} at {threshold:g}")
-        return (" or " if self.combine == "any" else " and ").join(texts)
+    obsolete: ClassVar[Obsolete] = {
+        "threshold": (None,),  # the default
+        "name": ("disagreement",),
+        "others": ([],),
+        "other_thresholds": ([],),
+        "combine": ("any", "all"),
+    }
 
 
 @dataclass(frozen=True)
@@ -249,10 +187,6 @@ class PointHeadConfig(Checked):
     """Channels of the fully connected layer before the scores."""
     position_scale: float = 0.05
     """Factor on x, y, z (metres) as features: brings them to the magnitude of the scores."""
-    pooling: Literal["max", "attention"] = "max"
-    """How the neighbours are pooled: by their maximum (the paper), or by attention."""
-    heads: Annotated[int, Range(1, 16)] = 1
-    """Heads, each trained from its own seed on its own draws, whose probabilities are averaged."""
     share: Share = 1.0
     """Weight of the head in its geometric mean with the ensemble, in predictions (1: the paper)."""
 
@@ -260,12 +194,8 @@ class PointHeadConfig(Checked):
         super().__post_init__()
 
         self.check(len(self.hidden) > 0, "one or more hidden layers", "none")
-        channels = self.heads * max(*self.hidden, self.fc)
-        self.check(
-            holds=channels <= MOST_CHANNELS,
-            expected=f"at most {MOST_CHANNELS} channels of all heads together",
-            found=str(channels),
-        )
+
+    obsolete: ClassVar[Obsolete] = {"pooling": ("max",), "heads": (1,)}
 
 
 @dataclass(frozen=True)
@@ -364,15 +294,11 @@ class NetworkTraining(Checked):
     def __post_init__(self) -> None:
         super().__post_init__()
 
-        _check_parts(self, self.batch, self.accumulate)
-
-
-def _check_parts(training: Checked, batch: int, accumulate: int) -> None:
-    training.check(
-        holds=batch % accumulate == 0,
-        expected=f"a batch that is a multiple of {accumulate}",
-        found=str(batch),
-    )
+        self.check(
+            holds=self.batch % self.accumulate == 0,
+            expected=f"a batch that is a multiple of {self.accumulate}",
+            found=str(self.batch),
+        )
 
 
 @dataclass(frozen=True)
@@ -408,41 +334,6 @@ class HeadTraining(Checked):
 
 
 @dataclass(frozen=True)
-class JointTraining(Checked):
-    """Fine-tuning of both networks and the head, end to end (the paper's outlook); all open."""
-
-    epochs: Count = 4
-    """Passes over the training scans."""
-    batch: Count = 8
-    """Scans of one optimizer step."""
-    lr: Positive = 1e-4
-    """Peak of the one-cycle learning rate; low, as all parts are trained already."""
-    weight_decay: NotNegative = 0.01
-    """AdamW's weight decay."""
-    warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
-    """Share of the steps before the learning rate's peak."""
-    rv_loss: NotNegative = 1.0
-    """Weight of the range view's own loss."""
-    bev_loss: NotNegative = 1.0
-    """Weight of the bird's-eye view's own loss."""
-    head_loss: NotNegative = 1.0
-    """Weight of the head's loss, whose gradient reaches both networks."""
-    points: Count = 4096
-    """Limit on the uncertain points of each scan for the head, drawn at random in each step."""
-    clip: Positive = 5.0
-    """Largest norm of the gradient; larger ones are scaled down."""
-    ema: Annotated[float, Range(0, 0.99999)] = 0.0
-    """Decay of the exponential moving average of the weights that is used in the end; 0: none."""
-    accumulate: Count = 1
-    """Parts that each process splits its batch into, if it does not fit into memory."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-
-        _check_parts(self, self.batch, self.accumulate)
-
-
-@dataclass(frozen=True)
 class TrainingConfig(Checked):
     """The stages of training."""
 
@@ -452,8 +343,6 @@ class TrainingConfig(Checked):
     """The bird's-eye-view network."""
     head: HeadTraining = HeadTraining()
     """The point head."""
-    joint: JointTraining = JointTraining()
-    """Both networks and the head together; a stage that only --stage joint trains."""
     augment: AugmentConfig = AugmentConfig()
     """Augmentation of the points."""
     keep: Literal["best", "last"] = "last"
@@ -471,6 +360,8 @@ class TrainingConfig(Checked):
     """Lightning's accelerator: auto, cpu, gpu."""
     compile: bool = False
     """Compile the network with torch.compile: a slow start, then faster steps."""
+
+    obsolete: ClassVar[Obsolete] = {"joint": None, "adapt": None}
 
     def __post_init__(self) -> None:
         super().__post_init__()

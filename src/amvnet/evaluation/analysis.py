@@ -17,7 +17,7 @@ from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.evaluation.scoring import stream_labelled
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter, check_scan
-from amvnet.models.assertions import Disagreement, cosine_similarity
+from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.models.methods import ENSEMBLES
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -99,22 +99,6 @@ def write_sweep(
 
     axes.legend(handles=[*miou_line, *share_line], frameon=False, loc="upper left")
     return _write(path, (name, "uncertain %", "mIoU %", "accuracy %"), rows, figure)
-
-
-def write_assertions(results: Iterable[tuple[str, Swept]], path: Path) -> list[Path]:
-    """Write a table of assertions at equal shares of uncertain points.
-
-    Args:
-        results: the name of each assertion, and AMVNet's figures by it.
-        path: the files to write, without an ending.
-
-    Returns:
-        The files that were written.
-    """
-    rows: list[Sequence[Cell]] = []
-    for name, result in results:
-        rows.append((name, 100 * result.uncertain, 100 * result.miou, 100 * result.accuracy))
-    return _write(path, ("assertion", "uncertain %", "mIoU %", "accuracy %"), rows)
 
 
 def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path) -> list[Path]:

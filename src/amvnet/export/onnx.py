@@ -215,7 +215,7 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
             "y",
             "intensity",
         ],
-        "assertion": to_dict(model.assertion.for_prediction()),
+        "assertion": {"name": "disagreement", **to_dict(model.assertion)},
     }
     if "point_head" in graphs:
         head = model.point_head

@@ -8,21 +8,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from amvnet.config.schema import AssertionConfig
 from amvnet.errors import InputError
 from amvnet.inference.score_files import SURE, check_probabilities
 from amvnet.inference.segmentation import Segmentation, to_segmentation
 from amvnet.inference.segmenter import check_scan
 from amvnet.models.amvnet import LateFusion, Scores
-from amvnet.models.assertions import Disagreement, build_assertion
-from amvnet.models.head_ensemble import HeadEnsemble
+from amvnet.models.assertion import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.weights.file import Weights, load
 
-Head = PointHead | HeadEnsemble | Weights | Path | str | None
+Head = PointHead | Weights | Path | str | None
 
 
 class Fusion:
@@ -109,13 +107,14 @@ def fuse(
     return Fusion(head, tau)(points, f, g).labels
 
 
-def _build_fusion(head: PointHead | HeadEnsemble | Weights | None, tau: float | None) -> LateFusion:
+def _build_fusion(head: PointHead | Weights | None, tau: float | None) -> LateFusion:
     """Return the head with the assertion that chooses its points."""
-    config = AssertionConfig()
+    assertion = Disagreement()
     if isinstance(head, Weights):
-        config = head.model.assertion
+        assertion = Disagreement(head.model.assertion.threshold)
         head = head.build_head()
+    if tau is not None:
+        assertion = Disagreement(tau)
 
-    assertion = build_assertion(config) if tau is None else Disagreement(tau)
     point_head = None if head is None else copy.deepcopy(head).cpu().eval()
     return LateFusion(assertion, point_head)

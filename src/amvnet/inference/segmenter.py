@@ -52,9 +52,6 @@ LARGE = 1_000_000  # points, from which on freed memory is returned: it would no
 class Segmenter:
     """Segments scans with trained weights.
 
-    If the head was trained on points of an assertion that needs labels (`loss`), the uncertain
-    points are those of the rest of it, or by default those on which the networks disagree.
-
     Args:
         weights: trained weights, or the name or path of a weights file.
         device: where to compute: "cpu", "cuda", "cuda:1", ...

@@ -25,7 +25,7 @@ from amvnet.inference.segmentation import label_ids
 from amvnet.inference.segmenter import Segmenter
 from amvnet.memory import peak_memory
 from amvnet.models.amvnet import build_amvnet
-from amvnet.models.assertions import cosine_similarity
+from amvnet.models.assertion import cosine_similarity
 from amvnet.models.layers import linear
 from amvnet.models.methods import geometric_mean
 from amvnet.models.streams import one_after_the_other
@@ -84,9 +84,7 @@ class LeastAgreeing:
 
     share: float
 
-    def __call__(
-        self, f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None
-    ) -> Tensor:
+    def __call__(self, f: Tensor, g: Tensor, points: Tensor) -> Tensor:
         count = round(self.share * len(f))
         least = cosine_similarity(f, g).topk(count, largest=False).indices
 

@@ -12,10 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import ModelConfig
-from amvnet.models.assertions import Assertion, build_assertion
-from amvnet.models.head_ensemble import Head, build_head
+from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import Ensemble, geometric_mean
 from amvnet.models.point_head import (
+    PointHead,
     nearest_neighbours,
     point_table,
     sectors,
@@ -80,7 +80,7 @@ class LateFusion(nn.Module):
         watch: returns the context in which a step runs, to time the steps; does nothing by default.
     """
 
-    def __init__(self, assertion: Assertion, point_head: Head | None) -> None:
+    def __init__(self, assertion: Assertion, point_head: PointHead | None) -> None:
         super().__init__()
         self.assertion = assertion
         self.point_head = point_head
@@ -165,7 +165,7 @@ class AMVNet(LateFusion):
         range_net: nn.Module,
         polar_net: nn.Module,
         assertion: Assertion,
-        point_head: Head | None,
+        point_head: PointHead | None,
     ) -> None:
         super().__init__(assertion, point_head)
         self.range_view = range_view
@@ -228,6 +228,6 @@ def build_amvnet(config: ModelConfig, classes: int) -> AMVNet:
         polar_view=PolarView(config.polar_view),
         range_net=RangeNet(config.range_net, classes),
         polar_net=PolarNet(config.polar_net, config.polar_view.vertical, classes),
-        assertion=build_assertion(config.assertion),
-        point_head=build_head(config.point_head, classes),
+        assertion=Disagreement(config.assertion.threshold),
+        point_head=PointHead(config.point_head, classes),
     )

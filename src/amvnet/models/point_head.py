@@ -10,7 +10,6 @@ from torch.nn import functional as F
 
 from amvnet.config.schema import PointHeadConfig
 from amvnet.models.layers import PointLinear
-from amvnet.models.neighbour_pooling import build_pooling
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import occurring
@@ -38,9 +37,8 @@ class PointHead(nn.Module):
         self.classes = classes
 
         width = 2 * classes + POINT_VALUES
-        # The pooling applies the last ReLU of the shared MLP.
+        # `_pool` applies the last ReLU of the shared MLP.
         self.mlp = nn.Sequential(*_layers((width, *config.hidden))[:-1])
-        self.pool = build_pooling(config.pooling, width, config.hidden[-1])
         self.fc = nn.Sequential(
             nn.Sequential(*_layers((width + config.hidden[-1], config.fc))),
             PointLinear(config.fc, classes),
@@ -49,8 +47,7 @@ class PointHead(nn.Module):
     def forward(self, point: Tensor, rows: Tensor) -> Tensor:
         u, n, width = rows.shape
         encoded = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1])
-        pooled = self.pool(point, encoded)  # (U, hidden[-1])
-        return self._classify(pooled, point)
+        return self._classify(_pool(encoded), point)
 
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
         """Return the (U, K) logits of `forward(*head_features(...))`, at less cost.
@@ -77,8 +74,8 @@ class PointHead(nn.Module):
             rows = rows.sub_(shift[:, None])  # (part, n, hidden[0])
 
             point[:, -POINT_VALUES:-1] *= self.config.position_scale
-            pooled = self.pool(point, rest(rows.flatten(0, 1)).unflatten(0, k.shape))
-            return self._classify(pooled, point)
+            encoded_rows = rest(rows.flatten(0, 1)).unflatten(0, k.shape)
+            return self._classify(_pool(encoded_rows), point)
 
         size = PART if table.is_cpu else PART_ON_GPU
         parts = list(zip(uncertain.split(size), near.split(size), strict=True))
@@ -96,6 +93,12 @@ class PointHead(nn.Module):
         f, g, _ = point.split([self.classes, self.classes, POINT_VALUES], dim=1)
         ensemble = (f * g).clamp_min(LEAST).log() / 2
         return share * logits + (1 - share) * ensemble
+
+
+def _pool(rows: Tensor) -> Tensor:
+    """Return the (U, C) maximum over the n neighbours, given (U, n, C) before the last ReLU."""
+    # ReLU is monotonic: after the maximum it gives the same for a fraction of the work.
+    return F.relu(rows.amax(dim=1))
 
 
 def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:

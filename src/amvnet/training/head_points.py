@@ -21,7 +21,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.distributed import ALONE, Processes, device_of
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
-from amvnet.models.assertions import Assertion, build_assertion
+from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
 from amvnet.progress import ends_tenth
@@ -97,7 +97,6 @@ class PointDraw:
         labels: (U,) train ids, to balance the classes; None to draw all points alike.
         balance: in [0, 1]. A point of a class with n points is drawn in proportion to
             n ** -balance, and may be drawn several times.
-        heads: of the ensemble; each has its own draw.
     """
 
     def __init__(
@@ -106,10 +105,8 @@ class PointDraw:
         drawn: int = 0,
         labels: np.ndarray | None = None,
         balance: float = 0.0,
-        heads: int = 1,
     ) -> None:
         self.size = size
-        self.heads = heads
         self.drawn = min(drawn, size) if drawn else size
         self.cumulative: np.ndarray | None = None
         if labels is not None and balance > 0:
@@ -121,7 +118,7 @@ class PointDraw:
         return self.drawn
 
     def __call__(self, rng: np.random.Generator) -> np.ndarray:
-        """Return the indices of an epoch's points for one head, in a random order."""
+        """Return the indices of an epoch's points, in a random order."""
         if self.cumulative is None:
             return rng.permutation(self.size)[: self.drawn]
 
@@ -132,11 +129,9 @@ class PointDraw:
 class PointSampler(data.Sampler[np.ndarray]):
     """Draws batches of indices; with several processes, each takes its part of every batch.
 
-    A batch to learn from has the points of each head of an ensemble, one after the other.
-
     Args:
         draw: draws the points of an epoch.
-        batch: points in a batch of all processes, for each head.
+        batch: points in a batch of all processes.
         seed: of the order.
         shuffle: whether to shuffle the points, as in training. A smaller last batch is then left
             out, as batch norm learns nothing good from a few points.
@@ -163,24 +158,12 @@ class PointSampler(data.Sampler[np.ndarray]):
         return -(-self.draw.size // self.batch)  # rounded up
 
     def __iter__(self) -> Iterator[np.ndarray]:
-        orders = self._orders()
+        order = np.arange(self.draw.size)
+        if self.shuffle:
+            order = self.draw(np.random.default_rng([self.seed, self.epoch]))
         for number in range(len(self)):
-            batch = slice(number * self.batch, (number + 1) * self.batch)
-            parts = [order[batch][self.processes.rank :: self.processes.size] for order in orders]
-            yield np.concatenate(parts)
-
-    def _orders(self) -> list[np.ndarray]:
-        """Return the points of the epoch in their order, for each head."""
-        if not self.shuffle:
-            return [np.arange(self.draw.size)]
-
-        orders = []
-        for head in range(self.draw.heads):
-            entropy = [self.seed, self.epoch]
-            if head > 0:  # the first head draws the same points as a single one
-                entropy.append(head)
-            orders.append(self.draw(np.random.default_rng(entropy)))
-        return orders
+            batch = order[number * self.batch : (number + 1) * self.batch]
+            yield batch[self.processes.rank :: self.processes.size]
 
 
 def make_head_loader(
@@ -241,7 +224,6 @@ class PointGatherer:
         folder: Path,
         views: int = 0,
         say: Callable[[str], None] = lambda line: None,
-        by_labels: bool = True,
     ) -> HeadPoints:
         """Gather the labelled uncertain points of some scans.
 
@@ -254,8 +236,6 @@ class PointGatherer:
             views: how often each scan is scored, each time augmented differently; 0 to score it
                 once, without augmentation. Taken as 0 if a source cannot score augmented scans.
             say: told the progress, line by line.
-            by_labels: whether an assertion that needs labels may use them, as for training. Points
-                to validate with are those that a prediction finds uncertain.
 
         Raises:
             InputError: if the scans have too few labelled points.
@@ -266,7 +246,7 @@ class PointGatherer:
         jobs = self._jobs(sources, views)
         least = max(2, self.processes.size)  # batch norm needs two, and each process one
 
-        assertion = build_assertion(self.model.assertion, labels=by_labels)
+        assertion = Disagreement(self.model.assertion.threshold)
         points = self._gather(jobs, folder, assertion, say)
         if len(points) < least:
             say("head: the networks agree everywhere; it learns from points drawn from all")
@@ -372,7 +352,7 @@ class PointGatherer:
         f, g = scorer(job.source.records[job.index], scan, batch)
         if job.scans.augment is not None:
             f, g = self._disturbed(f, g, batch.points, job)
-        uncertain = assertion(f, g, batch.points, labels) & (labels > 0)
+        uncertain = assertion(f, g, batch.points) & (labels > 0)
         matrices = _ensemble_matrices(f, g, labels, uncertain)
 
         candidates = uncertain.nonzero()[:, 0]
@@ -408,7 +388,7 @@ class PointGatherer:
         return point_dtype(self.dataset.taxonomy.size, self.model.point_head.neighbours)
 
 
-def _everywhere(f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
+def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
     """The assertion that finds every point uncertain."""
     return torch.ones(len(f), dtype=torch.bool, device=f.device)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.inference.score_files import SURE, ScorePair
-from amvnet.models.head_ensemble import Head
+from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.weights.file import Weights
@@ -114,7 +114,7 @@ def score_source(
 
 
 def scorer_with_head(
-    weights: Weights, head: Head, by_ring: bool = False
+    weights: Weights, head: PointHead, by_ring: bool = False
 ) -> Callable[[PointBatch], Tensor]:
     """Return what gives the (P, K) scores of a batch by AMVNet while its head is trained.
 

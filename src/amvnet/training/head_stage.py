@@ -10,7 +10,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from amvnet.config.schema import HeadTraining
-from amvnet.models.head_ensemble import Head, heads_of
 from amvnet.models.point_head import PointHead
 from amvnet.training.head_points import HeadBatch, HeadPoints
 from amvnet.training.stages import Stage
@@ -21,7 +20,7 @@ class HeadStage(Stage):
     """Stage `head`: it learns from scores gathered beforehand, so that the networks stay frozen.
 
     Args:
-        head: the point head, or an ensemble. The heads of an ensemble learn as each would alone.
+        head: the point head.
         train: the points to train with.
         val: the points to validate with, or None for no validation.
 
@@ -33,10 +32,10 @@ class HeadStage(Stage):
     config: HeadTraining
 
     def __init__(
-        self, head: Head, train: HeadPoints, val: HeadPoints | None, **shared: Any
+        self, head: PointHead, train: HeadPoints, val: HeadPoints | None, **shared: Any
     ) -> None:
         super().__init__(**shared)
-        self.trained: Head = head
+        self.trained: PointHead = head
         self.train_points = train
         self.val_points = val
 
@@ -46,19 +45,10 @@ class HeadStage(Stage):
 
     def training_step(self, batch: HeadBatch, index: int) -> Tensor:
         point, rows, labels, _ = batch
-        heads = heads_of(self.trained)
-        count = len(heads)
-
-        # Each head learns from its part of the batch. As they share no parameter, the gradients of
-        # the sum are those of each head alone.
-        losses = []
-        parts = (point.chunk(count), rows.chunk(count), labels.chunk(count))
-        for head, *part in zip(heads, *parts, strict=True):
-            losses.append(self._loss(head, *part))
-        loss = torch.stack(losses).sum()
+        loss = self._loss(point, rows, labels)
 
         self.check_finite(loss, "at points of the head")
-        self.log("train/loss", loss / count, prog_bar=True, batch_size=len(labels))
+        self.log("train/loss", loss, prog_bar=True, batch_size=len(labels))
         return loss
 
     def validation_step(self, batch: HeadBatch, index: int) -> None:
@@ -91,9 +81,9 @@ class HeadStage(Stage):
         )
         return self.one_cycle(optimizer, self.config.momentum)
 
-    def _loss(self, head: PointHead, point: Tensor, rows: Tensor, labels: Tensor) -> Tensor:
-        """Return the mean loss of one head over its points."""
-        loss = F.cross_entropy(head(point, rows), labels - 1, self.class_weights, reduction="sum")
+    def _loss(self, point: Tensor, rows: Tensor, labels: Tensor) -> Tensor:
+        logits = self.trained(point, rows)
+        loss = F.cross_entropy(logits, labels - 1, self.class_weights, reduction="sum")
 
         # The mean is over the batch of all processes; Lightning averages the processes' gradients.
         total = self.trainer.strategy.reduce(self._weight(labels), reduce_op="sum")

@@ -11,12 +11,11 @@ from typing import Literal
 
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
-from amvnet.training.joint_run import JointRun
 from amvnet.training.memory_estimate import check_memory
 from amvnet.training.run_plan import RunOptions, RunPlan
 from amvnet.training.run_record import initial_digests, write_record
 from amvnet.training.stage_run import HeadRun, NetworkRun, StageRun
-from amvnet.weights.file import PARTS, Weights, save
+from amvnet.weights.file import Weights, save
 
 # The stages in order: the part of the weights that each trains, and how.
 STAGES: dict[str, tuple[str, type[StageRun]]] = {
@@ -24,7 +23,6 @@ STAGES: dict[str, tuple[str, type[StageRun]]] = {
     "bev": ("polar_net", NetworkRun),
     "head": ("point_head", HeadRun),
 }
-JOINT = "joint"  # the stage after all of these, which goes on with their parts
 TRIAL_STEPS = 2  # the second of them is timed
 
 
@@ -47,9 +45,8 @@ class Run:
             The weights file, with all parts that have been trained so far.
 
         Raises:
-            InputError: if the head is to be trained without trained networks, or all parts together
-                without trained parts, or the folder holds a run that is not to be resumed or was
-                begun with other settings.
+            InputError: if the head is to be trained without trained networks, or the folder holds a
+                run that is not to be resumed or was begun with other settings.
         """
         plan = self.plan
         names = plan.recipe.stages if stage == "all" else (stage,)
@@ -62,7 +59,6 @@ class Run:
         if init is not None:
             self._check_init(init, names)
         weights = self._start(init, names)
-        self._check_joint(names, weights)
         for name in names:
             self._stage(name, weights).check_begun()
         processes = plan.options.processes
@@ -75,8 +71,7 @@ class Run:
         for name in names:
             weights = self._stage(name, weights).train()
             if processes.first:
-                finished = self._with_finished(weights)
-                save(self._stage(JOINT, finished).finished_weights(), path)
+                save(self._with_finished(weights), path)
             processes.wait()
         return path
 
@@ -104,29 +99,18 @@ class Run:
 
     @property
     def _of_folder(self) -> Sequence[str]:
-        """Return the names of the stages that the folder can hold before the joint one."""
+        """Return the names of the stages that the folder can hold."""
         # A head for other models' scores is of no use to these networks.
         return list(STAGES) if self.plan.scores is None else ["head"]
 
     def _with_finished(self, weights: Weights) -> Weights:
-        """Return the weights with the parts of this folder's finished stages before the joint one.
+        """Return the weights with the parts of this folder's finished stages.
 
         Another process may have finished some of them while this one trained.
         """
         for name in self._of_folder:
             weights = self._stage(name, weights).finished_weights()
         return weights
-
-    def _check_joint(self, names: Sequence[str], weights: Weights) -> None:
-        """Raise InputError if a stage is to be trained after the joint one has begun."""
-        joint = self._stage(JOINT, weights)
-        for name in names:
-            is_over = name == JOINT or self._stage(name, weights).is_finished
-            if joint.is_begun and not is_over:
-                raise InputError(
-                    f"{joint.folder}: expected the stage {name} before the stage joint, found it "
-                    "begun; give another folder, and --init"
-                )
 
     def _for_classes(self, init: Weights, part: str) -> Weights:
         """Return initial weights whose last layers are new, for the classes of the dataset."""
@@ -170,8 +154,6 @@ class Run:
                 )
 
     def _stage(self, name: str, weights: Weights) -> StageRun:
-        if name == JOINT:
-            return JointRun(self.plan, name, PARTS, weights, train_networks=train_networks)
         part, kind = STAGES[name]
         return kind(self.plan, name, (part,), weights, train_networks=train_networks)
 

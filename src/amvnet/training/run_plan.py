@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from amvnet.config.schema import JointTraining, NetworkTraining, Recipe
+from amvnet.config.schema import NetworkTraining, Recipe
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.distributed import ALONE, Processes
@@ -130,7 +130,7 @@ def without_mean(recipe: Recipe, init: Weights | None, classes: Taxonomy, say: S
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
 
-def check_batch(config: NetworkTraining | JointTraining, name: str, processes: int) -> None:
+def check_batch(config: NetworkTraining, name: str, processes: int) -> None:
     """Raise InputError if a batch of a stage cannot be divided evenly among processes."""
     if config.batch % (processes * config.accumulate):
         raise InputError(

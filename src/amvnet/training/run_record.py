@@ -122,8 +122,6 @@ def stage_settings(
     """
     recipe = to_dict(plan.recipe)
     training_keys = [name, "augment", "seed", "precision"]
-    if name == "joint":
-        training_keys += ["rv", "bev", "head"]  # they have the losses
     train = plan.scans.train
     val = plan.scans.val
     settings: dict[str, Any] = {
@@ -136,8 +134,6 @@ def stage_settings(
         settings["scores"] = plan.scores.digests([*train, *val])
     elif name == "head":
         settings["networks"] = {network: weights.digest(network) for network in BOTH_NETWORKS}
-    elif name == "joint":
-        settings["parts"] = {part: weights.digest(part) for part in parts}
     return settings
 
 

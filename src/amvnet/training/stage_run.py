@@ -16,14 +16,13 @@ import yaml
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 
-from amvnet.config.schema import JointTraining, NetworkTraining
+from amvnet.config.schema import NetworkTraining
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
-from amvnet.models.head_ensemble import heads_of
 from amvnet.models.views.points import PointBatch
 from amvnet.sensors.intensity import (
     TrainedIntensity,
@@ -275,8 +274,8 @@ class ScanRun(StageRun):
     """A stage that learns from batches of scans."""
 
     @property
-    def config(self) -> NetworkTraining | JointTraining:
-        config: NetworkTraining | JointTraining = getattr(self.plan.recipe.training, self.name)
+    def config(self) -> NetworkTraining:
+        config: NetworkTraining = getattr(self.plan.recipe.training, self.name)
         return config
 
     def fit_options(self) -> FitOptions:
@@ -391,11 +390,6 @@ class HeadRun(StageRun):
         options = self.plan.options
         processes = options.processes
 
-        assertion = self.weights.model.assertion
-        if assertion.needs_labels:
-            used = assertion.for_prediction().describe()
-            options.say(f"head: trained on points of {assertion.describe()}; validated on {used}")
-
         # Gather the uncertain points of all scans, with their scores and neighbours.
         val_source = self._score_source(scans.val)
         model = self.weights.model
@@ -405,7 +399,7 @@ class HeadRun(StageRun):
         )
         val = None
         if scans.val:
-            val = gatherer.gather([val_source], self.folder / "val", by_labels=False)
+            val = gatherer.gather([val_source], self.folder / "val")
 
         head = self.model().point_head
         assert head is not None
@@ -427,7 +421,7 @@ class HeadRun(StageRun):
             shuffle=True,
             seed=training.seed,
             processes=processes,
-            draw=PointDraw(len(train), config.drawn, labels, config.balance, len(heads_of(head))),
+            draw=PointDraw(len(train), config.drawn, labels, config.balance),
         )
         val_loader = None
         if val is not None:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from amvnet.config.schema import HeadTraining, JointTraining, NetworkTraining
+from amvnet.config.schema import HeadTraining, NetworkTraining
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
@@ -53,7 +53,7 @@ class Stage(L.LightningModule):
 
     def __init__(
         self,
-        config: NetworkTraining | HeadTraining | JointTraining,
+        config: NetworkTraining | HeadTraining,
         taxonomy: Taxonomy,
         weights: np.ndarray | None,
         processes: Processes = ALONE,
@@ -179,7 +179,7 @@ class ScanStage(Stage):
     """The base of the stages that learn from batches of scans, by AdamW."""
 
     unit = "scans"
-    config: NetworkTraining | JointTraining
+    config: NetworkTraining
 
     def size_of(self, batch: Batch) -> int:
         return batch[0].count

@@ -78,7 +78,7 @@ class HeadStudy:
             head = dataclasses.replace(model.point_head, neighbours=int(value))
             model = dataclasses.replace(model, point_head=head)
         else:
-            model = dataclasses.replace(model, assertion=AssertionConfig(threshold=value))
+            model = dataclasses.replace(model, assertion=AssertionConfig(value))
 
         networks = Weights(model, self.weights.taxonomy, self.weights.sensor)
         for part in ("range_net", "polar_net"):

@@ -17,7 +17,7 @@ from amvnet.inference.inputs import InputScan, LoadedScan, ScanOptions, adapter_
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Origin, Segmentation, expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter, check_scan
-from amvnet.models.assertions import cosine_similarity
+from amvnet.models.assertion import cosine_similarity
 from amvnet.models.methods import geometric_mean
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.sensors.adapt import ScanAdapter

@@ -126,11 +126,7 @@ def _sizes(weights: Weights) -> list[tuple[str, str]]:
         height = f"height {grid.z_min:g} to {grid.z_max:g} m"
         rows.append(("polar view", f"{cells}, {radius}, {height}"))
 
-    assertion = model.assertion
-    text = assertion.describe()
-    if assertion.needs_labels:
-        text += f" in training, {assertion.for_prediction().describe()} in predictions"
-    rows.append(("uncertain points", text))
+    rows.append(("uncertain points", f"disagreement at {model.assertion.threshold:g}"))
     return rows
 
 

@@ -26,7 +26,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, did_you_mean, shown
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
-from amvnet.models.head_ensemble import Head, build_head
+from amvnet.models.point_head import PointHead
 from amvnet.weights import hub
 
 # The parts of the method, each with the fields of `ModelConfig` that set its sizes.
@@ -212,7 +212,7 @@ class Weights:
             model.point_head = None
         return model.eval()
 
-    def build_head(self) -> Head:
+    def build_head(self) -> PointHead:
         """Return only the point head, in evaluation mode.
 
         Raises:
@@ -223,7 +223,7 @@ class Weights:
                 "expected weights with a point head, found none; train one with --stage head"
             )
 
-        head = build_head(self.model.point_head, self.taxonomy.size)
+        head = PointHead(self.model.point_head, self.taxonomy.size)
         self._load_part("point_head", head)
         return head.eval()
 

@@ -19,7 +19,6 @@ def analyze(
     sequences: str | None = None,
     neighbours: str | None = None,
     taus: str | None = None,
-    assertions: bool = False,
     recipe: str | None = None,
     train_sequences: str | None = None,
     device: str = "cpu",
@@ -39,8 +38,6 @@ def analyze(
             needs a recipe.
         taus: also train a head for each of these values of tau, separated by commas (Fig. 8a; 1
             makes all points uncertain); needs a recipe.
-        assertions: also compare assertions, a union and an intersection at equal shares of
-            uncertain points, with the head as it is.
         recipe: how these heads are trained: a built-in recipe's name or a YAML file.
         train_sequences: sequences or scenes, separated by commas, that these heads learn from;
             default: the official split.
@@ -57,7 +54,6 @@ def analyze(
     from amvnet.data.datasets.select import TrainingScans, labelled_records
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
-    from amvnet.evaluation.assertions import compare_assertions
     from amvnet.files import make_folder
     from amvnet.inference.inputs import open_for_weights
     from amvnet.training.fit import quiet_lightning
@@ -95,10 +91,6 @@ def analyze(
     with progress("scoring") as step:
         analysis = analyze_records(dataset, records, segmenter, step)
     written = charts.write_all(analysis, data, out)
-    if assertions:
-        with progress("comparing assertions") as step:
-            comparison = compare_assertions(dataset, records, segmenter, step)
-        written += charts.write_assertions(comparison.results(dataset), out / "assertions")
 
     for study, values in studies:
         sweep = list(study.sweep(values, say, device))

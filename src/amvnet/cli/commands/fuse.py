@@ -11,7 +11,6 @@ from amvnet.cli.options import (
     parse_names,
     parse_scores,
     refuse_other_formats,
-    say_assertion,
 )
 from amvnet.errors import InputError
 
@@ -74,8 +73,6 @@ def fuse(
             "expected no --taxonomy together with --head, which defines its classes; leave it out"
         )
     classes = None if taxonomy is None else taxonomy_named(taxonomy)
-    if weights is not None and tau is None:
-        say_assertion(weights)
 
     with progress("fusing") as step:
         written, uncertain = fuse_files(

@@ -18,7 +18,7 @@ def train(
     recipe: Any,
     data: list[str],
     out: Path,
-    stage: Literal["rv", "bev", "head", "joint", "all"] = "all",
+    stage: Literal["rv", "bev", "head", "all"] = "all",
     init: str | None = None,
     resume: bool = False,
     train_sequences: str | None = None,
@@ -44,8 +44,7 @@ def train(
             and validated, and the training scans of the others are mixed in; DATA@0.5 makes half of
             each epoch.
         out: folder of the run.
-        stage: which part to train; `all` trains one after the other, and `joint` fine-tunes trained
-            ones together.
+        stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them. Of weights for
             other classes, all layers but the last ones are taken.
         resume: continue an earlier run in the folder.

@@ -1,0 +1,44 @@
+"""The assertion: finds uncertain points by the two networks' scores (section 3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+TINY = 1e-12  # keeps the cosine of scores without length finite
+
+
+class Assertion(Protocol):
+    """A function that finds the uncertain points.
+
+    Args:
+        f: (P, K) class probabilities of the range-view network.
+        g: (P, K) class probabilities of the bird's-eye-view network.
+        points: (P, 4) x, y, z in metres and intensity in [0, 1].
+
+    Returns:
+        (P,) bool: True if a point is uncertain.
+    """
+
+    def __call__(self, f: Tensor, g: Tensor, points: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """The paper's assertion: uncertain if the cosine similarity of f and g is at most tau."""
+
+    tau: float = 0.85
+
+    def __call__(self, f: Tensor, g: Tensor, points: Tensor) -> Tensor:
+        return cosine_similarity(f, g) <= self.tau
+
+
+def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
+    """Return the (P,) similarity of class probabilities (P, K): 0 if disjoint, 1 if the same."""
+    product = torch.linalg.vecdot(f, g)
+    squared_lengths = torch.linalg.vecdot(f, f) * torch.linalg.vecdot(g, g)
+    similarity = product / squared_lengths.clamp_min(TINY).sqrt()
+    return similarity.clamp_max(1)  # rounding must not put a point beyond tau = 1
