@@ -57,7 +57,7 @@ COMMANDS = {
 CALLS = """
 import json, sys, time
 import amvnet
-from amvnet.data.scan_files import read_scan
+from amvnet import read as read_scan
 
 scan, weights, count = sys.argv[1:]
 segmenter = amvnet.load(weights, keep_memory=True)

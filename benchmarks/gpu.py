@@ -24,6 +24,7 @@ from tempfile import TemporaryDirectory
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from amvnet import read as read_scan
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import (
     ModelConfig,
@@ -33,7 +34,6 @@ from amvnet.config.schema import (
     RangeViewConfig,
     Recipe,
 )
-from amvnet.data.scan_files import read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import build_amvnet

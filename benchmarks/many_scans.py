@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from amvnet.data.scan_files import read_scan
+from amvnet import read as read_scan
 from amvnet.export.engines import use_engine
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmenter import Segmenter

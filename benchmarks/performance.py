@@ -30,8 +30,9 @@ import amvnet.models.amvnet
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
+from amvnet import read as read_scan
 from amvnet.config.recipes import load_recipe
-from amvnet.data.scan_files import read_scan, write_labels
+from amvnet.data.labels.ids import write_ids
 from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
@@ -146,7 +147,7 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
         job = Job(
             segmenter,
             read=lambda: read_scan(options.scan),
-            write=lambda ids: write_labels(target, ids),
+            write=lambda ids: write_ids(target, ids),
             name=options.engines,
             share=options.uncertain,
         )

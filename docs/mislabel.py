@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.open import open_dataset
-from amvnet.data.scan_files import write_labels
+from amvnet.data.labels.ids import write_ids
 from amvnet.ranking.clusters import cluster
 
 SHARE = 0.01  # of the things
@@ -41,7 +41,7 @@ def mislabel(data, wrong, seed, alike):
         labels = copy.read(copied_records[index]).labels
         labels[points] = rng.choice(other_classes(label, alike, dataset.taxonomy.size))
         raw = dataset.taxonomy.to_raw(labels)
-        write_labels(copied_records[index].labels_path, raw)
+        write_ids(copied_records[index].labels_path, raw)
         mark = marks.setdefault(copied_records[index].name, np.zeros(len(points), dtype=int))
         mark[points] = number + 1
     np.savez(Path(wrong, "wrong.npz"), things=len(things), **marks)

@@ -16,10 +16,10 @@ import numpy as np
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
-from amvnet.errors import InputError, shown
+from amvnet.errors import InputError
 from amvnet.models.neighbours import nearest_others
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity, are_quantiles, match_scan
+from amvnet.sensors.intensity import TrainedIntensity, check_quantiles, match_scan
 
 DESCRIPTION = "amvnet.json"  # in the folder of the graphs
 FORMAT = 2
@@ -212,12 +212,7 @@ def _read_intensity(folder: Path, description: Mapping[str, Any]) -> TrainedInte
         return None
 
     quantiles = values.get("quantiles") if isinstance(values, Mapping) else None
-    if not are_quantiles(quantiles):
-        raise InputError(
-            f"{folder}: expected {len(PROBABILITIES)} quantiles of the intensity, in order, found "
-            f"{shown(quantiles)}; export again"
-        )
-    return TrainedIntensity(quantiles, is_matched=True)
+    return TrainedIntensity(check_quantiles(quantiles, str(folder)), is_matched=True)
 
 
 def range_image(

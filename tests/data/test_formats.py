@@ -23,7 +23,7 @@ from amvnet.data.formats.cloud import MAX_POINTS
 from amvnet.data.formats.detect import find_scans, list_scans, read_cloud, scan_stem
 from amvnet.data.formats.pcd import unpack_lzf
 from amvnet.data.formats.pointcloud2 import read_message
-from amvnet.data.scan_files import read_scan
+from amvnet.scan import Scan
 
 from fixtures.scan_writers import (
     FLOATS,
@@ -41,6 +41,10 @@ REAL = os.environ.get("AMVNET_REAL_DATA")
 LAS_STEP = 0.0006  # metres: the LAS files have millimetres
 FLOAT_FIELDS = [("x", "F 4", 1), ("y", "F 4", 1), ("z", "F 4", 1), ("intensity", "F 4", 1)]
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+
+
+def read_scan(path: Path) -> Scan:
+    return read_cloud(path).to_scan()
 
 
 @pytest.fixture(scope="module")

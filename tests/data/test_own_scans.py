@@ -13,7 +13,7 @@ import yaml
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.select import split_records
-from amvnet.data.raw_labels import read_label_file
+from amvnet.data.labels.readers import read_labels
 
 from fixtures.scan_writers import some_points, write_las, write_ply
 from fixtures.worlds import fails
@@ -186,9 +186,9 @@ def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
     RAW[:-1].astype(np.uint32).tofile(path)
     fails(lambda: only_scan(site.parent), path, "60 labels")
     np.full(60, 5, np.uint32).tofile(path)
-    fails(lambda: only_scan(site.parent), path, "[5]")
+    fails(lambda: only_scan(site.parent), path, "found 5")
     np.save(site / "a.half.npy", np.full(60, 0.5))
-    fails(lambda: read_label_file(site / "a.half.npy", 60), "whole numbers")
-    fails(lambda: read_label_file(site / "none.npy", 60), "no file")
+    fails(lambda: read_labels(site / "a.half.npy", 60), "whole numbers")
+    fails(lambda: read_labels(site / "none.npy", 60), "no file")
     np.save(site / "evil.npy", np.array([{}], object), allow_pickle=True)
-    fails(lambda: read_label_file(site / "evil.npy", 1), "evil.npy")
+    fails(lambda: read_labels(site / "evil.npy", 1), "evil.npy")

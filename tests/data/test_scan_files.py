@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import yaml
 
+from amvnet import read as read_scan
 from amvnet.data.formats.detect import find_scans
-from amvnet.data.scan_files import read_scan, write_labels
+from amvnet.data.labels.ids import write_ids
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.files import atomic_write
 
@@ -111,11 +112,11 @@ def test_files_appear_whole_or_not_at_all(tmp_path: Path) -> None:
         stop_halfway()
     assert list(target.parent.iterdir()) == []
 
-    write_labels(target, np.array([10, 259], dtype=np.uint32))
+    write_ids(target, np.array([10, 259], dtype=np.uint32))
     assert np.fromfile(target, np.uint32).tolist() == [10, 259]
 
-    fails(lambda: write_labels(target / "b.label", np.zeros(1)), target, "folder")
-    fails(lambda: write_labels(tmp_path, np.zeros(1)), tmp_path)
+    fails(lambda: write_ids(target / "b.label", np.zeros(1)), target, "folder")
+    fails(lambda: write_ids(tmp_path, np.zeros(1)), tmp_path)
 
 
 # --- taxonomies ---
@@ -174,6 +175,11 @@ def test_label_maps_without_a_key_are_named(tmp_path: Path, key: str) -> None:
 def test_unusable_label_maps_are_named(tmp_path: Path) -> None:
     path = tmp_path / "labels.yaml"
     fails(lambda: taxonomy_from_yaml(path), path)
+
+    one_name = label_map()
+    one_name["labels"][11] = "car"
+    path.write_text(yaml.safe_dump(one_name))
+    fails(lambda: taxonomy_from_yaml(path), path, "car", "twice")
 
     few_labels = yaml.safe_dump({**label_map(), "labels": {0: "unlabeled"}})
     large_ids = yaml.safe_dump({**label_map(), "learning_map": {70_000: 1}})

@@ -27,6 +27,9 @@ def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monk
     make_own_scans(tmp_path)
     recipe = write_recipe(tmp_path / "tiny.yaml", training=ONE_EPOCH)
     save(fresh_weights(), tmp_path / "init.safetensors")
+    blocks = re.findall(r"```yaml\n(.*?)```", (Path(__file__).parents[2] / PAGE).read_text(), re.S)
+    (few,) = [block for block in blocks if "structure: {from" in block]
+    (tmp_path / "few.yaml").write_text(few)
     changes = {
         "semantickitti-compact": str(recipe),
         "simulated-compact": str(recipe),

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from amvnet import Scan, Segmenter, simulate
-from amvnet.data.scan_files import read_scan
+from amvnet import read as read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.inputs import adapter_for
 from amvnet.inference.journal import Journal

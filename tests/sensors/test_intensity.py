@@ -31,7 +31,7 @@ from amvnet.training.loaders import sensor_record
 from amvnet.weights.file import Weights
 
 from fixtures.sensors import LASERS, place
-from fixtures.worlds import fails, fresh_weights, make_streets
+from fixtures.worlds import fails, fresh_weights, make_streets, street, write_scan
 
 TRAINED = np.array(QUANTILES["hdl64e"])
 
@@ -155,15 +155,50 @@ def test_another_range_later_in_a_source_is_that_of_another_sensor() -> None:
     assert len(lines) == 2
 
 
-@pytest.mark.parametrize(
-    "record", [None, 3, {KEY: []}, {KEY: "x" * 11}, {KEY: [1.0] * 10 + [0.0]}, {"augment": 1}]
-)
+@pytest.mark.parametrize("record", [None, 3, {KEY: []}, {"augment": 1}])
 def test_weights_that_carry_no_quantiles_have_those_of_their_sensor(record: Any) -> None:
     trained = trained_intensity({"range_net": record}, "hdl64e")
     assert trained is not None
     assert not trained.is_optional
     np.testing.assert_array_equal(trained.quantiles, TRAINED)
     assert trained_intensity({"range_net": record}, "homemade") is None
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        "x" * 11,
+        [0.1, 0.2],
+        [1.0] * 10 + [0.0],
+        [0.5] * 11,
+        [-0.5, *np.linspace(0.1, 1, 10)],
+        [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, True],
+        [*np.linspace(0.1, 1, 10), np.nan],
+    ],
+)
+def test_quantiles_that_no_intensities_have_are_refused(values: Any) -> None:
+    fails(
+        lambda: trained_intensity({"polar_net": {KEY: values}}, "hdl64e"), "quantiles", "polar_net"
+    )
+
+
+def test_scans_without_intensities_have_quantiles_of_zero_and_equal_ones_are_left_out(
+    tmp_path: Path,
+) -> None:
+    for level, expected in ((0.0, [0.0] * len(PROBABILITIES)), (0.5, [])):
+        root = tmp_path / f"{level}"
+        for index in range(2):
+            points, raw = street(index)
+            points[:, 3] = level
+            write_scan(root, "00", f"{index:06d}", points, raw)
+        data = SemanticKitti(root)
+        record = sensor_record(data, data.records(["00"]))
+        assert record[KEY] == expected
+        trained = trained_intensity({"polar_net": record}, "")
+        assert (None if trained is None else trained.quantiles) == (expected or None)
+
+    matched = {"polar_net": {KEY: [0.0] * len(PROBABILITIES), MATCHED: True}}
+    fails(lambda: trained_intensity(matched, ""), "quantiles", "polar_net")
 
 
 def test_training_measures_the_intensities_that_weights_carry(tmp_path: Path) -> None:

@@ -143,6 +143,8 @@ DESCRIPTION: dict[str, tuple[str, Any]] = {
     "no pairs": ("taxonomy raw_to_train", 5),
     "colours as text": ("taxonomy colors 1", "red"),
     "colours beyond 255": ("taxonomy colors 1", [0, 0, 999]),
+    "two classes of one name": ("taxonomy classes 0", "bicycle"),
+    "raw ids that are all the same": ("taxonomy train_to_raw", [10] * 20),
     "no classes": ("taxonomy classes", []),
     "class names as numbers": ("taxonomy classes 0", 5),
     "class names of several lines": ("taxonomy classes 0", "car\n\x1b[2J"),

@@ -60,6 +60,8 @@ class Taxonomy:
         self._check_types()
         self._check_length("colours", len(self.colors))
         self._check_length("raw ids", len(self.train_to_raw))
+        self._check_different("classes", self.classes)
+        self._check_different("raw ids of the classes", self.train_to_raw)
 
         wrong_train_ids = set(self.raw_to_train.values()) - set(range(self.size + 1))
         if wrong_train_ids:
@@ -112,6 +114,14 @@ class Taxonomy:
                 f"taxonomy {self.name}: expected {self.size + 1} {kind} "
                 f"(ignored and {self.size} classes), found {length}; give one per train id"
             )
+
+    def _check_different(self, kind: str, values: tuple[Any, ...]) -> None:
+        for value in values:
+            if values.count(value) > 1:
+                raise InputError(
+                    f"taxonomy {self.name}: expected different {kind}, found {shown(value)} twice; "
+                    "correct the table"
+                )
 
     @property
     def size(self) -> int:
@@ -442,3 +452,14 @@ TAXONOMIES: Mapping[str, Taxonomy] = {
     SEMANTICKITTI.name: SEMANTICKITTI,
     NUSCENES.name: NUSCENES,
 }
+
+
+def taxonomy_named(text: str) -> Taxonomy:
+    """Return the classes of a benchmark, given its name, or of a label map, given its path (YAML).
+
+    Raises:
+        InputError: as `taxonomy_from_yaml`.
+    """
+    if text in TAXONOMIES:
+        return TAXONOMIES[text]
+    return taxonomy_from_yaml(text)

@@ -111,6 +111,8 @@ class Evaluation:
         points: number of points in these scans, labelled or not.
         uncertain: number of uncertain points.
         asked: number of points of which it is known whether they are uncertain.
+        labelled: number of points with a class here.
+        left_out: by name, the points of classes of the data that have none here.
     """
 
     taxonomy: Taxonomy
@@ -120,6 +122,8 @@ class Evaluation:
     points: int = 0
     uncertain: int = 0
     asked: int = 0
+    labelled: int = 0
+    left_out: dict[str, int] = field(default_factory=dict)
 
     def add(
         self,
@@ -148,10 +152,25 @@ class Evaluation:
 
         self.scans += 1
         self.points += len(points)
+        self.labelled += int(np.count_nonzero(truth))
 
         if uncertain is not None:
             self.uncertain += int(np.count_nonzero(uncertain))
             self.asked += len(uncertain)
+
+    def leave_out(self, name: str, is_left_out: np.ndarray) -> None:
+        """Count the points of a scan that are of a class without a name here; `add` has them as 0.
+
+        Args:
+            name: of the class.
+            is_left_out: (N,) bool.
+        """
+        self._add_left_out(name, int(np.count_nonzero(is_left_out)))
+
+    def left_out_shares(self) -> dict[str, float]:
+        """Return the shares of the labelled points that are in classes left out, by name."""
+        total = self.labelled + sum(self.left_out.values())
+        return {name: points / total for name, points in self.left_out.items()}
 
     def merge(self, other: Evaluation) -> None:
         """Add the counts of another evaluation, which scored other scans.
@@ -173,6 +192,9 @@ class Evaluation:
         self.points += other.points
         self.uncertain += other.uncertain
         self.asked += other.asked
+        self.labelled += other.labelled
+        for name, points in other.left_out.items():
+            self._add_left_out(name, points)
 
     def __add__(self, other: Evaluation) -> Evaluation:
         """Return a new evaluation with the counts of both; raises the same errors as `merge`."""
@@ -192,13 +214,16 @@ class Evaluation:
         for method, matrices in self.matrices.items():
             methods[method] = self._method_report(matrices)
 
-        return {
+        figures = {
             "dataset": dataset,
             "scans": self.scans,
             "points": self.points,
             "uncertain_fraction": _ratio(self.uncertain, self.asked),
             "methods": methods,
         }
+        if self.left_out:
+            figures["left_out"] = self.left_out_shares()
+        return figures
 
     def _method_report(self, matrices: np.ndarray) -> dict[str, Any]:
         bins = []
@@ -227,3 +252,7 @@ class Evaluation:
     def _add_counts(self, counts: Mapping[str, np.ndarray]) -> None:
         for method, matrices in counts.items():
             self.matrices[method] = self.matrices.get(method, 0) + matrices
+
+    def _add_left_out(self, name: str, points: int) -> None:
+        if points:
+            self.left_out[name] = self.left_out.get(name, 0) + points

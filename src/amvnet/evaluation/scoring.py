@@ -14,6 +14,7 @@ from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import check_classes
 from amvnet.data.spacing import evenly_spaced
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
@@ -28,6 +29,7 @@ from amvnet.scan import Scan
 Result = TypeVar("Result")
 
 PICTURES = 4  # scans that are drawn, evenly spaced
+MOST_LEFT_OUT = 0.5  # of the labelled points, in classes that a map of classes leaves out
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ def evaluate(
     records: Sequence[ScanRecord],
     labeller: Labeller,
     pictures: Path | None = None,
+    classes: ClassMap | None = None,
     progress: Progress = no_progress,
     processes: Processes = ALONE,
 ) -> Evaluation:
@@ -70,15 +73,20 @@ def evaluate(
     Args:
         dataset: the dataset that has the scans.
         records: the scans.
-        labeller: labels the scans.
+        labeller: labels the scans, in the classes of the map if there is one.
         pictures: folder for pictures of a few of the scans from above; None draws none.
+        classes: maps the classes of the dataset to those that are scored; None scores these.
         progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans; each returns the evaluation of all scans.
 
     Raises:
-        InputError: if a scan has no ground truth.
+        InputError: if a scan has no ground truth, or the map leaves out most of the labelled
+            points.
     """
-    evaluation = Evaluation(dataset.taxonomy)
+    own = dataset.taxonomy
+    taxonomy = own if classes is None else classes.target
+    table = np.arange(own.size + 1, dtype=np.uint8) if classes is None else classes.table(own)
+    evaluation = Evaluation(taxonomy)
     pictured = {record.name for record in evenly_spaced(records, PICTURES)}
 
     def label(record: ScanRecord, scan: Scan) -> tuple[ScanRecord, Scan, MethodLabels]:
@@ -88,19 +96,36 @@ def evaluate(
     labelled = stream_labelled(dataset, share, label, labeller.at_once, progress)
     for record, scan, labels in labelled:
         assert scan.labels is not None
-        evaluation.add(scan.points, scan.labels, labels.ids, labels.uncertain)
+        truth = table[scan.labels]
+        evaluation.add(scan.points, truth, labels.ids, labels.uncertain)
+        for train_id in np.flatnonzero(table[1:] == 0) + 1:
+            evaluation.leave_out(own.names[train_id], scan.labels == train_id)
         if pictures is not None and record.name in pictured:
             view = TopView(
                 scan.points,
-                dataset.taxonomy,
+                taxonomy,
                 labels.ids,
-                scan.labels,
+                truth,
                 uncertain=labels.uncertain,
                 title=record.name,
             )
             draw_scan(inside(pictures, f"{record.name.replace('/', '_')}.png"), view)
 
-    return sum(processes.gather(evaluation), Evaluation(dataset.taxonomy))
+    total = sum(processes.gather(evaluation), Evaluation(taxonomy))
+    _check_left_out(total, dataset)
+    return total
+
+
+def _check_left_out(evaluation: Evaluation, dataset: Dataset) -> None:
+    """Raise InputError if a map of classes leaves out so much that scores say little."""
+    shares = evaluation.left_out_shares()
+    share = sum(shares.values())
+    if share > MOST_LEFT_OUT:
+        raise InputError(
+            f"{dataset.root}: expected a map (--classes) of most of the labelled points, found "
+            f"{share:.0%} of them in classes that it leaves out ({', '.join(shares)}); "
+            "write a YAML file that names these, too"
+        )
 
 
 def stream_labelled(
@@ -146,7 +171,8 @@ def label_by_weights(
         dataset: the dataset that has the scans.
         segmenter: the networks, with the parts that the methods need.
         methods: names of the methods.
-        classes: maps the classes of the weights to those of the dataset; None if they are these.
+        classes: maps the classes of the weights to those that are scored; None if they are the
+            same.
 
     Raises:
         InputError: if the weights do not have the dataset's classes.
@@ -165,8 +191,16 @@ def label_by_weights(
     return Labeller(label, segmenter.at_once)
 
 
-def label_from_files(dataset: Dataset, folder: Path) -> Labeller:
+def label_from_files(
+    dataset: Dataset, folder: Path, classes: ClassMap | None = None, is_mapped: bool = False
+) -> Labeller:
     """Return what reads the labels of scans from a folder of predictions.
+
+    Args:
+        dataset: the dataset that has the scans.
+        folder: the predictions.
+        classes: maps the classes of the dataset to those that are scored; None scores these.
+        is_mapped: whether the predictions have the ids of the map; else those of the dataset.
 
     Raises:
         InputError: if there is no such folder.
@@ -174,7 +208,33 @@ def label_from_files(dataset: Dataset, folder: Path) -> Labeller:
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 
+    def read(record: ScanRecord) -> np.ndarray:
+        if classes is None:
+            return dataset.read_prediction(record, folder)
+        if is_mapped:
+            return dataset.read_prediction(record, folder, classes.target)
+
+        try:
+            ids = dataset.read_prediction(record, folder)
+        except InputError:
+            if _has_ids_of(classes.target, dataset, record, folder):
+                raise InputError(
+                    f"{folder / record.prediction}: expected the ids of {dataset.taxonomy.name}, "
+                    f"found those of {classes.target.name}; say --mapped"
+                ) from None
+            raise
+        return classes.table(dataset.taxonomy)[ids]
+
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
-        return MethodLabels({"predictions": dataset.read_prediction(record, folder)})
+        return MethodLabels({"predictions": read(record)})
 
     return Labeller(label)
+
+
+def _has_ids_of(taxonomy: Taxonomy, dataset: Dataset, record: ScanRecord, folder: Path) -> bool:
+    """Return whether the prediction of a scan can be read with the ids of some classes."""
+    try:
+        dataset.read_prediction(record, folder, taxonomy)
+    except InputError:
+        return False
+    return True

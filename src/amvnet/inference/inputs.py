@@ -9,7 +9,6 @@ from typing import Protocol
 
 import numpy as np
 
-from amvnet.data import label_bags
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
 from amvnet.data.datasets.open import open_if_dataset, open_with_classes
 from amvnet.data.datasets.own import OwnScans
@@ -17,7 +16,9 @@ from amvnet.data.formats.cloud import Cloud, Message
 from amvnet.data.formats.detect import NamedScan, ending_of, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.label_files import KINDS, label_points, read_scan_labels, write_scan_labels
+from amvnet.data.labels import label_bags
+from amvnet.data.labels.readers import read_scan_labels
+from amvnet.data.labels.writers import KINDS, label_points, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
@@ -68,7 +69,7 @@ class LabelFormat:
     """How labels of scan files are written.
 
     Attributes:
-        kind: one of `label_files.KINDS` or `label_bags.KINDS`.
+        kind: one of `writers.KINDS` or `label_bags.KINDS`.
         taxonomy: turns train ids into the raw ids that are written.
     """
 
@@ -160,10 +161,17 @@ class Labels:
 
 @dataclass(frozen=True)
 class DatasetScan:
-    """A scan of a dataset."""
+    """A scan of a dataset.
+
+    Attributes:
+        dataset: has the scan.
+        record: its files.
+        written: the classes of the labels that are written; None means those of the dataset.
+    """
 
     dataset: Dataset
     record: ScanRecord
+    written: Taxonomy | None = None
 
     @property
     def is_adapted(self) -> bool:
@@ -201,7 +209,7 @@ class DatasetScan:
     def write_labels(
         self, out: Path, form: LabelFormat, labels: Labels, file_xyz: np.ndarray | None
     ) -> Path:
-        return self.dataset.write_prediction(self.record, out, labels.ids)
+        return self.dataset.write_prediction(self.record, out, labels.ids, self.written)
 
 
 def adapter_for(

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from amvnet.data.formats.detect import READERS
-from amvnet.data.label_bags import KINDS as BAG_KINDS
-from amvnet.data.label_files import check_kind, write_uncertain
+from amvnet.data.labels.label_bags import KINDS as BAG_KINDS
+from amvnet.data.labels.writers import check_kind, write_uncertain
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError, SomeBroken
@@ -38,7 +38,7 @@ class OutputOptions:
 
     Attributes:
         folder: the folder of predictions.
-        kind: the format of scan files' labels, one of `label_files.KINDS` or `label_bags.KINDS`;
+        kind: the format of scan files' labels, one of `writers.KINDS` or `label_bags.KINDS`;
             datasets have their own.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.

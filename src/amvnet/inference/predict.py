@@ -7,12 +7,11 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
-from amvnet.data import label_bags
 from amvnet.data.class_maps import ClassMap
-from amvnet.data.datasets.mapped import MappedDataset
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.detect import BY_ENDING_OR_FOLDER, ending_of
 from amvnet.data.formats.rows import UNKNOWN
+from amvnet.data.labels import label_bags
 from amvnet.distributed import Processes
 from amvnet.errors import InputError, SomeBroken
 from amvnet.inference.certainty import UncertainCount, Verdict
@@ -116,7 +115,7 @@ def predict(
 def _with_classes(scan: InputScan, classes: ClassMap) -> InputScan:
     """Return a scan whose labels are written as those of mapped classes."""
     if isinstance(scan, DatasetScan):
-        return replace(scan, dataset=MappedDataset(scan.dataset, classes))
+        return replace(scan, written=classes.target)
     return scan
 
 

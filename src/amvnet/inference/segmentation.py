@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from amvnet.data.label_files import KINDS, write_scan_labels
+from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.certainty import Verdict, uncertain_share

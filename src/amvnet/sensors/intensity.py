@@ -15,7 +15,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from amvnet.data.formats.cloud import WILD_SHARE
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
 from amvnet.scan import Scan
 
 # The distribution of intensities is described by their quantiles at these probabilities. The ends
@@ -35,6 +35,7 @@ QUANTILES = {
 }
 LARGEST = 1e9  # no device writes larger intensities
 KEY = "intensity_quantiles"  # of a part's training record
+NO_INTENSITY = [0.0] * len(PROBABILITIES)  # of scans without intensities, as they are trained on
 MATCHED = "match_intensity"  # of a part's training record, see `TrainedIntensity.is_matched`
 
 
@@ -81,8 +82,10 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
             continue
 
         carried = record.get(KEY)
-        if are_quantiles(carried):
-            quantiles = carried
+        if carried == NO_INTENSITY and record.get(MATCHED) is not True:
+            quantiles = NO_INTENSITY
+        elif carried:
+            quantiles = check_quantiles(carried, f"the training record of {part}")
         augment = record.get("augment")
         share = augment.get("no_intensity") if isinstance(augment, Mapping) else None
         shares.append(share if isinstance(share, (int, float)) else 0)
@@ -137,12 +140,31 @@ def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarra
 
 
 def are_quantiles(values: Any) -> TypeGuard[list[float]]:
-    """Return whether a value of a file can be quantiles at `PROBABILITIES`."""
+    """Return whether a value of a file can be quantiles at `PROBABILITIES`: different ones."""
     if not isinstance(values, list) or len(values) != len(PROBABILITIES):
         return False
-    if not all(isinstance(value, (int, float)) and abs(value) < LARGEST for value in values):
+    if not all(type(value) in (int, float) and 0 <= value < LARGEST for value in values):
         return False  # NaN, too
-    return bool((np.diff(values) >= 0).all())
+    is_increasing = bool((np.diff(values) >= 0).all())
+    return is_increasing and not is_constant(values)
+
+
+def check_quantiles(values: Any, source: str) -> list[float]:
+    """Return the quantiles that a file holds.
+
+    Args:
+        values: of the file.
+        source: where they are from, for the message.
+
+    Raises:
+        InputError: if they cannot be quantiles.
+    """
+    if not are_quantiles(values):
+        raise InputError(
+            f"{source}: expected {len(PROBABILITIES)} quantiles of the intensities, different "
+            f"ones from 0 on, found {shown(values)}; train or export again"
+        )
+    return values
 
 
 def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
@@ -156,7 +178,7 @@ def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
     return np.quantile(finite.astype(np.float64), PROBABILITIES) if len(finite) else None
 
 
-def is_constant(quantiles: np.ndarray) -> bool:
+def is_constant(quantiles: np.ndarray | Sequence[float]) -> bool:
     """Return whether nearly all intensities are the same, so that they say nothing."""
     low, median, high = quantiles[1], quantiles[5], quantiles[9]
     return bool(high - low <= CONSTANT * abs(median))

@@ -13,11 +13,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from amvnet.data import scan_files as files
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.nuscenes import NuScenes
-from amvnet.data.datasets.predictions import check_size, train_ids
 from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.labels.ids import check_size, train_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
@@ -204,7 +203,7 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
                 required.add(name)
 
     for record in records:
-        points[record.prediction] = _count_points(record, files.KITTI_COLUMNS)
+        points[record.prediction] = _count_points(dataset, record)
         required.add(record.prediction)
 
     is_whole_test = split == "test" and sequences is None
@@ -246,7 +245,7 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     points: dict[str, int | None] = {}
     splits: set[str] = set()
     for record in dataset.records(scenes):
-        points[record.prediction] = _count_points(record, files.NUSCENES_COLUMNS)
+        points[record.prediction] = _count_points(dataset, record)
         splits.add(record.prediction.split("/")[1])
 
     if len(splits) != 1:
@@ -307,10 +306,9 @@ def check_sources(data: bytes, label: str) -> None:
             )
 
 
-def _count_points(record: ScanRecord, columns: int) -> int | None:
+def _count_points(dataset: Dataset, record: ScanRecord) -> int | None:
     """Return the number of points of a scan, or None if it is not on disk."""
-    path = record.points_path
-    return files.count_rows(path, np.float32, columns) if path.is_file() else None
+    return dataset.count_points(record) if record.points_path.is_file() else None
 
 
 def _describe(split: str, sequences: Sequence[str] | None) -> str:

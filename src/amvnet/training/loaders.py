@@ -24,7 +24,14 @@ from amvnet.models.views.points import PointBatch
 from amvnet.progress import Say, ends_tenth, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITY
-from amvnet.sensors.intensity import MATCHED, TrainedIntensity, match_scan, quantiles_of
+from amvnet.sensors.intensity import (
+    MATCHED,
+    NO_INTENSITY,
+    TrainedIntensity,
+    are_quantiles,
+    match_scan,
+    quantiles_of,
+)
 from amvnet.sensors.own import training_record
 from amvnet.sensors.record import AS_IS, measure_sensor
 from amvnet.sensors.record import KEY as SENSOR
@@ -292,7 +299,7 @@ def sensor_record(
     """Return what weights carry of the sensor of their training scans.
 
     These are the quantiles of the intensities at `sensors.intensity.PROBABILITIES`, on average over
-    a sample of the scans and empty if no scan has usable points, and the measures of
+    a sample of the scans and empty if no scan has usable ones, and the measures of
     `sensors.record`. Broken scans are left out: the training names them.
 
     Args:
@@ -311,7 +318,8 @@ def sensor_record(
         if quantiles is not None:
             quantiles_of_scans.append(quantiles)
     mean = np.mean(quantiles_of_scans, axis=0).round(4).tolist() if quantiles_of_scans else []
-    record: dict[str, Any] = {INTENSITY: mean}
+    is_known = mean == NO_INTENSITY or are_quantiles(mean)
+    record: dict[str, Any] = {INTENSITY: mean if is_known else []}
 
     # Scans that are adapted are as the weights will get them: what they are brought to counts.
     if isinstance(dataset, OwnScans) and dataset.is_adapted:

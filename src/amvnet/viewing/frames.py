@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from amvnet.data.datasets.select import taxonomy_named
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Taxonomy, taxonomy_named
 from amvnet.errors import InputError
 from amvnet.inference.inputs import InputScan, LoadedScan, ScanOptions, adapter_for, open_inputs
 from amvnet.inference.scan_stream import stream_scans

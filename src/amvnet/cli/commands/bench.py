@@ -80,13 +80,14 @@ def bench(
 
 def _job(segmenter: Segmenter, scan: Path, folder: Path, name: str, share: float | None) -> Job:
     """Return a job that reads a scan's file and writes its labels into a folder."""
-    from amvnet.data.scan_files import read_scan, write_labels
+    from amvnet.data.formats.detect import read_cloud
+    from amvnet.data.labels.ids import write_ids
     from amvnet.inference.timing import Job
 
     return Job(
         segmenter,
-        read=lambda: read_scan(scan),
-        write=lambda ids: write_labels(folder / "labels.label", ids),
+        read=lambda: read_cloud(scan).to_scan(),
+        write=lambda ids: write_ids(folder / "labels.label", ids),
         name=name,
         share=share,
     )

@@ -42,7 +42,7 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
     pictures = out / "pictures"
     with progress("scoring") as step:
         label = label_by_weights(dataset, segmenter)
-        evaluation = evaluate(dataset, records, label, pictures, step)
+        evaluation = evaluate(dataset, records, label, pictures, progress=step)
     metrics_path = out / "metrics.json"
-    show_evaluation(evaluation, f"simulated streets, seed {seed}", dataset.taxonomy, metrics_path)
+    show_evaluation(evaluation, f"simulated streets, seed {seed}", metrics_path)
     say(f"labels in {predictions}, pictures in {pictures}, figures in {metrics_path}")

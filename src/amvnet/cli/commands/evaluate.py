@@ -20,7 +20,6 @@ from amvnet.errors import InputError
 from amvnet.models.methods import EngineName, Precision, TtaName, widest_method
 
 if TYPE_CHECKING:
-    from amvnet.data.taxonomy import Taxonomy
     from amvnet.evaluation.metrics import Evaluation
 
 
@@ -70,7 +69,6 @@ def evaluate(
             most 4.
     """
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.mapped import map_classes
     from amvnet.data.datasets.select import labelled_records
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
@@ -89,7 +87,7 @@ def evaluate(
         loaded = load(weights)
         has_own = taxonomy is not None or class_map is not None
         opened = open_data(data, taxonomy) if has_own else None
-        dataset = map_classes(open_for_weights(data, loaded, opened), class_map)
+        dataset = open_for_weights(data, loaded, opened)
         records = labelled_records(dataset, choose_records(dataset, names, split))
         method_names = parse_methods(methods)
         # The head runs only if AMVNet is among the methods.
@@ -107,9 +105,9 @@ def evaluate(
     elif predictions is not None and weights is None:
         if tta is not None:
             raise InputError("--tta: expected --weights, found --predictions; leave --tta out")
-        dataset = map_classes(open_data(data, taxonomy), class_map, mapped)
+        dataset = open_data(data, taxonomy)
         records = labelled_records(dataset, choose_records(dataset, names, split))
-        labeller = label_from_files(dataset, predictions)
+        labeller = label_from_files(dataset, predictions, class_map, mapped)
     else:
         raise InputError(
             "expected either --weights or --predictions, found both or neither; give one of them"
@@ -121,16 +119,21 @@ def evaluate(
             make_folder(path.parent)
     with progress("scoring") as step:
         evaluation = evaluate_records(
-            dataset, records, labeller, pictures, progress=step, processes=processes
+            dataset,
+            records,
+            labeller,
+            pictures,
+            classes=class_map,
+            progress=step,
+            processes=processes,
         )
     if processes.first:
-        show_evaluation(evaluation, data, dataset.taxonomy, json, tta)
+        show_evaluation(evaluation, data, json, tta)
 
 
 def show_evaluation(
     evaluation: Evaluation,
     dataset: str,
-    taxonomy: Taxonomy,
     path: Path | None,
     tta: TtaName | None = None,
 ) -> None:
@@ -144,7 +147,7 @@ def show_evaluation(
     figures = evaluation.report(dataset)
     if tta is not None:
         figures["tta"] = tta
-    console.print(evaluation_table(figures, taxonomy))
+    console.print(evaluation_table(figures, evaluation.taxonomy))
     if path is not None:
         with atomic_write(path) as part:
             part.write_text(json_format.dumps(figures, indent=1))

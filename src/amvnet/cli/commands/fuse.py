@@ -58,8 +58,8 @@ def fuse(
         overwrite: replace files in the folder that amvnet did not write, too.
     """
     refuse_other_formats(inputs)
-    from amvnet.data.datasets.select import taxonomy_named
     from amvnet.data.formats.rows import parse_layout
+    from amvnet.data.taxonomy import taxonomy_named
     from amvnet.inference.fuse_files import FusionOptions, fuse_files
     from amvnet.inference.inputs import ScanOptions
     from amvnet.inference.pipeline import OutputOptions

@@ -9,7 +9,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from amvnet.data.labels.ids import check_count, read_ids, train_ids, write_ids
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.files import inside
 from amvnet.scan import Scan
 
 
@@ -83,19 +85,82 @@ class Dataset(Protocol):
             InputError: if a file is missing, truncated, empty or does not fit its scan.
         """
 
-    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
+    def count_points(self, record: ScanRecord) -> int:
+        """Return the number of points of a scan.
+
+        Raises:
+            InputError: as `read`.
+        """
+
+    def read_prediction(
+        self, record: ScanRecord, folder: Path, taxonomy: Taxonomy | None = None
+    ) -> np.ndarray:
         """Read the (N,) uint8 train ids (0..K) that were predicted for a scan.
+
+        Args:
+            record: the scan.
+            folder: a folder of predictions.
+            taxonomy: the classes of the prediction; None means those of the dataset.
 
         Raises:
             InputError: if the file is missing, has another number of points or an unknown id.
         """
 
-    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids as the benchmark's raw ids; the file appears whole or not at all.
+    def write_prediction(
+        self,
+        record: ScanRecord,
+        folder: Path,
+        ids: np.ndarray,
+        taxonomy: Taxonomy | None = None,
+    ) -> Path:
+        """Write (N,) train ids as raw ids; the file appears whole or not at all.
+
+        Args:
+            record: the scan.
+            folder: a folder of predictions.
+            ids: the train ids.
+            taxonomy: the classes of the prediction; None means those of the dataset.
 
         Raises:
             InputError: if there is not one id per point, or an id is outside 0..K.
         """
+
+
+class OnDisk:
+    """What the datasets have in common. `Dataset` documents the methods and their errors."""
+
+    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+        """Return the scan itself."""
+        return record
+
+    def count_points(self: Dataset, record: ScanRecord) -> int:
+        """Read the scan and return the number of its points."""
+        return len(self.read(record, labels=False))
+
+    def read_prediction(
+        self: Dataset, record: ScanRecord, folder: Path, taxonomy: Taxonomy | None = None
+    ) -> np.ndarray:
+        """Read a file of nothing but ids."""
+        path = Path(folder) / record.prediction
+        raw = read_ids(path, _id_type(path), self.count_points(record))
+        return train_ids(path, raw, taxonomy or self.taxonomy)
+
+    def write_prediction(
+        self: Dataset,
+        record: ScanRecord,
+        folder: Path,
+        ids: np.ndarray,
+        taxonomy: Taxonomy | None = None,
+    ) -> Path:
+        """Write a file of nothing but ids."""
+        ids = check_count(ids, record.points_path, self.count_points(record))
+        path = inside(folder, record.prediction)
+        return write_ids(path, (taxonomy or self.taxonomy).to_raw(ids), _id_type(path))
+
+
+def _id_type(path: Path) -> type[np.unsignedinteger]:
+    """Return the type of the ids in a prediction: uint8 of nuScenes, uint32 of all others."""
+    return np.uint8 if path.suffix == ".bin" else np.uint32
 
 
 def choose_records(

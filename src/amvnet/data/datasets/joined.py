@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset, OnDisk, ScanRecord
 from amvnet.data.datasets.open import check_classes
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.simulated import SCANS
-from amvnet.data.datasets.wrapped import WrappedDataset
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -55,7 +55,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Joined(WrappedDataset):
+class Joined(OnDisk):
     """Several datasets with the same classes. `Dataset` documents the methods and their errors.
 
     Scans of the first dataset keep their records. Scans of the others have a `MixedRecord`, and
@@ -68,8 +68,25 @@ class Joined(WrappedDataset):
         places: of each of them, the scans of an epoch.
     """
 
+    dataset: Dataset
     parts: tuple[Part, ...]
     places: tuple[int, ...]
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        return self.dataset.taxonomy
+
+    @property
+    def root(self) -> Path:
+        return self.dataset.root
+
+    @property
+    def spec(self) -> str:
+        return self.dataset.spec
+
+    @property
+    def is_adapted(self) -> bool:
+        return self.dataset.is_adapted
 
     @property
     def specs(self) -> list[str]:
@@ -79,6 +96,14 @@ class Joined(WrappedDataset):
             share = "" if part.share is None else f"@{part.share:g}"
             texts.append(f"{part.dataset.spec}{share}")
         return texts
+
+    def sequences(self, split: str) -> tuple[str, ...]:
+        """Return the sequences of the first dataset."""
+        return self.dataset.sequences(split)
+
+    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
+        """Return scans of the first dataset."""
+        return self.dataset.records(sequences)
 
     def mixed_records(self) -> list[MixedRecord]:
         """Return the places of all others in an epoch."""
@@ -91,7 +116,7 @@ class Joined(WrappedDataset):
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
         """Return the scan that takes a place in an epoch."""
         if not isinstance(record, MixedRecord):
-            return super().at_epoch(record, epoch)
+            return self.dataset.at_epoch(record, epoch)
 
         turn = self._record(record.member, record.place, epoch)
         dataset = self.parts[record.member - 1].dataset
@@ -100,7 +125,7 @@ class Joined(WrappedDataset):
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read a scan of any of them."""
         if not isinstance(record, MixedRecord):
-            return super().read(record, labels)
+            return self.dataset.read(record, labels)
         return self.parts[record.member - 1].dataset.read(record.original, labels)
 
     def _record(self, member: int, place: int, epoch: int) -> MixedRecord:

@@ -10,12 +10,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from amvnet.data import scan_files as files
-from amvnet.data.datasets.base import ScanRecord
-from amvnet.data.datasets.predictions import read_prediction
+from amvnet.data.datasets.base import OnDisk, ScanRecord
+from amvnet.data.formats.raw import (
+    FULL_INTENSITY,
+    NUSCENES_COLUMNS,
+    check_points,
+    count_rows,
+    read_table,
+    ring_column,
+)
+from amvnet.data.labels.ids import read_ids
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import checked_token, inside
+from amvnet.files import checked_token
 from amvnet.scan import Scan
 
 CHANNEL = "LIDAR_TOP"
@@ -54,7 +61,7 @@ TRAIN_DETECT = _scene_names(
 )
 
 
-class NuScenes:
+class NuScenes(OnDisk):
     """The LIDAR_TOP key frames of one version of nuScenes.
 
     `Dataset` documents the arguments and errors of the methods.
@@ -162,31 +169,23 @@ class NuScenes:
             records.extend(self._records_by_scene[scene])
         return records
 
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the scan itself."""
-        return record
-
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan, with the ring of every point."""
-        points, ring = files.read_nuscenes(record.points_path)
+        path = record.points_path
+        table = read_table(path, np.float32, NUSCENES_COLUMNS)
+        points = check_points(table[:, :4], path)
+        points[:, 3] /= FULL_INTENSITY
+        ring = ring_column(table[:, 4], path)
+
         ids = None
         if labels and record.labels_path is not None:
-            ids = files.read_labels(
-                record.labels_path, np.uint8, len(points), self._categories_to_train
-            )
-
+            indices = read_ids(record.labels_path, np.uint8, len(points))
+            ids = self._categories_to_train(indices, record.labels_path)
         return Scan(points, labels=ids, ring=ring, name=record.name)
 
-    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
-        """Read the predicted (N,) uint8 train ids of one scan."""
-        path = Path(folder) / record.prediction
-        return read_prediction(path, np.uint8, self._count_points(record), self.taxonomy)
-
-    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids as raw ids (uint8)."""
-        ids = files.check_count(ids, record.points_path, self._count_points(record))
-        path = inside(folder, record.prediction)
-        return files.write_labels(path, self.taxonomy.to_raw(ids), np.uint8)
+    def count_points(self, record: ScanRecord) -> int:
+        """Return the number of points of a scan, from the size of its file."""
+        return count_rows(record.points_path, np.float32, NUSCENES_COLUMNS)
 
     def _find_version(self, version: str | None) -> str:
         """Return the version to read: the one asked for, or the only one in the folder."""
@@ -257,8 +256,8 @@ class NuScenes:
 
         return table
 
-    def _categories_to_train(self, indices: np.ndarray) -> np.ndarray:
-        """Turn (N,) indices of category.json into (N,) uint8 train ids.
+    def _categories_to_train(self, indices: np.ndarray, path: Path) -> np.ndarray:
+        """Turn (N,) indices of category.json, from a file, into (N,) uint8 train ids.
 
         Raises:
             InputError: if an index is not in category.json.
@@ -269,7 +268,7 @@ class NuScenes:
         if (train_ids == UNKNOWN).any():
             unknown = np.unique(indices[train_ids == UNKNOWN])[:5].tolist()
             raise InputError(
-                f"expected indices of category.json, found {unknown}; "
+                f"{path}: expected indices of category.json, found {unknown}; "
                 "use the tables that came with the labels"
             )
 
@@ -354,9 +353,6 @@ class NuScenes:
                 return "mini_train"
 
         return "val" if scene in VAL else "train"
-
-    def _count_points(self, record: ScanRecord) -> int:
-        return files.count_rows(record.points_path, np.float32, files.NUSCENES_COLUMNS)
 
 
 def _lookup(rows: list[Row], key: str, value: str) -> dict[str, Any]:

@@ -13,16 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data import scan_files as files
-from amvnet.data.datasets.base import ScanRecord
-from amvnet.data.datasets.predictions import read_prediction
+from amvnet.data.datasets.base import OnDisk, ScanRecord
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.raw_labels import read_label_field, read_label_file
+from amvnet.data.labels.ids import train_ids
+from amvnet.data.labels.readers import read_label_field, read_scan_labels
 from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, Taxonomy
 from amvnet.errors import InputError, shown
-from amvnet.files import inside, read_yaml
+from amvnet.files import read_yaml
 from amvnet.scan import Scan
 
 ENDINGS = (".yaml", ".yml")
@@ -78,7 +77,7 @@ class Description:
 
 
 @dataclass(frozen=True)
-class OwnScans:
+class OwnScans(OnDisk):
     """A user's labelled scans. `Dataset` documents the arguments and errors of its methods.
 
     A scan's sequence is the first folder below the part of the pattern that has no wildcards. If
@@ -140,28 +139,21 @@ class OwnScans:
         chosen = [record for record, _ in self._listing if record.sequence in sequences]
         return sorted(chosen, key=lambda record: (record.sequence, record.name))
 
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the scan itself."""
-        return record
-
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan."""
         named = self._scans[record.name]
         cloud = named.read()
         scan = cloud.to_scan() if self.adapt is None else self.adapt(cloud, named.source)
+        self._counts[record.name] = len(scan)
 
         ids = self._read_labels(record, len(scan)) if labels else None
         return dataclasses.replace(scan, labels=ids, name=record.name)
 
-    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
-        """Read the predicted (N,) uint8 train ids of one scan."""
-        path = Path(folder) / record.prediction
-        count = len(self._scans[record.name].read().xyz)
-        return read_prediction(path, np.uint32, count, self.taxonomy)
-
-    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids as raw ids (uint32)."""
-        return files.write_labels(inside(folder, record.prediction), self.taxonomy.to_raw(ids))
+    def count_points(self, record: ScanRecord) -> int:
+        """Return the number of points of a scan; the file is not read a second time."""
+        if record.name not in self._counts:
+            self._counts[record.name] = len(self._scans[record.name].read().xyz)
+        return self._counts[record.name]
 
     def recordings(self) -> dict[str, list[NamedScan]]:
         """Return the scans of each recording, in order: those of one folder and ending."""
@@ -174,6 +166,11 @@ class OwnScans:
         """Return the scans for predictions of other classes, without their labels."""
         description = dataclasses.replace(self.description, taxonomy=taxonomy, labels=None)
         return dataclasses.replace(self, description=description)
+
+    @cached_property
+    def _counts(self) -> dict[str, int]:
+        """Numbers of points of the scans that have been read, by name."""
+        return {}
 
     @cached_property
     def _scans(self) -> dict[str, NamedScan]:
@@ -295,13 +292,9 @@ class OwnScans:
         if place is None or path is None:
             return None
         if place.file is not None:
-            raw = read_label_file(path, count, place.field)
-        else:
-            raw = read_label_field(path, count, str(place.field), self.description.layout)
-        try:
-            return self.taxonomy.to_train(raw)
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from None
+            return read_scan_labels(path, count, self.taxonomy, place.field)
+        raw = read_label_field(path, count, str(place.field), self.description.layout)
+        return train_ids(path, raw, self.taxonomy)
 
 
 def _patterns(names: frozenset[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Choose the scans to train on and to validate with, and the classes by name."""
+"""Choose the scans to train on, to validate with and to score."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.own import OwnScans
-from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.errors import InputError
 
 
@@ -36,17 +35,6 @@ class TrainingScans:
                 "expected different scans to train on and to validate with, "
                 f"found {min(common)} in both; name other sequences"
             )
-
-
-def taxonomy_named(text: str) -> Taxonomy:
-    """Return the classes of a benchmark, given its name, or of a label map, given its path (YAML).
-
-    Raises:
-        InputError: as `taxonomy_from_yaml`.
-    """
-    if text in TAXONOMIES:
-        return TAXONOMIES[text]
-    return taxonomy_from_yaml(text)
 
 
 def labelled_records(dataset: Dataset, records: Sequence[ScanRecord]) -> list[ScanRecord]:

@@ -9,17 +9,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from amvnet.data import scan_files as files
-from amvnet.data.datasets.base import ScanRecord
-from amvnet.data.datasets.predictions import read_prediction
+from amvnet.data.datasets.base import OnDisk, ScanRecord
+from amvnet.data.formats.raw import KITTI_COLUMNS, check_points, count_rows, read_table
+from amvnet.data.labels.ids import read_ids, train_ids
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
-from amvnet.files import inside
 from amvnet.scan import Scan
 
 
 @dataclass(frozen=True)
-class SemanticKitti:
+class SemanticKitti(OnDisk):
     """A SemanticKITTI dataset. `Dataset` documents the arguments and errors of its methods.
 
     Attributes:
@@ -79,30 +78,20 @@ class SemanticKitti:
             records.extend(self._records(sequence))
         return records
 
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the scan itself."""
-        return record
-
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan."""
-        points = files.read_kitti(record.points_path)
+        path = record.points_path
+        points = check_points(read_table(path, np.float32, KITTI_COLUMNS), path)
         ids = None
         if labels and record.labels_path is not None:
-            ids = files.read_labels(
-                record.labels_path, np.uint32, len(points), self.taxonomy.to_train
-            )
+            raw = read_ids(record.labels_path, np.uint32, len(points))
+            ids = train_ids(record.labels_path, raw, self.taxonomy)
 
         return Scan(points, labels=ids, name=record.name)
 
-    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
-        """Read the predicted (N,) uint8 train ids of one scan."""
-        path = Path(folder) / record.prediction
-        return read_prediction(path, np.uint32, self._count_points(record), self.taxonomy)
-
-    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids as raw ids (uint32)."""
-        ids = files.check_count(ids, record.points_path, self._count_points(record))
-        return files.write_labels(inside(folder, record.prediction), self.taxonomy.to_raw(ids))
+    def count_points(self, record: ScanRecord) -> int:
+        """Return the number of points of a scan, from the size of its file."""
+        return count_rows(record.points_path, np.float32, KITTI_COLUMNS)
 
     @property
     def _folder(self) -> Path:
@@ -116,9 +105,6 @@ class SemanticKitti:
         for path in self._folder.glob("*/velodyne"):
             names.append(path.parent.name)
         return tuple(sorted(names))
-
-    def _count_points(self, record: ScanRecord) -> int:
-        return files.count_rows(record.points_path, np.float32, files.KITTI_COLUMNS)
 
     def _records(self, sequence: str) -> list[ScanRecord]:
         """Return the scans of one sequence, in order.

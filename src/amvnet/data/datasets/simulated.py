@@ -17,13 +17,11 @@ from typing import ClassVar, ParamSpec
 
 import numpy as np
 
-from amvnet.data import scan_files as files
-from amvnet.data.datasets.base import ScanRecord
-from amvnet.data.datasets.predictions import read_prediction
+from amvnet.data.datasets.base import OnDisk, ScanRecord
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError, one_line_errors
-from amvnet.files import inside, make_folder
+from amvnet.files import make_folder
 from amvnet.scan import Scan
 from lidarstreets import SimulationError, drive_street
 from lidarstreets import simulate as simulate_streets
@@ -63,7 +61,7 @@ simulate = _with_input_errors(simulate_streets)
 
 
 @dataclass(frozen=True)
-class SimulatedStreets:
+class SimulatedStreets(OnDisk):
     """Streets of a simulated sensor. `Dataset` documents the arguments and errors of its methods.
 
     A sequence is a street, named by its number: "000012". Streets with any number exist. A street
@@ -142,17 +140,6 @@ class SimulatedStreets:
                 f"{street}: expected {SCANS} scans of a simulated street, found a part of them; "
                 "delete the folder"
             ) from None
-
-    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
-        """Read the predicted (N,) uint8 train ids of one scan."""
-        count = len(self.read(record, labels=False))
-        return read_prediction(Path(folder) / record.prediction, np.uint32, count, self.taxonomy)
-
-    def write_prediction(self, record: ScanRecord, folder: Path, ids: np.ndarray) -> Path:
-        """Write (N,) train ids as raw ids (uint32)."""
-        count = len(self.read(record, labels=False))
-        ids = files.check_count(ids, record.points_path, count)
-        return files.write_labels(inside(folder, record.prediction), self.taxonomy.to_raw(ids))
 
     @property
     def _is_nuscenes(self) -> bool:

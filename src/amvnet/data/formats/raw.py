@@ -108,6 +108,24 @@ def _read_rows(path: Path, layout: RowLayout) -> Cloud:
     return named_cloud(columns, layout.columns, str(path), layout.describe())
 
 
+def check_points(points: np.ndarray, path: Path) -> np.ndarray:
+    """Check that a scan has usable points, and return them as contiguous (N, 4) float32.
+
+    Raises:
+        InputError: if there is no point, or none with finite coordinates.
+    """
+    if not len(points):
+        raise InputError(f"{path}: expected a scan with points, found 0 points; leave the file out")
+
+    is_finite = np.isfinite(points[:, :3]).all(axis=1)
+    if not is_finite.any():
+        raise InputError(
+            f"{path}: expected finite coordinates, found NaN or infinity in every point; "
+            "leave the file out"
+        )
+    return np.ascontiguousarray(points, dtype=np.float32)
+
+
 def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
     """Read a file of rows of `columns` values each, with nothing else in it.
 

@@ -1,4 +1,4 @@
-"""Raw labels of single scans: a file next to the scan, or a field of the scan's own file."""
+"""Read the labels of single scans in any format: files of labels, and fields of scan files."""
 
 from __future__ import annotations
 
@@ -17,16 +17,31 @@ from amvnet.data.formats.ply import read_vertices
 from amvnet.data.formats.raw import count_rows
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import read_column
-from amvnet.data.label_files import LABEL_COLUMNS
+from amvnet.data.labels.ids import train_ids
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
 # Types of the ids in files of nothing but ids, by bytes per point.
 INTEGERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.int64}
-KEYS = ("labels", "label", "class", "arr_0")  # arrays of an archive of labels
+COLUMNS = ("class", "label", "scalar_class", "scalar_label")  # the latter by CloudCompare
+ARRAYS = ("labels", "label", "class", "arr_0")  # of an archive
+MOST_COLUMNS = 200  # of an array without names
+LARGEST = np.iinfo(np.uint32).max
 ADVICE = "write the labels again, one whole number per point"
 
 
-def read_label_file(path: Path, count: int, field: str | None = None) -> np.ndarray:
+def read_scan_labels(
+    path: Path, count: int, taxonomy: Taxonomy, field: str | None = None
+) -> np.ndarray:
+    """Read the labels of a scan as (N,) uint8 train ids; the arguments are those of `read_labels`.
+
+    Raises:
+        InputError: as `read_labels`, or if an id is unknown.
+    """
+    return train_ids(path, read_labels(path, count, field), taxonomy)
+
+
+def read_labels(path: Path, count: int, field: str | None = None) -> np.ndarray:
     """Read the raw labels of a scan from a file of labels.
 
     The ending tells the format: `.npy`, `.npz`, text with a number per line, `.pcd`, `.ply`,
@@ -53,7 +68,7 @@ def read_label_file(path: Path, count: int, field: str | None = None) -> np.ndar
         elif ending in (".npy", ".npz") and field is None:
             labels = read_array(path, _usual_member(path) if ending == ".npz" else None)
         elif ending in FIELD_READERS:
-            labels = FIELD_READERS[ending](path, field)
+            labels = _read_field(path, ending, field)
         else:
             labels = _read_integers(path, count)
     return _check(labels, path, count)
@@ -78,9 +93,9 @@ def read_label_field(path: Path, count: int, field: str, layout: RowLayout = UNK
     ending = ending_of(path)
     with reading(path, f"the field {field} with labels", ADVICE):
         if ending.endswith(".bin"):
-            labels = _read_raw_column(path, field, layout)
+            labels = _read_raw_column(path, layout, field)
         elif ending in FIELD_READERS:
-            labels = FIELD_READERS[ending](path, field)
+            labels = _read_field(path, ending, field)
         else:
             raise InputError(
                 f"{path}: expected a file with fields of labels ({', '.join(FIELD_READERS)}), "
@@ -102,6 +117,8 @@ def _check(labels: np.ndarray, path: Path, count: int) -> np.ndarray:
         raise InputError(
             f"{path}: expected whole numbers as labels, found {labels.dtype} with others; {ADVICE}"
         )
+    if count and not -LARGEST <= labels.min() <= labels.max() <= LARGEST:
+        raise InputError(f"{path}: expected labels of 32 bits, found larger ones; {ADVICE}")
     return labels.astype(np.int64)
 
 
@@ -129,47 +146,18 @@ def _read_numbers(path: Path) -> np.ndarray:
 def _usual_member(path: Path) -> str:
     """Return the name of the array of labels in an archive."""
     names = member_names(path)
-    if len(names) == 1:
-        return names[0]
-    return _choose(names, None, path, KEYS)
+    return names[0] if len(names) == 1 else _choose(None, path, names, ARRAYS)
 
 
-def _read_archive(path: Path, field: str | None) -> np.ndarray:
-    """Read an array of an archive, or else a column of the points in it."""
-    if field in member_names(path):
+def _read_field(path: Path, ending: str, field: str | None) -> np.ndarray:
+    """Read a column of a file, or an array of an archive."""
+    if ending == ".npz" and field in member_names(path):
         return read_array(path, field)
-    return _read_array_column(path, field)
-
-
-def _read_array_column(path: Path, field: str | None) -> np.ndarray:
-    """Read a named or numbered column of an array of points."""
-    array = read_array(path)
-    names = array.dtype.names
-    if names is not None:
-        return array[_choose(names, field, path)]
-    if field is not None and field.isdecimal() and int(field) < array.shape[-1]:
-        return array[..., int(field)]
-    raise InputError(
-        f"{path}: expected the number of a column from 0 to {array.shape[-1] - 1}, "
-        f"found {field!a}; correct the field"
-    )
-
-
-def _read_raw_column(path: Path, field: str, layout: RowLayout) -> np.ndarray:
-    """Read a column of rows of numbers that the user described."""
-    if not layout.is_complete:
-        raise InputError(
-            f"{path}: expected columns and dtype of rows with labels, found none; "
-            "add columns: [x, y, z, intensity, label] and dtype: float32"
-        )
-    index = _choose(layout.columns, field, path)
-    count = count_rows(path, layout.record, 1)
-    records = np.fromfile(path, dtype=layout.record, count=min(count, MAX_POINTS))
-    return records[str(layout.columns.index(index))]
+    return FIELD_READERS[ending](path, partial(_choose, field, path))
 
 
 def _choose(
-    names: Sequence[str], field: str | None, path: Path, usual: Sequence[str] = LABEL_COLUMNS
+    field: str | None, path: Path, names: Sequence[str], usual: Sequence[str] = COLUMNS
 ) -> str:
     """Return the column that a user names, or the first one with a usual name."""
     for name in usual if field is None else [field]:
@@ -182,33 +170,50 @@ def _choose(
     )
 
 
-def _find(names: Sequence[str], field: str | None, path: Path) -> dict[str, int]:
+Choose = Callable[[Sequence[str]], str]  # returns the column to read, given the names of all
+
+
+def _read_array_column(path: Path, choose: Choose) -> np.ndarray:
+    """Read a column of an array of points; columns without names are called "0", "1", ..."""
+    array = read_array(path)
+    if array.dtype.names is not None:
+        return array[choose(array.dtype.names)]
+    numbers = range(min(array.shape[-1], MOST_COLUMNS))
+    return array[..., int(choose(tuple(map(str, numbers))))]
+
+
+def _read_raw_column(path: Path, layout: RowLayout, field: str) -> np.ndarray:
+    """Read a column of rows of numbers that the user described."""
+    if not layout.is_complete:
+        raise InputError(
+            f"{path}: expected columns and dtype of rows with labels, found none; "
+            "add columns: [x, y, z, intensity, label] and dtype: float32"
+        )
+    column = _choose(field, path, layout.columns)
+    count = count_rows(path, layout.record, 1)
+    records = np.fromfile(path, dtype=layout.record, count=min(count, MAX_POINTS))
+    return records[str(layout.columns.index(column))]
+
+
+def _index(choose: Choose, names: Sequence[str]) -> dict[str, int]:
     """Return the index of the column with the labels, as the readers of formats want it."""
-    return {"labels": list(names).index(_choose(names, field, path))}
+    return {"labels": list(names).index(choose(names))}
 
 
-def _read_pcd(path: Path, field: str | None) -> np.ndarray:
-    return read_fields(path, partial(_find, field=field, path=path))["labels"]
+def _read_pcd(path: Path, choose: Choose) -> np.ndarray:
+    return read_fields(path, partial(_index, choose))["labels"]
 
 
-def _read_ply(path: Path, field: str | None) -> np.ndarray:
-    return read_vertices(path, partial(_find, field=field, path=path))["labels"]
+def _read_ply(path: Path, choose: Choose) -> np.ndarray:
+    return read_vertices(path, partial(_index, choose))["labels"]
 
 
-def _read_las(path: Path, field: str | None) -> np.ndarray:
-    return read_dimension(path, lambda names: _choose(names, field, path))
-
-
-def _read_text(path: Path, field: str | None) -> np.ndarray:
-    return read_column(path, lambda names: _choose(names, field, path))
-
-
-FIELD_READERS: dict[str, Callable[[Path, str | None], np.ndarray]] = {
+FIELD_READERS: dict[str, Callable[[Path, Choose], np.ndarray]] = {
     ".npy": _read_array_column,
-    ".npz": _read_archive,
+    ".npz": _read_array_column,
     ".pcd": _read_pcd,
     ".ply": _read_ply,
-    ".las": _read_las,
-    ".laz": _read_las,
-    **dict.fromkeys(TEXT, _read_text),
+    ".las": read_dimension,
+    ".laz": read_dimension,
+    **dict.fromkeys(TEXT, read_column),
 }

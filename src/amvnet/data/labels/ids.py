@@ -1,6 +1,7 @@
-"""Predicted labels from any tool: read them and recognise the usual mistakes.
+"""Files that hold nothing but the ids of a scan's points, as those of both benchmarks.
 
-The usual mistakes are another number type, another byte order, and train ids instead of raw ids.
+What other tools write by mistake is recognised: another number type, another byte order, train ids
+instead of raw ids.
 """
 
 from __future__ import annotations
@@ -12,33 +13,58 @@ from numpy.typing import DTypeLike
 
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy
 from amvnet.errors import InputError
+from amvnet.files import atomic_write
 
 WIDTHS = (1, 2, 4, 8)  # bytes of the number types that labels are written in by mistake
 SHOWN = 5  # unknown ids in a message
 
 
-def read_prediction(path: Path, dtype: DTypeLike, count: int, taxonomy: Taxonomy) -> np.ndarray:
-    """Read the predicted labels of one scan.
+def read_ids(path: Path, dtype: DTypeLike, count: int) -> np.ndarray:
+    """Read the raw ids of one scan, (N,) of a number type.
 
     Args:
-        path: the file, raw ids of `dtype`.
+        path: the file.
         dtype: number type of the ids.
         count: points of the scan.
-        taxonomy: the classes.
-
-    Returns:
-        (N,) uint8 train ids in 0..K.
 
     Raises:
-        InputError: if the file is missing, or as `check_size` and `train_ids` raise it.
+        InputError: if the file is missing, or as `check_size` raises it.
     """
     if not path.is_file():
         raise InputError(
-            f"{path}: expected the prediction of a scan, found no file; predict this scan, too"
+            f"{path}: expected the labels of a scan, found no file; add it, or leave the scan out"
         )
-
     check_size(path, path.stat().st_size, count, dtype)
-    return train_ids(path, np.fromfile(path, dtype=dtype, count=count), taxonomy)
+    return np.fromfile(path, dtype=dtype, count=count)
+
+
+def write_ids(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint32) -> Path:
+    """Write (N,) raw ids as `dtype` and return the path; the file appears whole or not at all.
+
+    The official `.label` files hold uint32.
+    """
+    with atomic_write(path) as part:
+        np.asarray(raw_ids).astype(dtype).tofile(part)
+    return Path(path)
+
+
+def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
+    """Check that there is one id per point, and return the ids as an array.
+
+    Args:
+        path: the file to name in the message.
+        count: the number of points.
+
+    Raises:
+        InputError: if the shape of the ids is not (count,).
+    """
+    ids = np.asarray(ids)
+    if ids.shape != (count,):
+        raise InputError(
+            f"{path}: expected {count} ids, one per point, found shape {ids.shape}; "
+            "segment the whole scan"
+        )
+    return ids
 
 
 def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> None:
@@ -76,14 +102,14 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
 
     Args:
         name: the beginning of the message.
-        raw: (N,) raw ids, unsigned integers.
+        raw: (N,) raw ids, integers.
         taxonomy: the classes.
 
     Returns:
         (N,) uint8 train ids in 0..K.
 
     Raises:
-        InputError: if an id is not one of the benchmark's raw ids, or if all of them look like
+        InputError: if an id is not one of the raw ids of the taxonomy, or if all of them look like
             float32 or big-endian ids.
     """
     classes = raw.astype(np.uint32) & np.uint32(INSTANCE_MASK)
@@ -112,5 +138,6 @@ def _describe_unknown(classes: np.ndarray, taxonomy: Taxonomy) -> str:
 
     expected = ", ".join(map(str, taxonomy.train_to_raw[1:]))
     return (
-        f"expected the raw ids of {taxonomy.name} ({expected}), found {listed}; write its raw ids"
+        f"expected the raw ids of {taxonomy.name} ({expected}), found {listed}; write its raw ids, "
+        "or give the label map (YAML) that they are of"
     )

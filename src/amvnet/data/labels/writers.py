@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
-from amvnet.data.formats.cloud import reading, split_records
-from amvnet.data.formats.las import check_header, require_laspy
-from amvnet.data.formats.pcd import read_fields
-from amvnet.data.formats.ply import read_vertices
+from amvnet.data.formats.cloud import split_records
 from amvnet.data.formats.pointcloud2 import pack_rgb
-from amvnet.data.scan_files import check_count, read_labels, write_labels
+from amvnet.data.labels.ids import check_count, write_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -27,9 +23,6 @@ MAX_ERROR = 0.0005  # metres: if float32 is off by more, coordinates are written
 LAS_STEP = 0.0001  # metres: the unit of LAS coordinates
 LAS_REACH = 200_000.0  # metres from the offset, either way: a little less than 32 bits can hold
 LAS_POINT_FORMAT = 7  # of LAS 1.4, with colours
-
-LABEL_COLUMNS = ("class", "label", "scalar_class", "scalar_label")  # the latter by CloudCompare
-LAS_LABELS = "class"
 
 PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 PCD_HEADER = """\
@@ -131,7 +124,7 @@ def write_scan_labels(
     ids = check_count(ids, path, len(xyz))
     raw = taxonomy.to_raw(ids)
     if kind == "label":
-        return write_labels(path, raw)
+        return write_ids(path, raw)
 
     with atomic_write(path) as part:
         if kind == "npy":
@@ -151,37 +144,6 @@ def label_points(
     """
     raw = taxonomy.to_raw(ids)
     return LabelledPoints(xyz, raw, np.asarray(taxonomy.colors, dtype=np.uint8)[ids], uncertain)
-
-
-def read_scan_labels(path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-    """Read the labels of a scan, as `write_scan_labels` writes them in any format.
-
-    Args:
-        path: the file; its ending tells the format, and any other ending means `label`.
-        count: the number of points of the scan.
-
-    Returns:
-        (N,) uint8 train ids.
-
-    Raises:
-        InputError: if the file is missing or broken, has no labels, has another number of them, or
-            an unknown id.
-    """
-    read_raw = LABEL_READERS.get(path.suffix.lower())
-    if read_raw is None or not path.is_file():
-        return read_labels(path, np.uint32, count, taxonomy.to_train)
-
-    with reading(path, "labels as predict writes them", "write the file again"):
-        raw = read_raw(path)
-    if len(raw) != count:
-        raise InputError(
-            f"{path}: expected {count} labels, one per point, found {len(raw)}; "
-            "give the label file of this scan"
-        )
-    try:
-        return taxonomy.to_train(raw)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def write_uncertain(path: Path, uncertain: np.ndarray) -> Path:
@@ -266,65 +228,6 @@ POINT_WRITERS: dict[str, Callable[[Path, LabelledPoints], None]] = {
     "pcd": _write_pcd,
     "las": _write_las,
 }
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    return _check_raw(np.load(path, mmap_mode="r", allow_pickle=False))
-
-
-def _read_ply(path: Path) -> np.ndarray:
-    return _check_raw(read_vertices(path, partial(_find_labels, path=path))["labels"])
-
-
-def _read_pcd(path: Path) -> np.ndarray:
-    return _check_raw(read_fields(path, partial(_find_labels, path=path))["labels"])
-
-
-def _read_las(path: Path) -> np.ndarray:
-    require_laspy(path)
-    import laspy
-
-    check_header(path)
-    with laspy.open(path, read_evlrs=False) as file:
-        points = file.read()
-    if LAS_LABELS not in points.point_format.extra_dimension_names:
-        _find_labels(list(points.point_format.dimension_names), path)
-    return _check_raw(np.asarray(points[LAS_LABELS]))
-
-
-def _find_labels(names: Sequence[str], path: Path) -> dict[str, int]:
-    """Return the index of the column with the labels, given the names of all columns.
-
-    Raises:
-        InputError: if there is none.
-    """
-    for name in LABEL_COLUMNS:
-        if name in names:
-            return {"labels": names.index(name)}
-    raise InputError(
-        f"{path}: expected a column of labels ({', '.join(LABEL_COLUMNS)}), "
-        f"found {', '.join(names)[:200]!a}; give a file that predict has written"
-    )
-
-
-LABEL_READERS: dict[str, Callable[[Path], np.ndarray]] = {
-    ".npy": _read_npy,
-    ".ply": _read_ply,
-    ".pcd": _read_pcd,
-    ".las": _read_las,
-}
-
-
-def _check_raw(values: np.ndarray) -> np.ndarray:
-    """Return (N,) whole numbers from 0 on as uint32.
-
-    Raises:
-        ValueError: if they are others.
-    """
-    is_whole = values.ndim == 1 and np.array_equal(values, np.round(values))
-    if not is_whole or (values < 0).any() or (values > np.iinfo(np.uint32).max).any():
-        raise ValueError(f"{values.dtype} of shape {values.shape} instead of one id per point")
-    return values.astype(np.uint32)
 
 
 @np.errstate(invalid="ignore", over="ignore")

@@ -16,7 +16,7 @@ import numpy as np
 
 from amvnet.data.formats.cloud import Message
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, Origin, encode_labels
-from amvnet.data.label_files import LabelledPoints
+from amvnet.data.labels.writers import LabelledPoints
 from amvnet.errors import InputError
 from amvnet.files import atomic_write, inside, make_folder, publish
 
