@@ -20,8 +20,6 @@ from hypothesis import strategies as st
 
 from amvnet import files
 from amvnet.data.class_maps import class_map
-from amvnet.data.datasets.base import Dataset
-from amvnet.data.datasets.mapped import MappedDataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud, Message
 from amvnet.data.formats.detect import NamedScan
@@ -178,11 +176,10 @@ def test_names_of_scans_write_nothing_elsewhere(name: str, kind: str, link: str)
 @given(token=NAMES, link=LINKS, is_mapped=st.booleans())
 def test_tokens_write_nothing_elsewhere(token: str, link: str, is_mapped: bool) -> None:
     with surroundings(link, make=with_token(token)) as base, suppress(InputError):
-        dataset: Dataset = open_dataset(f"nuscenes:{base}/data")
-        if is_mapped:
-            dataset = MappedDataset(dataset, class_map("coarse"))
+        dataset = open_dataset(f"nuscenes:{base}/data")
+        written = class_map("coarse").target if is_mapped else None
         records = dataset.records(dataset.sequences("all"))
-        write(base, [DatasetScan(dataset, record) for record in records])
+        write(base, [DatasetScan(dataset, record, written) for record in records])
 
 
 @settings(deadline=None, max_examples=100)
