@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 
+from amvnet.inference import segmenter
+from amvnet.models import precision
 from amvnet.scan import Scan
 
 from fixtures.submissions import MAKERS, Case
@@ -21,6 +23,20 @@ def _random_scan(count: int, seed: int = 0) -> Scan:
     points = np.column_stack([xyz, rng.random(count)]).astype(np.float32)
     labels = rng.integers(0, 20, count).astype(np.uint8)
     return Scan(points, labels, rng.integers(0, LASERS, count))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def on_cpu() -> Iterator[None]:
+    """Let `auto` be the CPU also where there is a GPU, whose sums are rounded otherwise."""
+    choose = precision.choose_device
+
+    def choose_cpu(name: str, engine: str = "torch") -> str:
+        return choose("cpu" if name == "auto" else name, engine)
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (precision, segmenter):
+            patch.setattr(module, "choose_device", choose_cpu)
+        yield
 
 
 @pytest.fixture

@@ -58,34 +58,46 @@ _SUBMODULES = ("onnx_runner", "weights")
 
 def load(
     weights: str,
-    device: str = "cpu",
+    device: str = "auto",
     method: MethodName = "amvnet",
-    precision: Precision = "float32",
+    precision: Precision = "auto",
     engine: str = "torch",
     keep_memory: bool = False,
     tta: TtaName | None = None,
+    tau: float | None = None,
 ) -> Segmenter:
     """Return a segmenter with trained weights.
 
     Args:
         weights: the path of a weights file, the name of built-in weights (`sim-hdl64e`,
             `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
-        device: "cpu", "cuda", "cuda:1", ...
+        device: "cpu", "cuda", "cuda:1", ..., or "auto": "cuda" if there is one and the engine runs
+            there, else "cpu".
         method: "amvnet", or a part of it: "rv", "rv-knn" (with a vote of neighbours in the range
             image), "bev", "ensemble", "arithmetic" or "maximum".
-        precision: of the two networks: "float32", "bfloat16", or on a GPU "float16".
+        precision: of the two networks: "float32", "bfloat16", on a GPU "float16", or "auto":
+            bfloat16 on a GPU that has it, else float32.
         engine: what runs the networks: "torch", "compile", "onnx", "int8", or "auto", the fastest
             that gives the same labels here.
         keep_memory: let the whole process keep freed memory, see `Segmenter`.
         tta: test-time augmentation: "flips", "yaw" or "both", see `Segmenter`.
+        tau: the cosine similarity up to which points are uncertain, in [0, 1]; None means as the
+            weights say.
 
     Raises:
         InputError: if there are no such weights, they lack a part that the method needs, or the
             engine lacks a library.
     """
     segmenter_class = import_module("amvnet.inference.segmenter").Segmenter
+    choose_device = import_module("amvnet.models.precision").choose_device
     segmenter: Segmenter = segmenter_class(
-        weights, device, method, precision, keep_memory=keep_memory, tta=tta
+        weights,
+        choose_device(device, engine),
+        method,
+        precision,
+        keep_memory=keep_memory,
+        tta=tta,
+        tau=tau,
     )
     if engine != "torch":
         import_module("amvnet.export.engines").use_engine(segmenter, engine)

@@ -108,7 +108,8 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
 ) -> None:
     monkeypatch.chdir(folder)
     succeed("predict cloud.pcd --weights sim-hdl64e --method bev --out labels")
-    printed = capsys.readouterr().out.splitlines()[0]
+    lines = capsys.readouterr().out.splitlines()
+    (printed,) = [line for line in lines if line.startswith("cloud.pcd")]
     (documented,) = re.findall(r"    (cloud\.pcd: .*)\n    (.*)\n", read_page("own_scans.md"))
 
     # The measured height differs by some millimetres.

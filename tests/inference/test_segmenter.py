@@ -271,6 +271,30 @@ def test_an_unknown_method_is_refused() -> None:
         Segmenter(WEIGHTS, method="vote")  # type: ignore[arg-type]
 
 
+def test_tau_is_that_of_the_weights_unless_it_is_given(result: Segmentation) -> None:
+    same = amvnet.Segmenter(WEIGHTS, tau=THRESHOLD)(POINTS)
+    assert np.array_equal(same.scores, result.scores)
+
+    shares = []
+    for tau in (0.0, 0.5 * THRESHOLD, THRESHOLD, 1.0):
+        rv, bev = both_networks(result)
+        cosine = (rv * bev).sum(axis=1) / np.linalg.norm(rv, axis=1) / np.linalg.norm(bev, axis=1)
+        actual = Segmenter(WEIGHTS, tau=tau)(POINTS)
+        is_clear = np.abs(cosine - tau) > 1e-4
+        assert np.array_equal(actual.uncertain[is_clear], (cosine <= tau)[is_clear])
+        shares.append(actual.uncertain.mean())
+    assert shares == sorted(shares)
+    assert shares[-1] == 1
+    assert np.array_equal(Segmenter(WEIGHTS, tau=0)(POINTS).labels, labels_by("ensemble"))
+
+
+@pytest.mark.parametrize("tau", [-0.1, 1.01, float("nan")])
+def test_a_tau_that_is_no_cosine_of_probabilities_is_refused(tau: float) -> None:
+    fails(lambda: Segmenter(WEIGHTS, tau=tau), "tau", "0 to 1", str(tau))
+    f = equal_probabilities()
+    fails(lambda: fuse(POINTS, f, f, tau=tau), "tau", "0 to 1", str(tau))
+
+
 @pytest.mark.parametrize("device", ["abacus", "cuda:99"])
 def test_an_unknown_device_is_refused(device: str) -> None:
     with pytest.raises(InputError):

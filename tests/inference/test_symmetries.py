@@ -205,8 +205,20 @@ def test_evaluate_says_what_was_averaged_and_names_the_vote(
     assert averaged["methods"]["rv"] != averaged["methods"]["rv-knn"]
 
 
+def test_evaluate_says_which_tau_was_chosen(world: Path) -> None:
+    shares = []
+    for tau in (0.0, 1.0):
+        command = f"evaluate {world} --weights {world}/w.safetensors"
+        succeed(f"{command} --tau {tau} --json {world}/tau.json")
+        figures = json.loads((world / "tau.json").read_text())
+        assert figures["tau"] == tau
+        shares.append(figures["uncertain_fraction"])
+    assert shares == [0, 1]
+
+
 def test_predictions_cannot_be_averaged(world: Path) -> None:
     assert "--tta" in refusal(f"evaluate {world} --predictions {world} --tta flips")
+    assert "--tau" in refusal(f"evaluate {world} --predictions {world} --tau 0.5")
 
 
 @pytest.mark.parametrize("method", ["rv-knn", "amvnet"])

@@ -16,7 +16,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from amvnet import Scan, Segmenter, simulate
+from amvnet import Scan, Segmenter, load, simulate
 from amvnet import read as read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.inputs import adapter_for
@@ -29,7 +29,7 @@ from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import Precision
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
-from amvnet.models.precision import InPrecision
+from amvnet.models.precision import InPrecision, choose_device, choose_precision
 from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.weights.file import save
@@ -319,6 +319,41 @@ def test_a_network_on_a_cpu_leaves_the_settings_of_gpus_alone(precision: Precisi
     assert net.tf32 == torch.backends.cudnn.allow_tf32
 
 
+@pytest.mark.parametrize(
+    ("has_gpu", "has_bfloat16", "device", "precision"),
+    [
+        (False, False, "cpu", "float32"),
+        (True, True, "cuda", "bfloat16"),
+        (True, False, "cuda", "float32"),
+    ],
+)
+def test_a_gpu_is_used_if_there_is_one_in_bfloat16_if_it_has_it(
+    has_gpu: bool, has_bfloat16: bool, device: str, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: has_gpu)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda **_: has_bfloat16)
+    assert choose_device("auto") == device
+    assert choose_precision("auto", device) == precision
+
+    # What is named is used, and ONNX Runtime is used on a CPU only.
+    assert choose_device("cuda:1") == "cuda:1"
+    assert choose_precision("float32", "cuda") == "float32"
+    assert choose_device("auto", "onnx") == "cpu"
+
+
+def test_on_a_cpu_auto_is_float32_on_the_cpu_and_the_commands_say_so(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    segmenter = load(str(world / "w.safetensors"))
+    assert (segmenter.device, segmenter.precision) == ("cpu", "float32")
+
+    arguments = ("predict", world / "data", "--weights", world / "w.safetensors")
+    assert run_cli(*arguments, "--out", tmp_path) == (0, "")
+    assert capsys.readouterr().out.count("computing on cpu in float32\n") == 1
+
+
 @pytest.mark.parametrize("precision", ["float16", "float64", ""])
 def test_a_precision_that_a_cpu_lacks_is_refused(precision: Any) -> None:
     weights = fresh_weights()
@@ -405,7 +440,7 @@ def test_predicting_three_at_a_time_writes_what_one_at_a_time_does(
             np.testing.assert_allclose(scores, np.load(second)[view], atol=2e-3)  # float16
 
 
-def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_precision(
+def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels(
     world: Path, tmp_path: Path
 ) -> None:
     arguments = ("predict", world / "data", "--weights", world / "w.safetensors", "--out", tmp_path)
@@ -423,9 +458,10 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_another_prec
     }
     Journal(tmp_path, settings)
 
-    code, error = run_cli(*arguments, "--resume", "--precision", "bfloat16")
-    assert (code, error.count("\n")) == (2, 1)
-    assert "precision" in error
+    for option, value in (("precision", "bfloat16"), ("tau", 0.1)):
+        code, error = run_cli(*arguments, "--resume", f"--{option}", value)
+        assert (code, error.count("\n")) == (2, 1)
+        assert option in error
     assert run_cli(*arguments, "--resume", "--batch", 2) == (0, "")
     assert files(tmp_path) == names
 
@@ -467,14 +503,15 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
 
 
 @pytest.mark.parametrize("verb", ["predict", "evaluate", "bench"])
-def test_every_verb_that_segments_takes_a_precision(world: Path, tmp_path: Path, verb: str) -> None:
+def test_every_verb_that_segments_takes_a_precision_and_a_tau(
+    world: Path, tmp_path: Path, verb: str
+) -> None:
     inputs = {
         "predict": (world / "data", "--out", tmp_path),
         "evaluate": (world / "data",),
         "bench": ("--runs", 1, "--scan", world / "scans/000000.bin"),
     }
-    options = ("--weights", world / "w.safetensors", "--precision", "bfloat16")
-
+    options = ("--weights", world / "w.safetensors", "--precision", "bfloat16", "--tau", 0.6)
     assert run_cli(verb, *inputs[verb], *options) == (0, "")
 
 

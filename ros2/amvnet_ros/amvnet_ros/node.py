@@ -67,7 +67,7 @@ class SegmentNode(Node):
         settings = self._declare_settings()
         topic = self.resolve_topic_name("points")
         self._segment = CloudSegmenter(settings, topic, self.get_logger().info)
-        self._hardware = settings.device
+        self._hardware = self._segment.hardware
         self._health = Health(self._segment.usual_uncertain)
         self._report_time = time.monotonic()
 
@@ -86,7 +86,7 @@ class SegmentNode(Node):
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
         self.create_timer(REPORT_PERIOD, self._report)
-        self.get_logger().info(f"{settings.weights} on {settings.device} waits for {topic}")
+        self.get_logger().info(f"{settings.weights} on {self._hardware} waits for {topic}")
 
     def close(self) -> None:
         """End the thread that labels."""

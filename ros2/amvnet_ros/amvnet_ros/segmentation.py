@@ -26,9 +26,9 @@ class Settings:
 
     weights: str = _parameter("sim-hdl64e", "a name, a path, or hf-hub:OWNER/NAME")
     method: str = _parameter("amvnet", "amvnet, rv, rv-knn, bev, ensemble, arithmetic or maximum")
-    device: str = _parameter("cpu", "cpu, cuda, cuda:1, ...")
+    device: str = _parameter("auto", "cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU")
     engine: str = _parameter("auto", "auto, torch, compile or onnx")
-    precision: str = _parameter("float32", "float32, bfloat16, or on a GPU float16")
+    precision: str = _parameter("auto", "float32, bfloat16, on a GPU float16, or auto")
     threads: int = _parameter(0, "of the processor; 0: as many as it has cores")
     sensor: str = _parameter("", "a name such as os1-64, or a YAML file; empty: measured")
     height: float = _parameter(-1.0, "metres over the ground; negative: measured")
@@ -121,6 +121,7 @@ class CloudSegmenter:
             keep_memory=True,
         )
         self.taxonomy = segmenter.taxonomy
+        self.hardware = segmenter.hardware
         self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
         self._adapt = adapter_for(segmenter.weights, sensor, say)

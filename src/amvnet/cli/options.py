@@ -85,6 +85,8 @@ def make_segmenter(
     at_once: int | None,
     method: MethodName | None = None,
     tta: TtaName | None = None,
+    tau: float | None = None,
+    processes: Processes | None = None,
 ) -> Segmenter:
     """Return the segmenter of a verb.
 
@@ -96,15 +98,22 @@ def make_segmenter(
         at_once: as for --at-once; None means the best number.
         method: by which it labels scans; by default the widest that the weights have parts for.
         tta: as for --tta.
+        tau: as for --tau.
+        processes: those that share the scans, each on a GPU of its own if there are several.
 
     Raises:
         InputError: if one of the options does not fit the weights or this machine.
     """
     from amvnet.export.engines import use_engine
     from amvnet.inference.segmenter import Segmenter
+    from amvnet.models.precision import choose_device
 
     chosen = method or widest_method(weights.parts)
-    segmenter = Segmenter(weights, device, chosen, precision, keep_memory=True, tta=tta)
+    device = choose_device(device, engine)
+    if processes is not None:
+        device = processes.device(device)
+    segmenter = Segmenter(weights, device, chosen, precision, keep_memory=True, tta=tta, tau=tau)
+    say(f"computing on {segmenter.hardware} in {segmenter.precision}")
     if at_once is not None:
         segmenter.at_once = at_once
     use_engine(segmenter, engine, say)

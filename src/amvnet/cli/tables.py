@@ -47,6 +47,8 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     title = f"{report['dataset']}: {report['scans']} scans, {report['points']:,} points"
     if "tta" in report:
         title += f", test-time augmentation: {report['tta']}"
+    if "tau" in report:
+        title += f", tau: {report['tau']}"
     table = Table(title=title, show_edge=False)
     table.add_column("IoU in %")
     for name in methods:

@@ -140,7 +140,7 @@ def _label(scan: Scan, segmenter: Segmenter) -> LabelledScan:
     """Label a scan by every method, and by the head for every point that a tau would ask."""
     own = segmenter.model.assertion
 
-    def is_asked(f: Tensor, g: Tensor, points: Tensor, labels: Tensor | None = None) -> Tensor:
+    def is_asked(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
         return (_bins(f, g) < SWEPT) | own(f, g, points)
 
     model = copy.copy(segmenter.model)

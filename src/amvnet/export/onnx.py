@@ -111,7 +111,7 @@ def export(
     """
     check_libraries()
     loaded = weights if isinstance(weights, Weights) else load(weights)
-    segmenter = Segmenter(loaded, method=widest_method(loaded.parts))
+    segmenter = Segmenter(loaded, "cpu", widest_method(loaded.parts), "float32")
     scans = [] if int8 is None else calibration_scans(int8, segmenter)
 
     # Write everything into a temporary folder first.

@@ -200,7 +200,7 @@ def _report(segment: NetworkSegmentation, processes: Processes, say: Say) -> Non
 def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter) -> dict[str, Any]:
     """Return what the written files depend on, as JSON types."""
     weights = segmenter.weights
-    settings = {
+    settings: dict[str, Any] = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": segmenter.method,
         "sensor": repr(adapter.sensor),
@@ -213,4 +213,6 @@ def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter)
         settings["precision"] = segmenter.precision
     if segmenter.tta is not None:
         settings["tta"] = segmenter.tta
+    if segmenter.tau is not None:
+        settings["tau"] = segmenter.tau
     return settings

@@ -27,6 +27,7 @@ from amvnet.inference.segmentation import (
 from amvnet.inference.symmetries import SYMMETRIES, Score, average
 from amvnet.memory import keep_freed_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
+from amvnet.models.assertion import Disagreement
 from amvnet.models.layers import fold_batch_norms
 from amvnet.models.methods import (
     METHODS,
@@ -36,7 +37,7 @@ from amvnet.models.methods import (
     Precision,
     TtaName,
 )
-from amvnet.models.precision import InPrecision, check_precision
+from amvnet.models.precision import InPrecision, choose_device, choose_precision
 from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import Voting
@@ -54,18 +55,23 @@ class Segmenter:
 
     Args:
         weights: trained weights, or the name or path of a weights file.
-        device: where to compute: "cpu", "cuda", "cuda:1", ...
+        device: where to compute: "cpu", "cuda", "cuda:1", ..., or "auto": "cuda" if there is one,
+            else "cpu".
         method: "amvnet", or for comparison "rv" or "bev" (one network), "rv-knn" (the range view
             with `models.voting`), "ensemble" (geometric mean), "arithmetic" or "maximum".
-        precision: of the two networks: "float32", "bfloat16", or on a GPU "float16". Everything
-            else is computed in float32, the projections in float64.
+        precision: of the two networks: "float32", "bfloat16", on a GPU "float16", or "auto":
+            bfloat16 on a GPU that has it, else float32. Everything else is computed in float32, the
+            projections in float64.
         keep_memory: on a CPU, let the whole process keep freed memory (`keep_freed_memory`), which
             saves time for each scan. This changes the allocator of your program.
         tta: test-time augmentation: the networks' class probabilities are means over "flips" of the
             scan in x and y, "yaw" turns by quarters (4 passes of the networks each), or "both" (8).
+        tau: points whose class probabilities by the two networks have a cosine similarity of at
+            most this are uncertain, in [0, 1]; None means as the weights say.
 
     Attributes:
-        weights, device, precision, tta: as given; the weights as `Weights`.
+        weights, device, precision, tta, tau: as given, the weights as `Weights`; device and
+            precision are never "auto", but what it stands for.
         method: the name of the method.
         intensity: the intensities of the training, to which those of a scan may be brought
             (`sensors.intensity.match_scan`); None if unknown.
@@ -73,30 +79,31 @@ class Segmenter:
 
     Raises:
         InputError: if the weights lack a part that the method needs, or there is no such method,
-            device, precision or augmentation.
+            device, precision or augmentation, or tau is out of range.
     """
 
     def __init__(
         self,
         weights: Weights | Path | str,
-        device: str = "cpu",
+        device: str = "auto",
         method: MethodName = "amvnet",
-        precision: Precision = "float32",
+        precision: Precision = "auto",
         keep_memory: bool = False,
         tta: TtaName | None = None,
+        tau: float | None = None,
     ) -> None:
         self.weights = weights if isinstance(weights, Weights) else load(weights)
         self.method = _check_method(method, self.weights)
         self.tta = _check_tta(tta)
+        self.tau = tau
         # Weights that were trained with other intensities take them, too.
         trained = trained_intensity(self.weights.training, self.weights.sensor)
         self._are_fractions = trained is None or trained.quantiles[-1] <= 1
         self.intensity = trained
         self.engine = "torch"
         self._at_once: int | None = None
-        self.device = _check_device(device)
-        self.precision = precision
-        check_precision(precision, device)
+        self.device = device = _check_device(choose_device(device))
+        self.precision = precision = choose_precision(precision, device)
         self._keeps_memory = keep_memory and device == "cpu"
         if self._keeps_memory:
             keep_freed_memory()
@@ -108,6 +115,8 @@ class Segmenter:
         fold_batch_norms(self.model)
         _set_up_networks(self.model, device, precision)
 
+        if tau is not None:
+            self.model.assertion = Disagreement(tau)
         method_used = METHODS[method]
         if method_used.ensemble is not None:
             self.model.ensemble = method_used.ensemble
@@ -135,6 +144,13 @@ class Segmenter:
     def taxonomy(self) -> Taxonomy:
         """The classes."""
         return self.weights.taxonomy
+
+    @property
+    def hardware(self) -> str:
+        """The device in words, with the name of a GPU."""
+        if not _is_gpu(self.device):
+            return self.device
+        return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
     def __repr__(self) -> str:
         return f"<Segmenter {self.method} on {self.device}, {self.precision}: {self.weights!r}>"

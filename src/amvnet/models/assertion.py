@@ -8,6 +8,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from amvnet.errors import InputError
+
 TINY = 1e-12  # keeps the cosine of scores without length finite
 
 
@@ -31,6 +33,10 @@ class Disagreement:
     """The paper's assertion: uncertain if the cosine similarity of f and g is at most tau."""
 
     tau: float = 0.85
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.tau <= 1:  # nor NaN
+            raise InputError(f"expected tau from 0 to 1, found {self.tau}; give another")
 
     def __call__(self, f: Tensor, g: Tensor, points: Tensor) -> Tensor:
         return cosine_similarity(f, g) <= self.tau

@@ -1,4 +1,4 @@
-"""The precision that a network computes in; its inputs and outputs stay float32."""
+"""Where a network computes, and in which precision; its inputs and outputs stay float32."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.errors import InputError
-from amvnet.models.methods import PRECISIONS, Precision
+from amvnet.models.methods import ONNX_ENGINES, PRECISIONS, Precision
 
 
 class InPrecision(nn.Module):
@@ -35,14 +35,34 @@ class InPrecision(nn.Module):
             return self.net(view).float()
 
 
-def check_precision(precision: str, device: str) -> None:
-    """Raise InputError if there is no such precision, or the device does not have it."""
+def choose_device(name: str, engine: str = "torch") -> str:
+    """Return the name of a device; for "auto" that is `cuda` if there is one, else `cpu`.
+
+    An engine of ONNX Runtime computes on the CPU.
+    """
+    if name != "auto":
+        return name
+    return "cuda" if torch.cuda.is_available() and engine not in ONNX_ENGINES else "cpu"
+
+
+def choose_precision(precision: Precision, device: str) -> Precision:
+    """Return the precision; for "auto", bfloat16 on a GPU that has it, else float32.
+
+    Raises:
+        InputError: if there is no such precision, or the device does not have it.
+    """
     if precision not in PRECISIONS:
         raise InputError(
             f"expected a precision of {', '.join(PRECISIONS)}, found {precision!r}; use one of them"
         )
-    if precision == "float16" and torch.device(device).type == "cpu":
+    kind = torch.device(device).type
+    if precision == "float16" and kind == "cpu":
         raise InputError("expected float32 or bfloat16 on a CPU, found float16; use bfloat16")
+
+    if precision != "auto":
+        return precision
+    has_bfloat16 = kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+    return "bfloat16" if has_bfloat16 else "float32"
 
 
 @contextmanager

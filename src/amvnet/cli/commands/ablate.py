@@ -15,7 +15,7 @@ def ablate(
     out: Path,
     train_sequences: str | None = None,
     val_sequences: str | None = None,
-    device: str = "cpu",
+    device: str = "auto",
 ) -> None:
     """Train the range-view network with and without GRU and class weights: the paper's Table 5.
 
@@ -27,7 +27,8 @@ def ablate(
             official split.
         val_sequences: sequences or scenes, separated by commas, to score; default: the official
             split.
-        device: where the trained networks are scored: cpu, cuda, cuda:1, ...
+        device: where the trained networks are scored: cpu, cuda, cuda:1, ..., or auto: cuda if
+            there is a GPU.
     """
     from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of

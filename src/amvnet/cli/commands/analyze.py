@@ -21,9 +21,9 @@ def analyze(
     taus: str | None = None,
     recipe: str | None = None,
     train_sequences: str | None = None,
-    device: str = "cpu",
+    device: str = "auto",
     engine: EngineName = "auto",
-    precision: Precision = "float32",
+    precision: Precision = "auto",
     at_once: int | None = None,
 ) -> None:
     """Draw the paper's figures: agreement, mIoU by distance, sweeps, tables by class and by method.
@@ -41,11 +41,11 @@ def analyze(
         recipe: how these heads are trained: a built-in recipe's name or a YAML file.
         train_sequences: sequences or scenes, separated by commas, that these heads learn from;
             default: the official split.
-        device: cpu, cuda, cuda:1, ...
+        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
             (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
             here that changes none.
-        precision: of the networks; float16 on a GPU only.
+        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
     """

@@ -7,8 +7,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from amvnet.cli.console import console, progress, say
-from amvnet.cli.options import WEIGHTS, parse_names
+from amvnet.cli.console import console, progress
+from amvnet.cli.options import WEIGHTS, make_segmenter, parse_names
 from amvnet.models.methods import Precision
 
 if TYPE_CHECKING:
@@ -22,9 +22,10 @@ def bench(
     scan: Path | None = None,
     runs: int = 10,
     uncertain: float | None = None,
+    tau: float | None = None,
     engines: str = "torch",
-    device: str = "cpu",
-    precision: Precision = "float32",
+    device: str = "auto",
+    precision: Precision = "auto",
     json: Path | None = None,
 ) -> None:
     """Time each stage from a scan's file to its labels, and the networks against a matrix product.
@@ -37,21 +38,22 @@ def bench(
         runs: the number of timed runs, after two warm-up runs; medians and quartiles are shown.
         uncertain: the share of the points that counts as uncertain; default: the share that the
             networks disagree on, or 0.1 with --recipe.
+        tau: the cosine similarity of the two networks' probabilities up to which points are
+            uncertain, in [0, 1]; default: that of the weights.
         engines: torch, compile, onnx, int8, or several separated by commas, which are timed in
             turn.
-        device: cpu, cuda, cuda:1, ...
-        precision: of the networks; float16 on a GPU only.
+        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
+        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
         json: also write the figures to this file.
     """
     from amvnet.cli.tables import timing_table
     from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.simulated import simulate
-    from amvnet.export.engines import use_engine
     from amvnet.files import atomic_write
-    from amvnet.inference.segmenter import Segmenter
     from amvnet.inference.timing import UNCERTAIN, time_jobs, untrained
+    from amvnet.weights.file import load
 
-    timed_weights = weights if recipe is None else untrained(load_recipe(recipe))
+    timed_weights = load(weights) if recipe is None else untrained(load_recipe(recipe))
     if recipe is not None and uncertain is None:
         uncertain = UNCERTAIN
 
@@ -63,10 +65,18 @@ def bench(
 
         jobs = []
         for engine in parse_names(engines) or []:
-            segmenter = Segmenter(timed_weights, device, precision=precision, keep_memory=True)
-            name = use_engine(segmenter, engine, say)
-            if precision != "float32":
-                name = f"{name}, {precision}"
+            segmenter = make_segmenter(
+                timed_weights,
+                device,
+                engine,  # type: ignore[arg-type]  # checked there
+                precision,
+                None,
+                method="amvnet",
+                tau=tau,
+            )
+            name = segmenter.engine
+            if segmenter.precision != "float32":
+                name = f"{name}, {segmenter.precision}"
             jobs.append(_job(segmenter, scan, folder, name, uncertain))
 
         with progress("timing") as step:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json as json_format
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 from amvnet.cli.console import console, progress
 from amvnet.cli.options import (
@@ -31,14 +33,15 @@ def evaluate(
     sequences: str | None = None,
     methods: str = "rv,bev,ensemble,amvnet",
     tta: TtaName | None = None,
+    tau: float | None = None,
     json: Path | None = None,
     pictures: Path | None = None,
     taxonomy: Path | None = None,
     classes: str | None = None,
     mapped: bool = False,
-    device: str = "cpu",
+    device: str = "auto",
     engine: EngineName = "auto",
-    precision: Precision = "float32",
+    precision: Precision = "auto",
     at_once: int | None = None,
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
@@ -54,17 +57,19 @@ def evaluate(
         tta: test-time augmentation of weights, the mean of the networks' probabilities over flips
             or quarter turns (yaw) of the scan, 4 times the work of the networks, or over both, 8
             times.
+        tau: points whose probabilities by the two networks have a cosine similarity of at most this
+            go to the head, in [0, 1]; fewer points take less time; default: that of the weights.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
         taxonomy: a semantic-kitti.yaml with other classes.
         classes: score these classes instead, to which those of the data and of the weights are
             mapped: coarse, or a YAML file.
         mapped: the predictions have the ids of --classes, as predict --classes writes them.
-        device: cpu, cuda, cuda:1, ...
+        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
             (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
             here that changes none.
-        precision: of the networks; float16 on a GPU only.
+        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
     """
@@ -94,17 +99,22 @@ def evaluate(
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in method_names]
         segmenter = make_segmenter(
             loaded,
-            processes.device(device),
+            device,
             engine,
             precision,
             at_once,
             method=widest_method(parts),
             tta=tta,
+            tau=tau,
+            processes=processes,
         )
         labeller = label_by_weights(dataset, segmenter, method_names, class_map)
     elif predictions is not None and weights is None:
-        if tta is not None:
-            raise InputError("--tta: expected --weights, found --predictions; leave --tta out")
+        for option, value in (("tta", tta), ("tau", tau)):
+            if value is not None:
+                raise InputError(
+                    f"--{option}: expected --weights, found --predictions; leave --{option} out"
+                )
         dataset = open_data(data, taxonomy)
         records = labelled_records(dataset, choose_records(dataset, names, split))
         labeller = label_from_files(dataset, predictions, class_map, mapped)
@@ -128,25 +138,24 @@ def evaluate(
             processes=processes,
         )
     if processes.first:
-        show_evaluation(evaluation, data, json, tta)
+        show_evaluation(evaluation, data, json, {"tta": tta, "tau": tau})
 
 
 def show_evaluation(
     evaluation: Evaluation,
     dataset: str,
     path: Path | None,
-    tta: TtaName | None = None,
+    settings: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Print the table, and write the same figures as JSON if there is a path.
 
-    Both say so if there was a test-time augmentation.
+    Both have the settings that are not None.
     """
     from amvnet.cli.tables import evaluation_table
     from amvnet.files import atomic_write
 
     figures = evaluation.report(dataset)
-    if tta is not None:
-        figures["tta"] = tta
+    figures |= {name: value for name, value in settings.items() if value is not None}
     console.print(evaluation_table(figures, evaluation.taxonomy))
     if path is not None:
         with atomic_write(path) as part:

@@ -25,6 +25,7 @@ def predict(
     out: Path,
     method: MethodName = "amvnet",
     tta: TtaName | None = None,
+    tau: float | None = None,
     split: Split = "all",
     sequences: str | None = None,
     scores: bool = False,
@@ -32,9 +33,9 @@ def predict(
     format: FormatName = "label",
     uncertain: bool = False,
     classes: str | None = None,
-    device: str = "cpu",
+    device: str = "auto",
     engine: EngineName = "auto",
-    precision: Precision = "float32",
+    precision: Precision = "auto",
     batch: int = 1,
     at_once: int | None = None,
     topic: str | None = None,
@@ -58,6 +59,8 @@ def predict(
         method: the whole of AMVNet, or a part of it.
         tta: test-time augmentation, the mean of the networks' probabilities over flips or quarter
             turns (yaw) of the scan, 4 times the work of the networks, or over both, 8 times.
+        tau: points whose probabilities by the two networks have a cosine similarity of at most this
+            go to the head, in [0, 1]; fewer points take less time; default: that of the weights.
         split: of datasets, the official split.
         sequences: of datasets, these sequences or scenes instead, separated by commas.
         scores: also write the probabilities of both networks.
@@ -67,11 +70,11 @@ def predict(
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         classes: write the ids of these classes, to which those of the weights are mapped: coarse,
             or a YAML file.
-        device: cpu, cuda, cuda:1, ...
+        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
             (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
             here that changes none.
-        precision: of the networks; float16 on a GPU only.
+        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
         batch: scans that go through the networks at a time; more than one suits a GPU.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
@@ -114,7 +117,15 @@ def predict(
         offset=offset,
     )
     segmenter = make_segmenter(
-        load(weights), processes.device(device), engine, precision, at_once, method=method, tta=tta
+        load(weights),
+        device,
+        engine,
+        precision,
+        at_once,
+        method=method,
+        tta=tta,
+        tau=tau,
+        processes=processes,
     )
 
     with progress("segmenting") as step:

@@ -16,9 +16,9 @@ def rank(
     split: Split = "all",
     sequences: str | None = None,
     pictures: Path | None = None,
-    device: str = "cpu",
+    device: str = "auto",
     engine: EngineName = "auto",
-    precision: Precision = "float32",
+    precision: Precision = "auto",
     at_once: int | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -31,11 +31,11 @@ def rank(
         split: the official split.
         sequences: sequences or scenes instead, separated by commas.
         pictures: folder for drawings of the first clusters from above.
-        device: cpu, cuda, cuda:1, ...
+        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
             (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
             here that changes none.
-        precision: of the networks; float16 on a GPU only.
+        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
         overwrite: replace files that amvnet did not write, too.

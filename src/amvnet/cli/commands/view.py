@@ -25,7 +25,7 @@ def view(
     split: Split = "all",
     sequences: str | None = None,
     taxonomy: str | None = None,
-    device: str = "cpu",
+    device: str = "auto",
     topic: str | None = None,
     columns: str | None = None,
     dtype: str | None = None,
@@ -37,7 +37,7 @@ def view(
     rotate: str | None = None,
     offset: str | None = None,
     engine: EngineName = "auto",
-    precision: Precision = "float32",
+    precision: Precision = "auto",
     at_once: int | None = None,
 ) -> None:
     """Look at scans, labels, uncertain points and errors in 3D: in Rerun, or in a browser.
@@ -54,7 +54,7 @@ def view(
         split: of datasets, the official split.
         sequences: of datasets, these sequences or scenes instead, separated by commas.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
-        device: cpu, cuda, cuda:1, ...
+        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
         topic: of bags, the topic of the scans; default: the only one with scans.
         columns: of .bin, .npy and text files, what their columns hold, as of predict.
         dtype: of .bin files, the type of the numbers, as of predict.
@@ -72,7 +72,7 @@ def view(
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
             (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
             here that changes none.
-        precision: of the networks; float16 on a GPU only.
+        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
         at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
             most 4.
     """
