@@ -10,13 +10,7 @@ import numpy as np
 Option = TypeVar("Option")
 
 
-def normalised(shares: Mapping[Option, float]) -> dict[Option, float]:
-    """Return shares that add up to 1 in the ratios of the given ones."""
-    total = sum(shares.values())
-    return {option: share / total for option, share in shares.items()}
-
-
-def weighted_choice(rng: np.random.Generator, chances: Mapping[Option, float]) -> Option:
-    """Draw one of the keys, each with the chance that is its value; the chances add up to 1."""
-    options = list(chances)
-    return options[rng.choice(len(options), p=list(chances.values()))]
+def weighted_choice(rng: np.random.Generator, shares: Mapping[Option, float]) -> Option:
+    """Draw one of the keys, each with a chance in proportion to its value."""
+    weights = np.array(list(shares.values()))
+    return list(shares)[rng.choice(len(weights), p=weights / weights.sum())]

@@ -78,7 +78,7 @@ def _drive_one_street(
     ground = Ground(style, end + drive.margin, rng, (drive.margin, end))
     speed = float(rng.uniform(*drive.speed)) * style.speed
     site, course = build_site(ground, scans, speed, rng, drive)
-    fixed_scene = RayScene(join([ground.mesh(), *site.fixed]))
+    fixed_scene = RayScene(join(ground.mesh(), *site.fixed))
 
     first_pose: np.ndarray | None = None
     for index in range(scans):
@@ -121,7 +121,7 @@ def _moving_mesh(site: Site, course: Course, index: int, time: float) -> Mesh:
             pose = mover.pose_at(site.ground, time)
             if not covers(mover.mesh, pose, ego, MOVING_CLEARANCE):
                 bodies.append(mover.at(site.ground, time))
-    return join(bodies)
+    return join(*bodies)
 
 
 def _tilted_pose(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lidarstreets.errors import SimulationError
-from lidarstreets.materials import MOVING, NUSCENES_CATEGORIES, SEMANTICKITTI_IDS
+from lidarstreets.materials import MOVING, Label
 
 Row = dict[str, Any]
 CLASS_MASK = np.uint32(0xFFFF)
@@ -51,7 +51,7 @@ SCENE_STEP = 1_000_000_000
 
 WRITING = threading.Lock()  # held while a file is written
 
-_CATEGORIES = ("noise", *sorted(set(NUSCENES_CATEGORIES.values())))
+_CATEGORIES = ("noise", *sorted({label.category for label in Label} - {"noise"}))
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class SimulatedScan:
     def semantickitti_ids(self) -> np.ndarray:
         """Return the (N,) uint32 raw labels of SemanticKITTI, with instances."""
         table = np.arange(2**16, dtype=np.uint32)
-        for label, raw in SEMANTICKITTI_IDS.items():
-            table[label] = raw
+        for label in Label:
+            table[label] = label.raw
         return table[self.labels & CLASS_MASK] | self.labels & ~CLASS_MASK
 
     def nuscenes_categories(self) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -87,10 +87,8 @@ class SimulatedScan:
         Lost returns are noise.
         """
         table = np.zeros(2**16, dtype=np.uint8)
-        for label, category in NUSCENES_CATEGORIES.items():
-            table[label] = _CATEGORIES.index(category)
-        for label, moving in MOVING.items():
-            table[moving] = table[label]
+        for label in Label:
+            table[[label, MOVING.get(label, label)]] = _CATEGORIES.index(label.category)
         return table[self.labels & CLASS_MASK], _CATEGORIES
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass
 from enum import IntEnum
-from functools import lru_cache
 
 import numpy as np
 
@@ -12,37 +11,52 @@ import numpy as np
 class Label(IntEnum):
     """A class of a simulated street.
 
-    The values are raw SemanticKITTI ids; those from 300 are classes that only nuScenes has.
+    The values are raw SemanticKITTI ids; those from 300 are classes that only nuScenes has. The
+    category of nuScenes-lidarseg follows, then the raw SemanticKITTI id if it is another one.
+
+    Attributes:
+        category: of nuScenes-lidarseg; it counts riders as part of their vehicle.
+        raw: SemanticKITTI id.
     """
 
-    OUTLIER = 1
-    CAR = 10
-    BICYCLE = 11
-    BUS = 13
-    MOTORCYCLE = 15
-    TRUCK = 18
-    OTHER_VEHICLE = 20
-    PERSON = 30
-    BICYCLIST = 31
-    MOTORCYCLIST = 32
-    ROAD = 40
-    PARKING = 44
-    SIDEWALK = 48
-    OTHER_GROUND = 49
-    BUILDING = 50
-    FENCE = 51
-    OTHER_STRUCTURE = 52
-    LANE_MARKING = 60
-    VEGETATION = 70
-    TRUNK = 71
-    TERRAIN = 72
-    POLE = 80
-    TRAFFIC_SIGN = 81
-    OTHER_OBJECT = 99
-    BARRIER = 300
-    TRAFFIC_CONE = 301
-    CONSTRUCTION_VEHICLE = 302
-    TRAILER = 303
+    OUTLIER = 1, "noise"
+    CAR = 10, "vehicle.car"
+    BICYCLE = 11, "vehicle.bicycle"
+    BUS = 13, "vehicle.bus.rigid"
+    MOTORCYCLE = 15, "vehicle.motorcycle"
+    TRUCK = 18, "vehicle.truck"
+    OTHER_VEHICLE = 20, "vehicle.trailer"
+    PERSON = 30, "human.pedestrian.adult"
+    BICYCLIST = 31, "vehicle.bicycle"
+    MOTORCYCLIST = 32, "vehicle.motorcycle"
+    ROAD = 40, "flat.driveable_surface"
+    PARKING = 44, "flat.driveable_surface"
+    SIDEWALK = 48, "flat.sidewalk"
+    OTHER_GROUND = 49, "flat.other"
+    BUILDING = 50, "static.manmade"
+    FENCE = 51, "static.manmade"
+    OTHER_STRUCTURE = 52, "static.manmade"
+    LANE_MARKING = 60, "flat.driveable_surface"
+    VEGETATION = 70, "static.vegetation"
+    TRUNK = 71, "static.vegetation"
+    TERRAIN = 72, "flat.terrain"
+    POLE = 80, "static.manmade"
+    TRAFFIC_SIGN = 81, "static.manmade"
+    OTHER_OBJECT = 99, "static.other"
+    BARRIER = 300, "movable_object.barrier", 52
+    TRAFFIC_CONE = 301, "movable_object.trafficcone", 99
+    CONSTRUCTION_VEHICLE = 302, "vehicle.construction", 20
+    TRAILER = 303, "vehicle.trailer", 20
+
+    category: str
+    raw: int
+
+    def __new__(cls, value: int, category: str, raw: int | None = None) -> Label:
+        label = int.__new__(cls, value)
+        label._value_ = value
+        label.category = category
+        label.raw = value if raw is None else raw
+        return label
 
 
 # The raw SemanticKITTI id of moving bodies, by class. Other classes have no such id.
@@ -56,131 +70,75 @@ MOVING = {
     Label.OTHER_VEHICLE: 259,
 }
 
-# The SemanticKITTI class that is written in place of each class that only nuScenes has.
-SEMANTICKITTI_IDS = {
-    Label.BARRIER: Label.OTHER_STRUCTURE,
-    Label.TRAFFIC_CONE: Label.OTHER_OBJECT,
-    Label.CONSTRUCTION_VEHICLE: Label.OTHER_VEHICLE,
-    Label.TRAILER: Label.OTHER_VEHICLE,
-}
-
-# The nuScenes-lidarseg category of each class; those without one, outliers, are noise.
-NUSCENES_CATEGORIES = {
-    Label.CAR: "vehicle.car",
-    Label.BICYCLE: "vehicle.bicycle",
-    Label.BUS: "vehicle.bus.rigid",
-    Label.MOTORCYCLE: "vehicle.motorcycle",
-    Label.TRUCK: "vehicle.truck",
-    Label.OTHER_VEHICLE: "vehicle.trailer",
-    Label.PERSON: "human.pedestrian.adult",
-    Label.BICYCLIST: "vehicle.bicycle",  # nuScenes counts riders as part of the vehicle
-    Label.MOTORCYCLIST: "vehicle.motorcycle",
-    Label.ROAD: "flat.driveable_surface",
-    Label.PARKING: "flat.driveable_surface",
-    Label.SIDEWALK: "flat.sidewalk",
-    Label.OTHER_GROUND: "flat.other",
-    Label.BUILDING: "static.manmade",
-    Label.FENCE: "static.manmade",
-    Label.OTHER_STRUCTURE: "static.manmade",
-    Label.LANE_MARKING: "flat.driveable_surface",
-    Label.VEGETATION: "static.vegetation",
-    Label.TRUNK: "static.vegetation",
-    Label.TERRAIN: "flat.terrain",
-    Label.POLE: "static.manmade",
-    Label.TRAFFIC_SIGN: "static.manmade",
-    Label.OTHER_OBJECT: "static.other",
-    Label.BARRIER: "movable_object.barrier",
-    Label.TRAFFIC_CONE: "movable_object.trafficcone",
-    Label.CONSTRUCTION_VEHICLE: "vehicle.construction",
-    Label.TRAILER: "vehicle.trailer",
-}
-
-
-class Surface(IntEnum):
-    """A kind of surface; the value is its row in `reflection_table`."""
-
-    ASPHALT = 0
-    PAVING = 1
-    GRASS = 2
-    GRAVEL = 3
-    ROAD_PAINT = 4
-    PLASTER = 5
-    BRICK = 6
-    GLASS = 7
-    WOOD = 8
-    LEAF = 9
-    BARK = 10
-    METAL = 11
-    SIGN_FACE = 12
-    CLOTH = 13
-    SKIN = 14
-    DARK_PAINT = 15
-    LIGHT_PAINT = 16
-    RUBBER = 17
-    PLATE = 18
-    PLASTIC = 19
-    ROOF_TILE = 20
-    WINDOW = 21
-    STONE = 22
-    TWIG = 23
-
 
 @dataclass(frozen=True)
 class Reflection:
-    """How one kind of surface reflects a laser pulse, as measured on KITTI's scans."""
+    """How one kind of surface reflects a laser pulse, as measured on KITTI's scans.
 
-    # Intensity in [0, 1] that an HDL-64E reports for a near surface that is hit head-on.
+    Attributes:
+        reflectivity: intensity in [0, 1] that an HDL-64E reports for a near surface hit head-on.
+        spread: standard deviation of the intensity between returns of one body, relative to its
+            mean.
+        shade: standard deviation of the logarithm of the reflectivity between bodies.
+        dark: share of returns with intensity 0: glossy surfaces reflect most light elsewhere.
+        drop: share of the pulses that never return, whatever the range.
+        rough: mean height in metres of relief, such as grass, that is too fine for triangles.
+        ghost: share of returns from a mirrored body and so from farther along the ray.
+    """
+
     reflectivity: float
-    # Standard deviation of the intensity between returns of one body, relative to its mean.
     spread: float
-    # Standard deviation of the logarithm of the reflectivity between bodies.
     shade: float
-    # Share of the returns with intensity 0: glossy surfaces reflect most of the light elsewhere.
     dark: float = 0.02
-    # Share of the pulses that never return, whatever the range.
     drop: float = 0.0
-    # Mean height in metres of relief, such as grass, that is too fine to model with triangles.
     rough: float = 0.0
-    # Share of the returns that come from a mirrored body and so from farther along the ray.
     ghost: float = 0.0
 
 
-REFLECTIONS: dict[Surface, Reflection] = {
-    Surface.ASPHALT: Reflection(0.30, spread=0.11, shade=0.14, dark=0.004),
-    Surface.PAVING: Reflection(0.33, spread=0.09, shade=0.12, dark=0.003),
-    Surface.GRASS: Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.018),
-    Surface.GRAVEL: Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004),
-    Surface.ROAD_PAINT: Reflection(0.55, spread=0.20, shade=0.15),
-    Surface.PLASTER: Reflection(0.42, spread=0.10, shade=0.25, drop=0.01),
-    Surface.BRICK: Reflection(0.38, spread=0.12, shade=0.25, drop=0.01, rough=0.002),
-    Surface.GLASS: Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65, ghost=0.04),
-    Surface.WOOD: Reflection(0.38, spread=0.13, shade=0.25, rough=0.003),
-    Surface.LEAF: Reflection(0.36, spread=0.23, shade=0.17, dark=0.05, drop=0.03),
-    Surface.BARK: Reflection(0.37, spread=0.28, shade=0.20, dark=0.05, rough=0.010),
-    Surface.METAL: Reflection(0.28, spread=0.26, shade=0.50, dark=0.12, drop=0.03, rough=0.004),
-    Surface.SIGN_FACE: Reflection(0.50, spread=0.20, shade=0.40),
-    Surface.CLOTH: Reflection(0.46, spread=0.20, shade=0.25, rough=0.006),
-    Surface.SKIN: Reflection(0.45, spread=0.20, shade=0.10, dark=0.03),
-    Surface.DARK_PAINT: Reflection(
-        0.04, spread=0.50, shade=0.90, dark=0.30, drop=0.12, rough=0.002
-    ),
-    Surface.LIGHT_PAINT: Reflection(
-        0.26, spread=0.30, shade=0.45, dark=0.08, drop=0.05, rough=0.002
-    ),
-    Surface.RUBBER: Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.10),
-    Surface.PLATE: Reflection(0.95, spread=0.10, shade=0.10, dark=0.0),
-    Surface.PLASTIC: Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03),
-    Surface.ROOF_TILE: Reflection(0.33, spread=0.13, shade=0.20, drop=0.01, rough=0.003),
+class Surface(IntEnum):
+    """A kind of surface; the value is its row in `REFLECTIONS`."""
+
+    ASPHALT = Reflection(0.30, spread=0.11, shade=0.14, dark=0.004)
+    PAVING = Reflection(0.33, spread=0.09, shade=0.12, dark=0.003)
+    GRASS = Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.018)
+    GRAVEL = Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004)
+    ROAD_PAINT = Reflection(0.55, spread=0.20, shade=0.15)
+    PLASTER = Reflection(0.42, spread=0.10, shade=0.25, drop=0.01)
+    BRICK = Reflection(0.38, spread=0.12, shade=0.25, drop=0.01, rough=0.002)
+    GLASS = Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65, ghost=0.04)
+    WOOD = Reflection(0.38, spread=0.13, shade=0.25, rough=0.003)
+    LEAF = Reflection(0.36, spread=0.23, shade=0.17, dark=0.05, drop=0.03)
+    BARK = Reflection(0.37, spread=0.28, shade=0.20, dark=0.05, rough=0.010)
+    METAL = Reflection(0.28, spread=0.26, shade=0.50, dark=0.12, drop=0.03, rough=0.004)
+    SIGN_FACE = Reflection(0.50, spread=0.20, shade=0.40)
+    CLOTH = Reflection(0.46, spread=0.20, shade=0.25, rough=0.006)
+    SKIN = Reflection(0.45, spread=0.20, shade=0.10, dark=0.03)
+    DARK_PAINT = Reflection(0.04, spread=0.50, shade=0.90, dark=0.30, drop=0.12, rough=0.002)
+    LIGHT_PAINT = Reflection(0.26, spread=0.30, shade=0.45, dark=0.08, drop=0.05, rough=0.002)
+    RUBBER = Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.10)
+    PLATE = Reflection(0.95, spread=0.10, shade=0.10, dark=0.0)
+    PLASTIC = Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03)
+    ROOF_TILE = Reflection(0.33, spread=0.13, shade=0.20, drop=0.01, rough=0.003)
     # The window of a house. Unlike a car's, it has curtains and frames that reflect.
-    Surface.WINDOW: Reflection(
-        0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01, ghost=0.02
-    ),
-    Surface.STONE: Reflection(0.36, spread=0.16, shade=0.25, rough=0.014),
-    Surface.TWIG: Reflection(0.28, spread=0.28, shade=0.20, dark=0.08, drop=0.05),
-}
+    WINDOW = Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01, ghost=0.02)
+    STONE = Reflection(0.36, spread=0.16, shade=0.25, rough=0.014)
+    TWIG = Reflection(0.28, spread=0.28, shade=0.20, dark=0.08, drop=0.05)
+
+    reflection: Reflection
+
+    def __new__(cls, reflection: Reflection) -> Surface:
+        row = len(cls.__members__)
+        surface = int.__new__(cls, row)
+        surface._value_ = row
+        surface.reflection = reflection
+        return surface
+
+
+# (S, 7): rows are the surfaces by value, columns the fields of `Reflection` in order.
+REFLECTIONS = np.array([astuple(surface.reflection) for surface in Surface], dtype=np.float32)
 
 # The surface of each class of ground.
-GROUND_SURFACES: dict[Label, Surface] = {
+GROUND_SURFACES = {
     Label.ROAD: Surface.ASPHALT,
     Label.PARKING: Surface.PAVING,
     Label.SIDEWALK: Surface.PAVING,
@@ -188,25 +146,3 @@ GROUND_SURFACES: dict[Label, Surface] = {
     Label.LANE_MARKING: Surface.ROAD_PAINT,
     Label.TERRAIN: Surface.GRASS,
 }
-
-
-@lru_cache(maxsize=1)
-def reflection_table() -> np.ndarray:
-    """Return `REFLECTIONS` as an (S, 7) float32 table.
-
-    Rows are the S surfaces by value; columns are the fields of `Reflection` in order.
-    """
-    rows = [astuple(REFLECTIONS[surface]) for surface in Surface]
-    return np.array(rows, dtype=np.float32)
-
-
-@lru_cache(maxsize=1)
-def ground_surface_table() -> np.ndarray:
-    """Return the (256,) uint8 surface of each class of ground, indexed by class id.
-
-    Entries of other ids are 0 and have no meaning.
-    """
-    table = np.zeros(256, dtype=np.uint8)
-    for label, surface in GROUND_SURFACES.items():
-        table[label] = surface
-    return table

@@ -67,7 +67,7 @@ def part(
     )
 
 
-def join(meshes: Sequence[Mesh]) -> Mesh:
+def join(*meshes: Mesh) -> Mesh:
     """Return several meshes as one; the result is empty if there are none."""
     if not meshes:
         return part([np.zeros((0, 3, 3))], Surface.ASPHALT, 0)

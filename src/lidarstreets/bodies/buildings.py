@@ -33,11 +33,11 @@ def building(
         wing = _walls(rng, facade, *size)
         lid = part([box((size[0], size[1], 0.2), (0, 0, size[2]))], facade.surface, Label.BUILDING)
         x = width * rng.uniform(0.1, 0.35) * rng.choice([-1, 1])
-        parts.append(place(join([wing, lid]), x, -depth * 0.5, 0, 0))
+        parts.append(place(join(wing, lid), x, -depth * 0.5, 0, 0))
     if rng.random() < 0.2:
         side = rng.choice([-1, 1])
         parts.append(place(garages(rng, 1), side * (width / 2 + 1.6), -depth * 0.1, 0, 0))
-    return join(parts)
+    return join(*parts)
 
 
 def _walls(
@@ -45,12 +45,10 @@ def _walls(
 ) -> Mesh:
     """Return four walls, the one at the back without windows."""
     return join(
-        [
-            place(wall(rng, facade, width, height), 0, -depth / 2, 0, 0),
-            place(wall(rng, facade, depth, height), -width / 2, 0, 0, -np.pi / 2),
-            place(wall(rng, facade, depth, height), width / 2, 0, 0, np.pi / 2),
-            place(plain_wall(facade, width, height), 0, depth / 2, 0, np.pi),
-        ]
+        place(wall(rng, facade, width, height), 0, -depth / 2, 0, 0),
+        place(wall(rng, facade, depth, height), -width / 2, 0, 0, -np.pi / 2),
+        place(wall(rng, facade, depth, height), width / 2, 0, 0, np.pi / 2),
+        place(plain_wall(facade, width, height), 0, depth / 2, 0, np.pi),
     )
 
 
@@ -90,10 +88,8 @@ def shed(rng: np.random.Generator) -> Mesh:
     surface = Surface.WOOD if rng.random() < 0.6 else Surface.PLASTER
 
     return join(
-        [
-            part([walls, door], surface, Label.BUILDING),
-            part([roof], Surface.ROOF_TILE, Label.BUILDING),
-        ]
+        part([walls, door], surface, Label.BUILDING),
+        part([roof], Surface.ROOF_TILE, Label.BUILDING),
     )
 
 
@@ -114,10 +110,8 @@ def garages(rng: np.random.Generator, count: int) -> Mesh:
     surface = Surface.METAL if rng.random() < 0.5 else Surface.WOOD
 
     return join(
-        [
-            part(solids, Surface.PLASTER, Label.BUILDING, tint=rng.normal(scale=0.5)),
-            part([gates], surface, Label.BUILDING, tint=rng.normal(scale=0.5)),
-        ]
+        part(solids, Surface.PLASTER, Label.BUILDING, tint=rng.normal(scale=0.5)),
+        part([gates], surface, Label.BUILDING, tint=rng.normal(scale=0.5)),
     )
 
 
@@ -159,18 +153,16 @@ def hall(rng: np.random.Generator, width: float, depth: float, height: float) ->
         gates = planks(rng.uniform(-0.3, 0.3, 2) * length, rng.uniform(2.5, 4.5), -0.2, 3.6, -0.05)
         band = planks(0, length * 0.9, height - 1.6, height - 0.7, -0.04)
         side = join(
-            [
-                sheets,
-                part([gates], Surface.PLASTIC, Label.BUILDING, tint=rng.normal()),
-                part([band], Surface.WINDOW, Label.BUILDING),
-            ]
+            sheets,
+            part([gates], Surface.PLASTIC, Label.BUILDING, tint=rng.normal()),
+            part([band], Surface.WINDOW, Label.BUILDING),
         )
         at = distance * np.array([np.sin(yaw), -np.cos(yaw)])
         parts.append(place(side, at[0], at[1], 0, yaw))
 
     roof = box((width + 0.2, depth + 0.2, 0.4), (0, 0, height - 0.1))
     parts.append(part([roof], Surface.METAL, Label.BUILDING))
-    return join(parts)
+    return join(*parts)
 
 
 def greenhouse(rng: np.random.Generator) -> Mesh:
@@ -191,10 +183,8 @@ def greenhouse(rng: np.random.Generator) -> Mesh:
     posts = copies(frame, x=x[:, None], y=np.linspace(-length / 2, length / 2, 6))
 
     return join(
-        [
-            part([prism(profile, length)], Surface.WINDOW, Label.BUILDING),
-            part([base, posts], Surface.METAL, Label.BUILDING),
-        ]
+        part([prism(profile, length)], Surface.WINDOW, Label.BUILDING),
+        part([base, posts], Surface.METAL, Label.BUILDING),
     )
 
 
@@ -209,10 +199,8 @@ def church(rng: np.random.Generator) -> Mesh:
     roof = box((11, 21, 7), (0, 2, height), top=(0.02, 1.0))
 
     return join(
-        [
-            part([nave, buttresses, tower], Surface.STONE, Label.BUILDING),
-            part([roof], Surface.ROOF_TILE, Label.BUILDING),
-        ]
+        part([nave, buttresses, tower], Surface.STONE, Label.BUILDING),
+        part([roof], Surface.ROOF_TILE, Label.BUILDING),
     )
 
 
@@ -224,8 +212,6 @@ def gable_barn(rng: np.random.Generator, width: float, depth: float, height: flo
     surface = (Surface.PLASTER, Surface.WOOD, Surface.BRICK)[rng.integers(3)]
     gate = planks(rng.uniform(-0.2, 0.2) * width, 3.2, 0, 3.0, -depth / 2 - 0.05)
     return join(
-        [
-            part([prism(profile, depth)], surface, Label.BUILDING),
-            part([gate], Surface.WOOD, Label.BUILDING),
-        ]
+        part([prism(profile, depth)], surface, Label.BUILDING),
+        part([gate], Surface.WOOD, Label.BUILDING),
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarstreets.chance import normalised, weighted_choice
+from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Maker, Mesh, join, part
 from lidarstreets.solids import box, copies, hull, leaning, moved, planks, tube
@@ -40,7 +40,7 @@ def bins(rng: np.random.Generator) -> Mesh:
         at = (0.68 * (index - count / 2) + 0.3, rng.normal(scale=0.05), 0)
         yaw = rng.normal(scale=0.1)
         meshes.append(_object([moved(body, at, yaw), moved(lid, at, yaw)], Surface.PLASTIC, rng))
-    return join(meshes)
+    return join(*meshes)
 
 
 def cabinet(rng: np.random.Generator) -> Mesh:
@@ -80,7 +80,7 @@ def parasol(rng: np.random.Generator) -> Mesh:
     parts = [_object([table, stand, *chairs], Surface.PLASTIC, rng)]
     if rng.random() < 0.6:
         parts.append(_object([roof], Surface.CLOTH, rng))
-    return join(parts)
+    return join(*parts)
 
 
 def column(rng: np.random.Generator) -> Mesh:
@@ -108,7 +108,7 @@ def planter(rng: np.random.Generator) -> Mesh:
     tub = _object([box(size, top=(1.15, 1.15))], Surface.PLASTER, rng)
     radii = (size[0] * 0.45, size[1] * 0.45, rng.uniform(0.2, 0.6))
     leaves = hull(rng, (0, 0, size[2]), radii, fine=False)
-    return join([tub, part([leaves], Surface.LEAF, Label.VEGETATION, 0.1)])
+    return join(tub, part([leaves], Surface.LEAF, Label.VEGETATION, 0.1))
 
 
 def playground(rng: np.random.Generator) -> Mesh:
@@ -126,7 +126,7 @@ def playground(rng: np.random.Generator) -> Mesh:
         legs = copies(box((0.1, 0.1, 2.2)), x=width + np.array([[-0.6], [0.6]]), y=[-0.6, 0.6])
         slide = leaning(planks(0, 0.5, 0, 1.3), 0, 1.5)
         parts.append(_object([tower, legs, moved(slide, (width, -2.6, 0))], Surface.PLASTIC, rng))
-    return join(parts)
+    return join(*parts)
 
 
 def trampoline(rng: np.random.Generator) -> Mesh:
@@ -140,7 +140,7 @@ def trampoline(rng: np.random.Generator) -> Mesh:
     for angle in np.arange(6) * np.pi / 3:
         foot = (radius * np.cos(angle), radius * np.sin(angle), -0.1)
         legs.append(tube(foot, (foot[0], foot[1], 2.5), 0.03, sides=4))
-    return join([_object([mat, *legs], Surface.PLASTIC, rng), net])
+    return join(_object([mat, *legs], Surface.PLASTIC, rng), net)
 
 
 def heap(rng: np.random.Generator) -> Mesh:
@@ -172,7 +172,7 @@ def container(rng: np.random.Generator) -> Mesh:
         for index in range(int(rng.integers(1, 4))):
             dome = box((1.4, 1.3, 1.6), (index * 1.7, 0, 0), top=(0.7, 0.7))
             domes.append(_object([dome], Surface.PLASTIC, rng))
-        return join(domes)
+        return join(*domes)
     if kind < 0.75:
         return _object([box((3.4, 1.8, 1.3), top=(1.3, 1.0))], Surface.METAL, rng)
     size = (rng.uniform(3, 6.1), 2.4, 2.5)
@@ -210,7 +210,7 @@ def tent(rng: np.random.Generator) -> Mesh:
     if rng.random() < 0.5:
         side = planks(0, size[0], 0, 2.1, size[1] / 2)
         parts.append(_structure([side], Surface.CLOTH, rng))
-    return join(parts)
+    return join(*parts)
 
 
 def pump(rng: np.random.Generator) -> Mesh:
@@ -240,7 +240,7 @@ def structure(rng: np.random.Generator) -> Mesh:
         board = box((length, 0.1, rng.uniform(1.2, 2.8)), (0, 0, rng.uniform(0.1, 1.0)))
         posts = copies(box((0.12, 0.12, height)), x=np.array([-0.4, 0.4]) * length, y=0.12)
         return join(
-            [_structure([board], Surface.PLASTER, rng), _structure([posts], Surface.METAL, rng)]
+            _structure([board], Surface.PLASTER, rng), _structure([posts], Surface.METAL, rng)
         )
     if kind < 0.7:
         ramp = box((length, 1.6, 1.1 + FOOT), (0, 0, -FOOT), top=(rng.uniform(0.3, 1.0), 1.0))
@@ -259,35 +259,31 @@ def structure(rng: np.random.Generator) -> Mesh:
 
 
 # Shares of the objects at the edge of a street, and of those in gardens and yards.
-_STREET: dict[Maker, float] = normalised(
-    {
-        bins: 0.36,
-        cabinet: 0.22,
-        bench: 0.08,
-        column: 0.06,
-        letter_box: 0.08,
-        planter: 0.07,
-        container: 0.05,
-        structure: 0.04,
-        bike_rack: 0.05,
-        statue: 0.03,
-    }
-)
-_YARD: dict[Maker, float] = normalised(
-    {
-        bins: 0.20,
-        bench: 0.10,
-        parasol: 0.10,
-        planter: 0.10,
-        playground: 0.10,
-        trampoline: 0.06,
-        heap: 0.20,
-        tent: 0.05,
-        statue: 0.04,
-        container: 0.05,
-        structure: 0.14,
-    }
-)
+_STREET: dict[Maker, float] = {
+    bins: 0.36,
+    cabinet: 0.22,
+    bench: 0.08,
+    column: 0.06,
+    letter_box: 0.08,
+    planter: 0.07,
+    container: 0.05,
+    structure: 0.04,
+    bike_rack: 0.05,
+    statue: 0.03,
+}
+_YARD: dict[Maker, float] = {
+    bins: 0.20,
+    bench: 0.10,
+    parasol: 0.10,
+    planter: 0.10,
+    playground: 0.10,
+    trampoline: 0.06,
+    heap: 0.20,
+    tent: 0.05,
+    statue: 0.04,
+    container: 0.05,
+    structure: 0.14,
+}
 
 
 def clutter(rng: np.random.Generator) -> Mesh:
@@ -311,10 +307,8 @@ def shelter(rng: np.random.Generator) -> Mesh:
     surface = Surface.GLASS if rng.random() < 0.6 else Surface.WOOD
 
     return join(
-        [
-            part([posts, roof, seat], Surface.METAL, Label.OTHER_STRUCTURE),
-            part([pane], surface, Label.OTHER_STRUCTURE),
-        ]
+        part([posts, roof, seat], Surface.METAL, Label.OTHER_STRUCTURE),
+        part([pane], surface, Label.OTHER_STRUCTURE),
     )
 
 
@@ -333,7 +327,7 @@ def steps(rng: np.random.Generator) -> Mesh:
         rail = tube((x, -0.3 * count, 0.9), (x, 0, 0.9 + 0.17 * count), 0.03, sides=4)
         foot = tube((x, -0.3 * count, 0), (x, -0.3 * count, 0.9), 0.03, sides=4)
         parts.append(part([rail, foot], Surface.METAL, Label.OTHER_STRUCTURE))
-    return join(parts)
+    return join(*parts)
 
 
 def bridge(rng: np.random.Generator, width: float) -> Mesh:

@@ -108,7 +108,7 @@ def wall(rng: np.random.Generator, facade: Facade, width: float, height: float) 
 
     last = planks(0, width, bottom, height)
     parts.append(part([last], facade.surface, Label.BUILDING))
-    return join([*parts, *_extras(rng, facade, width, height)])
+    return join(*parts, *_extras(rng, facade, width, height))
 
 
 def _storey(

@@ -48,7 +48,7 @@ def lamp(rng: np.random.Generator) -> Mesh:
         solids.append(tube((0, 0, 0), (0, 0, foot_height), radius * 1.4, closed=False))
     surface = Surface.METAL if rng.random() < 0.8 else Surface.PLASTER
     pole = part(solids, surface, Label.POLE, tint=rng.normal(DARK_METAL, 0.6))
-    return join([pole, *_carried(rng)])
+    return join(pole, *_carried(rng))
 
 
 def _carried(rng: np.random.Generator) -> list[Mesh]:
@@ -87,10 +87,8 @@ def guide_post(rng: np.random.Generator) -> Mesh:
     body = box((0.1, 0.12, 1.25), (0, 0, -0.25), top=(0.9, 0.9))
     reflector = box((0.02, 0.06, 0.18), (-0.06, 0, 0.7))
     return join(
-        [
-            part([body], Surface.PLASTIC, Label.POLE, tint=1.0),
-            part([reflector], Surface.PLATE, Label.POLE),
-        ]
+        part([body], Surface.PLASTIC, Label.POLE, tint=1.0),
+        part([reflector], Surface.PLATE, Label.POLE),
     )
 
 
@@ -106,7 +104,7 @@ def utility_pole(rng: np.random.Generator) -> Mesh:
     if rng.random() < 0.5:
         solids.append(box((0.12, rng.uniform(0.8, 2.2), 0.12), (0, 0, height - 0.8)))
     surface = Surface.WOOD if rng.random() < 0.75 else Surface.PLASTER
-    return join([part(solids, surface, Label.POLE), *_carried(rng)])
+    return join(part(solids, surface, Label.POLE), *_carried(rng))
 
 
 def flag_pole(rng: np.random.Generator) -> Mesh:
@@ -114,10 +112,8 @@ def flag_pole(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(6, 9)
     flag = box((0.03, 1.1, rng.uniform(1.5, 3.5)), (0, 0.6, height - 3.8))
     return join(
-        [
-            part([_pole(rng, height, 0.05, 0.03)], Surface.METAL, Label.POLE),
-            part([flag], Surface.CLOTH, Label.OTHER_OBJECT),
-        ]
+        part([_pole(rng, height, 0.05, 0.03)], Surface.METAL, Label.POLE),
+        part([flag], Surface.CLOTH, Label.OTHER_OBJECT),
     )
 
 
@@ -147,10 +143,8 @@ def _face(rng: np.random.Generator, height: float, x: float = -0.06) -> Mesh:
 
 def _two_sided(rng: np.random.Generator, front: np.ndarray, back: np.ndarray) -> Mesh:
     return join(
-        [
-            part([front], Surface.SIGN_FACE, Label.TRAFFIC_SIGN, tint=rng.normal(scale=0.8)),
-            part([back], Surface.METAL, Label.TRAFFIC_SIGN, tint=rng.normal(0.5, 0.5)),
-        ]
+        part([front], Surface.SIGN_FACE, Label.TRAFFIC_SIGN, tint=rng.normal(scale=0.8)),
+        part([back], Surface.METAL, Label.TRAFFIC_SIGN, tint=rng.normal(0.5, 0.5)),
     )
 
 
@@ -172,7 +166,7 @@ def sign(rng: np.random.Generator) -> Mesh:
         parts = [mast, _face(rng, height)]
         if rng.random() < 0.3:
             parts.append(_face(rng, height - rng.uniform(0.4, 0.9)))
-        mesh = join(parts)
+        mesh = join(*parts)
 
     # Most face the traffic; the others show their backs, or face a side road.
     turn = rng.normal(scale=0.15) + rng.choice([0.0, np.pi, np.pi / 2], p=[0.7, 0.15, 0.15])
@@ -190,7 +184,7 @@ def _large_board(rng: np.random.Generator) -> Mesh:
     posts = part([copies(post_solid, y=post_y)], Surface.METAL, Label.POLE)
     front = box((0.03, width, rise), (-0.1, 0, height))
     back = box((0.02, width, rise), (-0.074, 0, height))
-    return join([posts, _two_sided(rng, front, back)])
+    return join(posts, _two_sided(rng, front, back))
 
 
 def _chevron(rng: np.random.Generator) -> Mesh:
@@ -199,7 +193,7 @@ def _chevron(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(0.2, 0.7)
     front = box(size, (-0.05, 0, height))
     posts = part([_pole(rng, height + size[2], 0.03)], Surface.METAL, Label.POLE)
-    return join([posts, _two_sided(rng, front, front + np.array([0.031, 0, 0]))])
+    return join(posts, _two_sided(rng, front, front + np.array([0.031, 0, 0])))
 
 
 def traffic_light(rng: np.random.Generator) -> Mesh:
@@ -217,10 +211,8 @@ def traffic_light(rng: np.random.Generator) -> Mesh:
         backboard.append(box((0.02, 0.5, 1.1), (0.1, reach, 4.9)))
 
     return join(
-        [
-            part(solids, Surface.METAL, Label.POLE),
-            part(lamps + backboard, Surface.PLASTIC, Label.TRAFFIC_SIGN),
-        ]
+        part(solids, Surface.METAL, Label.POLE),
+        part(lamps + backboard, Surface.PLASTIC, Label.TRAFFIC_SIGN),
     )
 
 
@@ -234,11 +226,9 @@ def gantry(rng: np.random.Generator, width: float) -> Mesh:
     board = box((0.05, width * 0.3, 2.0), (-0.25, -width * 0.2, height))
 
     return join(
-        [
-            part([masts], Surface.METAL, Label.POLE),
-            part([beams], Surface.METAL, Label.OTHER_STRUCTURE),
-            _two_sided(rng, board, board + np.array([0.06, 0, 0])),
-        ]
+        part([masts], Surface.METAL, Label.POLE),
+        part([beams], Surface.METAL, Label.OTHER_STRUCTURE),
+        _two_sided(rng, board, board + np.array([0.06, 0, 0])),
     )
 
 

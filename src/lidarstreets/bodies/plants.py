@@ -131,7 +131,7 @@ def bush(rng: np.random.Generator, radius: float) -> Mesh:
     kind = rng.random()
 
     if kind < 0.15:
-        return join([_sticks(rng, radius, 1.7 * height), _ball(rng, radius, height, 0.9)])
+        return join(_sticks(rng, radius, 1.7 * height), _ball(rng, radius, height, 0.9))
     if kind < 0.33:
         return _ball(rng, radius, height, rng.uniform(0.15, 0.9))
     if kind < 0.5:
@@ -222,7 +222,7 @@ class Thicket:
             stems.append(tube((x, y, -FOOT), tip, rng.uniform(0.03, 0.12), 0.03, 5, closed=False))
 
         trunks = part(stems, Surface.BARK, Label.TRUNK)
-        return join([trunks, foliage(leaves, self.depth, self.tint + rng.normal(scale=0.3))])
+        return join(trunks, foliage(leaves, self.depth, self.tint + rng.normal(scale=0.3)))
 
 
 def draw_thicket(rng: np.random.Generator) -> Thicket:

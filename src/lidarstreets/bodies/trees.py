@@ -30,14 +30,14 @@ def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
 
     kind = rng.random()
     if not fine:
-        return join([*parts, _distant_crown(rng, fork, height, spread)])
+        return join(*parts, _distant_crown(rng, fork, height, spread))
     if kind < 0.45:
         crown = _clumps(rng, fork, height, spread, radius)
     elif kind < 0.85:
         crown = _cloud(rng, fork, height, spread, radius)
     else:
         crown = _bare_boughs(rng, fork, height, spread, radius)
-    return join([*parts, crown])
+    return join(*parts, crown)
 
 
 def _stem(
@@ -84,7 +84,7 @@ def _clumps(
         clump = hull(rng, (x, y, z), (size, size, size * 0.9), fine=False)
         clumps.append(foliage([clump], depth, rng.normal(scale=0.4)))
 
-    return join([part(boughs, Surface.BARK, Label.VEGETATION), *clumps])
+    return join(part(boughs, Surface.BARK, Label.VEGETATION), *clumps)
 
 
 def _cloud(
@@ -103,7 +103,7 @@ def _cloud(
     centre = (fork[0], fork[1], low + half)
     crown = hull(rng, centre, (spread, spread * rng.uniform(0.8, 1.2), half))
     depth = float(np.exp(rng.uniform(np.log(0.1), np.log(2.0))))
-    return join([part(boughs, Surface.BARK, Label.VEGETATION), foliage([crown], depth)])
+    return join(part(boughs, Surface.BARK, Label.VEGETATION), foliage([crown], depth))
 
 
 def _bare_boughs(
@@ -125,7 +125,7 @@ def _bare_boughs(
     half = (height - fork[2] * 0.8) / 2
     twigs = hull(rng, (*fork[:2], height - half), (spread, spread, half), fine=False)
     haze = foliage([twigs], rng.uniform(2, 7), surface=Surface.TWIG)
-    return join([part(rods, Surface.BARK, Label.VEGETATION), haze])
+    return join(part(rods, Surface.BARK, Label.VEGETATION), haze)
 
 
 def _distant_crown(rng: np.random.Generator, fork: Vector, height: float, spread: float) -> Mesh:
@@ -146,7 +146,7 @@ def conifer(rng: np.random.Generator, height: float) -> Mesh:
         rng, (0, 0, height - half), (radius, radius, half), taper=rng.uniform(0.5, 0.8), fine=False
     )
     leaves = foliage([branches], rng.uniform(0.05, 0.5), rng.normal(scale=0.5))
-    return join([part([trunk], Surface.BARK, Label.TRUNK), leaves])
+    return join(part([trunk], Surface.BARK, Label.TRUNK), leaves)
 
 
 def column(rng: np.random.Generator, height: float) -> Mesh:
@@ -176,7 +176,7 @@ def sapling(rng: np.random.Generator) -> Mesh:
         for x in (-0.3, 0.3):
             stakes.append(tube((x, 0, -0.2), (x, 0, 1.6), 0.035, sides=5, closed=False))
         parts.append(part(stakes, Surface.WOOD, Label.POLE))
-    return join(parts)
+    return join(*parts)
 
 
 def random_tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarstreets.errors import SimulationError
-from lidarstreets.materials import Label, Surface, ground_surface_table
+from lidarstreets.materials import GROUND_SURFACES, Label, Surface
 from lidarstreets.mesh import Mesh, part
 from lidarstreets.sensing.sensors import LidarModel
 
@@ -259,7 +259,8 @@ def trace(
     bare = np.flatnonzero(label == 0)
     x, y = (origin[hit[bare], :2] + direction[hit[bare], :2] * distance[bare, None]).T
     label[bare] = ground.label(x, y)
-    surface[bare] = ground_surface_table()[label[bare]]
+    for ground_label, ground_surface in GROUND_SURFACES.items():
+        surface[bare[label[bare] == ground_label]] = ground_surface
     tint[bare] = ground.tint(x, y, label[bare])
 
     is_foliage = nearest.depth[hit] > 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarstreets.materials import Label, reflection_table
+from lidarstreets.materials import REFLECTIONS, Label
 from lidarstreets.sensing.lidar import Hits
 from lidarstreets.sensing.sensors import LidarModel
 
@@ -48,7 +48,7 @@ def receive(
         (N, 4) float32 x, y, z, intensity; (N,) uint32 class ids with the instance in the upper
         half; (N,) uint8 rings.
     """
-    base, spread, shade, dark, drop, relief, ghost = reflection_table()[hits.surface].T
+    base, spread, shade, dark, drop, relief, ghost = REFLECTIONS[hits.surface].T
     count = len(hits.distance)
     reflectivity = base * np.exp(shade * hits.tint)
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarstreets.bodies.fence_shapes import gate
-from lidarstreets.bodies.fences import Fence, draw_fence
+from lidarstreets.bodies.fences import Fence, draw_fence, gate
 from lidarstreets.bodies.plants import Hedge, draw_hedge
 from lidarstreets.sites.plot import Plot
 

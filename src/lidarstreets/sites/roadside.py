@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarstreets.bodies import clutter, fence_shapes, furniture, plants, trees
+from lidarstreets.bodies import clutter, fences, furniture, plants, trees
 from lidarstreets.mesh import Mesh
 from lidarstreets.sites.site import Site
 from lidarstreets.sites.traffic import along_road
@@ -76,7 +76,7 @@ def _put_guard_rail(site: Site, side: int) -> None:
     if style.strips[int(side > 0)] and style.kind == "motorway":
         t = side * (ground.front(side) - rng.uniform(0.3, 0.8))
     for x in np.arange(0, ground.length, BARRIER_STEP):
-        site.put(fence_shapes.guard_rail(BARRIER_STEP + RAIL_OVERLAP), x, t, yaw)
+        site.put(fences.guard_rail(BARRIER_STEP + RAIL_OVERLAP), x, t, yaw)
 
 
 def _put_on_street(site: Site, mesh: Mesh, x: float, t: float, yaw: float) -> None:
@@ -135,7 +135,7 @@ def _put_barriers(site: Site, x: tuple[float, float], t: float, kind: str) -> No
         t: of the barrier.
         kind: "rail" for steel on both sides, otherwise concrete.
     """
-    rail = fence_shapes.guard_rail(BARRIER_STEP + RAIL_OVERLAP)
+    rail = fences.guard_rail(BARRIER_STEP + RAIL_OVERLAP)
     concrete = furniture.barrier(BARRIER_STEP + CONCRETE_OVERLAP)
     for middle in np.arange(x[0], x[1], BARRIER_STEP):
         if kind == "rail":

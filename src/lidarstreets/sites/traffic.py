@@ -73,7 +73,7 @@ def _fill_parallel(site: Site, side: int) -> None:
         middle = x + half
         if rng.random() < style.parked and _is_bay(site, middle, half):
             if rng.random() < 0.05:
-                mesh = join([mesh, open_door(rng)])
+                mesh = join(mesh, open_door(rng))
             t = side * (style.road / 2 + width / 2 + rng.normal(scale=0.12))
             yaw = along_road(side) + rng.normal(scale=0.03) + np.pi * (rng.random() < 0.12)
             site.put(mesh, middle, t, yaw, thing=True, margin=half + 3.0)

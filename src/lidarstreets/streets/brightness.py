@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidarstreets.materials import GROUND_SURFACES, REFLECTIONS, Label
+from lidarstreets.materials import GROUND_SURFACES, Label
 
 # Median reflectivities of asphalt and of other pavements, measured on KITTI's scans.
 ASPHALT = 0.28
@@ -34,7 +34,7 @@ class GroundBrightness:
                 wanted[label] = rng.lognormal(np.log(PAVEMENT), 0.2)
 
         for label, reflectivity in wanted.items():
-            reflection = REFLECTIONS[GROUND_SURFACES[label]]
+            reflection = GROUND_SURFACES[label].reflection
             ratio = np.log(reflectivity / reflection.reflectivity)
             self._tints[label] = ratio / reflection.shade
 

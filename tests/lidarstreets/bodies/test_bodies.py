@@ -124,7 +124,7 @@ def row_of(fence: fences.Fence, segments: int = 4) -> Mesh:
     pieces = []
     for index in range(segments):
         pieces.append(place(fence.segment(rng, 2.5), 2.5 * index - 3.75, 0, 0, 0))
-    return join(pieces)
+    return join(*pieces)
 
 
 def test_a_mesh_fence_lets_more_pulses_through_than_boards() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lidarstreets import SENSORS
-from lidarstreets.materials import REFLECTIONS, Label, Surface
+from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place, with_random_tint
 from lidarstreets.sensing.sensors import LidarModel
 from lidarstreets.solids import box, hull
@@ -127,7 +127,7 @@ def test_the_car_hides_what_is_behind_its_parts(ground: Points) -> None:
 
 @pytest.mark.parametrize(("mixed", "smallest", "largest"), [(0.0, 0, 0), (0.5, 11, np.inf)])
 def test_some_returns_at_edges_lie_in_between(mixed: float, smallest: int, largest: int) -> None:
-    walls = join([wall(10, (1, 9)), wall(12, (-9, 9))])
+    walls = join(wall(10, (1, 9)), wall(12, (-9, 9)))
     points, _, _ = scan_mesh(walls, replace(EXACT, mixed=mixed))
     between = np.count_nonzero((points[:, 0] > 10.05) & (points[:, 0] < 11.95))
     assert smallest <= between <= largest
@@ -154,18 +154,18 @@ def share_through(scene: Mesh) -> float:
 
 def test_overlapping_clumps_are_one() -> None:
     """Their union is 4 m deep, not the 2 m at which the first of them ends."""
-    scene = join([slab(14, 16, 1), slab(15, 18, 1), wall(22)])
+    scene = join(slab(14, 16, 1), slab(15, 18, 1), wall(22))
     assert share_through(scene) == pytest.approx(np.exp(-4), rel=0.2)
 
 
 def test_many_clumps_can_be_passed() -> None:
     clumps = [slab(10 + 2 * i, 11 + 2 * i, 100.0) for i in range(5)]
-    assert share_through(join([*clumps, wall(22)])) == pytest.approx(np.exp(-5 / 100), rel=0.05)
+    assert share_through(join(*clumps, wall(22))) == pytest.approx(np.exp(-5 / 100), rel=0.05)
 
 
 def test_some_pulses_pass_a_thin_crown() -> None:
     """Their share is that of exponential free paths: exp(-thickness / depth)."""
-    scene = join([slab(14.5, 15.5, 0.5), wall(20)])
+    scene = join(slab(14.5, 15.5, 0.5), wall(20))
     # A leaf reflects less than the wall and is lost a little more often.
     assert share_through(scene) == pytest.approx(np.exp(-1 / 0.5), rel=0.12)
 
@@ -206,7 +206,7 @@ def test_a_moving_sensor_smears_a_scan_unless_it_is_corrected(
     )
     left_wall = replace(wall(10), triangles=wall(10).triangles[..., [1, 0, 2]])
     pole = part([box((0.2, 0.2, 20), (0, 10, -10))], Surface.METAL, Label.POLE)
-    scene = join([place(left_wall, 0, 5, 0, 0), wall(20), pole])
+    scene = join(place(left_wall, 0, 5, 0, 0), wall(20), pole)
     points, labels, _ = scan_mesh(scene, sensor, speed=20.0)
 
     pole_x = points[labels == Label.POLE, 0].mean()
@@ -221,7 +221,7 @@ def test_a_body_has_one_brightness_and_bodies_differ() -> None:
     rng = np.random.default_rng(1)
     rights = range(-8, 8)  # y of the right edges of 16 walls, 1 m wide each
     panels = [with_random_tint(wall(15, (y, y + 1)), rng) for y in rights]
-    points, _, _ = scan_mesh(join(panels))
+    points, _, _ = scan_mesh(join(*panels))
 
     medians = []
     deviations = []
@@ -232,7 +232,7 @@ def test_a_body_has_one_brightness_and_bodies_differ() -> None:
         deviations.append(np.median(np.abs(intensity - medians[-1])))
 
     assert np.std(medians) > 2 * np.mean(deviations)
-    shade = REFLECTIONS[Surface.PLASTER].shade
+    shade = Surface.PLASTER.reflection.shade
     assert 0.5 * shade < np.log(medians).std() < 1.7 * shade
 
 

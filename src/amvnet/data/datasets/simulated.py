@@ -220,10 +220,11 @@ def _name(number: int) -> str:
 
 @cache
 def _simulator() -> str:
-    """Return a digest of the simulator's code: another simulator makes other streets."""
+    """Return a digest of the simulator's code and tables: another one makes other streets."""
     digest = hashlib.sha256()
-    for path in sorted(Path(inspect.getfile(drive_street)).parent.rglob("*.py")):
-        digest.update(path.read_bytes())
+    for path in sorted(Path(inspect.getfile(drive_street)).parent.rglob("*")):
+        if path.suffix in (".py", ".toml"):
+            digest.update(path.read_bytes())
     return digest.hexdigest()[:8]
 
 

@@ -26,7 +26,7 @@ def bus(rng: np.random.Generator) -> Mesh:
     rear = _section(rng, 7.5, width, 3.0, (-0.1,))
     bellows = part([box((1.2, width * 0.9, 2.5), (-0.6, 0, 0.4))], Surface.RUBBER, Label.BUS)
     bend = rng.normal(scale=0.1)
-    return join([place(front, x=4.75), bellows, place(rear, x=-4.75, yaw=bend)])
+    return join(place(front, x=4.75), bellows, place(rear, x=-4.75, yaw=bend))
 
 
 def tram(rng: np.random.Generator) -> Mesh:
@@ -44,7 +44,7 @@ def tram(rng: np.random.Generator) -> Mesh:
     bogies = copies(box((2.2, 1.9, 0.5), (0, 0, 0.02)), x=bogie_x)
     bellows_x = (np.arange(1, sections) - sections / 2) * (length + 0.8)
     bellows = copies(box((0.9, width * 0.9, 2.8), (0, 0, 0.45)), x=bellows_x)
-    return join([*pieces, part([bogies, bellows], Surface.RUBBER, Label.BUS)])
+    return join(*pieces, part([bogies, bellows], Surface.RUBBER, Label.BUS))
 
 
 def _section(
@@ -71,7 +71,7 @@ def _section(
         painted.append(machinery)
 
     return join(
-        [
+        *[
             part(painted, draw_paint(rng, 0.75), Label.BUS),
             glass([windows], Label.BUS, bool(rng.random() < 0.5)),
             part([seats], Surface.CLOTH, Label.BUS),

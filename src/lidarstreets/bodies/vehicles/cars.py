@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 
-from lidarstreets.bodies.vehicles.car_types import CAR_TYPES, CarShape, draw_shape
 from lidarstreets.bodies.vehicles.parts import draw_paint, glass, lamps, plates, wheels
-from lidarstreets.chance import normalised, weighted_choice
+from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, prism, tube, turned
+from lidarstreets.tables import read_table
+
+Range = tuple[float, float]
 
 # Shares of vans among all cars, and of convertibles among the types that may be open.
 VANS = 0.09
@@ -17,13 +22,80 @@ CONVERTIBLES = 0.09
 OPEN_TYPES = ("coupe", "city car", "saloon")
 
 
+CAR_TYPES = read_table(Path(__file__).with_suffix(".toml"))
+SHARES = {name: limits["share"] for name, limits in CAR_TYPES.items()}
+
+
+@dataclass(frozen=True)
+class CarShape:
+    """The proportions of one car, as in cars.toml; all of them are lengths in metres or slants."""
+
+    length: float
+    width: float
+    height: float
+    belt: float
+    bonnet: float
+    boot: float
+    windscreen: float
+    tail: float
+
+    @property
+    def half(self) -> float:
+        return self.length / 2
+
+    @property
+    def front(self) -> float:
+        """x of the foot of the windscreen."""
+        return self.half - self.bonnet
+
+    @property
+    def rear(self) -> float:
+        """x of the foot of the rear window."""
+        return -self.half + self.boot + 0.04
+
+    @property
+    def roof(self) -> tuple[float, float]:
+        """x of the rear and of the front end of the roof."""
+        rise = self.height - self.belt
+        front = self.front - rise * self.windscreen
+        rear = self.rear + rise * self.tail
+
+        shortest = 0.25 * (self.front - self.rear)
+        if front - rear < shortest:
+            middle = (front + rear) / 2
+            return middle - shortest / 2, middle + shortest / 2
+        return rear, front
+
+
+def draw_shape(rng: np.random.Generator, limits: dict[str, Range]) -> CarShape:
+    """Draw a car between the limits of a type; one in five lies a little outside."""
+
+    def draw(proportion: str) -> float:
+        low, high = limits[proportion]
+        margin = 0.15 * (high - low) if rng.random() < 0.2 else 0.0
+        return float(max(rng.uniform(low - margin, high + margin), 0.0))
+
+    length = draw("length")
+    height = draw("height")
+
+    return CarShape(
+        length=length,
+        width=draw("width"),
+        height=height,
+        belt=height * draw("belt"),
+        bonnet=length * draw("bonnet"),
+        boot=length * draw("boot"),
+        windscreen=draw("windscreen"),
+        tail=draw("tail"),
+    )
+
+
 def car(rng: np.random.Generator) -> Mesh:
     """Return a car or a van of a random shape, size and paint."""
     if rng.random() < VANS:
         return van(rng)
 
-    shares = {name: kind.share for name, kind in CAR_TYPES.items()}
-    name = weighted_choice(rng, normalised(shares))
+    name = weighted_choice(rng, SHARES)
     shape = draw_shape(rng, CAR_TYPES[name])
     paint = draw_paint(rng, 0.45)
     is_open = name in OPEN_TYPES and rng.random() < CONVERTIBLES
@@ -53,7 +125,7 @@ def car(rng: np.random.Generator) -> Mesh:
         lamps(shape.half, shape.width, lamp_z, Label.CAR),
         wheels(Label.CAR, axles, shape.width, radius),
     ]
-    return join(pieces)
+    return join(*pieces)
 
 
 def _lower_body(rng: np.random.Generator, shape: CarShape) -> np.ndarray:
@@ -206,7 +278,7 @@ def van(rng: np.random.Generator) -> Mesh:
         lamps(half, width, belt - 0.3, Label.CAR),
         wheels(Label.CAR, (-half * 0.62, half * 0.64), width, rng.uniform(0.31, 0.37)),
     ]
-    return join(pieces)
+    return join(*pieces)
 
 
 def open_door(rng: np.random.Generator) -> Mesh:

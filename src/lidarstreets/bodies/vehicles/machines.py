@@ -46,7 +46,7 @@ def trailer(rng: np.random.Generator) -> Mesh:
         pieces.append(part([box(size, (0, 0, floor))], Surface.WOOD, Label.TRAILER))
     pieces.append(wheels(Label.TRAILER, _axles(rng, length), width + 0.1, 0.3, 0.18))
     pieces.append(lamps(length / 2, width, floor + 0.05, Label.TRAILER))
-    return join(pieces)
+    return join(*pieces)
 
 
 def caravan(rng: np.random.Generator) -> Mesh:
@@ -68,13 +68,11 @@ def caravan(rng: np.random.Generator) -> Mesh:
     door = box((0.65, 0.05, 1.75), (0, -width / 2, floor + 0.1))
 
     return join(
-        [
-            part([prism(profile, width)], Surface.LIGHT_PAINT, Label.TRAILER),
-            part([panes], Surface.GLASS, Label.TRAILER),
-            part([door, *_drawbar(length, floor + 0.1)], Surface.PLASTIC, Label.TRAILER),
-            wheels(Label.TRAILER, _axles(rng, length), width, 0.33, 0.2),
-            lamps(half, width, floor + 0.3, Label.TRAILER),
-        ]
+        part([prism(profile, width)], Surface.LIGHT_PAINT, Label.TRAILER),
+        part([panes], Surface.GLASS, Label.TRAILER),
+        part([door, *_drawbar(length, floor + 0.1)], Surface.PLASTIC, Label.TRAILER),
+        wheels(Label.TRAILER, _axles(rng, length), width, 0.33, 0.2),
+        lamps(half, width, floor + 0.3, Label.TRAILER),
     )
 
 
@@ -91,11 +89,9 @@ def _boat_trailer(rng: np.random.Generator) -> Mesh:
     surface = Surface.PLASTIC if rng.random() < 0.5 else Surface.LIGHT_PAINT
 
     return join(
-        [
-            part([hull], surface, Label.TRAILER),
-            part([frame, *_drawbar(length, 0.4)], Surface.METAL, Label.TRAILER),
-            wheels(Label.TRAILER, _axles(rng, length), width, 0.3, 0.18),
-        ]
+        part([hull], surface, Label.TRAILER),
+        part([frame, *_drawbar(length, 0.4)], Surface.METAL, Label.TRAILER),
+        wheels(Label.TRAILER, _axles(rng, length), width, 0.3, 0.18),
     )
 
 
@@ -143,11 +139,9 @@ def excavator(rng: np.random.Generator) -> Mesh:
     scale = np.float32(size)
 
     return join(
-        [
-            part([tracks * scale], Surface.RUBBER, _MACHINE),
-            part([np.concatenate(painted) * scale], Surface.LIGHT_PAINT, _MACHINE),
-            glass([turned(cabin, angle) * scale], _MACHINE, clear=False),
-        ]
+        part([tracks * scale], Surface.RUBBER, _MACHINE),
+        part([np.concatenate(painted) * scale], Surface.LIGHT_PAINT, _MACHINE),
+        glass([turned(cabin, angle) * scale], _MACHINE, clear=False),
     )
 
 
@@ -172,7 +166,7 @@ def _tractor(rng: np.random.Generator) -> Mesh:
     if rng.random() < 0.4:
         implement = box((0.6, rng.uniform(1.5, 2.8), 0.7), (-2.3, 0, rng.uniform(0.1, 0.6)))
         pieces.append(part([implement], Surface.METAL, _MACHINE))
-    mesh = join(pieces)
+    mesh = join(*pieces)
     return scaled(mesh, size)
 
 
@@ -189,12 +183,10 @@ def _wheel_loader(rng: np.random.Generator) -> Mesh:
     bucket = [(2.5, lift), (3.5, lift), (2.8, lift + 1.0), (2.45, lift + 0.9)]
     solids = [prism(body, 1.6), frame, *arms]
     mesh = join(
-        [
-            part(solids, Surface.LIGHT_PAINT, _MACHINE),
-            part([prism(bucket, 2.4)], Surface.METAL, _MACHINE),
-            glass([cabin], _MACHINE, bool(rng.random() < 0.5)),
-            wheels(_MACHINE, (-1.4, 1.4), 2.3, radius, 0.5),
-        ]
+        part(solids, Surface.LIGHT_PAINT, _MACHINE),
+        part([prism(bucket, 2.4)], Surface.METAL, _MACHINE),
+        glass([cabin], _MACHINE, bool(rng.random() < 0.5)),
+        wheels(_MACHINE, (-1.4, 1.4), 2.3, radius, 0.5),
     )
     return scaled(mesh, rng.uniform(0.6, 1.1))
 
@@ -211,7 +203,7 @@ def _forklift(rng: np.random.Generator) -> Mesh:
     solids = [part([prism(body, 1.05)], Surface.LIGHT_PAINT, _MACHINE)]
     solids.append(part([posts, roof, rails, forks], Surface.METAL, _MACHINE))
     solids.append(wheels(_MACHINE, (-0.9, 0.6), 1.1, 0.28, 0.2))
-    return join(solids)
+    return join(*solids)
 
 
 def _roller(rng: np.random.Generator) -> Mesh:
@@ -225,8 +217,6 @@ def _roller(rng: np.random.Generator) -> Mesh:
     roof = box((1.6, width, 0.08), (0, 0, 2.5))
 
     return join(
-        [
-            part(drums, Surface.METAL, _MACHINE),
-            part([body, posts, roof], draw_paint(rng, 0.8), _MACHINE),
-        ]
+        part(drums, Surface.METAL, _MACHINE),
+        part([body, posts, roof], draw_paint(rng, 0.8), _MACHINE),
     )

@@ -61,7 +61,7 @@ def figure(
         clothed.append(tube(shoulder, elbow, 0.055 * girth, 0.045, sides=5))
         clothed.append(tube(elbow, hand, 0.045, 0.04, sides=5))
 
-    return join([part(clothed, surface, label), part(skin, Surface.SKIN, label)])
+    return join(part(clothed, surface, label), part(skin, Surface.SKIN, label))
 
 
 def _joint(start: Vector, end: Vector, reach: float, forward: float) -> Vector:
@@ -117,7 +117,7 @@ def person(rng: np.random.Generator) -> Mesh:
 
     feet: tuple[Vector, Vector] = ((stride, -0.1, 0.0), (-stride, 0.1, lift))
     posture = Posture((0.0, hip_z), lean, feet, _draw_hands(rng, hip_z, lean))
-    mesh = join([figure(rng, Label.PERSON, posture), *_clothes(rng, hip_z), *_things(rng, hip_z)])
+    mesh = join(figure(rng, Label.PERSON, posture), *_clothes(rng, hip_z), *_things(rng, hip_z))
     return scaled(mesh, size)
 
 
@@ -207,11 +207,9 @@ def _wheelchair_user(rng: np.random.Generator) -> Mesh:
     casters = copies(box((0.14, 0.05, 0.14)), x=0.5, y=[-0.25, 0.25])
     chair = [box((0.45, 0.46, 0.06), (0.1, 0, 0.45)), box((0.05, 0.46, 0.5), (-0.14, 0, 0.48))]
     return join(
-        [
-            place(sitter(rng, 0.5), x=0.02),
-            part([tyres, casters], Surface.RUBBER, Label.PERSON),
-            part(chair, Surface.CLOTH, Label.PERSON),
-        ]
+        place(sitter(rng, 0.5), x=0.02),
+        part([tyres, casters], Surface.RUBBER, Label.PERSON),
+        part(chair, Surface.CLOTH, Label.PERSON),
     )
 
 
@@ -260,4 +258,4 @@ def rider(
         z = seat[1] + 0.06 + np.sqrt(0.27 - lean**2)
         helmet = tube((x, 0, z + 0.06), (x + 0.02, 0, z + 0.36), 0.14, 0.11, sides=6)
         pieces.append(part([helmet], Surface.PLASTIC, label))
-    return rolled(join(pieces), float(rng.normal(scale=0.03)))
+    return rolled(join(*pieces), float(rng.normal(scale=0.03)))

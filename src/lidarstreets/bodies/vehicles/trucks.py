@@ -48,11 +48,9 @@ def truck(rng: np.random.Generator) -> Mesh:
     radius = 0.38 if is_light else rng.uniform(0.45, 0.53)
 
     return join(
-        [
-            cab(rng, half, cab_length, width * rng.uniform(0.92, 1.0), cab_height),
-            _chassis(rng, length, width, load.floor, radius),
-            *weighted_choice(rng, LOADS)(rng, load),
-        ]
+        cab(rng, half, cab_length, width * rng.uniform(0.92, 1.0), cab_height),
+        _chassis(rng, length, width, load.floor, radius),
+        *weighted_choice(rng, LOADS)(rng, load),
     )
 
 
@@ -111,13 +109,11 @@ def cab(rng: np.random.Generator, nose: float, length: float, width: float, heig
         painted.append(copies(box((0.2, 0.3, 0.14)), x=front - 0.6, y=[-0.5, 0.5], z=height))
 
     return join(
-        [
-            part(painted, draw_paint(rng, 0.7), Label.TRUCK),
-            glass([window], Label.TRUCK, bool(rng.random() < 0.5)),
-            part([seats], Surface.CLOTH, Label.TRUCK),
-            part([mirrors, bumper], Surface.PLASTIC, Label.TRUCK),
-            part([headlamps], Surface.SIGN_FACE, Label.TRUCK),
-        ]
+        part(painted, draw_paint(rng, 0.7), Label.TRUCK),
+        glass([window], Label.TRUCK, bool(rng.random() < 0.5)),
+        part([seats], Surface.CLOTH, Label.TRUCK),
+        part([mirrors, bumper], Surface.PLASTIC, Label.TRUCK),
+        part([headlamps], Surface.SIGN_FACE, Label.TRUCK),
     )
 
 
@@ -143,12 +139,10 @@ def _chassis(
     metal.append(tail_bar)
 
     return join(
-        [
-            part(metal, Surface.METAL, Label.TRUCK),
-            wheels(Label.TRUCK, axles, width, radius, 0.3),
-            plates(half, 0.62, Label.TRUCK),
-            lamps(half, width, floor - 0.25, Label.TRUCK),
-        ]
+        part(metal, Surface.METAL, Label.TRUCK),
+        wheels(Label.TRUCK, axles, width, radius, 0.3),
+        plates(half, 0.62, Label.TRUCK),
+        lamps(half, width, floor - 0.25, Label.TRUCK),
     )
 
 
@@ -168,7 +162,7 @@ def _semi_trailer(rng: np.random.Generator) -> Mesh:
     axles = [half - 1.4, half - 4.9, -half + 1.6, -half + 2.9, -half + 4.2]
 
     return join(
-        [
+        *[
             cab(rng, half, rng.uniform(1.9, 2.4), width * 0.98, rng.uniform(3.0, 3.8)),
             part([rails, legs, unit], Surface.METAL, Label.TRUCK),
             wheels(Label.TRUCK, axles, width, 0.5, 0.35),
@@ -201,7 +195,7 @@ def _camper(rng: np.random.Generator) -> Mesh:
     awning = box((length * 0.5, 0.12, 0.12), (-0.3, -width / 2, height - 0.3))
 
     return join(
-        [
+        *[
             part([*white, awning], Surface.LIGHT_PAINT, Label.TRUCK),
             glass([prism(screen, width * 0.88)], Label.TRUCK, bool(rng.random() < 0.5)),
             part([panes], Surface.GLASS, Label.TRUCK),

@@ -25,7 +25,7 @@ def bicycle(rng: np.random.Generator, label: Label = Label.BICYCLE) -> Mesh:
     pieces = [_wheels(label, radius, rng.uniform(0.04, 0.07), wheelbase)]
     pieces.append(_frame(label, radius, wheelbase, (saddle, bar), has_low_frame))
     pieces += _bicycle_load(rng, label, radius, wheelbase)
-    mesh = join(pieces)
+    mesh = join(*pieces)
     if label == Label.BICYCLE:
         return rolled(mesh, float(rng.uniform(-STAND_LEAN, STAND_LEAN)))
 
@@ -160,7 +160,7 @@ def _motorbike(rng: np.random.Generator, label: Label) -> Mesh:
     ]
     if boxes:
         pieces.append(part(boxes, Surface.PLASTIC, label))
-    return join(pieces)
+    return join(*pieces)
 
 
 def _scooter(rng: np.random.Generator, label: Label) -> Mesh:
@@ -188,7 +188,7 @@ def _scooter(rng: np.random.Generator, label: Label) -> Mesh:
     if rng.random() < 0.2:
         screen = box((0.03, 0.4, 0.45), (0.42, 0, 0.98), top=(1, 0.8), shift=-0.12)
         pieces.append(part([screen], Surface.GLASS, label))
-    return scaled(join(pieces), size)
+    return scaled(join(*pieces), size)
 
 
 def _covered(rng: np.random.Generator) -> Mesh:
@@ -199,7 +199,7 @@ def _covered(rng: np.random.Generator) -> Mesh:
     )
     pieces = [part([cover], Surface.CLOTH, Label.MOTORCYCLE)]
     pieces.append(_thick_wheels(Label.MOTORCYCLE, 0.3, length - 0.55))
-    return join(pieces)
+    return join(*pieces)
 
 
 def _thick_wheels(label: Label, radius: float, wheelbase: float) -> Mesh:
@@ -228,7 +228,7 @@ def bicyclist(rng: np.random.Generator) -> Mesh:
         tyres = copies(hoop(0.25, 0.05, (-1.7, 0, 0.25)), y=[-0.42, 0.42])
         pieces.append(part([tub], Surface.CLOTH, Label.BICYCLIST))
         pieces.append(part([tyres], Surface.RUBBER, Label.BICYCLIST))
-    return rolled(join(pieces), float(rng.normal(scale=0.04)))
+    return rolled(join(*pieces), float(rng.normal(scale=0.04)))
 
 
 def motorcyclist(rng: np.random.Generator) -> Mesh:
@@ -239,4 +239,4 @@ def motorcyclist(rng: np.random.Generator) -> Mesh:
     pieces.append(rider(rng, Label.MOTORCYCLIST, (-0.28, 0.8), grip, feet))
     if rng.random() < 0.12:
         pieces.append(rider(rng, Label.MOTORCYCLIST, (-0.62, 0.84), (-0.3, 1.1), feet))
-    return rolled(join(pieces), float(rng.normal(scale=0.05)))
+    return rolled(join(*pieces), float(rng.normal(scale=0.05)))

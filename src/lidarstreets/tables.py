@@ -1,0 +1,17 @@
+"""Read the tables of numbers that lie next to the code."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+
+def read_table(path: Path) -> dict[str, dict[str, Any]]:
+    """Read the rows of a TOML file by name; arrays become tuples."""
+    table = tomllib.loads(path.read_text(encoding="utf-8"))
+    for row in table.values():
+        for column, value in row.items():
+            if isinstance(value, list):
+                row[column] = tuple(value)
+    return table
