@@ -21,6 +21,8 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # characters that names of files 
 LONGEST_NAME = 255  # bytes, in most file systems
 LONGEST_ENDING = 20  # characters, of the names of unfinished files
 
+unfinished: set[Path] = set()  # what is being written; to be removed if the process exits at once
+
 
 @contextmanager
 def atomic_write(path: Path | str) -> Iterator[Path]:
@@ -44,6 +46,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
     ending = path.suffix if len(path.suffix) <= LONGEST_ENDING else ""
     part = path.with_name(f".{uuid.uuid4().hex}.part{ending}")
 
+    unfinished.add(part)
     try:
         part.touch()
         mode = part.stat().st_mode
@@ -61,6 +64,7 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         raise
     finally:
         part.unlink(missing_ok=True)
+        unfinished.discard(part)
 
 
 def publish(part: Path, path: Path) -> None:

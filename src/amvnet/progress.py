@@ -2,15 +2,29 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 Progress = Callable[[int, int], None]  # takes what is done, and the total
 Say = Callable[[str], None]  # takes a line
 
+QUIET_SECONDS = 20  # at the beginning, without lines
 
-def ends_tenth(done: int, total: int) -> bool:
-    """Return whether the last of `done` things completes another tenth of all of them."""
-    return done * 10 // total > (done - 1) * 10 // total
+
+class Tenths:
+    """Decides when a line about progress is due: ten times at most, and not at the beginning."""
+
+    def __init__(self) -> None:
+        self._start = time.monotonic()
+        self._said = 0
+
+    def ends(self, done: int, total: int) -> bool:
+        """Return whether the last of `done` things has completed another tenth of all of them."""
+        tenths = 10 * done // max(total, 1)
+        if tenths <= self._said or time.monotonic() - self._start < QUIET_SECONDS:
+            return False
+        self._said = tenths
+        return True
 
 
 def no_progress(done: int, total: int) -> None:

@@ -1,29 +1,48 @@
-"""Progress without a terminal: lines with a pace, at sensible intervals."""
+"""What is printed: escaped, short, and never a reason to fail; progress in at most ten lines."""
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
-from itertools import pairwise
+from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.table import Table
 
+from amvnet import progress
 from amvnet.cli import console
+from amvnet.progress import QUIET_SECONDS
+from amvnet.weights.file import save
+
+from fixtures.worlds import fresh_weights, street
+
+PROGRESS_LINE = r"segmenting: (\d+) of \d+, .*, \d+:\d\d:\d\d left"
+
+
+# ---- progress without a terminal
+
+LinesAt = Callable[[float, int], list[tuple[float, str]]]
 
 
 @pytest.fixture
-def lines_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, int], list[tuple[float, str]]]:
+def lines_at(monkeypatch: pytest.MonkeyPatch) -> LinesAt:
     """Return what says which lines appear, and when, at a pace of seconds per item."""
 
     def run(seconds: float, total: int) -> list[tuple[float, str]]:
         now = [0.0]
         lines: list[tuple[float, str]] = []
-        monkeypatch.setattr(console.time, "monotonic", lambda: now[0])
+        for module in (console, progress):
+            monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
         monkeypatch.setattr(console, "say", lambda line: lines.append((now[0], line)))
-        progress = console.ProgressLines("segmenting")
+        step = console.ProgressLines("segmenting")
         for done in range(total + 1):
             now[0] = seconds * done
-            progress(done, total)
+            step(done, total)
         return lines
 
     return run
@@ -31,19 +50,99 @@ def lines_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, int], list[tup
 
 @pytest.mark.parametrize("seconds", [0.001, 0.1, 1, 20, 500])
 @pytest.mark.parametrize("total", [1, 7, 300])
-def test_lines_are_neither_crowded_nor_far_apart(
-    lines_at: Callable[[float, int], list[tuple[float, str]]], seconds: float, total: int
+def test_a_step_has_ten_lines_at_most_and_none_at_the_beginning(
+    lines_at: LinesAt, seconds: float, total: int
 ) -> None:
-    times = [0.0, *(time for time, _ in lines_at(seconds, total))]
-    gaps = [later - earlier for earlier, later in pairwise(times)]
-    assert all(gap >= console.LEAST_SECONDS for gap in gaps)
-    assert all(gap <= console.MOST_SECONDS + seconds for gap in gaps)
+    lines = lines_at(seconds, total)
+    assert len(lines) <= 10
+    assert all(time >= QUIET_SECONDS for time, _ in lines)
+    assert bool(lines) == (seconds * total >= QUIET_SECONDS)
 
 
-def test_a_line_has_the_pace_and_the_time_left(
-    lines_at: Callable[[float, int], list[tuple[float, str]]],
-) -> None:
+def test_a_line_has_the_pace_and_the_time_left(lines_at: LinesAt) -> None:
     texts = [text for _, text in lines_at(10, 100)]
-    assert texts[0] == "segmenting: 6 of 100, 10 s each, 0:15:40 left"
-    assert all(re.fullmatch(r"segmenting: \d+ of 100, .*, \d+:\d\d:\d\d left", t) for t in texts)
+    assert texts[0] == "segmenting: 10 of 100, 10 s each, 0:15:00 left"
+    done = [int(re.fullmatch(PROGRESS_LINE, text)[1]) for text in texts]  # type: ignore[index]
+    assert done == list(range(10, 101, 10))
     assert "2 a second" in lines_at(0.5, 100)[0][1]
+
+
+# ---- what reaches the terminal
+
+
+@given(st.text(max_size=50))
+def test_a_printed_text_is_one_line_that_is_printable(text: str) -> None:
+    line = console.printable(text)
+    assert line.isprintable()
+    assert text.isprintable() == (line == text)
+
+
+def test_escapes_in_names_do_not_reach_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "a\x1b[2J\nb\u202e :warning: [red]"
+    console.say(name)
+    console.complain(name)
+    table = Table(title=name)
+    table.add_row(name)
+    console.show(table)
+
+    out, err = capsys.readouterr()
+    assert "\x1b" not in out + err
+    assert "\u202e" not in out + err
+    assert out.startswith("a\\x1b[2J\\nb\\u202e :warning: [red]\n")
+    assert err == "amvnet: a\\x1b[2J\\nb\\u202e :warning: [red]\n"
+
+
+def test_long_texts_are_shortened(capsys: pytest.CaptureFixture[str]) -> None:
+    console.say("x" * 3_000_000)
+    console.say_lines("x\n" * 100_000)
+    out = capsys.readouterr().out
+    assert "(3,000,000 characters)" in out
+    assert "more lines)" in out
+    assert len(out) < 20_000
+
+
+# ---- streams that fail
+
+
+def amvnet(shell: str, **environment: str) -> tuple[int, str, str]:
+    """Run a line of bash in which $AMVNET is the command; return its exit code and output."""
+    command = {"AMVNET": f"{sys.executable} -m amvnet", **environment}
+    done = subprocess.run(
+        ["bash", "-c", shell], env=os.environ | command, capture_output=True, text=True, timeout=120
+    )
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights and three scans."""
+    root = tmp_path_factory.mktemp("world")
+    save(fresh_weights(), root / "w.safetensors")
+    (root / "scans").mkdir()
+    for name in "abc":
+        street(ord(name), 300)[0].tofile(root / f"scans/{name}.bin")
+    return root
+
+
+@pytest.mark.parametrize("sink", ["| true", "> /dev/full", ">&-", "> /dev/full 2> /dev/full"])
+def test_the_work_goes_on_without_a_reader(sink: str, world: Path, tmp_path: Path) -> None:
+    command = f"$AMVNET predict {world}/scans --weights {world}/w.safetensors --out {tmp_path}"
+    code, _, error = amvnet(f"set -o pipefail; {command} {sink}")
+    assert code == 0
+    assert {path.name for path in tmp_path.glob("*.label")} == {"a.label", "b.label", "c.label"}
+    expected = "stdout cannot be written" if sink == "> /dev/full" else ""
+    assert error.count("\n") == bool(expected)
+    assert expected in error
+
+
+@pytest.mark.parametrize("verb", ["--version", "--help", "predict --help"])
+def test_what_only_speaks_does_not_fail_either(verb: str) -> None:
+    code, _, error = amvnet(f"$AMVNET {verb} > /dev/full")
+    assert code == 0
+    assert error.count("\n") == 1
+
+
+def test_letters_that_the_terminal_does_not_have_are_escaped(tmp_path: Path) -> None:
+    code, _, error = amvnet("$AMVNET info münchen.safetensors", PYTHONIOENCODING="ascii")
+    assert code == 2
+    assert "m\\xfcnchen" in error

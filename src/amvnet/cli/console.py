@@ -1,26 +1,119 @@
-"""Print lines and progress."""
+"""Lines, tables and progress on stdout, and faults on stderr.
+
+Only this module prints. It escapes what is not printable, shortens what is long, and never fails:
+labels do not depend on whether anybody reads about them.
+"""
 
 from __future__ import annotations
 
+import errno
+import os
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import timedelta
+from typing import Any
 
 from rich import progress as rich_progress
-from rich.console import Console
+from rich.console import Console, RenderableType
 
-from amvnet.progress import Progress
+from amvnet.progress import Progress, Tenths
 
-LEAST_SECONDS = 5  # between two lines about progress
-MOST_SECONDS = 60
+LONGEST_LINE = 5000  # characters
+MOST_LINES = 2000  # of one text
 
-console = Console(highlight=False)
+
+class SafeStream:
+    """A standard stream on which nothing fails: what cannot be written is lost.
+
+    Args:
+        name: stdout or stderr.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    @property
+    def _stream(self) -> Any:
+        """The stream as it is now, also if tests or a progress bar have replaced it."""
+        stream = getattr(sys, self.name)
+        return getattr(stream, "rich_proxied_file", stream)
+
+    def write(self, text: str) -> None:
+        """Write a text; characters that the stream cannot encode are escaped."""
+        stream = self._stream
+        encoding = getattr(stream, "encoding", None) or "utf-8"
+        with self._losing():
+            stream.write(text.encode(encoding, "backslashreplace").decode(encoding))
+
+    def flush(self) -> None:
+        """Write what is buffered."""
+        with self._losing():
+            self._stream.flush()
+
+    @contextmanager
+    def _losing(self) -> Iterator[None]:
+        """Drop this and all that follows if the stream is closed, its disk is full, or the like."""
+        try:
+            yield
+        except (OSError, ValueError, AttributeError) as error:  # AttributeError: None, as of >&-
+            with suppress(OSError, ValueError, AttributeError), open(os.devnull, "w") as nothing:
+                os.dup2(nothing.fileno(), self._stream.fileno())
+            if not isinstance(error, OSError) or self.name == "stderr":
+                return
+            if error.errno != errno.EPIPE:  # a reader such as head has read enough
+                complain(f"stdout cannot be written ({error.strerror}); the work goes on")
+
+
+stdout = SafeStream("stdout")
+stderr = SafeStream("stderr")
+console = Console(file=stdout, markup=False, emoji=False, highlight=False)  # type: ignore[arg-type]
 
 
 def say(line: str) -> None:
     """Print a line without wrapping it, because paths are copied from it."""
-    console.print(line, markup=False, soft_wrap=True)
+    console.print(printable(line), soft_wrap=True)
+
+
+def say_lines(text: str) -> None:
+    """Print a text of several lines."""
+    lines = text.split("\n")
+    for line in lines[:MOST_LINES]:
+        say(line)
+    if len(lines) > MOST_LINES:
+        say(f"... ({len(lines) - MOST_LINES} more lines)")
+
+
+def show(table: RenderableType) -> None:
+    """Print a table, without styles."""
+    plain = Console(file=stdout, width=console.width, color_system=None, emoji=False, markup=False)  # type: ignore[arg-type]
+    with plain.capture() as captured:
+        plain.print(table)
+    say_lines(captured.get().rstrip("\n"))
+
+
+def complain(line: str) -> None:
+    """Print a line about a fault to stderr."""
+    stderr.write(f"amvnet: {printable(line)}\n")
+    stderr.flush()
+
+
+def printable(text: str) -> str:
+    """Return a text on one line: shortened, and with escapes for what is not printable."""
+    if len(text) > LONGEST_LINE:
+        text = f"{text[:LONGEST_LINE]}... ({len(text):,} characters)"
+    if text.isprintable():
+        return text
+    characters = []
+    for character in text:
+        if not character.isprintable():
+            character = character.encode("unicode_escape").decode("ascii")
+        characters.append(character)
+    return "".join(characters)
 
 
 def silence() -> None:
@@ -52,9 +145,7 @@ def progress(title: str) -> Iterator[Progress]:
 
 
 class ProgressLines:
-    """Says in lines what is done, how fast, and how long the rest takes.
-
-    A line is due for each tenth, and once a minute; in between are at least some seconds.
+    """Says in at most ten lines what is done, how fast, and how long the rest takes.
 
     Args:
         title: the beginning of each line.
@@ -63,20 +154,12 @@ class ProgressLines:
     def __init__(self, title: str) -> None:
         self.title = title
         self.start = time.monotonic()
-        self.last = self.start
-        self.tenths = 0
+        self.tenths = Tenths()
 
     def __call__(self, done: int, total: int) -> None:
-        now = time.monotonic()
-        tenths = 10 * done // max(total, 1)
-        since_last = now - self.last
-        is_due = tenths > self.tenths or since_last >= MOST_SECONDS
-        if not done or not is_due or since_last < LEAST_SECONDS:
-            return
-
-        self.last = now
-        self.tenths = tenths
-        say(f"{self.title}: {done} of {total}, {self._pace(done, total, now - self.start)}")
+        if self.tenths.ends(done, total):
+            pace = self._pace(done, total, time.monotonic() - self.start)
+            say(f"{self.title}: {done} of {total}, {pace}")
 
     def _pace(self, done: int, total: int, elapsed: float) -> str:
         """Return the rate and the time left: "2.1 a second, 0:01:16 left"."""

@@ -24,8 +24,9 @@ from amvnet.cli.commands.simulate import simulate
 from amvnet.cli.commands.submit import submit
 from amvnet.cli.commands.train import train
 from amvnet.cli.commands.view import view
-from amvnet.cli.console import say
+from amvnet.cli.console import complain, say, say_lines, stdout
 from amvnet.cli.parser import Command, join_negative_values, make_parser
+from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean
 from amvnet.threads import wait_passively
 
@@ -35,6 +36,7 @@ FAILED = 1
 WRONG_INPUT = 2
 SOME_BROKEN = 3
 
+GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done
 SHARED = ("train", "predict", "evaluate", "ablate")  # verbs whose work several processes can share
 
 _DATA = {"data": {"metavar": "DATA"}}
@@ -86,12 +88,39 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0 if done, 2 if the input is wrong, 3 if only some of the inputs are broken,
-        1 for a full disk or an interruption.
+        130 after Ctrl-C, 143 after SIGTERM, 1 for anything else, such as a full disk.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     wait_passively()
+    try:
+        with stoppable(_last_words(arguments), exits=argv is None) as stop:
+            try:
+                code = _run_in_one_line(arguments)
+            except BaseException:  # libraries turn an interruption into exceptions of their own
+                if stop.signal is None:
+                    raise
+            if stop.signal is not None:
+                stop.end()
+                code = stop.exit_code
+        return code
+    finally:
+        stdout.flush()  # the interpreter's own flush at the end could fail
+
+
+def _last_words(arguments: Sequence[str]) -> str:
+    """Return what is said if the verb is stopped: whether it can go on."""
+    verb = arguments[0] if arguments else ""
+    if verb in VERBS and VERBS[verb].can_resume:
+        return "stopped; go on with --resume"
+    if verb in GOES_ON:
+        return "stopped; start it again to go on"
+    return "stopped"
+
+
+def _run_in_one_line(arguments: Sequence[str]) -> int:
+    """Run the command line as `main` does, and return the exit code."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        say(USAGE)
+        say_lines(USAGE)
         return DONE if arguments else WRONG_INPUT
     if arguments[0] == "--version":
         say(__version__)
@@ -100,27 +129,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         run(arguments[0], arguments[1:])
     except InputError as error:
-        _complain(str(error))
+        complain(str(error))
         return WRONG_INPUT
     except SomeBroken as error:
         for fault in error.faults:
-            _complain(fault)
-        _complain(str(error))
+            complain(fault)
+        complain(str(error))
         return SOME_BROKEN
     except OSError as error:  # a full disk, for example; earlier files are still whole
         # Some libraries raise an error without its parts.
-        _complain(
-            f"{error.filename or 'the disk'}: {error.strerror or error}; fix this and run it again"
-        )
-        return FAILED
-    except KeyboardInterrupt:
-        _complain("interrupted")
+        place = error.filename or "the disk"
+        complain(f"{place}: {error.strerror or error}; fix this and run it again")
         return FAILED
     return DONE
-
-
-def _complain(line: str) -> None:
-    print(f"amvnet: {line}", file=sys.stderr)
 
 
 def run(verb: str, arguments: Sequence[str]) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_args, get_origin, 
 import docstring_parser
 from jsonargparse import ArgumentParser
 
+from amvnet.cli.console import say_lines
 from amvnet.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
@@ -66,6 +67,11 @@ class Command:
         """Whether a recipe is an argument, and each of its values an option."""
         return "recipe" in self.positional
 
+    @property
+    def can_resume(self) -> bool:
+        """Whether it has the option --resume."""
+        return "resume" in inspect.signature(self.run).parameters
+
 
 class HelpFormatter(argparse.HelpFormatter):
     """Writes help texts without types, and a default unless the text has one."""
@@ -91,6 +97,9 @@ class Parser(ArgumentParser):
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         line = self._in_words(" ".join(message.split()) or str(ex))
         raise InputError(line if line.endswith("?") else f"{line}; see {self.prog} --help")
+
+    def print_help(self, file: Any = None) -> None:
+        say_lines(self.format_help().rstrip())
 
     def _in_words(self, line: str) -> str:
         """Return what a message of jsonargparse or argparse says, in the words of this project."""

@@ -24,7 +24,7 @@ from amvnet.evaluation.metrics import confusion
 from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
-from amvnet.progress import ends_tenth
+from amvnet.progress import Tenths
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.disturb import disturb
 from amvnet.training.head_scores import Scorer, ScoreSource
@@ -317,6 +317,7 @@ class PointGatherer:
         share = self.processes.share(jobs)
         most = -(-self.training.head.points // len(jobs))  # points of a scan, rounded up
         source = None
+        tenths = Tenths()
         with path.open("wb") as file:
             for number, job in enumerate(share, start=1):
                 if job.source is not source:
@@ -328,7 +329,7 @@ class PointGatherer:
                 counts.append(len(points))
                 matrices += scan_matrices
 
-                if ends_tenth(number, len(share)):
+                if tenths.ends(number, len(share)):
                     say(f"head: scored {number * len(jobs) // len(share)} of {len(jobs)} scans")
 
         return counts, matrices

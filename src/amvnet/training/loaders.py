@@ -21,7 +21,7 @@ from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
-from amvnet.progress import Say, ends_tenth, say_nothing
+from amvnet.progress import Say, Tenths, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITY
 from amvnet.sensors.intensity import (
@@ -275,11 +275,12 @@ def count_classes(
 
     counts = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
     share = processes.share(records)
+    tenths = Tenths()
     for number, record in enumerate(share, start=1):
         labels = dataset.read(record).labels
         if labels is not None:
             counts += np.bincount(labels, minlength=len(counts))
-        if ends_tenth(number, len(share)):
+        if tenths.ends(number, len(share)):
             done = number * len(records) // len(share)
             say(f"classes: counted in {done} of {len(records)} scans")
 

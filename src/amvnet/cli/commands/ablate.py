@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from amvnet.cli.console import on_terminal, say
+from amvnet.cli.console import on_terminal, say, say_lines
 from amvnet.cli.options import describe_records, join_processes, parse_names
 
 
@@ -48,4 +48,4 @@ def ablate(
     rows = list(ablate_recipe(recipe, scans, out, options, device))
     if processes.first:
         files = charts.write_ablation(rows, out / "ablation")
-        say(files[-1].read_text().rstrip())
+        say_lines(files[-1].read_text().rstrip())

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from amvnet.cli.console import console, progress
+from amvnet.cli.console import progress, show
 from amvnet.cli.options import WEIGHTS, make_segmenter, parse_names
 from amvnet.models.methods import Precision
 
@@ -82,7 +82,8 @@ def bench(
         with progress("timing") as step:
             reports = time_jobs(jobs, runs, step)
 
-    console.print(*[timing_table(report) for report in reports], sep="\n")
+    for report in reports:
+        show(timing_table(report))
     if json is not None:
         with atomic_write(json) as part:
             part.write_text(dumps(reports, indent=1))

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from amvnet.cli.console import console, progress
+from amvnet.cli.console import progress, show
 from amvnet.cli.options import (
     Split,
     join_processes,
@@ -156,7 +156,7 @@ def show_evaluation(
 
     figures = evaluation.report(dataset)
     figures |= {name: value for name, value in settings.items() if value is not None}
-    console.print(evaluation_table(figures, evaluation.taxonomy))
+    show(evaluation_table(figures, evaluation.taxonomy))
     if path is not None:
         with atomic_write(path) as part:
             part.write_text(json_format.dumps(figures, indent=1))

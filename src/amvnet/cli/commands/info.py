@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from amvnet.cli.console import console, say
+from amvnet.cli.console import say_lines, show
 
 
 def info(weights: str | None = None) -> None:
@@ -16,7 +16,7 @@ def info(weights: str | None = None) -> None:
     from amvnet.weights.file import built_in, load
 
     if weights is None:
-        console.print(installation_table())
+        show(installation_table())
         return
     license_id = OURS if weights in built_in() else None
-    say(model_card(load(weights), weights, license_id).rstrip())
+    say_lines(model_card(load(weights), weights, license_id).rstrip())

@@ -1,0 +1,109 @@
+"""Stop on Ctrl-C or SIGTERM: within a second, with one line and an exit code of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from amvnet.cli.console import complain, console, stdout
+from amvnet.files import unfinished
+
+PATIENCE = 0.6  # seconds in which a verb may end by itself
+
+
+class Stop:
+    """What has become of a request to stop.
+
+    Args:
+        line: what is said when the verb has stopped.
+        exits: whether this process belongs to the command line, and ends with the verb.
+    """
+
+    def __init__(self, line: str, exits: bool) -> None:
+        self.line = line
+        self.exits = exits
+        self.signal: int | None = None
+        self._process = os.getpid()
+        self._is_first = threading.Lock()
+
+    @property
+    def exit_code(self) -> int:
+        """128 + the number of the signal: 130 after Ctrl-C, 143 after SIGTERM."""
+        assert self.signal is not None
+        return 128 + self.signal
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Raise KeyboardInterrupt; the process exits if that does not end the verb soon."""
+        if os.getpid() != self._process:  # a worker has this handler from the process that forked
+            os._exit(128 + number)
+        is_second = self.signal is not None
+        self.signal = number
+        if self.exits:
+            # An exception within the C++ code that torch runs when it is imported aborts.
+            if is_second or _is_importing(frame):
+                self.end()
+            deadline = threading.Timer(PATIENCE, self._insist)
+            deadline.daemon = True
+            deadline.start()
+        raise KeyboardInterrupt
+
+    def _insist(self) -> None:
+        """End the processes that the verb may be waiting for, and then this one."""
+        for child in multiprocessing.active_children():
+            child.kill()
+        time.sleep(PATIENCE / 3)
+        self.end()
+
+    def end(self) -> None:
+        """Say that the verb has stopped; end the process if it is the command line's.
+
+        It leaves no half-written file. Threads that still compute are not waited for.
+        """
+        if not self._is_first.acquire(blocking=False):
+            return
+        complain(self.line)
+        if not self.exits:
+            return
+
+        for path in list(unfinished):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        console.show_cursor()  # a bar hides it
+        stdout.flush()
+        os._exit(self.exit_code)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Return whether a frame, or one that called it, imports a module."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
+
+
+@contextmanager
+def stoppable(line: str, exits: bool) -> Iterator[Stop]:
+    """Yield what says whether a signal has asked the block to stop, by a KeyboardInterrupt in it.
+
+    Args:
+        line: as of `Stop`.
+        exits: as of `Stop`.
+    """
+    stop = Stop(line, exits)
+    earlier = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if signal.getsignal(number) is not signal.SIG_IGN:  # as in the background of a shell
+                earlier[number] = signal.signal(number, stop.handle)
+    try:
+        yield stop
+    finally:
+        for number, handler in earlier.items():
+            signal.signal(number, handler)

@@ -1,0 +1,183 @@
+"""Exit codes of every verb, and how Ctrl-C and SIGTERM end one: soon, and with one line."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from amvnet.cli import main as command_line
+from amvnet.cli.main import GOES_ON, VERBS
+from amvnet.errors import InputError, SomeBroken
+from amvnet.files import unfinished
+from amvnet.weights.file import save
+
+from fixtures.worlds import fresh_weights, run_cli, street
+
+SOON = 5  # seconds on a busy machine; a second on an idle one
+
+Run = Callable[[str, Sequence[str]], None]
+
+
+def raising(error: BaseException) -> Run:
+    """Return a verb that fails."""
+
+    def run(verb: str, arguments: Sequence[str]) -> None:
+        raise error
+
+    return run
+
+
+def signalled(number: int, becomes: type[BaseException] | None) -> Run:
+    """Return a verb that gets a signal; the interruption may become another exception, or none."""
+
+    def run(verb: str, arguments: Sequence[str]) -> None:
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(60)
+        except KeyboardInterrupt:
+            if becomes is not None:
+                raise becomes from None
+
+    return run
+
+
+ENDS: dict[str, tuple[Run, int, str]] = {
+    "done": (lambda verb, arguments: None, 0, ""),
+    "wrong input": (raising(InputError("expected a, found b; c")), 2, "expected a, found b; c"),
+    "some broken": (raising(SomeBroken("1 of 2 scans", ["a: broken"])), 3, "a: broken"),
+    "full disk": (raising(OSError(28, "No space left on device", "out")), 1, "No space left"),
+    "Ctrl-C": (signalled(signal.SIGINT, KeyboardInterrupt), 130, "stopped"),
+    "SIGTERM": (signalled(signal.SIGTERM, KeyboardInterrupt), 143, "stopped"),
+    "a library that exits": (signalled(signal.SIGTERM, SystemExit), 143, "stopped"),
+    "a library that fails": (signalled(signal.SIGINT, RuntimeError), 130, "stopped"),
+    "a library that returns": (signalled(signal.SIGTERM, None), 143, "stopped"),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_exit_code_of_every_verb(verb: str, end: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, code, words = ENDS[end]
+    monkeypatch.setattr(command_line, "run", run)
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    actual, error = run_cli(verb)
+
+    assert actual == code
+    assert words in error
+    assert error.count("\n") == (code != 0) + (code == 3)
+    assert before == [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    if code > 128:
+        assert ("--resume" in error) == (verb in ("train", "predict"))
+        assert ("start it again" in error) == (verb in GOES_ON)
+
+
+def test_the_page_has_all_exit_codes() -> None:
+    page = (Path(__file__).parents[2] / "docs/command_line.md").read_text()
+    codes = re.findall(r"^\| (\d+) \|", page, re.M)
+    assert {int(code) for code in codes} == {code for _, code, _ in ENDS.values()}
+
+
+STUBBORN = """
+import sys, time
+from amvnet.cli import main
+from amvnet.files import atomic_write
+
+def run(verb, arguments):
+    with atomic_write("{path}") as part:
+        part.write_text("half")
+        print("ready", flush=True)
+        while True:
+            try:
+                time.sleep(60)
+            except KeyboardInterrupt:
+                pass
+
+main.run = run
+sys.argv = ["amvnet", "predict"]
+sys.exit(main.main())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_verb_that_does_not_end_is_ended(number: int, tmp_path: Path) -> None:
+    """It leaves no half file, and says one line."""
+    script = STUBBORN.replace("{path}", str(tmp_path / "a.txt"))
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline() == "ready\n"
+        start = time.monotonic()
+        process.send_signal(number)
+        assert process.wait(60) == 128 + number
+        assert time.monotonic() - start < SOON
+        assert process.stderr.read() == "amvnet: stopped; go on with --resume\n"
+    assert not list(tmp_path.iterdir())
+
+
+IMPORTING = """
+import os, signal, sys
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from amvnet.cli import main
+
+class Finder(MetaPathFinder, Loader):
+    def find_spec(self, name, path=None, target=None):
+        return ModuleSpec(name, self) if name == "stubborn" else None
+    def exec_module(self, module):
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        except BaseException:
+            os.abort()
+
+sys.meta_path.insert(0, Finder())
+main.run = lambda verb, arguments: __import__("stubborn")
+sys.argv = ["amvnet", "info"]
+sys.exit(main.main())
+"""
+
+
+def test_a_signal_during_an_import_raises_nothing_in_it() -> None:
+    """Libraries in C++ abort at an exception then."""
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTING], capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stderr) == (143, "amvnet: stopped\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_predict_goes_on(number: int, tmp_path: Path) -> None:
+    save(fresh_weights(), tmp_path / "w.safetensors")
+    (tmp_path / "scans").mkdir()
+    for index in range(40):
+        street(index, 20_000)[0].tofile(tmp_path / f"scans/{index:02d}.bin")
+    command = ["predict", tmp_path / "scans", "--weights", tmp_path / "w.safetensors", "--out"]
+    assert run_cli(*command, tmp_path / "whole") == (0, "")
+
+    words = [sys.executable, "-m", "amvnet", *map(str, command), str(tmp_path / "parts")]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+        while not list(tmp_path.glob("parts/*.label")) and process.poll() is None:
+            time.sleep(0.01)
+        process.send_signal(number)
+        assert process.wait(60) == 128 + number
+        assert process.stderr is not None
+        assert process.stderr.read() == "amvnet: stopped; go on with --resume\n"
+    assert 0 < len(list(tmp_path.glob("parts/*.label"))) < 40
+    assert not list(tmp_path.glob("parts/.*.part*"))
+
+    assert run_cli(*command, tmp_path / "parts", "--resume") == (0, "")
+    for path in (tmp_path / "whole").glob("*.label"):
+        assert path.read_bytes() == (tmp_path / "parts" / path.name).read_bytes()
+
+
+def test_finished_files_are_not_listed_as_unfinished() -> None:
+    assert not unfinished
