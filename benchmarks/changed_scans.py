@@ -24,7 +24,7 @@ from rich.table import Table
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
-from amvnet.inference.inputs import adapter_for
+from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import AXES, HEIGHTS, make_sensor, rotation_from_degrees
@@ -119,7 +119,7 @@ class Outcome:
 
 
 class Labeller:
-    """Labels adapted scans; the same scan only once, as many changes are undone exactly."""
+    """Labels normalised scans; the same scan only once, as many changes are undone exactly."""
 
     def __init__(self, weights: str) -> None:
         self.segmenter = Segmenter(weights).by_ring()
@@ -145,9 +145,11 @@ def measure(
     accuracies = []
     for scan in scans:
         cloud = change.apply(scan.points[:, :3], scan.points[:, 3])
-        adapter = adapter_for(labeller.segmenter.weights, make_sensor(**options), lines.append)
+        normaliser = normaliser_for(
+            labeller.segmenter.weights, make_sensor(**options), lines.append
+        )
         try:
-            labels = labeller(adapter(cloud, scan.name))
+            labels = labeller(normaliser(cloud, scan.name))
         except InputError as error:
             refusal = str(error)
             continue

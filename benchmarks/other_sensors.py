@@ -18,7 +18,7 @@ import numpy as np
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
 from amvnet.evaluation.metrics import Evaluation
-from amvnet.inference.inputs import adapter_for
+from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from lidarstreets import simulate
 from lidarstreets.sensing.sensors import HDL64E, SENSORS, LidarModel
@@ -57,7 +57,7 @@ OTHERS = {
 def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
     """Print mIoU over the classes present and accuracy of AMVNet, without and with fitting."""
     dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
-    fit = adapter_for(segmenter.weights)
+    fit = normaliser_for(segmenter.weights)
     segment_by_ring = segmenter.by_ring()
     unfitted = Evaluation(dataset.taxonomy)
     fitted = Evaluation(dataset.taxonomy)

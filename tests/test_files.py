@@ -26,15 +26,9 @@ from amvnet.data.formats.detect import NamedScan
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.inference.inputs import (
-    DatasetScan,
-    FileReader,
-    FileScan,
-    InputScan,
-    LabelFormat,
-    Labels,
-)
+from amvnet.inference.listing import DatasetScan, FileScan, InputScan
 from amvnet.inference.pipeline import OutputOptions, Pipeline
+from amvnet.inference.reading import FileReader
 from amvnet.inference.segmenter import Segmentation
 from amvnet.scan import Scan
 from amvnet.weights.file import save
@@ -132,7 +126,9 @@ def some_cloud() -> Cloud:
 
 def named(name: str) -> InputScan:
     """Return a scan file with a name."""
-    return FileScan(NamedScan(name, "source", Path("scan.bin"), some_cloud), FileReader(None))
+    return FileScan(
+        NamedScan(name, "source", Path("scan.bin"), ".bin", some_cloud), FileReader(None)
+    )
 
 
 def set_token(root: Path, token: str) -> None:
@@ -167,9 +163,8 @@ def test_names_of_scans_write_nothing_elsewhere(name: str, kind: str, link: str)
         with suppress(InputError):
             write(base, [scan], kind)
         with suppress(InputError):  # the names are checked once more when a file is written
-            form = LabelFormat(kind, NUSCENES)
-            labels = Labels(np.ones(COUNT, np.uint8))
-            scan.write_labels(base / "out", form, labels, scan.load().file_xyz)
+            ids = np.ones(COUNT, np.uint8)
+            scan.write_labels(base / "out", scan.load(), ids, kind=kind, taxonomy=NUSCENES)
 
 
 @settings(deadline=None, max_examples=100)
@@ -271,7 +266,7 @@ def test_every_file_has_the_mode_of_the_umask(umask: int, tmp_path: Path) -> Non
     assert (code, error) == (0, "")
 
     paths = [path for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(paths) == 6
+    assert len(paths) == 7
     assert {stat.S_IMODE(path.stat().st_mode) for path in paths} == {0o666 & ~umask}
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from amvnet.data.datasets.simulated import simulate
     from amvnet.errors import InputError
     from amvnet.inference.fusion import fuse
-    from amvnet.inference.read import read, read_all
+    from amvnet.inference.listing import read, read_all
     from amvnet.inference.segmentation import Segmentation
     from amvnet.inference.segmenter import Segmenter
     from amvnet.models.methods import MethodName, Precision, TtaName
@@ -49,8 +49,8 @@ _MODULES = {
     "Weights": "amvnet.weights.file",
     "fuse": "amvnet.inference.fusion",
     "push": "amvnet.weights.push",
-    "read": "amvnet.inference.read",
-    "read_all": "amvnet.inference.read",
+    "read": "amvnet.inference.listing",
+    "read_all": "amvnet.inference.listing",
     "simulate": "amvnet.data.datasets.simulated",
 }
 _SUBMODULES = ("onnx_runner", "weights")

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 
 RECORD = ".amvnet-written.json"
+
+try:
+    import fcntl
+except ImportError:  # Windows: files are not locked
+    fcntl = None  # type: ignore[assignment]
 
 Stamp = tuple[int, int]  # a file's size in bytes, and when it changed last, in nanoseconds
 
@@ -37,7 +44,7 @@ class WrittenFiles:
         Raises:
             InputError: if a file exists that is not listed, or was changed since, or is a folder.
         """
-        foreign = [path for path in paths if self._is_foreign(path)]
+        foreign = [path for path in paths if self.is_foreign(path)]
         for path in foreign:
             if (self.folder / path).is_dir():
                 raise InputError(
@@ -51,7 +58,8 @@ class WrittenFiles:
                 "found another; change --out, or say --overwrite to replace it"
             )
 
-    def _is_foreign(self, path: Path) -> bool:
+    def is_foreign(self, path: Path) -> bool:
+        """Return whether a file exists that is not listed, or was changed since."""
         stamp = _stamp_of(self.folder / path)
         if stamp is None:
             return False
@@ -63,7 +71,7 @@ class WrittenFiles:
         """List files before they are written."""
         paths = list(paths)
         for path in paths:
-            if self._is_foreign(path):
+            if self.is_foreign(path):
                 self._replaced[path.as_posix()] = _stamp_of(self.folder / path)
         self._update({path.as_posix(): None for path in paths})
 
@@ -80,17 +88,53 @@ class WrittenFiles:
 
     def _update(self, stamps: dict[str, Stamp | None], is_finished: bool = False) -> None:
         """Write the record with other stamps; entries of other runs stay."""
-        self._stamps = _read(self.folder / RECORD) | stamps
-        if is_finished:
-            for name, stamp in stamps.items():
-                if stamp is None:
-                    del self._stamps[name]
-
-        if not self._stamps:
-            (self.folder / RECORD).unlink(missing_ok=True)
+        if not self.folder.is_dir():
             return
-        with atomic_write(self.folder / RECORD) as part:
-            part.write_text(json.dumps(self._stamps, indent=0))
+        with folder_lock(self.folder):
+            self._stamps = _read(self.folder / RECORD) | stamps
+            if is_finished:
+                for name, stamp in stamps.items():
+                    if stamp is None:
+                        del self._stamps[name]
+
+            if not self._stamps:
+                (self.folder / RECORD).unlink(missing_ok=True)
+                return
+            with atomic_write(self.folder / RECORD) as part:
+                part.write_text(json.dumps(self._stamps, indent=0))
+
+
+@contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Keep other processes out of this block for the same folder, where the system can."""
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def hold(file: IO[str]) -> None:
+    """Lock a file until it is closed or its process ends, where the system can."""
+    if fcntl is not None:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_held(path: Path) -> bool:
+    """Return whether a process holds a file by `hold`."""
+    if fcntl is not None:
+        with suppress(OSError), path.open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return True
+    return False
 
 
 @contextmanager

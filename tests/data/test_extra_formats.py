@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from amvnet.data.formats.detect import list_scans, read_cloud
 from amvnet.data.formats.livox import TYPES as LIVOX
-from amvnet.inference.inputs import FileReader
+from amvnet.inference.reading import FileReader
 
 from fixtures.scan_writers import some_points
 from fixtures.worlds import fails

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from amvnet import Segmenter
-from amvnet.inference.certainty import UncertainCount, Verdict, uncertain_share
+from amvnet.inference.certainty import Verdict, uncertain_share
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 
 from fixtures.worlds import fresh_weights, make_streets, run_cli, street, without
@@ -76,17 +76,12 @@ def test_one_network_has_no_verdict(method: Any) -> None:
     assert Segmenter(fresh_weights(), method=method)(POINTS).verdict is None
 
 
-def test_a_count_of_scans_is_that_of_all_their_points() -> None:
-    count = UncertainCount()
+def test_the_share_is_that_of_the_valid_points() -> None:
     rng = np.random.default_rng(0)
-    labels = rng.integers(0, 3, (5, 100))
-    uncertain = (rng.random((5, 100)) < 0.3) & (labels > 0)
-    for pair in zip(labels, uncertain, strict=True):
-        count.add(*pair)
-
-    assert count.share == uncertain_share(labels.ravel(), uncertain.ravel())
-    assert count.share == uncertain[labels > 0].mean()
-    assert UncertainCount().share == 0
+    labels = rng.integers(0, 3, 100)
+    uncertain = (rng.random(100) < 0.3) & (labels > 0)
+    assert uncertain_share(labels, uncertain) == uncertain[labels > 0].mean()
+    assert uncertain_share(labels[:0], uncertain[:0]) == 0
 
 
 # ---- the command

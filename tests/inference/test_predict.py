@@ -18,12 +18,13 @@ import torch
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.inference.inputs import InputScan, adapter_for
-from amvnet.inference.journal import Journal
+from amvnet.inference.journal import JOURNAL, PATTERN, Entry, Journal, read_journals
+from amvnet.inference.listing import InputScan
 from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
-from amvnet.inference.predict import NetworkSegmentation
+from amvnet.inference.predict import segment_by
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
+from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 from amvnet.written import WrittenFiles
 
@@ -73,7 +74,7 @@ def settings_of(world: Path) -> dict[str, object]:
     return {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(adapter_for(weights).sensor),
+        "sensor": repr(Sensor()),
         "scores": False,
         "uncertain": False,
         "format": "label",
@@ -126,9 +127,9 @@ def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> N
     scans = counted_scans(8, Counter())
     execution = ExecutionOptions(batch=4)
     pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
-    faults = {scan.name: fault for scan, fault in pipeline.stream(scans)}
-    assert faults.pop("3") == "3: broken"
-    assert list(faults.values()) == [None] * 7
+    outcomes = list(pipeline.stream(scans))
+    assert [outcome for outcome in outcomes if isinstance(outcome, str)] == ["3: broken"]
+    assert sum(isinstance(outcome, Entry) for outcome in outcomes) == 7
 
 
 # ---- interrupted runs
@@ -184,63 +185,173 @@ def check_kept(folder: Path, times: dict[str, int]) -> None:
     assert kept >= len(times) - 1
 
 
-def test_an_interrupted_run_is_not_gone_on_with_by_others(world: Path, tmp_path: Path) -> None:
-    Journal(tmp_path, {**settings_of(world), "method": "rv"})
-    assert "method" in refusal(predict(world, tmp_path, "--resume"))
-    Journal(tmp_path, {**settings_of(world), "tta": "flips"})
-    assert "tta" in refusal(predict(world, tmp_path, "--resume"))
-    assert "tta" in refusal(predict(world, tmp_path, "--resume --tta yaw"))
+def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_path: Path) -> None:
+    """Neither a finished nor an interrupted run is; the line says which option differs."""
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    other = save(fresh_weights(seed=1), tmp_path / "other.safetensors")
+    for options, key in (
+        ("--method rv", "method"),
+        ("--tta flips", "tta"),
+        ("--height 2", "sensor"),
+        ("--scores", "scores"),
+        (f"--weights {other}", "weights"),
+    ):
+        line = refusal(predict(world, out, f"--resume {options}"))
+        assert f"another {key};" in line
+    check_same(out, whole)
 
-    # Without --resume it starts again.
-    succeed(predict(world, tmp_path))
-    assert len(files(tmp_path)) == SCANS
+    (out / JOURNAL).rename(out / PATTERN.replace("*", "0"))
+    assert "another method;" in refusal(predict(world, out, "--resume --method rv"))
+
+    # Without --resume it starts over.
+    succeed(predict(world, out, "--method rv"))
+    assert files(out) == files(whole)
+    assert (out / "000000.label").read_bytes() != (whole / "000000.label").read_bytes()
 
 
-def test_a_finished_run_is_not_taken_for_an_interrupted_one(
+def times_of(folder: Path) -> dict[str, int]:
+    """Return when each label file was written."""
+    return {path.name: path.stat().st_mtime_ns for path in folder.glob("*.label")}
+
+
+def said_by(command: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Run a command, and return what it says at the end."""
+    capsys.readouterr()
+    succeed(command)
+    return "\n".join(capsys.readouterr().out.splitlines()[-2:])
+
+
+def test_only_new_scans_of_a_growing_folder_are_segmented(
+    world: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The labels, and the share of uncertain points, are those of a run over all scans."""
+    out = tmp_path / "out"
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    paths = sorted((world / "scans").glob("*.bin"))
+    for path in paths[:9]:
+        shutil.copy(path, scans)
+    command = f"predict {scans} --weights {world}/{WEIGHTS} --out {out} --resume"
+    succeed(command)
+    times = times_of(out)
+
+    for path in paths[9:]:
+        shutil.copy(path, scans)
+    said = said_by(command, capsys)
+    check_same(out, whole)
+    assert times.items() <= times_of(out).items()
+    assert said.replace(str(out), "OUT") == said_by(
+        f"predict {scans} --weights {world}/{WEIGHTS} --out {tmp_path}/again", capsys
+    ).replace(f"{tmp_path}/again", "OUT")
+
+    # Nothing is left to do, and a label that is gone or was changed is made again.
+    times = times_of(out)
+    succeed(command)
+    assert times_of(out) == times
+    (out / "000003.label").unlink()
+    (out / "000005.label").write_bytes(b"other")
+    assert "000005.label" in refusal(command)
+    succeed(f"{command} --overwrite")
+    check_same(out, whole)
+    changed = {name for name, time in times_of(out).items() if time != times[name]}
+    assert changed == {"000003.label", "000005.label"}
+
+
+def test_scans_before_the_first_ones_change_how_all_are_normalised(
     world: Path, whole: Path, tmp_path: Path
 ) -> None:
-    succeed(predict(world, tmp_path, "--resume"))
-    (tmp_path / "000005.label").write_bytes(b"other")
-    succeed(predict(world, tmp_path, "--resume --overwrite"))
-    check_same(tmp_path, whole)
+    out = tmp_path / "out"
+    scans = tmp_path / "scans"
+    shutil.copytree(world / "scans", scans)
+    (scans / "000000.bin").unlink()
+    command = f"predict {scans} --weights {world}/{WEIGHTS} --out {out} --resume"
+    succeed(command)
+    shutil.copy(world / "scans/000000.bin", scans)
+    succeed(command)
+    check_same(out, whole)
+
+
+def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) -> None:
+    """A folder grows while a scan is still being copied."""
+    scans = tmp_path / "scans"
+    shutil.copytree(world / "scans", scans)
+    (scans / "000011.bin").write_bytes(b"123")
+    command = f"predict {scans} --weights {world}/{WEIGHTS} --out {tmp_path}/out --resume"
+    assert run_cli(*command.split())[0] == 3
+    shutil.copy(world / "scans/000011.bin", scans)
+    succeed(command)
+    check_same(tmp_path / "out", whole)
+
+
+ENTRIES = [Entry(name, "0f", "drive", 10, 3) for name in "ab"]
 
 
 @pytest.mark.parametrize(
     ("text", "done"),
     [
-        ('"a"\n"b"\n', {"a", "b"}),
-        ('"a"\n"b"', {"a"}),
-        ('"a"\n"b', {"a"}),
-        ('"a"\n\x00\n"b"\n{}\n', {"a", "b"}),
+        ('["a","0f","drive",10,3]\n["b","0f","drive",10,3]\n', 2),
+        ('["a","0f","drive",10,3]\n["b","0f","drive",10,3]', 1),
+        ('["a","0f","drive",10,3]\n["b","0f', 1),
+        ('["a","0f","drive",10,3]\n\x00\n["b","0f","drive",10,3]\n{}\n', 2),
+        ('["a","0f","drive",10,3]\n["b","0f","drive","10",3]\n"b"\n', 1),
+        ('["a","0f","drive",10,3]\n' + "[" * 100_000 + "\n", 1),
     ],
 )
-def test_a_journal_reads_what_was_written_to_the_end(
-    tmp_path: Path, text: str, done: set[str]
-) -> None:
-    """A scan whose name was not written to the end is not done."""
+def test_a_journal_reads_what_was_written_to_the_end(tmp_path: Path, text: str, done: int) -> None:
+    """A scan whose line was not written to the end is not done."""
     journal = Journal(tmp_path, {"x": 1})
     with journal.path.open("a") as file:
         file.write(text)
 
-    assert Journal(tmp_path, {"x": 1}, resume=True).done == done
-    lines = (tmp_path / ".unfinished-0.jsonl").read_text().splitlines()
-    for line in lines:
-        json.loads(line)
+    read = read_journals(tmp_path, {"x": 1})
+    assert list(read.values()) == ENTRIES[:done]
+    del journal
+    lines = Journal(tmp_path, {"x": 1}, read.values()).path.read_text().splitlines()
     assert json.loads(lines[0]) == {"x": 1}
+    assert [Entry(*json.loads(line)) for line in lines[1:]] == ENTRIES[:done]
 
 
-def test_a_part_of_a_folder_is_labelled_as_in_the_whole(
-    world: Path, whole: Path, tmp_path: Path
-) -> None:
-    """A folder's first scans say what its sensor is, whichever scans are left to segment."""
-    journal = Journal(tmp_path, settings_of(world))
-    for index in range(9):
-        journal.add(f"{index:06d}.npz")
+def test_the_journal_is_at_most_as_late_as_the_writing(world: Path, tmp_path: Path) -> None:
+    """Scans that are written are in the journal when the next one is segmented."""
+    lines = []
+    scans = counted_scans(8, Counter())
 
-    succeed(predict(world, tmp_path, "--resume"))
-    assert files(tmp_path) == {"000009.label", "000010.label", "000011.label"}
-    for name in files(tmp_path):
-        assert (tmp_path / name).read_bytes() == (whole / name).read_bytes()
+    def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
+        time.sleep(0.1)  # longer than the writing takes
+        lines.append(len((tmp_path / ".unfinished-0.jsonl").read_text().splitlines()) - 1)
+        return list(map(no_segmentation, loaded))
+
+    Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI).run({})
+    assert all(line >= scan - 2 for scan, line in enumerate(lines))
+
+
+HOLD = """
+import sys
+from pathlib import Path
+from amvnet.inference.journal import Journal
+
+journal = Journal(Path(sys.argv[1]), {})
+print("begun", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_folder_belongs_to_one_run_at_a_time(world: Path, tmp_path: Path) -> None:
+    """A second run says so and touches nothing; after the first is killed, it may begin."""
+    pytest.importorskip("fcntl")
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as first:
+        assert first.stdout is not None
+        assert first.stdout.readline() == b"begun\n"
+        before = files(tmp_path)
+        assert "another run" in refusal(predict(world, tmp_path))
+        assert files(tmp_path) == before
+        first.kill()
+
+    succeed(predict(world, tmp_path))
+    assert len(files(tmp_path)) == SCANS
 
 
 def test_what_a_killed_run_left_half_written_is_taken_away(
@@ -250,7 +361,7 @@ def test_what_a_killed_run_left_half_written_is_taken_away(
     with atomic_write(tmp_path / "000000.label") as part:
         part.write_bytes(b"whole")
     part.write_bytes(b"half")  # under the name that a file has until it is whole
-    Journal(tmp_path, settings_of(world)).add("000000.npz")
+    Journal(tmp_path, settings_of(world)).add(Entry("000000.npz", "", "", 1, 0))
     WrittenFiles(tmp_path).claim([Path("000000.label")])
 
     succeed(predict(world, tmp_path))
@@ -269,13 +380,13 @@ def test_few_scans_are_in_memory_however_many_there_are(
     scans = counted_scans(30, counter, seconds_to_write=0.02)  # slower than the reading
     pipeline = Pipeline(
         scans,
-        NetworkSegmentation(Segmenter(str(world / WEIGHTS))),
+        segment_by(Segmenter(str(world / WEIGHTS))),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
         ExecutionOptions(at_once=at_once),
     )
-    done = [scan.name for scan, fault in pipeline.stream(scans) if fault is None]
-    assert done == list(map(str, range(30)))
+    done = [entry.scan for entry in pipeline.stream(scans) if isinstance(entry, Entry)]
+    assert done == [f"{index}.npz" for index in range(30)]
     assert counter.most <= 2 * AHEAD + 2 * at_once
     assert not counter.in_memory
 
@@ -302,5 +413,5 @@ def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
     execution = ExecutionOptions(at_once=2)
     pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
     first, second = pipeline.stream(scans)
-    assert first[1] is None
-    assert second[1] is None
+    assert isinstance(first, Entry)
+    assert isinstance(second, Entry)

@@ -19,10 +19,9 @@ from torch import Tensor, nn
 from amvnet import Scan, Segmenter, load, simulate
 from amvnet import read as read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.inference.inputs import adapter_for
-from amvnet.inference.journal import Journal
+from amvnet.inference.journal import Entry, Journal
 from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
-from amvnet.inference.predict import NetworkSegmentation
+from amvnet.inference.predict import segment_by
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import LateFusion
 from amvnet.models.assertion import Disagreement
@@ -32,6 +31,7 @@ from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_bl
 from amvnet.models.precision import InPrecision, choose_device, choose_precision
 from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
+from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
 from fixtures.counted_scans import Counter, counted_scans
@@ -451,7 +451,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
-        "sensor": repr(adapter_for(weights).sensor),
+        "sensor": repr(Sensor()),
         "scores": False,
         "uncertain": False,
         "format": "label",
@@ -489,14 +489,14 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
     scans = counted_scans(23, counter)
     pipeline = Pipeline(
         scans,
-        NetworkSegmentation(Segmenter(fresh_weights())),
+        segment_by(Segmenter(fresh_weights())),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
         ExecutionOptions(batch=4),
     )
     results = list(pipeline.stream(scans))
-    assert [scan.name for scan, _ in results] == [str(seed) for seed in range(23)]
-    assert not any(fault for _, fault in results)
+    done = [result.scan for result in results if isinstance(result, Entry)]
+    assert done == [f"{seed}.npz" for seed in range(23)]
     assert sizes == [4, 4, 4, 4, 4, 3]
     assert counter.most <= 2 * 4 + AHEAD + 2
     assert not counter.in_memory

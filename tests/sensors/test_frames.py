@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from amvnet.data.formats.cloud import Cloud
-from amvnet.inference.inputs import adapter_for
+from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.frame import find_frame
 from amvnet.sensors.ground import find_ground
@@ -34,12 +34,12 @@ def tilted(xyz: np.ndarray, pitch: float, roll: float) -> np.ndarray:
     return xyz @ rotation_from_degrees(0, pitch, roll).T
 
 
-def adapt(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]:
-    """Return the adapted scan, and what was said."""
+def normalise(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]:
+    """Return the normalised scan, and what was said."""
     lines: list[str] = []
     weights = replace(fresh_weights(), sensor="hdl64e")
     intensity = np.linspace(0, 0.6, len(xyz))
-    scan = adapter_for(weights, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")
+    scan = normaliser_for(weights, sensor, lines.append)(Cloud(xyz, intensity, name="a"), "a")
     return scan, lines[0]
 
 
@@ -54,8 +54,8 @@ def assert_alike(scan: Scan, expected: Scan, atol: float) -> None:
 @pytest.mark.parametrize("unit", [1, 1000])
 def test_axes_and_millimetres_are_recognised_and_said(axes: str, unit: float) -> None:
     xyz = scan_xyz()
-    expected, usual = adapt(xyz)
-    scan, line = adapt(unit * in_axes(xyz, axes))
+    expected, usual = normalise(xyz)
+    scan, line = normalise(unit * in_axes(xyz, axes))
     assert_alike(scan, expected, atol=1e-4)
     assert f"--axes {axes}" in line
     assert ("--unit mm" in line) == (unit == 1000)
@@ -66,7 +66,7 @@ def test_axes_and_millimetres_are_recognised_and_said(axes: str, unit: float) ->
 @pytest.mark.parametrize("axes", ["x-forward", "z-forward"])
 def test_a_tilted_scan_is_levelled(tilt: tuple[float, float], axes: str) -> None:
     xyz = scan_xyz()
-    scan, line = adapt(in_axes(tilted(xyz, *tilt), axes))
+    scan, line = normalise(in_axes(tilted(xyz, *tilt), axes))
     ground = find_ground(scan.points[:, :3].astype(np.float64))
     assert ground is not None
     assert ground.tilt < 0.3
@@ -81,43 +81,43 @@ def test_an_origin_on_the_ground_or_below_it_is_mended(
     rise: float, options: dict[str, Any]
 ) -> None:
     xyz = scan_xyz()
-    expected, _ = adapt(xyz)
-    scan, _ = adapt(xyz + np.array([0, 0, rise]), Sensor(**options))
+    expected, _ = normalise(xyz)
+    scan, _ = normalise(xyz + np.array([0, 0, rise]), Sensor(**options))
     assert_alike(scan, expected, atol=0.16)  # a difference in height of 0.15 m is left alone
 
 
 @pytest.mark.parametrize("z", [-1.73, 0, 1.73])
 def test_no_offset_hurts(z: float) -> None:
     xyz = scan_xyz()
-    expected, _ = adapt(xyz)
-    scan, _ = adapt(xyz + np.array([1, 0, 1.73]), Sensor(offset=(-1, 0, z)))
+    expected, _ = normalise(xyz)
+    scan, _ = normalise(xyz + np.array([1, 0, 1.73]), Sensor(offset=(-1, 0, z)))
     assert_alike(scan, expected, atol=0.05)
 
 
 def test_an_offset_is_in_the_axes_of_the_file_if_these_are_guessed() -> None:
     xyz = scan_xyz()
-    expected, _ = adapt(xyz)
+    expected, _ = normalise(xyz)
     moved = in_axes(xyz, "z-forward") + np.array([0.4, -1.2, 0.3])
     for sensor in (Sensor(offset=(-0.4, 1.2, -0.3)), Sensor(unit="m", offset=(-0.4, 1.2, -0.3))):
-        assert_alike(adapt(moved, sensor)[0], expected, atol=0.05)
+        assert_alike(normalise(moved, sensor)[0], expected, atol=0.05)
 
 
 def test_what_the_user_describes_is_not_guessed() -> None:
     xyz = tilted(scan_xyz(), 8, 0)
-    scan, _ = adapt(xyz, Sensor(rotate=(0, 0, 0), height=1.73))
+    scan, _ = normalise(xyz, Sensor(rotate=(0, 0, 0), height=1.73))
     np.testing.assert_allclose(scan.points[:, :3], xyz, atol=1e-5)
 
     down = in_axes(scan_xyz(), "z-down")
-    scan, _ = adapt(down, Sensor(axes="x-forward", height=1.73))
+    scan, _ = normalise(down, Sensor(axes="x-forward", height=1.73))
     np.testing.assert_allclose(scan.points[:, :3], down, atol=1e-5)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("cm", 100), ("ft", 1 / 0.3048)])
 def test_other_units_are_refused_with_the_option_that_mends_it(unit: str, factor: float) -> None:
     xyz = scan_xyz()
-    fails(lambda: adapt(factor * xyz), "a:", "--unit", unit)
-    expected, _ = adapt(xyz)
-    assert_alike(adapt(factor * xyz, Sensor(unit=unit))[0], expected, atol=1e-4)
+    fails(lambda: normalise(factor * xyz), "a:", "--unit", unit)
+    expected, _ = normalise(xyz)
+    assert_alike(normalise(factor * xyz, Sensor(unit=unit))[0], expected, atol=1e-4)
 
 
 def test_map_coordinates_are_not_taken_for_millimetres() -> None:
@@ -147,9 +147,9 @@ def test_a_raised_road_is_not_upside_down() -> None:
 
 def test_scans_that_sway_are_levelled_one_by_one() -> None:
     weights = replace(fresh_weights(), sensor="hdl64e")
-    adapter = adapter_for(weights)
+    normaliser = normaliser_for(weights)
     for seed, pitch in enumerate((8, -8, 8, -8, 8, -8, 8)):
         xyz = scan_xyz(seed=seed)
         cloud = Cloud(tilted(xyz, pitch, 0), np.linspace(0, 0.6, len(xyz)), name="a")
-        scan = adapter(cloud, "a")
+        scan = normaliser(cloud, "a")
         np.testing.assert_allclose(scan.points[:, 2], xyz[:, 2], atol=0.2)

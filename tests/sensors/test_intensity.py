@@ -13,7 +13,7 @@ import pytest
 
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
-from amvnet.inference.inputs import adapter_for
+from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.ground import ground_height
@@ -48,13 +48,13 @@ def weights_with(training: dict[str, Any]) -> Weights:
     return replace(fresh_weights(), sensor="hdl64e", training=training)
 
 
-def adapt(
+def normalise(
     clouds: list[Cloud], sensor: Sensor | None = None, training: dict[str, Any] | None = None
 ) -> tuple[list[Scan], list[str]]:
-    """Return the adapted scans of one source, and what was said."""
+    """Return the normalised scans of one source, and what was said."""
     lines: list[str] = []
-    adapter = adapter_for(weights_with(training or {}), sensor, lines.append)
-    return [adapter(cloud, "a") for cloud in clouds], lines
+    normaliser = normaliser_for(weights_with(training or {}), sensor, lines.append)
+    return [normaliser(cloud, "a") for cloud in clouds], lines
 
 
 def quantile_gap(intensity: np.ndarray) -> float:
@@ -65,7 +65,7 @@ def quantile_gap(intensity: np.ndarray) -> float:
 
 def test_intensities_like_those_of_the_training_stay_as_they_are() -> None:
     points = scan_points()
-    (scan,), _ = adapt([Cloud(points[:, :3], points[:, 3], name="a")])
+    (scan,), _ = normalise([Cloud(points[:, :3], points[:, 3], name="a")])
     np.testing.assert_array_equal(scan.points[:, 3], points[:, 3])
 
 
@@ -84,7 +84,7 @@ def test_intensities_of_any_range_become_those_of_the_training(
     change: Callable[[np.ndarray], np.ndarray],
 ) -> None:
     points = scan_points()
-    (scan,), _ = adapt([Cloud(points[:, :3], change(points[:, 3]), name="a")])
+    (scan,), _ = normalise([Cloud(points[:, :3], change(points[:, 3]), name="a")])
     intensity = scan.points[:, 3]
     assert quantile_gap(intensity) < 0.05
     assert 0 <= intensity.min() < intensity.max() <= 1
@@ -98,8 +98,8 @@ def test_one_wild_value_changes_nothing_else(scale: int) -> None:
     wild = intensity.copy()
     wild[7] = 300 * scale
 
-    (expected,), _ = adapt([Cloud(points[:, :3], intensity, name="a")])
-    (scan,), _ = adapt([Cloud(points[:, :3], wild, name="a")])
+    (expected,), _ = normalise([Cloud(points[:, :3], intensity, name="a")])
+    (scan,), _ = normalise([Cloud(points[:, :3], wild, name="a")])
     is_other = np.arange(len(points)) != 7
     np.testing.assert_array_equal(scan.points[is_other], expected.points[is_other])
     assert scan.points[7, 3] == 1
@@ -107,7 +107,7 @@ def test_one_wild_value_changes_nothing_else(scale: int) -> None:
 
 def test_a_scale_that_the_user_gives_is_all_that_is_done() -> None:
     points = scan_points()
-    (scan,), lines = adapt(
+    (scan,), lines = normalise(
         [Cloud(points[:, :3], 40 * points[:, 3], name="a")], Sensor(intensity_scale=1000)
     )
     np.testing.assert_allclose(scan.points[:, 3], 0.04 * points[:, 3], rtol=1e-6)
@@ -124,7 +124,7 @@ def test_missing_intensities_are_filled_in_as_the_weights_need_it(
     record = {"augment": {"no_intensity": share}}
     training = {"range_net": record, "polar_net": record}
 
-    (scan, again), lines = adapt([Cloud(xyz, values, name="a")] * 2, training=training)
+    (scan, again), lines = normalise([Cloud(xyz, values, name="a")] * 2, training=training)
     assert scan.valid.all()
     np.testing.assert_array_equal(scan.points, again.points)
     if share >= 0.2:
@@ -141,16 +141,17 @@ def test_another_range_later_in_a_source_is_that_of_another_sensor() -> None:
         first.append(Cloud(points[:, :3], points[:, 3], name="a"))
 
     lines: list[str] = []
-    adapter = adapter_for(weights_with({}), say=lines.append)
-    adapter.learn("a", [partial(Cloud, cloud.xyz, cloud.intensity, name="a") for cloud in first])
+    normaliser = normaliser_for(weights_with({}), say=lines.append)
+    for cloud in first:
+        normaliser.expect("a", partial(Cloud, cloud.xyz, cloud.intensity, name="a"))
     for height in (1.0, 2.5):
         points = scan_points(height)
-        scan = adapter(Cloud(points[:, :3], 255 * points[:, 3], name="b"), "a")
+        scan = normaliser(Cloud(points[:, :3], 255 * points[:, 3], name="b"), "a")
         np.testing.assert_allclose(scan.points[:, 3], points[:, 3], atol=1e-6)
         assert ground_height(scan.points[:, :3].astype(float)) == pytest.approx(1.73, abs=0.05)
 
     points = scan_points()
-    scan = adapter(Cloud(points[:, :3], points[:, 3], name="c"), "a")
+    scan = normaliser(Cloud(points[:, :3], points[:, 3], name="c"), "a")
     np.testing.assert_array_equal(scan.points, points)
     assert len(lines) == 2
 
@@ -271,11 +272,11 @@ def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> Non
     darker = segmenter(dark)
     np.testing.assert_allclose(darker.scores, expected.scores, atol=0.02)
 
-    # The scan is labelled alike as a file: its adapter leaves the intensities to the segmenter.
+    # The scan is labelled alike as a file: its normaliser leaves the intensities to the segmenter.
     said: list[str] = []
-    adapter = adapter_for(weights, None, said.append)
-    adapted = adapter(Cloud(dark[:, :3], dark[:, 3], name="a"), "a")
-    np.testing.assert_allclose(adapted.points[:, 3], dark[:, 3], atol=1e-6)
+    normaliser = normaliser_for(weights, None, said.append)
+    normalised = normaliser(Cloud(dark[:, :3], dark[:, 3], name="a"), "a")
+    np.testing.assert_allclose(normalised.points[:, 3], dark[:, 3], atol=1e-6)
     assert "spread as in the training" in said[0]
 
 

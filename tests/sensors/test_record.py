@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from amvnet.data.datasets.semantickitti import SemanticKitti
-from amvnet.inference.inputs import adapter_for
+from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import HEIGHTS, SENSORS
 from amvnet.sensors.record import KEY, measure_sensor, trained_sensor
@@ -134,5 +134,5 @@ def test_a_weights_file_keeps_the_record(tmp_path: Path) -> None:
     loaded = load(save(weights, tmp_path / "w.safetensors"))
     assert trained_sensor(loaded.training, loaded.sensor).height == pytest.approx(2.6, abs=0.05)
     lines: list[str] = []
-    adapter = adapter_for(loaded, say=lines.append)
-    assert adapter.target()["height"] == trained_sensor(loaded.training, "").height
+    normaliser = normaliser_for(loaded, say=lines.append)
+    assert normaliser.target()["height"] == trained_sensor(loaded.training, "").height

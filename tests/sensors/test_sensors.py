@@ -18,11 +18,11 @@ from amvnet.cli.main import main
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.inputs import adapter_for
+from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import MEASURED, ScanAdapter, _raise_points
 from amvnet.sensors.ground import ground_height
+from amvnet.sensors.lasers import measure
 from amvnet.sensors.lidars import (
     AXES,
     HEIGHTS,
@@ -31,7 +31,8 @@ from amvnet.sensors.lidars import (
     make_sensor,
     rotation_from_degrees,
 )
-from amvnet.sensors.measure import measure
+from amvnet.sensors.measure import MEASURED, raise_points
+from amvnet.sensors.normalise import Normaliser
 from amvnet.weights.file import save
 from lidarstreets.sensing.sensors import HDL32E, HDL64E
 
@@ -107,17 +108,17 @@ def test_real_sensors_have_the_height_that_is_known(name: str, beams: int) -> No
     assert np.abs(np.array(heights) - expected).max() < 0.2
 
 
-# --- adapting
+# --- normalising
 
 
-def make_adapter(
+def make_normaliser(
     sensor: Sensor | None = None, trained_for: str = "hdl64e", is_nuscenes: bool = False
-) -> tuple[ScanAdapter, list[str]]:
-    """Return an adapter for fresh weights, and the list of the lines that it says."""
+) -> tuple[Normaliser, list[str]]:
+    """Return a normaliser for fresh weights, and the list of the lines that it says."""
     lines: list[str] = []
     taxonomy = NUSCENES if is_nuscenes else SEMANTICKITTI
     weights = replace(fresh_weights(taxonomy), sensor=trained_for)
-    return adapter_for(weights, sensor, lines.append), lines
+    return normaliser_for(weights, sensor, lines.append), lines
 
 
 def make_cloud(points: np.ndarray, ring: np.ndarray | None = None) -> Cloud:
@@ -134,8 +135,8 @@ def assert_alike(a: Scan, b: Scan, atol: float = 1e-4) -> None:
 @pytest.mark.parametrize("height", [0.6, 1.73, 2.6])
 def test_the_sensor_is_moved_to_the_height_of_the_training(height: float) -> None:
     points, _ = place(LASERS["os1-64"], height)
-    adapter, _ = make_adapter()
-    scan = adapter(make_cloud(points), "a")
+    normaliser, _ = make_normaliser()
+    scan = normaliser(make_cloud(points), "a")
     np.testing.assert_array_equal(scan.points[:, [0, 1, 3]], points[:, [0, 1, 3]])
     assert ground_height(scan.points[:, :3].astype(np.float64)) == pytest.approx(1.73, abs=0.05)
 
@@ -146,8 +147,8 @@ def test_the_sensor_is_moved_to_the_height_of_the_training(height: float) -> Non
 
 def test_a_given_height_counts_whatever_the_ground_says() -> None:
     points, _ = place(LASERS["os1-64"], 1.2)
-    adapter, _ = make_adapter(Sensor(height=2.23))
-    scan = adapter(make_cloud(points), "a")
+    normaliser, _ = make_normaliser(Sensor(height=2.23))
+    scan = normaliser(make_cloud(points), "a")
     np.testing.assert_allclose(scan.points[:, 2] - points[:, 2], 0.5, atol=1e-5)
 
 
@@ -158,16 +159,16 @@ def test_any_frame_that_is_described_gives_the_same_scan(
 ) -> None:
     points, _ = place(LASERS["os1-64"], 1.2)
     points[5] = 0
-    level_adapter, _ = make_adapter()
-    expected = level_adapter(make_cloud(points), "a")
+    level_normaliser, _ = make_normaliser()
+    expected = level_normaliser(make_cloud(points), "a")
 
     offset = (0.1, -0.2, 0.4)
     matrix = rotation_from_degrees(*turn) @ np.array(AXES[axes], float)
     file_xyz = (points[:, :3] - offset) @ matrix  # the inverse of matrix @ file_xyz + offset
     file_xyz[5] = 0
 
-    adapter, _ = make_adapter(Sensor(axes=axes, rotate=turn, offset=offset))
-    scan = adapter(Cloud(file_xyz, points[:, 3], None, "a.pcd"), "a")
+    normaliser, _ = make_normaliser(Sensor(axes=axes, rotate=turn, offset=offset))
+    scan = normaliser(Cloud(file_xyz, points[:, 3], None, "a.pcd"), "a")
 
     assert_alike(scan, expected)
     assert np.flatnonzero(~scan.valid).tolist() == [5]
@@ -194,7 +195,7 @@ def test_axes_do_not_mirror(axes: Any) -> None:
 def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
     points, _ = place(HDL64E.elevations, 1.73)
     weights = replace(fresh_weights(), sensor="hdl64e")
-    scan = adapter_for(weights)(make_cloud(points), "a")
+    scan = normaliser_for(weights)(make_cloud(points), "a")
     np.testing.assert_array_equal(scan.points, points)
 
     segmenter = Segmenter(weights)
@@ -206,8 +207,8 @@ def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
 
 def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None:
     points, laser = place(LASERS["os1-64"], 0.8)
-    adapter, _ = make_adapter()
-    ring = adapter(make_cloud(points), "a").ring
+    normaliser, _ = make_normaliser()
+    ring = normaliser(make_cloud(points), "a").ring
     assert ring is not None
 
     rows = []
@@ -224,8 +225,8 @@ def test_rows_follow_the_lasers_when_the_sensor_is_moved_and_sees_more() -> None
 def test_weights_with_rings_as_rows_get_the_rings_of_the_training(kind: str) -> None:
     points, laser = place(LASERS["hdl32e"], 1.84)
     rings = {"none": None, "right": laser, "reversed": 31 - laser}
-    adapter, _ = make_adapter(trained_for="hdl32e", is_nuscenes=True)
-    ring = adapter(make_cloud(points, rings[kind]), "a").ring
+    normaliser, _ = make_normaliser(trained_for="hdl32e", is_nuscenes=True)
+    ring = normaliser(make_cloud(points, rings[kind]), "a").ring
 
     assert ring is not None
     np.testing.assert_array_equal(ring, laser)
@@ -234,61 +235,61 @@ def test_weights_with_rings_as_rows_get_the_rings_of_the_training(kind: str) -> 
 def test_weights_of_an_unknown_sensor_get_rings_if_the_lasers_can_be_told_apart() -> None:
     points, laser = place(np.linspace(-20, 12, 32), 1.84)
     fewer_lasers, _ = place(np.linspace(-20, 12, 20), 1.84)
-    adapter, _ = make_adapter(trained_for="homemade", is_nuscenes=True)
+    normaliser, _ = make_normaliser(trained_for="homemade", is_nuscenes=True)
 
-    np.testing.assert_array_equal(adapter(make_cloud(points), "a").ring, laser)
-    assert adapter(make_cloud(fewer_lasers), "b").ring is None
+    np.testing.assert_array_equal(normaliser(make_cloud(points), "a").ring, laser)
+    assert normaliser(make_cloud(fewer_lasers), "b").ring is None
 
-    scan = adapter(make_cloud(points, 31 - laser), "c")
+    scan = normaliser(make_cloud(points, 31 - laser), "c")
     np.testing.assert_array_equal(scan.ring, 31 - laser)
 
 
 def test_what_was_assumed_is_said_once_for_a_source() -> None:
-    adapter, lines = make_adapter()
+    normaliser, lines = make_normaliser()
     for seed in range(3):
         points, _ = place(LASERS["vlp16"], 0.9, seed=seed)
         points[:, 3] *= 255
-        adapter(make_cloud(points), "drive")
+        normaliser(make_cloud(points), "drive")
 
     assert len(lines) == 1
     lasers = ("16 lasers", "+15 to -15", "hdl64e", "no such sensor")
     for word in ("a.pcd", "0 to 255", "m over the ground", "1.73 m", *lasers):
         assert word in lines[0]
 
-    adapter(make_cloud(points), "other")
+    normaliser(make_cloud(points), "other")
     assert len(lines) == 2
 
 
 def test_the_sensor_of_the_training_is_said_to_be_familiar_and_in_place() -> None:
     points, _ = place(HDL64E.elevations, 1.73)
-    adapter, lines = make_adapter()
-    adapter(make_cloud(points), "drive")
+    normaliser, lines = make_normaliser()
+    normaliser(make_cloud(points), "drive")
     assert "no such sensor" not in lines[0]
     assert "moved" not in lines[0]
 
 
-def rise_of(adapter: ScanAdapter, points: np.ndarray, source: str) -> float:
-    """Return how far an adapter moves a scan up, metres."""
-    scan = adapter(make_cloud(points), source)
+def rise_of(normaliser: Normaliser, points: np.ndarray, source: str) -> float:
+    """Return how far a normaliser moves a scan up, metres."""
+    scan = normaliser(make_cloud(points), source)
     return float((scan.points[:, 2] - points[:, 2]).mean())
 
 
 def test_scans_of_one_source_keep_one_height() -> None:
-    adapter, _ = make_adapter()
+    normaliser, _ = make_normaliser()
     rises = []
     for seed, height in enumerate((1.0, 1.0, 1.1, 1.0, 1.0, 1.1, 1.1, 1.1, 1.1, 1.1)):
         points, _ = place(LASERS["os1-64"], height, seed=seed)
-        rises.append(rise_of(adapter, points, "drive"))
+        rises.append(rise_of(normaliser, points, "drive"))
 
     assert np.ptp(rises[MEASURED:]) < 1e-5
     assert rises[-1] == pytest.approx(1.0 - 1.73, abs=0.03)
 
 
 def test_scans_of_two_robots_in_one_source_get_their_own_heights() -> None:
-    adapter, _ = make_adapter()
+    normaliser, _ = make_normaliser()
     for height in (1.0, 2.5, 1.0, 2.5):
         points, _ = place(LASERS["os1-64"], height)
-        rise = rise_of(adapter, points, "mixed")
+        rise = rise_of(normaliser, points, "mixed")
         assert rise == pytest.approx(height - 1.73, abs=0.05)
 
 
@@ -297,9 +298,9 @@ def test_a_scan_whose_origin_is_on_the_ground_or_below_is_moved(up: float) -> No
     points, _ = place(HDL64E.elevations, 1.73)
     raised = points + np.array([0, 0, up, 0], np.float32)
 
-    adapter, _ = make_adapter()
-    scan = adapter(make_cloud(raised), "raised")
-    expected = adapter(make_cloud(points), "level")
+    normaliser, _ = make_normaliser()
+    scan = normaliser(make_cloud(raised), "raised")
+    expected = normaliser(make_cloud(points), "level")
     assert_alike(scan, expected, atol=0.05)
 
 
@@ -330,11 +331,11 @@ def test_any_numbers_end_in_a_scan_or_one_line(
 ) -> None:
     points = np.array(rows * repeated, np.float32).reshape(-1, 4)
     cloud = make_cloud(points, np.arange(len(points)) % 40 if has_ring else None)
-    adapter, _ = make_adapter(sensor, trained_for, is_nuscenes)
+    normaliser, _ = make_normaliser(sensor, trained_for, is_nuscenes)
 
     with contextlib.suppress(InputError):
         for _ in range(2):
-            scan = adapter(cloud, "a")
+            scan = normaliser(cloud, "a")
             assert len(scan) == len(points)
 
             assert not scan.valid[(points[:, :3] == 0).all(axis=1)].any()
@@ -495,7 +496,7 @@ def test_mistakes_are_one_line(mistake: str, world: Path, tmp_path: Path) -> Non
     assert not files(tmp_path)
 
 
-def test_scans_of_datasets_are_not_adapted(tmp_path: Path) -> None:
+def test_scans_of_datasets_are_not_normalised(tmp_path: Path) -> None:
     weights = tmp_path / "w.safetensors"
     save(replace(fresh_weights(), sensor="hdl64e"), weights)
     data = make_streets(tmp_path / "data", ("00",), 1)
@@ -522,6 +523,6 @@ def test_random_bytes_as_points_give_no_warning(seed: int) -> None:
     points = np.frombuffer(data, np.float32).reshape(-1, 4)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        raised = _raise_points(Scan(points), 0.5)
+        raised = raise_points(Scan(points), 0.5)
     finite = np.isfinite(points[:, 2]) & (np.abs(points[:, 2]) < 1e30)
     assert np.allclose(raised.points[finite, 2], points[finite, 2] + np.float32(0.5))

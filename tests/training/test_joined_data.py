@@ -94,14 +94,14 @@ def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: P
         join(scans, [half, half])
 
 
-def test_scans_that_are_adapted_are_not_mixed_with_others(tmp_path: Path) -> None:
+def test_scans_that_are_normalised_are_not_mixed_with_others(tmp_path: Path) -> None:
     """The rows of their points are given in some of the scans only."""
     scans = joined(tmp_path, None)
     np.save(tmp_path / "scan.npy", np.ones((5, 4), np.float32))
     classes = {name: number for number, name in enumerate(SEMANTICKITTI.classes, start=1)}
     description = {"classes": classes, "scans": "*.npy"}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
-    own = replace(open_own(tmp_path / "own.yaml"), is_adapted=True)
+    own = replace(open_own(tmp_path / "own.yaml"), is_normalised=True)
     with pytest.raises(InputError, match="found both"):
         join(scans, [Part(own, own.records(own.sequences("all")))])
 

@@ -105,7 +105,7 @@ class CloudSegmenter:
         import torch
 
         import amvnet
-        from amvnet.inference.inputs import adapter_for
+        from amvnet.inference.reading import normaliser_for
         from amvnet.sensors.lidars import make_sensor
 
         sensor = make_sensor(**settings.sensor_options())
@@ -124,7 +124,7 @@ class CloudSegmenter:
         self.hardware = segmenter.hardware
         self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
-        self._adapt = adapter_for(segmenter.weights, sensor, say)
+        self._normalise = normaliser_for(segmenter.weights, sensor, say)
         self._segment = segmenter.by_ring()
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)
 
@@ -138,7 +138,7 @@ class CloudSegmenter:
             cloud = read_message(message, self._topic)
             origin = Origin.of(message)
 
-        scan = self._adapt(cloud, self._topic)
+        scan = self._normalise(cloud, self._topic)
         result = self._segment(scan)
         verdict = result.verdict  # None for a single network
         return LabelledCloud(

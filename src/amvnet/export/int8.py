@@ -13,7 +13,8 @@ import numpy as np
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.export.onnx_files import digest, quiet, strip, writer_errors
-from amvnet.inference.inputs import ScanOptions, adapter_for, open_inputs
+from amvnet.inference.listing import list_inputs
+from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
@@ -106,9 +107,9 @@ def _read(text: str, segmenter: Segmenter) -> list[Scan]:
     Raises:
         InputError: if an input is missing or broken, or no scan has a finite point.
     """
-    adapter = adapter_for(segmenter.weights)
-    opened = open_inputs([text], ScanOptions(), segmenter.taxonomy, adapter)
-    loaded = [opened_scan.load().scan for opened_scan in evenly_spaced(opened.scans, SCANS)]
+    normaliser = normaliser_for(segmenter.weights)
+    inputs, _ = list_inputs([text], taxonomy=segmenter.taxonomy, normaliser=normaliser)
+    loaded = [scan_input.load().scan for scan_input in evenly_spaced(inputs, SCANS)]
 
     scans = [match_scan(scan, segmenter.intensity) for scan in loaded if scan.valid.any()]
     if not scans:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from threading import Lock
 
 import numpy as np
 
@@ -31,9 +30,13 @@ class Verdict:
         """Whether so many points are uncertain that the weights do not know such scans."""
         return self.share * (1 - self.usual) > UNUSUAL_ODDS * self.usual * (1 - self.share)
 
+    @property
+    def shares(self) -> str:
+        """Both shares, as text."""
+        return f"{self.share:.1%} of the points are uncertain (usual: {self.usual:.1%})"
+
     def __str__(self) -> str:
-        shares = f"{self.share:.1%} of the points are uncertain (usual: {self.usual:.1%})"
-        return f"do not rely on these labels: {shares}" if self.is_doubtful else shares
+        return f"do not rely on these labels: {self.shares}" if self.is_doubtful else self.shares
 
 
 def uncertain_share(labels: np.ndarray, uncertain: np.ndarray) -> float:
@@ -43,33 +46,4 @@ def uncertain_share(labels: np.ndarray, uncertain: np.ndarray) -> float:
         labels: (N,) train ids; 0 for points that are not valid.
         uncertain: (N,) bool.
     """
-    count = UncertainCount()
-    count.add(labels, uncertain)
-    return count.share
-
-
-class UncertainCount:
-    """Counts the uncertain points of scans; several threads may add to it."""
-
-    def __init__(self) -> None:
-        self.points = 0
-        self.uncertain = 0
-        self._lock = Lock()
-
-    def add(self, labels: np.ndarray, uncertain: np.ndarray) -> None:
-        """Add a scan.
-
-        Args:
-            labels: (N,) train ids; points with id 0 are not valid and do not count.
-            uncertain: (N,) bool.
-        """
-        points = int(np.count_nonzero(labels))
-        count = int(np.count_nonzero(uncertain))
-        with self._lock:
-            self.points += points
-            self.uncertain += count
-
-    @property
-    def share(self) -> float:
-        """The share of the points that are uncertain, in [0, 1]; 0 without points."""
-        return self.uncertain / max(self.points, 1)
+    return int(np.count_nonzero(uncertain)) / max(int(np.count_nonzero(labels)), 1)

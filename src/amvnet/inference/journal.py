@@ -1,112 +1,182 @@
-"""A record next to the output of what a run has done, so that an interrupted run can be resumed."""
+"""A record next to the output of which scans are done, so that a run can be resumed."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, NamedTuple
 
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import PARTS, atomic_write, make_folder
+from amvnet.written import folder_lock, hold, is_held
 
-PATTERN = ".unfinished-*.jsonl"  # one file per process; a run that ends removes them
+JOURNAL = ".amvnet-journal.jsonl"  # of a run that has ended
+PATTERN = ".unfinished-*.jsonl"  # one file per process, until the run ends
+
+
+class Entry(NamedTuple):
+    """A scan that is done.
+
+    Attributes:
+        scan: its name.
+        first: a digest of the names of the first scans of its recording, by which the scan is
+            normalised; empty if it is not.
+        sensor: a title of what recorded it.
+        points: how many of its points are valid.
+        uncertain: how many are uncertain.
+    """
+
+    scan: str
+    first: str
+    sensor: str
+    points: int
+    uncertain: int
 
 
 class Journal:
-    """A file with the names of the scans that are done, each added after its output.
+    """A file of the scans that are done, each added after its output.
+
+    A line is lost at most if the process is killed. After a power cut, the last lines may be
+    missing, and the last one torn: these scans are done again. The output of a scan that the
+    journal has is on the disk, because `atomic_write` puts it there before.
 
     Args:
         folder: of the output.
         settings: what the output depends on, as JSON types.
-        resume: whether to continue an interrupted run with the same settings; else start over.
+        done: entries of an earlier run that stay valid, from `read_journals`.
         processes: those that share the run.
 
     Raises:
-        InputError: if the interrupted run had other settings.
+        InputError: if another run is writing into the folder.
     """
 
     def __init__(
         self,
         folder: Path,
         settings: Mapping[str, Any],
-        resume: bool = False,
+        done: Iterable[Entry] = (),
         processes: Processes = ALONE,
     ) -> None:
         self.folder = folder
         self.processes = processes
         self.path = folder / PATTERN.replace("*", str(processes.rank))
-        self.done = self._read_all(dict(settings)) if resume else set()
-        processes.wait()  # until all have read, before the first one removes files
+        self._settings = dict(settings)
+        _check_alone(folder)
+        processes.wait()  # until all have read the earlier journals, before they are replaced
 
         make_folder(folder)
         if processes.first:
-            self._remove_old_files()
+            with folder_lock(folder):
+                _check_alone(folder)
+                self._file = self._begin(done)
+                self._remove_old_files()
         processes.wait()
+        if not processes.first:
+            self._file = self._begin()
 
-        with atomic_write(self.path) as part, part.open("w") as file:
-            file.write(_to_line(dict(settings)))
-            for name in sorted(self.done):
-                file.write(_to_line(name))
-
-    def _read_all(self, settings: dict[str, Any]) -> set[str]:
-        """Return the names that the interrupted run's journals hold, if it had these settings."""
-        done: set[str] = set()
-        for path in self.folder.glob(PATTERN):
-            earlier_settings, names = _read(path)
-            if earlier_settings != settings:
-                changed = ", ".join(_changed_keys(earlier_settings, settings))
-                raise InputError(
-                    f"{self.folder}: expected the settings of the interrupted run, found another "
-                    f"{changed}; resume it with the same, or leave --resume out to start over"
-                )
-
-            done.update(names)
-        return done
+    def _begin(self, done: Iterable[Entry] = ()) -> IO[str]:
+        """Write the beginning of the journal, and hold it until the run ends."""
+        _write(self.path, self._settings, done)
+        file = self.path.open("a")
+        hold(file)
+        return file
 
     def _remove_old_files(self) -> None:
-        """Remove the journals of an interrupted run, and the files that it did not finish."""
-        journals = list(self.folder.glob(PATTERN))
-        if journals:
-            for path in [*journals, *self.folder.rglob(PARTS)]:
-                path.unlink()
+        """Remove the journals of earlier runs, and the files that these did not finish."""
+        (self.folder / JOURNAL).unlink(missing_ok=True)
+        journals = [path for path in self.folder.glob(PATTERN) if path != self.path]
+        for path in [*journals, *self.folder.rglob(PARTS)]:
+            path.unlink()
 
-    def add(self, name: str) -> None:
+    def add(self, entry: Entry) -> None:
         """Write down that a scan is done."""
-        with self.path.open("a") as file:
-            file.write(_to_line(name))
+        self._file.write(_to_line(entry))
+        self._file.flush()
 
-    def close(self) -> None:
-        """Remove the journal at the end of the run."""
+    def close(self) -> dict[str, Entry]:
+        """End the run of all processes; return all entries by the name of the scan.
+
+        The journals become one, by which a later run leaves out what is done.
+        """
+        self._file.close()
         self.processes.wait()
-        self.path.unlink(missing_ok=True)
+        entries: dict[str, Entry] = {}
+        for path in self.folder.glob(PATTERN):
+            entries.update({entry.scan: entry for entry in _read(path)[1]})
+        self.processes.wait()  # until all have read
+
+        if self.processes.first:
+            if entries:
+                _write(self.folder / JOURNAL, self._settings, entries.values())
+            for path in self.folder.glob(PATTERN):
+                path.unlink()
+        self.processes.wait()
+        return entries
+
+
+def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]:
+    """Return what an earlier run into a folder has done, by the name of the scan.
+
+    Raises:
+        InputError: if that run had other settings.
+    """
+    done: dict[str, Entry] = {}
+    for path in [folder / JOURNAL, *folder.glob(PATTERN)]:
+        if not path.is_file():
+            continue
+        earlier_settings, entries = _read(path)
+        if earlier_settings != settings:
+            changed = ", ".join(_changed_keys(earlier_settings, dict(settings)))
+            raise InputError(
+                f"{folder}: expected the settings of the earlier run, found another {changed}; "
+                "resume it with the same, or leave --resume out to start over"
+            )
+        done.update({entry.scan: entry for entry in entries})
+    return done
+
+
+def _check_alone(folder: Path) -> None:
+    """Raise InputError if another run is writing into the folder."""
+    if any(is_held(path) for path in folder.glob(PATTERN)):
+        raise InputError(
+            f"{folder}: expected a folder for this run alone, found another run that is writing "
+            "into it; wait until it ends, or change --out"
+        )
+
+
+def _write(path: Path, settings: Mapping[str, Any], entries: Iterable[Entry]) -> None:
+    with atomic_write(path) as part, part.open("w") as file:
+        file.write(_to_line(settings))
+        for entry in entries:
+            file.write(_to_line(entry))
 
 
 def _to_line(value: Any) -> str:
     return f"{json.dumps(value)}\n"
 
 
-def _read(path: Path) -> tuple[Any, list[str]]:
-    """Return the settings and the names in a journal; None for settings that cannot be read."""
+def _read(path: Path) -> tuple[Any, list[Entry]]:
+    """Return the settings and the entries in a journal; None for settings that cannot be read."""
     lines = path.read_text(errors="replace").splitlines(keepends=True)
     settings = _from_line(lines[0]) if lines else None
 
-    names = []
+    entries = []
     for line in lines[1:]:
-        name = _from_line(line)
-        if isinstance(name, str):
-            names.append(name)
-    return settings, names
+        values = _from_line(line)
+        if isinstance(values, list) and list(map(type, values)) == [str, str, str, int, int]:
+            entries.append(Entry(*values))
+    return settings, entries
 
 
 def _from_line(line: str) -> Any:
-    """Return the value in a line; None if a killed process left it unfinished, or it is corrupt."""
+    """Return the value in a line; None if it was not written to its end, or is corrupt."""
     if not line.endswith("\n"):
         return None
     try:
         return json.loads(line)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
 
 

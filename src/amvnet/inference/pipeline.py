@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,16 +23,18 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError, SomeBroken
 from amvnet.files import atomic_write, inside
-from amvnet.inference.inputs import InputScan, LabelFormat, Labels, LoadedScan
-from amvnet.inference.journal import Journal
+from amvnet.inference.journal import Entry, Journal, read_journals
+from amvnet.inference.listing import InputScan
+from amvnet.inference.reading import LoadedScan
 from amvnet.inference.scan_stream import AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
+from amvnet.sensors.measure import MEASURED
 from amvnet.written import WrittenFiles
 
 UNCERTAIN_ENDING = ".uncertain.npy"
-Result = Segmentation | InputError
+DIGITS = 16  # of a digest in the journal
 
 
 @dataclass(frozen=True)
@@ -78,7 +83,7 @@ class ExecutionOptions:
         at_once: on a CPU, scans that are segmented at the same time, each with its share of the
             threads. None means as many as there are threads, at most 4; 1 on a GPU, or with an
             engine other than torch, which shares out the threads itself.
-        resume: leave out the scans that an interrupted run into the same folder has done.
+        resume: leave out the scans that an earlier run into the same folder has done.
         processes: those that share the scans.
 
     Raises:
@@ -98,39 +103,242 @@ class ExecutionOptions:
                 )
 
 
-class SegmentScans(Protocol):
-    """Segments scans that have been read."""
+# Segments scans in memory, given where each is from; an InputError says that one is broken.
+Segment = Callable[[Sequence[InputScan], Sequence[Scan]], list[Segmentation]]
+# A scan that was read and segmented, or why it could not be.
+Outcome = tuple[InputScan, LoadedScan | None, Segmentation | InputError]
 
-    def __call__(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
-        """Return the results in the order of the scans.
+
+@dataclass(frozen=True)
+class Pipeline:
+    """Reads, segments and writes scans at the same time.
+
+    Attributes:
+        scans: the scans, for all processes together.
+        segment: segments scans that have been read.
+        output: what is written, and where.
+        taxonomy: the classes of the labels.
+        execution: how many scans at a time; an `at_once` of None means 1 here.
+    """
+
+    scans: Sequence[InputScan]
+    segment: Segment
+    output: OutputOptions
+    taxonomy: Taxonomy
+    execution: ExecutionOptions = ExecutionOptions()
+
+    def run(
+        self, settings: Mapping[str, Any], progress: Progress = no_progress
+    ) -> tuple[list[Entry], list[str]]:
+        """Segment the scans, and write the results.
 
         Args:
-            inputs: where each scan is from.
-            scans: the same scans, in memory.
+            settings: what the labels depend on, as JSON types; an earlier run is resumed only with
+                the same settings.
+
+        Returns:
+            The entries of the scans that are done, with those of the run that is resumed; and a
+            line for each scan that is broken.
 
         Raises:
-            InputError: if one of them cannot be segmented.
+            InputError: if two scans would have the same files, an output folder is that of a scan,
+                a file of the user would be replaced, or another run is writing into the folder.
         """
+        is_new = not self.output.folder.exists()
+        written = self._check_output()
+        done = self._read_done(settings, written)
+        remaining = [scan for scan in self.scans if _key(scan) not in done]
+
+        journal = self._begin(settings, done, written, remaining)
+        faults = self._process(remaining, journal, progress)
+        entries = self._finish(journal, written, remaining, is_new)
+        processes = self.execution.processes
+        return entries, list(chain.from_iterable(processes.gather(faults)))
+
+    def _check_output(self) -> WrittenFiles:
+        """Check that the output replaces no file of the user; return the record of the folder's.
+
+        Raises:
+            InputError: if it does, two scans have the same files, or a file would lie outside the
+                folder.
+        """
+        paths = self._paths_of(self.scans)
+        for path in paths:
+            inside(self.output.folder, path)
+        _check_names(self.scans)
+        for scan in self.scans:
+            _check_folder(scan, self.output)
+
+        written = WrittenFiles(self.output.folder)
+        if not self.output.overwrite:
+            written.check(paths)
+        return written
+
+    def _read_done(self, settings: Mapping[str, Any], written: WrittenFiles) -> dict[str, Entry]:
+        """Return what an earlier run has done that is as this run would do it.
+
+        The files have to be there, as they were written, and the scan has to be normalised by the
+        same scans: the first ones of its recording.
+        """
+        if not self.execution.resume:
+            return {}
+        earlier = read_journals(self.output.folder, settings)
+        done = dict(earlier)
+        for scan in self.scans:
+            entry = earlier.get(_key(scan))
+            if entry is None:
+                continue
+            paths = self.output.paths_of(scan)
+            is_there = all((self.output.folder / path).is_file() for path in paths)
+            is_same = entry.first == self._first_of[scan.source]
+            if not is_there or not is_same or any(map(written.is_foreign, paths)):
+                del done[entry.scan]
+        return done
+
+    @cached_property
+    def _first_of(self) -> dict[str, str]:
+        """A digest of the names of the first scans by recording; empty if none is measured."""
+        names: dict[str, list[str]] = {}
+        for scan in self.scans:
+            first = names.setdefault(scan.source, [])
+            if scan.is_normalised and len(first) < MEASURED:
+                first.append(scan.name)
+        digests = {}
+        for source, first in names.items():
+            digest = hashlib.sha256(json.dumps(first).encode()).hexdigest()
+            digests[source] = digest[:DIGITS] if first else ""
+        return digests
+
+    def _begin(
+        self,
+        settings: Mapping[str, Any],
+        done: Mapping[str, Entry],
+        written: WrittenFiles,
+        remaining: Sequence[InputScan],
+    ) -> Journal:
+        """Begin the journal, and claim the files that will be written."""
+        processes = self.execution.processes
+        journal = Journal(self.output.folder, settings, done.values(), processes)
+        if processes.first:
+            written.claim(self._paths_of(remaining))
+        processes.wait()  # so that no file is written before it is claimed
+        return journal
+
+    def _process(
+        self, remaining: Sequence[InputScan], journal: Journal, progress: Progress
+    ) -> list[str]:
+        """Do this process's share of the scans; return a line for each that is broken."""
+        share = self.execution.processes.share(remaining)
+        faults = []
+        for count, outcome in enumerate(self.stream(share)):
+            progress(count, len(share))
+            if isinstance(outcome, Entry):
+                journal.add(outcome)
+            else:
+                faults.append(outcome)
+        progress(len(share), len(share))
+        return faults
+
+    def _finish(
+        self,
+        journal: Journal,
+        written: WrittenFiles,
+        remaining: Sequence[InputScan],
+        is_new: bool,
+    ) -> list[Entry]:
+        """End the journal and list the files; return the entries of this run's scans."""
+        entries = journal.close()
+        if self.execution.processes.first:
+            written.finish(self._paths_of(remaining))
+            if is_new:
+                with suppress(OSError):  # stays unless all scans were broken
+                    self.output.folder.rmdir()
+        return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries]
+
+    def _paths_of(self, scans: Sequence[InputScan]) -> list[Path]:
+        """Return the paths of the files of scans, relative to the folder."""
+        return list(chain.from_iterable(map(self.output.paths_of, scans)))
+
+    def stream(self, scans: Sequence[InputScan]) -> Iterator[Entry | str]:
+        """Read, segment and write scans, of which only a few are in memory at a time.
+
+        Yields:
+            The entry of each scan when its files are written, in order; or of a scan that is
+            broken, a line that says why, which may come before its turn.
+        """
+        groups = stream_groups(
+            scans,
+            load=lambda scan: scan.load(),
+            compute=self._segment_group,
+            batch=self.execution.batch,
+            at_once=self.execution.at_once or 1,
+        )
+        writing = deque[Future[Entry]]()
+        # Reading, computing and writing go on at the same time, each on other scans.
+        with closing(groups), ThreadPoolExecutor(1) as writer:
+            for scan, loaded, result in chain.from_iterable(groups):
+                if loaded is None or isinstance(result, InputError):
+                    yield str(result)
+                    continue
+                writing.append(writer.submit(self._write, scan, loaded, result))
+                # Those that are written are yielded at once, so that the journal has them.
+                while writing and (len(writing) > AHEAD or writing[0].done()):
+                    yield writing.popleft().result()
+            while writing:
+                yield writing.popleft().result()
+
+    def _segment_group(
+        self, group: Sequence[tuple[InputScan, Future[LoadedScan]]]
+    ) -> list[Outcome]:
+        """Wait for scans that are being read, and segment them together.
+
+        Scans that cannot be read come first in the result.
+        """
+        outcomes: list[Outcome] = []
+        loaded: list[tuple[InputScan, LoadedScan]] = []
+        for scan, load in group:
+            try:
+                loaded.append((scan, load.result()))
+            except InputError as error:
+                outcomes.append((scan, None, error))
+        return outcomes + self._segment_loaded(loaded)
+
+    def _segment_loaded(self, loaded: Sequence[tuple[InputScan, LoadedScan]]) -> list[Outcome]:
+        """Segment scans together; if that fails, one by one to find those that are broken."""
+        if not loaded:
+            return []
+        try:
+            results = self.segment([scan for scan, _ in loaded], [item.scan for _, item in loaded])
+            return [(*pair, result) for pair, result in zip(loaded, results, strict=True)]
+        except InputError as error:
+            if len(loaded) == 1:
+                return [(loaded[0][0], None, error)]
+        return list(chain.from_iterable(self._segment_loaded([pair]) for pair in loaded))
+
+    def _write(self, scan: InputScan, loaded: LoadedScan, result: Segmentation) -> Entry:
+        """Write the files of a scan, the labels last: where they are, the others are too."""
+        folder = self.output.folder
+        scores_path = inside(folder, scan.scores_path)
+        if self.output.scores:
+            write_scores(scores_path, result)
+        if self.output.uncertain:
+            write_uncertain(scores_path.with_suffix(UNCERTAIN_ENDING), result.uncertain)
+
+        has_two_networks = result.rv is not None and result.bev is not None
+        scan.write_labels(
+            folder,
+            loaded,
+            result.labels,
+            kind=self.output.kind,
+            taxonomy=self.taxonomy,
+            uncertain=result.uncertain if has_two_networks else None,
+        )
+        points = int(np.count_nonzero(loaded.scan.valid))
+        uncertain = int(np.count_nonzero(result.uncertain))
+        return Entry(_key(scan), self._first_of[scan.source], loaded.sensor, points, uncertain)
 
 
-@dataclass(frozen=True)
-class Segmented:
-    """A scan that waits to be written; of its points, only what the writing needs is kept."""
-
-    scan: InputScan
-    file_xyz: np.ndarray | None
-    result: Segmentation
-
-
-@dataclass(frozen=True)
-class Broken:
-    """A scan that could not be read or segmented, and why: one line."""
-
-    scan: InputScan
-    fault: str
-
-
-def _raise_faults(faults: list[str], total: int) -> None:
+def check_faults(faults: Sequence[str], total: int) -> None:
     """Raise SomeBroken if some of `total` scans are broken, InputError if all are."""
     if faults and len(faults) == total:
         others = len(faults) - 1
@@ -139,7 +347,7 @@ def _raise_faults(faults: list[str], total: int) -> None:
     if faults:
         raise SomeBroken(
             f"{total - len(faults)} of {total} scans are segmented, {len(faults)} are broken",
-            faults,
+            list(faults),
         )
 
 
@@ -168,170 +376,9 @@ def _check_folder(scan: InputScan, output: OutputOptions) -> None:
         )
 
 
-@dataclass(frozen=True)
-class Pipeline:
-    """Reads, segments and writes scans at the same time.
-
-    Attributes:
-        scans: the scans, for all processes together.
-        segment: segments scans that have been read.
-        output: what is written, and where.
-        taxonomy: the classes of the labels.
-        execution: how many scans at a time; an `at_once` of None means 1 here.
-    """
-
-    scans: Sequence[InputScan]
-    segment: SegmentScans
-    output: OutputOptions
-    taxonomy: Taxonomy
-    execution: ExecutionOptions = ExecutionOptions()
-
-    def run(self, settings: Mapping[str, Any], progress: Progress = no_progress) -> int:
-        """Segment the scans, and write the results.
-
-        Args:
-            settings: what the labels depend on, as JSON types; an interrupted run is resumed only
-                with the same settings.
-
-        Returns:
-            The number of label files of these scans, with those of the run that is resumed.
-
-        Raises:
-            InputError: if two scans would have the same files, an output folder is that of a scan,
-                a file of the user would be replaced, or all scans are broken.
-            SomeBroken: at the end, if some of several scans are broken.
-        """
-        processes = self.execution.processes
-        paths = list(chain.from_iterable(map(self.output.paths_of, self.scans)))
-        for path in paths:
-            inside(self.output.folder, path)
-        _check_names(self.scans)
-        for scan in self.scans:
-            _check_folder(scan, self.output)
-
-        written = WrittenFiles(self.output.folder)
-        if not self.output.overwrite:
-            written.check(paths)
-
-        is_new = not self.output.folder.exists()
-        journal = Journal(self.output.folder, settings, self.execution.resume, processes)
-        if processes.first:
-            written.claim(paths)
-        processes.wait()  # so that no file is written before it is claimed
-
-        share = processes.share(self.scans)
-        remaining = [scan for scan in share if str(scan.scores_path) not in journal.done]
-
-        faults: list[str] = []
-        for done, (scan, fault) in enumerate(self.stream(remaining)):
-            progress(done, len(remaining))
-            if fault is None:
-                journal.add(str(scan.scores_path))
-            else:
-                faults.append(fault)
-        progress(len(remaining), len(remaining))
-        journal.close()
-        if processes.first:
-            written.finish(paths)
-            if is_new:
-                with suppress(OSError):  # stays unless all scans were broken
-                    self.output.folder.rmdir()
-
-        all_faults = list(chain.from_iterable(processes.gather(faults)))
-        _raise_faults(all_faults, len(self.scans))
-        return len(self.scans)
-
-    def stream(self, scans: Sequence[InputScan]) -> Iterator[tuple[InputScan, str | None]]:
-        """Read, segment and write scans, of which only a few are in memory at a time.
-
-        Yields:
-            Each scan and None when its files are written, in order; or a scan that is broken and a
-            line that says why, which may come before its turn.
-        """
-        groups = stream_groups(
-            scans,
-            load=lambda scan: scan.load(),
-            compute=self._segment_group,
-            batch=self.execution.batch,
-            at_once=self.execution.at_once or 1,
-        )
-        writing = deque[tuple[InputScan, Future[None]]]()
-        # Reading, computing and writing go on at the same time, each on other scans.
-        with closing(groups), ThreadPoolExecutor(1) as writer:
-            for outcome in chain.from_iterable(groups):
-                if isinstance(outcome, Broken):
-                    yield outcome.scan, outcome.fault
-                    continue
-                writing.append((outcome.scan, writer.submit(self._write, outcome)))
-                # Those that are written are yielded at once, so that the journal has them.
-                while writing and (len(writing) > AHEAD or writing[0][1].done()):
-                    yield _wait(*writing.popleft())
-            while writing:
-                yield _wait(*writing.popleft())
-
-    def _segment_group(
-        self, group: Sequence[tuple[InputScan, Future[LoadedScan]]]
-    ) -> list[Segmented | Broken]:
-        """Wait for scans that are being read, and segment them together.
-
-        Scans that cannot be read come first in the result.
-        """
-        outcomes: list[Segmented | Broken] = []
-        scans: list[InputScan] = []
-        loaded: list[LoadedScan] = []
-        for scan, load in group:
-            try:
-                loaded.append(load.result())
-                scans.append(scan)
-            except InputError as error:
-                outcomes.append(Broken(scan, str(error)))
-
-        results = self._segment_scans(scans, [item.scan for item in loaded])
-        for scan, scan_loaded, result in zip(scans, loaded, results, strict=True):
-            if isinstance(result, InputError):
-                outcomes.append(Broken(scan, str(result)))
-            else:
-                outcomes.append(Segmented(scan, scan_loaded.file_xyz, result))
-        return outcomes
-
-    def _segment_scans(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Result]:
-        """Segment scans together; if that fails, one by one to find those that are broken."""
-        if not scans:
-            return []
-        try:
-            return list(self.segment(inputs, scans))
-        except InputError as error:
-            if len(scans) == 1:
-                return [error]
-
-        results: list[Result] = []
-        for scan_input, scan in zip(inputs, scans, strict=True):
-            results += self._segment_scans([scan_input], [scan])
-        return results
-
-    def _write(self, segmented: Segmented) -> None:
-        """Write the files of a scan, the labels last: where they are, the others are too."""
-        result = segmented.result
-        folder = self.output.folder
-        scores_path = inside(folder, segmented.scan.scores_path)
-
-        if self.output.scores:
-            write_scores(scores_path, result)
-        if self.output.uncertain:
-            write_uncertain(scores_path.with_suffix(UNCERTAIN_ENDING), result.uncertain)
-
-        has_two_networks = result.rv is not None and result.bev is not None
-        segmented.scan.write_labels(
-            folder,
-            LabelFormat(self.output.kind, self.taxonomy),
-            Labels(result.labels, result.uncertain if has_two_networks else None),
-            segmented.file_xyz,
-        )
-
-
-def _wait(scan: InputScan, writing: Future[None]) -> tuple[InputScan, None]:
-    writing.result()  # raises the exception of a failed write
-    return scan, None
+def _key(scan: InputScan) -> str:
+    """Return the name of a scan in the journal."""
+    return str(scan.scores_path)
 
 
 def write_scores(path: Path, result: Segmentation) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -9,29 +10,30 @@ from typing import Any
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.bags import Bag
-from amvnet.data.formats.detect import BY_ENDING_OR_FOLDER, ending_of
+from amvnet.data.formats.detect import BY_ENDING_OR_FOLDER
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.data.labels import label_bags
-from amvnet.distributed import Processes
-from amvnet.errors import InputError, SomeBroken
-from amvnet.inference.certainty import UncertainCount, Verdict
-from amvnet.inference.inputs import (
-    DatasetScan,
-    FileScan,
-    InputScan,
-    ScanOptions,
-    adapter_for,
-    open_inputs,
+from amvnet.errors import InputError
+from amvnet.inference.certainty import Verdict
+from amvnet.inference.journal import Entry
+from amvnet.inference.listing import DatasetScan, FileScan, InputScan, ScanOptions, list_inputs
+from amvnet.inference.pipeline import (
+    ExecutionOptions,
+    OutputOptions,
+    Pipeline,
+    Segment,
+    check_faults,
 )
-from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
+from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmentation import Segmentation
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
-from amvnet.sensors.adapt import ScanAdapter
+from amvnet.sensors.lidars import Sensor
 from amvnet.written import WrittenFiles
 
+NAMED = 10  # recordings with doubtful labels, each in a line
 # What to try if the labels are doubtful.
 ADVICE = (
     "check what was assumed, and try --height, --axes, --rotate or --intensity-scale, "
@@ -45,7 +47,7 @@ def predict(
     output: OutputOptions,
     options: ScanOptions = ScanOptions(),
     execution: ExecutionOptions = ExecutionOptions(),
-    adapter: ScanAdapter | None = None,
+    sensor: Sensor | None = None,
     classes: ClassMap | None = None,
     progress: Progress = no_progress,
     say: Say = say_nothing,
@@ -58,10 +60,10 @@ def predict(
         output: what is written, and where.
         options: which scans of the inputs to segment.
         execution: how many scans at a time, and by which processes.
-        adapter: adapts scan files to what the weights expect; None measures everything about the
-            sensor and says nothing.
+        sensor: what is known of the sensor of scan files; the rest is measured.
         classes: maps the classes of the weights to those that are written; None writes these.
-        say: is told at the end how sure the labels are, if there are two networks.
+        say: is told what was assumed of the sensor, and at the end how sure the labels are, if
+            there are two networks.
 
     Returns:
         The number of label files of these scans, with those of the run that is resumed.
@@ -72,44 +74,33 @@ def predict(
             write; at the end, if every scan is broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
-    if output.uncertain and not METHODS[segmenter.method].has_two_networks:
+    method = METHODS[segmenter.method]
+    if output.uncertain and not method.has_two_networks:
         raise InputError(
             f"expected a method of two networks for --uncertain, found {segmenter.method}; "
             "use amvnet"
         )
 
-    adapter = adapter or adapter_for(segmenter.weights)
-    opened = open_inputs(inputs, options, segmenter.taxonomy, adapter)
-    scans = opened.scans
-    taxonomy = segmenter.taxonomy
+    normaliser = normaliser_for(segmenter.weights, sensor, say)
+    scans, taxonomy = list_inputs(inputs, options, segmenter.taxonomy, normaliser, say)
+    writes_bags = output.kind in label_bags.KINDS
+    if writes_bags:
+        _check_bags(scans, output)
+
+    settings = _settings(segmenter, output, normaliser.sensor, options, classes)
     if classes is not None:
         scans = [_with_classes(scan, classes) for scan in scans]
         taxonomy = classes.target
-
-    if output.kind in label_bags.KINDS:
-        _check_bags(opened.scans, output)
-
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
-    segment = NetworkSegmentation(segmenter, classes)
-    pipeline = Pipeline(scans, segment, output, taxonomy, execution)
-    settings = _settings(segmenter, output, adapter)
-    if options.layout != UNKNOWN:
-        settings["layout"] = repr(options.layout)
-    if classes is not None:
-        settings["classes"] = repr(classes)
+    segment = segment_by(segmenter, classes)
+    entries, faults = Pipeline(scans, segment, output, taxonomy, execution).run(settings, progress)
 
-    faults: SomeBroken | None = None
-    try:
-        written = pipeline.run(settings, progress)
-    except SomeBroken as error:  # the others are written
-        faults = error
-    if output.kind in label_bags.KINDS and execution.processes.first:
-        _write_bags(opened.scans, output)
-
-    _report(segment, execution.processes, say)
-    if faults is not None:
-        raise faults
-    return written
+    if writes_bags and execution.processes.first:
+        _write_bags(scans, output)
+    if method.has_two_networks:
+        _report(entries, segmenter.weights.usual_uncertain, say)
+    check_faults(faults, len(scans))
+    return len(scans)
 
 
 def _with_classes(scan: InputScan, classes: ClassMap) -> InputScan:
@@ -131,7 +122,7 @@ def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
     for scan in scans:
         if not isinstance(scan, FileScan):
             continue
-        if BY_ENDING_OR_FOLDER[ending_of(scan.path)].open is not Bag:
+        if BY_ENDING_OR_FOLDER[scan.scan.ending].open is not Bag:
             raise InputError(
                 f"{scan.path}: expected a bag for --format {output.kind}, found another file; "
                 "choose another format, such as ply"
@@ -156,54 +147,66 @@ def _write_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
     written.finish(label_bags.join_parts(output.folder, names, output.kind))
 
 
-class NetworkSegmentation:
-    """Segments scans of the inputs; those that are adapted to the weights, by their rings.
+def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment:
+    """Return what segments scans of the inputs; those that are normalised, by their rings.
 
     Args:
         segmenter: labels the scans.
         classes: maps the labels to other classes; None leaves them.
     """
+    by_ring = segmenter.by_ring()
+    table = None if classes is None else classes.table(segmenter.taxonomy)
 
-    def __init__(self, segmenter: Segmenter, classes: ClassMap | None = None) -> None:
-        self.segmenter = segmenter
-        self._table = None if classes is None else classes.table(segmenter.taxonomy)
-        self.by_ring = segmenter.by_ring()
-        self.counted = UncertainCount()
-
-    def __call__(self, inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
         results: list[Segmentation] = []
-
         pairs = zip(inputs, scans, strict=True)
-        for is_adapted, group in groupby(pairs, key=lambda pair: pair[0].is_adapted):
-            segmenter = self.by_ring if is_adapted else self.segmenter
-            results += segmenter.many([scan for _, scan in group])
-
-        for result in results:
-            self.counted.add(result.labels, result.uncertain)
-        if self._table is None:
+        for is_normalised, group in groupby(pairs, key=lambda pair: pair[0].is_normalised):
+            fitting = by_ring if is_normalised else segmenter
+            results += fitting.many([scan for _, scan in group])
+        if table is None:
             return results
-        return [replace(result, labels=self._table[result.labels]) for result in results]
+        return [replace(result, labels=table[result.labels]) for result in results]
+
+    return segment
 
 
-def _report(segment: NetworkSegmentation, processes: Processes, say: Say) -> None:
-    """Say how sure the labels of all processes are, and what to try if they are doubtful."""
-    shares = processes.gather((segment.counted.points, segment.counted.uncertain))
-    points = sum(points for points, _ in shares)
-    uncertain = sum(uncertain for _, uncertain in shares)
-    if not points or not METHODS[segment.segmenter.method].has_two_networks:
+def _report(entries: Sequence[Entry], usual: float, say: Say) -> None:
+    """Say how sure the labels are, which recordings have doubtful ones, and what to try."""
+    points: Counter[str] = Counter()
+    uncertain: Counter[str] = Counter()
+    for entry in entries:
+        points[entry.sensor] += entry.points
+        uncertain[entry.sensor] += entry.uncertain
+    if not points.total():
         return
 
-    verdict = Verdict(uncertain / points, segment.segmenter.weights.usual_uncertain)
-    say(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else str(verdict))
+    verdicts = {sensor: Verdict(uncertain[sensor] / points[sensor], usual) for sensor in +points}
+    doubtful = {sensor: verdict for sensor, verdict in verdicts.items() if verdict.is_doubtful}
+    verdict = Verdict(uncertain.total() / points.total(), usual)
+    if len(verdicts) == 1 or not doubtful:
+        say(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else verdict.shares)
+        return
+
+    say(verdict.shares)
+    for sensor in list(doubtful)[:NAMED]:
+        say(f"warning: {sensor}: {doubtful[sensor]}")
+    others = len(doubtful) - NAMED
+    say(f"warning: {f'as in {others} more; ' if others > 0 else ''}{ADVICE}")
 
 
-def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter) -> dict[str, Any]:
+def _settings(
+    segmenter: Segmenter,
+    output: OutputOptions,
+    sensor: Sensor,
+    options: ScanOptions,
+    classes: ClassMap | None,
+) -> dict[str, Any]:
     """Return what the written files depend on, as JSON types."""
     weights = segmenter.weights
     settings: dict[str, Any] = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": segmenter.method,
-        "sensor": repr(adapter.sensor),
+        "sensor": repr(sensor),
         "scores": output.scores,
         "uncertain": output.uncertain,
         "format": output.kind,
@@ -211,8 +214,16 @@ def _settings(segmenter: Segmenter, output: OutputOptions, adapter: ScanAdapter)
 
     if segmenter.precision != "float32":
         settings["precision"] = segmenter.precision
+    if segmenter.engine == "int8":  # no other engine changes labels
+        settings["engine"] = segmenter.engine
     if segmenter.tta is not None:
         settings["tta"] = segmenter.tta
     if segmenter.tau is not None:
         settings["tau"] = segmenter.tau
+    if options.topic is not None:
+        settings["topic"] = options.topic
+    if options.layout != UNKNOWN:
+        settings["layout"] = repr(options.layout)
+    if classes is not None:
+        settings["classes"] = repr(classes)
     return settings

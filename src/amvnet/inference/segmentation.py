@@ -120,7 +120,7 @@ class Segmentation:
 
     @property
     def assumed(self) -> str:
-        """What was assumed of the sensor to adapt the scan of a file; else empty."""
+        """What was assumed of the sensor to normalise the scan of a file; else empty."""
         return "" if self.origin is None else self.origin.assumed
 
     def save(self, path: Path | str) -> Path:

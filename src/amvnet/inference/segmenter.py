@@ -15,7 +15,8 @@ from torch import Tensor
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.inputs import InputScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
+from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmentation import (
     Origin,
     Segmentation,
@@ -160,7 +161,7 @@ class Segmenter:
 
         Args:
             points: (N, 4) x, y, z in metres and intensity in [0, 1]; or a `Scan`; or the path of a
-                scan file, which is adapted to the weights as `amvnet predict` does.
+                scan file, which is normalised to the weights as `amvnet predict` does.
 
         Raises:
             InputError: if there is no valid point, more than a few intensities are out of range,
@@ -201,7 +202,7 @@ class Segmenter:
     def each(self, path: Path | str, topic: str | None = None) -> Iterator[Segmentation]:
         """Segment the scans of a file, a bag, a folder of these, or a dataset, one after the other.
 
-        Scans of files and bags are adapted to the weights as `amvnet predict` does; all of one
+        Scans of files and bags are normalised to the weights as `amvnet predict` does; all of one
         folder or bag alike.
 
         Args:
@@ -222,14 +223,15 @@ class Segmenter:
     ) -> tuple[Sequence[InputScan], list[str]]:
         """Return the scans of a path, and a list that receives what is assumed of them."""
         assumed: list[str] = []
-        adapter = adapter_for(self.weights, say=assumed.append)
-        opened = open_inputs([str(path)], ScanOptions(topic=topic), self.taxonomy, adapter)
-        return opened.scans, assumed
+        normaliser = normaliser_for(self.weights, say=assumed.append)
+        options = ScanOptions(topic=topic)
+        scans, _ = list_inputs([str(path)], options, self.taxonomy, normaliser)
+        return scans, assumed
 
     def _segment_input(self, scan: InputScan, assumed: list[str]) -> Segmentation:
         """Read and segment a scan of `_open`."""
         loaded = scan.load(labels=True)
-        segmenter = self.by_ring() if scan.is_adapted else self
+        segmenter = self.by_ring() if scan.is_normalised else self
         result = segmenter(loaded.scan)
 
         assert result.origin is not None
@@ -250,8 +252,8 @@ class Segmenter:
         return segmenter
 
     def for_dataset(self, dataset: Dataset) -> Segmenter:
-        """Return the segmenter for the scans of a dataset: `by_ring` if these are adapted."""
-        return self.by_ring() if dataset.is_adapted else self
+        """Return the segmenter for the scans of a dataset: `by_ring` if these are normalised."""
+        return self.by_ring() if dataset.is_normalised else self
 
     def labels_by_method(
         self, scan: Scan, methods: Sequence[str] = PAPER_METHODS

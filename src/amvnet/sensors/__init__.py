@@ -1,1 +1,1 @@
-"""LiDAR sensors: known ones, measured ones, and scans adapted to the weights."""
+"""LiDAR sensors: known ones, measured ones, and scans normalised to the weights."""

@@ -1,151 +1,281 @@
-"""Measure a LiDAR by one of its scans: lasers, field of view, height over the ground."""
+"""Measure the sensor of a recording: its frame, lasers, field of view, height and intensities."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
-from amvnet.sensors.ground import MIN_DISTANCE, ground_height
+from amvnet.data.formats.cloud import Cloud
+from amvnet.errors import InputError
+from amvnet.scan import Scan
+from amvnet.sensors.frame import STEADY_TILT, Frame, find_frame, median_frame
+from amvnet.sensors.intensity import are_of_one_range, quantiles_of
+from amvnet.sensors.lasers import MEASURES, SensorGeometry, field_of_view, measure_lasers
+from amvnet.sensors.lidars import Sensor
 
-MIN_POINTS = 100  # fewer say nothing about the sensor
-FOV_PERCENTILES = (0.5, 99.5)  # of the elevations: the ends of the field of view
-MIN_BEAMS = 4
-MAX_BEAMS = 256
+MEASURED = 5  # scans of a recording that are measured; later ones get the median of these
+STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
+SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
+LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
 
-# Lasers counted in a file that stores one laser after the other
-FULL_TURN = 350.0  # degrees: a narrower scan is only part of a turn
-JUMP = 0.7  # of the width of a part of a turn: if the azimuth jumps by more, a new laser begins
-STEP = 0.05  # of the width: in an ordered file, most steps of the azimuth are smaller
-ORDERED_SHARE = 0.9  # of the steps that must be that small
-
-# Lasers counted as peaks in the histogram of the elevations
-BIN = 0.02  # degrees
-PEAK_WINDOW = 1.5  # degrees on each side, in which a bin is compared with the highest one
-PEAK_HEIGHT = 0.15  # of that highest bin: fuller bins belong to peaks
-MIN_PEAK_POINTS = 0.9  # share of the points that lie in peaks
-MAX_PEAK_WIDTH = 0.1  # share of the field of view that peaks cover; if it is more, they are blurred
-SECTORS = 12  # of the turn
-MIN_SECTOR_PEAKS = 0.75  # share of all peaks that a good sector must have
+# A scan is from a known sensor if some of its points differ by less. If not, all points decide.
+QUICK_STEP = 7  # only one of so many points; no multiple of it is a number of lasers
+QUICK_ANGLE = 3.0  # degrees
+QUICK_COUNT = 1.5  # factor between the numbers of points
 
 
 @dataclass(frozen=True)
-class SensorGeometry:
-    """The geometry of a sensor as far as it is known; None stands for an unknown value.
+class Estimate:
+    """What was measured of the sensor of a scan, or of several scans as their median.
 
     Attributes:
-        beams: number of lasers.
-        fov_up, fov_down: ends of the field of view, degrees above the horizon.
-        height: metres of the sensor over the ground.
+        frame: of the coordinates in the files.
+        lasers: of the sensor, without its height.
+        quantiles: of the intensities as they are in the files; None if there are none.
+        count: of the points.
+        is_steady: whether the scans were recorded in one frame, at one height.
     """
 
-    beams: int | None = None
-    fov_up: float | None = None
-    fov_down: float | None = None
-    height: float | None = None
+    frame: Frame
+    lasers: SensorGeometry
+    quantiles: np.ndarray | None
+    count: int
+    is_steady: bool = True
 
 
-def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:
-    """Measure the sensor of a scan.
+@dataclass(frozen=True)
+class Gauge:
+    """Measures scans by what is known of their sensor.
+
+    Attributes:
+        sensor: what is known; the rest is measured.
+        usual_height: metres over the ground of a sensor that is not at the origin, if nothing says
+            how high it is; None if that is unknown, too.
+    """
+
+    sensor: Sensor
+    usual_height: float | None = None
+
+    def __call__(self, cloud: Cloud) -> Estimate:
+        """Measure the sensor of one scan.
+
+        Raises:
+            InputError: if the unit of the coordinates is in doubt, or no point is usable.
+        """
+        usable = np.isfinite(cloud.xyz).all(axis=1) & (cloud.xyz != 0).any(axis=1)
+        try:
+            frame = find_frame(cloud.xyz[usable], self.sensor)
+        except InputError as error:
+            raise InputError(f"{cloud.name}: {error}") from None
+
+        lasers = self.lasers(cloud, frame)
+        return Estimate(frame, lasers, quantiles_of(cloud.intensity), len(cloud.xyz))
+
+    def lasers(self, cloud: Cloud, frame: Frame) -> SensorGeometry:
+        """Measure the lasers of a scan whose frame is known."""
+        seen = self._seen(cloud, frame)
+        return measure_lasers(seen.points, seen.ring)
+
+    def _seen(self, cloud: Cloud, frame: Frame) -> Scan:
+        """Return the valid points of a scan as its sensor saw them.
+
+        All lasers are needed, in the order of the file, so that intensities do not count.
+        """
+        to_sensor, _ = self.rises(frame)
+        scan = level_scan(cloud, frame.complete(self.sensor))
+        seen = raise_points(scan, to_sensor)
+        valid = scan.valid
+        ring = None if scan.ring is None else scan.ring[valid]
+        return dataclasses.replace(seen, points=seen.points[valid], ring=ring)
+
+    def is_on_ground(self, frame: Frame) -> bool:
+        """Return whether the origin of the coordinates lies on the ground, or below."""
+        height = self.sensor.height
+        may_be_higher = height is None or height >= LOWEST
+        return frame.height is not None and frame.height < LOWEST and may_be_higher
+
+    def rises(self, frame: Frame) -> tuple[float, float]:
+        """Return how far to move a scan up, metres.
+
+        Returns:
+            The rise after which the sensor is at the origin, and the one after which it is
+            `usual_height` over the ground.
+        """
+        known = self.sensor.height
+        usual = self.usual_height
+        if self.is_on_ground(frame):
+            assert frame.height is not None
+            above = known if known is not None else usual
+            if above is None:
+                return 0.0, 0.0
+            target = above if usual is None else usual
+            return frame.height - above, frame.height - target
+
+        height = known if known is not None else frame.height
+        if height is None or usual is None or abs(height - usual) < SAME_HEIGHT:
+            return 0.0, 0.0
+        return 0.0, height - usual
+
+    def may_have_recorded(self, cloud: Cloud, estimate: Estimate) -> bool:
+        """Return whether a scan may be from the sensor of an estimate, by its lasers.
+
+        Some of the points are enough for most scans. Their lasers are counted only if the field of
+        view or the number of points differs.
+        """
+        some = dataclasses.replace(cloud, xyz=cloud.xyz[::QUICK_STEP], intensity=None, ring=None)
+        ratio = len(cloud.xyz) / max(estimate.count, 1)
+        known = estimate.lasers.field_of_view
+        if known is None:
+            return True
+        if 1 / QUICK_COUNT < ratio < QUICK_COUNT:
+            ends = field_of_view(self._seen(some, estimate.frame).points)
+            if ends is not None and np.abs(np.subtract(ends, known)).max() < QUICK_ANGLE:
+                return True
+        return self.lasers(cloud, estimate.frame).is_like(estimate.lasers)
+
+
+class Recording:
+    """The scans of one source, and what was measured of the first ones.
+
+    A source usually has one sensor. Its scans get the median of the first `MEASURED` estimates;
+    scans of other sensors, told by their lasers and the range of their intensities, get their own.
 
     Args:
-        points: (N, 3 or more) finite x, y, z in the sensor's frame, in the order of the file.
-        ring: (N,) indices of the lasers, or None if the file has none.
+        gauge: measures the scans.
     """
-    lasers = measure_lasers(points, ring)
-    if lasers.fov_up is None:
-        return lasers
-    height = ground_height(points[:, :3].astype(np.float64))
-    return dataclasses.replace(lasers, height=height)
+
+    def __init__(self, gauge: Gauge) -> None:
+        self.medians: list[Estimate] = []  # one for each sensor of the first scans
+        self._gauge = gauge
+        self._estimates: list[list[Estimate]] = []  # those of each median
+        self._is_learnt = False
+
+    def learn(self, first: Sequence[Callable[[], Cloud]]) -> None:
+        """Measure the first scans; later ones add nothing.
+
+        Args:
+            first: functions that read these scans; broken scans are left out.
+        """
+        for read in first:
+            if not self._is_learnt:
+                with suppress(InputError):
+                    self._add(self._gauge(read()))
+        self._is_learnt = bool(self.medians)
+
+    def estimate(self, cloud: Cloud) -> tuple[int | None, Estimate]:
+        """Return the estimate for a scan.
+
+        Returns:
+            Which of the sensors of the first scans it is from, None if from none of them; and what
+            to assume of the sensor.
+
+        Raises:
+            InputError: as `Gauge`.
+        """
+        if self._is_learnt:
+            return self._recall(cloud)
+
+        measured = self._gauge(cloud)
+        index = self._add(measured)
+        median = self.medians[index]
+        if median.is_steady:
+            return index, median
+        return index, dataclasses.replace(measured, quantiles=median.quantiles)
+
+    def _recall(self, cloud: Cloud) -> tuple[int | None, Estimate]:
+        """Return the same as `estimate` for a scan that adds nothing to the medians."""
+        quantiles = quantiles_of(cloud.intensity)
+        measured: Estimate | None = None
+        for index, median in enumerate(self.medians):
+            if not are_of_one_range(quantiles, median.quantiles):
+                continue
+            if median.is_steady:
+                if self._gauge.may_have_recorded(cloud, median):
+                    return index, median
+                continue
+            # The frame of each scan is its own, so that its lasers are known only in that.
+            measured = measured or self._gauge(cloud)
+            if measured.lasers.is_like(median.lasers):
+                return index, dataclasses.replace(measured, quantiles=median.quantiles)
+        return None, measured or self._gauge(cloud)
+
+    def _add(self, estimate: Estimate) -> int:
+        """Add the estimate of one of the first scans; return the index of its sensor."""
+        index = self._sensor_of(estimate)
+        if index == len(self.medians):
+            self._estimates.append([])
+            self.medians.append(estimate)
+        self._estimates[index].append(estimate)
+        self.medians[index] = median_of(self._estimates[index])
+        self._is_learnt = sum(map(len, self._estimates)) == MEASURED
+        return index
+
+    def _sensor_of(self, estimate: Estimate) -> int:
+        """Return the index of the first sensor that is like that of an estimate."""
+        for index, median in enumerate(self.medians):
+            is_of_one_range = are_of_one_range(estimate.quantiles, median.quantiles)
+            if is_of_one_range and estimate.lasers.is_like(median.lasers):
+                return index
+        return len(self.medians)
 
 
-def measure_lasers(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:
-    """Measure the lasers of a sensor as `measure` does, but not its height."""
-    xyz = points[:, :3].astype(np.float64)
-    is_distant = np.hypot(xyz[:, 0], xyz[:, 1]) > MIN_DISTANCE
-    if is_distant.sum() < MIN_POINTS:
-        return SensorGeometry()
+def median_of(estimates: Sequence[Estimate]) -> Estimate:
+    """Return the median of each value that is known."""
+    medians: dict[str, Any] = {}
+    for key in MEASURES:
+        values = [getattr(estimate.lasers, key) for estimate in estimates]
+        known = [value for value in values if value is not None]
+        if known:
+            medians[key] = float(np.median(known))
+    if "beams" in medians:
+        medians["beams"] = round(medians["beams"])
 
-    distant = xyz[is_distant]
-    down, up = np.percentile(elevations(distant), FOV_PERCENTILES)
-
-    if ring is not None:
-        beams: int | None = len(np.unique(ring))
-    else:
-        beams = beams_by_order(xyz) or beams_by_peaks(distant)
-    return SensorGeometry(beams, float(up), float(down))
-
-
-def elevations(xyz: np.ndarray) -> np.ndarray:
-    """Return the (N,) elevations of (N, 3) points, degrees above the horizon."""
-    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+    frames = [estimate.frame for estimate in estimates]
+    quantiles = [each.quantiles for each in estimates if each.quantiles is not None]
+    return Estimate(
+        median_frame(frames),
+        SensorGeometry(**medians),
+        quantiles=np.median(quantiles, axis=0) if quantiles else None,
+        count=int(np.median([estimate.count for estimate in estimates])),
+        is_steady=_are_steady(frames),
+    )
 
 
-def beams_by_order(xyz: np.ndarray) -> int | None:
-    """Return the number of lasers of (N, 3) points that are stored laser by laser.
+def _are_steady(frames: Sequence[Frame]) -> bool:
+    """Return whether the scans of a recording were recorded in one frame, at one height."""
+    if len({(frame.unit, frame.axes) for frame in frames}) > 1:
+        return False
+    heights = [frame.height for frame in frames if frame.height is not None]
+    if heights and max(heights) - min(heights) >= STEADY:
+        return False
+    turns = np.array([(frame.pitch, frame.roll) for frame in frames])
+    return bool((np.ptp(turns, axis=0) < STEADY_TILT).all())
 
-    None if the points are in another order.
+
+def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:
+    """Return a scan in the package's axes.
+
+    Args:
+        sensor: with everything about its frame known.
+        intensity: (N,) in [0, 1]; None means zeros.
+
+    Raises:
+        InputError: if no point is usable.
     """
-    azimuth = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))
-    low, high = np.percentile(azimuth, (0.1, 99.9))
-    width = high - low
-    steps = np.diff(azimuth)
-
-    if width > FULL_TURN:
-        # Each laser adds a full turn to the sum of the steps.
-        steps = (steps + 180) % 360 - 180
-        beams = round(abs(float(steps.sum())) / 360)
-    else:
-        # Each new laser jumps back to where the scan begins. Points near the two ends may also be
-        # swapped, but such jumps go forth as often as back.
-        forth = int((steps > JUMP * width).sum())
-        back = int((steps < -JUMP * width).sum())
-        beams = 1 + abs(forth - back)
-
-    is_ordered = np.mean(np.abs(steps) < STEP * width) > ORDERED_SHARE
-    return beams if is_ordered and MIN_BEAMS <= beams <= MAX_BEAMS else None
+    xyz = sensor.to_level(cloud.xyz)
+    return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 
 
-def beams_by_peaks(xyz: np.ndarray) -> int | None:
-    """Return the number of peaks in the histogram of the elevations of (N, 3) points.
+def raise_points(scan: Scan, rise: float) -> Scan:
+    """Return the scan moved up by some metres."""
+    if not rise:
+        return scan
 
-    None if the peaks are blurred. If the scan was corrected for the motion of the vehicle, the
-    peak of one laser may be split into several: most sectors then have fewer peaks than the scan.
-    """
-    elevation = elevations(xyz)
-    beams, width = _count_peaks(elevation)
-
-    turns = np.arctan2(xyz[:, 1], xyz[:, 0]) / (2 * np.pi) + 0.5
-    sector = (turns * SECTORS).astype(int)
-    sector_beams = []
-    for index in range(SECTORS):
-        is_inside = sector == index
-        if is_inside.sum() >= MIN_POINTS:
-            sector_beams.append(_count_peaks(elevation[is_inside])[0])
-
-    good_sector = np.percentile(sector_beams or [0], 75)
-    is_sharp = width < MAX_PEAK_WIDTH and good_sector >= MIN_SECTOR_PEAKS * beams
-    return beams if is_sharp and MIN_BEAMS <= beams <= MAX_BEAMS else None
-
-
-def _count_peaks(elevation: np.ndarray) -> tuple[int, float]:
-    """Count the peaks in the histogram of (N,) elevations.
-
-    Returns:
-        The number of peaks, and the share of the field of view that they cover; 0 and 1.0 if too
-        many points lie outside the peaks.
-    """
-    low, high = np.percentile(elevation, (0.05, 99.95))
-    edges = np.arange(low - PEAK_WINDOW, high + PEAK_WINDOW, BIN)
-    counts, _ = np.histogram(elevation, edges)
-
-    highest = maximum_filter1d(counts, int(2 * PEAK_WINDOW / BIN))
-    is_peak = counts > np.maximum(PEAK_HEIGHT * highest, 1)
-    if counts[is_peak].sum() < MIN_PEAK_POINTS * len(elevation):
-        return 0, 1.0
-
-    begins = np.diff(is_peak.astype(int), prepend=0) == 1
-    width = is_peak.sum() * BIN / max(high - low, BIN)
-    return int(begins.sum()), width
+    offset = np.array([0, 0, rise, 0], np.float32)
+    with np.errstate(invalid="ignore"):  # points that are not valid may be any NaN
+        return dataclasses.replace(scan, points=scan.points + offset)

@@ -8,16 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from amvnet.data.datasets.own import OwnScans
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 from amvnet.sensors.ground import MIN_DISTANCE
+from amvnet.sensors.intensity import KEY as INTENSITY
+from amvnet.sensors.lasers import MEASURES, SensorGeometry, elevations, measure
 from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
-from amvnet.sensors.measure import SensorGeometry, elevations, measure
+from amvnet.sensors.normalise import Normaliser
 
 KEY = "sensor"  # of a part's training record
-AS_IS = "as_is"  # in it: whether the scans were trained on as they were, not adapted as files are
-MEASURES = ("beams", "fov_up", "fov_down", "height")  # attributes of Sensor that it has
-
+AS_IS = "as_is"  # in it: whether the scans of the training were not normalised as files are
+MEASURED_RECORDINGS = 20  # of a user's own scans, whose sensor is measured for the weights
 LARGEST = 1e6  # no measure of a sensor is larger
 
 
@@ -38,7 +40,7 @@ def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
 
 
 def is_trained_as_is(training: Mapping[str, Any]) -> bool:
-    """Return whether weights were trained on scans that were not adapted, by their records."""
+    """Return whether weights were trained on scans that were not normalised, by their records."""
     for part in ("range_net", "polar_net"):
         record = training.get(part)
         carried = record.get(KEY) if isinstance(record, Mapping) else None
@@ -101,3 +103,20 @@ def _with_laser_ends(
     if min(ends) == max(ends):
         return geometry
     return dataclasses.replace(geometry, fov_up=max(ends), fov_down=min(ends))
+
+
+def normalised_record(dataset: OwnScans) -> dict[str, Any]:
+    """Return what weights that are trained on a user's normalised scans carry of their sensor.
+
+    With it, other scans are normalised as these.
+    """
+    normaliser = dataset.normalise
+    if not isinstance(normaliser, Normaliser) or normaliser.expected is None:
+        return {}
+    for source in list(dataset.recordings())[:MEASURED_RECORDINGS]:
+        normaliser.measure(source)
+
+    record: dict[str, Any] = {KEY: normaliser.target()}
+    if normaliser.expected.intensity is not None:
+        record[INTENSITY] = list(normaliser.expected.intensity.quantiles)
+    return record

@@ -32,8 +32,7 @@ from amvnet.sensors.intensity import (
     match_scan,
     quantiles_of,
 )
-from amvnet.sensors.own import training_record
-from amvnet.sensors.record import AS_IS, measure_sensor
+from amvnet.sensors.record import AS_IS, measure_sensor, normalised_record
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
@@ -322,9 +321,9 @@ def sensor_record(
     is_known = mean == NO_INTENSITY or are_quantiles(mean)
     record: dict[str, Any] = {INTENSITY: mean if is_known else []}
 
-    # Scans that are adapted are as the weights will get them: what they are brought to counts.
-    if isinstance(dataset, OwnScans) and dataset.is_adapted:
-        record |= training_record(dataset)
+    # Scans that are normalised are as the weights will get them: what they are brought to counts.
+    if isinstance(dataset, OwnScans) and dataset.is_normalised:
+        record |= normalised_record(dataset)
     else:
         record[SENSOR] = {**measure_sensor(scans), AS_IS: True}
     if intensity is not None and intensity.is_matched:

@@ -170,7 +170,7 @@ class StageRun:
                     "use the recipe of the weights"
                 ) from None
 
-        if self.plan.scans.dataset.is_adapted:
+        if self.plan.scans.dataset.is_normalised:
             model.range_view = model.range_view.by_ring()
         return model
 
@@ -437,7 +437,7 @@ class HeadRun(StageRun):
         # Pictures show batches of points, which do not say whose scores to read from files.
         if self.plan.scores is None:
             callbacks.append(
-                self.pictures(scorer_with_head(self.weights, head, scans.dataset.is_adapted))
+                self.pictures(scorer_with_head(self.weights, head, scans.dataset.is_normalised))
             )
 
         # The head multiplies so little that a lower precision would save nothing.
@@ -453,7 +453,7 @@ class HeadRun(StageRun):
 
     def _score_source(self, records: Sequence[ScanRecord]) -> ScoreSource:
         """Return the source of the scores of some scans."""
-        by_ring = self.plan.scans.dataset.is_adapted
+        by_ring = self.plan.scans.dataset.is_normalised
         return score_source(self.weights, self.plan.scores, records, by_ring)
 
     def _score_sources(self) -> list[ScoreSource]:
@@ -505,4 +505,4 @@ class HeadRun(StageRun):
         )
 
         weights = load(self.train_networks(plan))
-        return NetworkScores(weights, unseen, scans.dataset.is_adapted)
+        return NetworkScores(weights, unseen, scans.dataset.is_normalised)

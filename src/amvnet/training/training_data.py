@@ -13,7 +13,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import training_records
 from amvnet.data.taxonomy import Taxonomy, taxonomy_from_yaml
 from amvnet.errors import InputError
-from amvnet.inference.inputs import open_for_weights
+from amvnet.inference.reading import open_for_weights
 from amvnet.weights.file import Weights, load
 
 
@@ -22,7 +22,7 @@ def open_for_training(
 ) -> Dataset:
     """Open the dataset of a training.
 
-    A user's own scans are adapted as `predict` adapts them: to the initial weights, to what this
+    A user's own scans are normalised as by `predict`: to the initial weights, to what this
     run has trained before, or else to the sensor of the recipe.
 
     Args:
@@ -82,7 +82,7 @@ def open_parts(
 
 
 def _frame(recipe: Recipe, taxonomy: Taxonomy, earlier: Weights | None) -> Weights:
-    """Return weights without parameters that say what scans are to be adapted to."""
+    """Return weights without parameters that say what scans are to be normalised to."""
     weights = Weights(recipe.model, taxonomy, recipe.sensor)
     if earlier is None:
         return weights

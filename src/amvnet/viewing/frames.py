@@ -12,16 +12,16 @@ import torch
 
 from amvnet.data.taxonomy import Taxonomy, taxonomy_named
 from amvnet.errors import InputError
-from amvnet.inference.inputs import InputScan, LoadedScan, ScanOptions, adapter_for, open_inputs
+from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
+from amvnet.inference.reading import LoadedScan, normaliser_for
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Origin, Segmentation, expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter, check_scan
 from amvnet.models.assertion import cosine_similarity
 from amvnet.models.methods import geometric_mean
 from amvnet.progress import Progress, Say, no_progress, say_nothing
-from amvnet.sensors.adapt import ScanAdapter
 from amvnet.sensors.lidars import Sensor
-from amvnet.sensors.plain import PlainAdapter
+from amvnet.sensors.normalise import Normaliser
 
 # Colours for a dark background, RGB in 0..255. The official colour of points without a class is
 # black, which would hide them.
@@ -143,7 +143,7 @@ class Frames:
 
         segmenter = self.source.segmenter
         if segmenter is not None:
-            if scan_input.is_adapted:
+            if scan_input.is_normalised:
                 segmenter = segmenter.by_ring()
             result = segmenter(scan)
             assert result.origin is not None
@@ -166,7 +166,7 @@ def choose_frames(
     """Choose up to `count` scans of the inputs, evenly spaced, to look at.
 
     Args:
-        inputs: as of `open_inputs`.
+        inputs: as of `list_inputs`.
         count: the largest number of scans.
         source: where their labels come from, if anywhere.
         options: which scans of the inputs to choose from.
@@ -185,11 +185,10 @@ def choose_frames(
             f"{labels_path}: expected a file or a folder of labels, found none; check the path"
         )
 
-    adapter: ScanAdapter | PlainAdapter = PlainAdapter(sensor, say)
+    normaliser = Normaliser(None, sensor, say)
     if source.segmenter is not None:
-        adapter = adapter_for(source.segmenter.weights, sensor, say)
-    opened = open_inputs(inputs, options, source.named_taxonomy(), adapter)
-    scans = opened.scans
+        normaliser = normaliser_for(source.segmenter.weights, sensor, say)
+    scans, taxonomy = list_inputs(inputs, options, source.named_taxonomy(), normaliser, say)
     if labels_path is not None and labels_path.is_file() and len(scans) > 1:
         raise InputError(
             f"{labels_path}: expected a folder of labels for {len(scans)} scans, found a file; "
@@ -197,7 +196,7 @@ def choose_frames(
         )
 
     indices = np.linspace(0, len(scans) - 1, min(count, len(scans))).round().astype(int)
-    return Frames(opened.taxonomy, [scans[index] for index in indices], source)
+    return Frames(taxonomy, [scans[index] for index in indices], source)
 
 
 def frame_of(result: Segmentation, origin: Origin) -> Frame:

@@ -55,7 +55,7 @@ def analyze(
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
-    from amvnet.inference.inputs import open_for_weights
+    from amvnet.inference.reading import open_for_weights
     from amvnet.training.fit import quiet_lightning
     from amvnet.training.studies import HeadStudy
     from amvnet.weights.file import load

@@ -78,7 +78,7 @@ def evaluate(
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
-    from amvnet.inference.inputs import open_for_weights
+    from amvnet.inference.reading import open_for_weights
     from amvnet.weights.file import load
 
     processes = join_processes()

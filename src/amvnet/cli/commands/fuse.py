@@ -60,8 +60,8 @@ def fuse(
     refuse_other_formats(inputs)
     from amvnet.data.formats.rows import parse_layout
     from amvnet.data.taxonomy import taxonomy_named
-    from amvnet.inference.fuse_files import FusionOptions, fuse_files
-    from amvnet.inference.inputs import ScanOptions
+    from amvnet.inference.fuse_files import fuse_files
+    from amvnet.inference.listing import ScanOptions
     from amvnet.inference.pipeline import OutputOptions
     from amvnet.weights.file import load
 
@@ -79,8 +79,10 @@ def fuse(
             inputs,
             pair,
             OutputOptions(out, overwrite=overwrite),
-            FusionOptions(weights, tau, classes),
-            options=ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
+            ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
+            head=weights,
+            tau=tau,
+            taxonomy=classes,
             progress=step,
         )
     say(f"{written} label files in {out}; the two models disagree on {uncertain:.1%} of the points")

@@ -64,7 +64,8 @@ def predict(
         split: of datasets, the official split.
         sequences: of datasets, these sequences or scenes instead, separated by commas.
         scores: also write the probabilities of both networks.
-        resume: continue an interrupted run into the folder.
+        resume: continue an earlier run into the folder: segment only the scans that are new or were
+            not done, with the same weights and options.
         format: of scan files' labels: raw ids alone (label, npy), coloured points (ply, pcd, las),
             or, of bags, a bag of coloured points with the stamps of the scans (bag, mcap).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
@@ -99,7 +100,7 @@ def predict(
     """
     refuse_other_formats(inputs)
     from amvnet.data.formats.rows import parse_layout
-    from amvnet.inference.inputs import ScanOptions, adapter_for
+    from amvnet.inference.listing import ScanOptions
     from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
     from amvnet.inference.predict import predict as predict_inputs
     from amvnet.sensors.lidars import make_sensor
@@ -135,7 +136,7 @@ def predict(
             OutputOptions(out, format, scores, uncertain, overwrite),
             options=ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
             execution=ExecutionOptions(batch, at_once, resume, processes),
-            adapter=adapter_for(segmenter.weights, given_sensor, say),
+            sensor=given_sensor,
             classes=class_map,
             progress=step,
             say=say,

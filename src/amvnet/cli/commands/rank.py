@@ -43,7 +43,7 @@ def rank(
     from amvnet.data.datasets.base import choose_records
     from amvnet.data.datasets.select import labelled_records
     from amvnet.files import make_folder
-    from amvnet.inference.inputs import open_for_weights
+    from amvnet.inference.reading import open_for_weights
     from amvnet.ranking.label_errors import rank as rank_records
     from amvnet.ranking.label_errors import scans_path, write_ranking
     from amvnet.ranking.pictures import draw, possible_files

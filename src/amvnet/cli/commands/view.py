@@ -79,7 +79,7 @@ def view(
     refuse_other_formats(inputs)
     from amvnet.data.formats.rows import parse_layout
     from amvnet.files import make_folder
-    from amvnet.inference.inputs import ScanOptions
+    from amvnet.inference.listing import ScanOptions
     from amvnet.sensors.lidars import make_sensor
     from amvnet.viewing.frames import LabelSource, choose_frames
     from amvnet.viewing.rerun_log import check_rerun, check_window

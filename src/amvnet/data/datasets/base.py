@@ -51,7 +51,7 @@ class Dataset(Protocol):
         """What `open_dataset` opens the same dataset with."""
 
     @property
-    def is_adapted(self) -> bool:
+    def is_normalised(self) -> bool:
         """Whether `ring` of each scan is the row of each point in the range image, 0 the lowest."""
 
     def sequences(self, split: str) -> tuple[str, ...]:

@@ -85,8 +85,8 @@ class Joined(OnDisk):
         return self.dataset.spec
 
     @property
-    def is_adapted(self) -> bool:
-        return self.dataset.is_adapted
+    def is_normalised(self) -> bool:
+        return self.dataset.is_normalised
 
     @property
     def specs(self) -> list[str]:
@@ -160,7 +160,7 @@ def join(scans: TrainingScans, parts: Sequence[Part]) -> TrainingScans:
         return scans
     for part in parts:
         check_classes(part.dataset, scans.dataset.taxonomy)
-        if part.dataset.is_adapted != scans.dataset.is_adapted:
+        if part.dataset.is_normalised != scans.dataset.is_normalised:
             raise InputError(
                 f"{part.dataset.root}: expected either scans of your own (a YAML file) or datasets "
                 "in every --data, found both; train on one after the other, with --init"

@@ -76,7 +76,7 @@ class NuScenes(OnDisk):
             missing.
     """
 
-    is_adapted: ClassVar[bool] = False
+    is_normalised: ClassVar[bool] = False
 
     def __init__(
         self, root: Path | str, version: str | None = None, taxonomy: Taxonomy = NUSCENES

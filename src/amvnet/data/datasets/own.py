@@ -34,7 +34,7 @@ VALUE = 0.95
 GOLDEN_ANGLE = 0.381966  # of the circle of hues: each next colour is far from all earlier ones
 
 # Turns what a file holds into a scan, given the recording that it is from.
-Adapt = Callable[[Cloud, str], Scan]
+Normalise = Callable[[Cloud, str], Scan]
 
 
 @dataclass(frozen=True)
@@ -85,14 +85,14 @@ class OwnScans(OnDisk):
 
     Attributes:
         description: what the YAML file says.
-        adapt: brings the scans to the frame, height, intensities and rows that some weights expect;
-            None reads them as they are.
-        is_adapted: whether it does, so that `ring` is the row of each point.
+        normalise: brings the scans to the frame, height, intensities and rows that some weights
+            expect; None reads them as they are.
+        is_normalised: whether it does, so that `ring` is the row of each point.
     """
 
     description: Description
-    adapt: Adapt | None = None
-    is_adapted: bool = False
+    normalise: Normalise | None = None
+    is_normalised: bool = False
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -143,7 +143,7 @@ class OwnScans(OnDisk):
         """Read one scan."""
         named = self._scans[record.name]
         cloud = named.read()
-        scan = cloud.to_scan() if self.adapt is None else self.adapt(cloud, named.source)
+        scan = cloud.to_scan() if self.normalise is None else self.normalise(cloud, named.source)
         self._counts[record.name] = len(scan)
 
         ids = self._read_labels(record, len(scan)) if labels else None

@@ -31,7 +31,7 @@ class SemanticKitti(OnDisk):
 
     root: Path
     taxonomy: Taxonomy = SEMANTICKITTI
-    is_adapted: ClassVar[bool] = False
+    is_normalised: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", Path(self.root))

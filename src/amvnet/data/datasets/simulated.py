@@ -76,7 +76,7 @@ class SimulatedStreets(OnDisk):
 
     root: Path
     sensor: str = "hdl64e"
-    is_adapted: ClassVar[bool] = False
+    is_normalised: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", Path(self.root))

@@ -177,12 +177,14 @@ class NamedScan:
             `drive/000000` for the first scan of the bag `drive.bag`.
         source: the same for all scans of one recording: the bag, or the folder and the ending.
         path: the file or the bag.
+        ending: that the file should have, by its content (`ending_of`); empty if it is broken.
         read: reads it.
     """
 
     name: str
     source: str
     path: Path
+    ending: str
     read: Callable[[], Cloud]
 
 
@@ -215,7 +217,7 @@ def find_scans(path: Path | str) -> list[Path]:
         InputError: if nothing has this name, or there is no scan.
     """
     path = Path(path)
-    if path.is_file() or is_bag_folder(path):
+    if path.is_file() or is_bag_folder(path) or is_dead_link(path):
         return [path]
     if path.is_dir():
         paths = _scans_of_folder(path)
@@ -239,29 +241,50 @@ def list_scans(
 ) -> Iterator[NamedScan]:
     """Yield the scans that a text names, as `find_scans` finds them; those of a bag in its order.
 
+    A link that leads nowhere, and one of several files whose format cannot be told, is yielded as
+    one scan, which cannot be read.
+
     Args:
         topic: of bags; None means the only topic with scans.
         layout: what rows of numbers without names hold, as far as the user says it.
 
     Raises:
-        InputError: if there is no scan, a format cannot be told, or a bag cannot be read.
+        InputError: if there is no scan, or the only file has an unknown format or is a bag that
+            cannot be read.
     """
     files = find_scans(path)
     folder = Path(os.path.commonpath([file.parent for file in files]))
     for file in files:
-        ending = ending_of(file)
         # Files of several folders can have the same names.
         name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
         name = name.replace(f"/{KITTI_RAW}/", "/").replace(f"/{ARGOVERSE}/", "/")
-        kind = BY_ENDING_OR_FOLDER[ending]
-        if kind.open is None:
-            source = str(file.parent / f"*{ending}")
-            yield NamedScan(name, source, file, partial(_read_file, file, kind, layout))
-            continue
-        recording = kind.open(file, ending, topic)
-        for index in range(len(recording)):
-            read = partial(recording.read, index)
-            yield NamedScan(f"{name}/{index:06d}", str(file), file, read)
+        try:
+            scans = _scans_of(file, name, topic, layout)
+        except InputError as error:
+            if len(files) == 1 and not is_dead_link(file):
+                raise
+            scans = [NamedScan(name, str(file), file, "", partial(_refuse, str(error)))]
+        yield from scans
+
+
+def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> list[NamedScan]:
+    """Return the scans of a file or a bag."""
+    ending = ending_of(file)
+    kind = BY_ENDING_OR_FOLDER[ending]
+    if kind.open is None:
+        source = str(file.parent / f"*{ending}")
+        return [NamedScan(name, source, file, ending, partial(_read_file, file, kind, layout))]
+
+    recording = kind.open(file, ending, topic)
+    scans = []
+    for index in range(len(recording)):
+        read = partial(recording.read, index)
+        scans.append(NamedScan(f"{name}/{index:06d}", str(file), file, ending, read))
+    return scans
+
+
+def _refuse(message: str) -> Cloud:
+    raise InputError(message)
 
 
 def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
@@ -354,9 +377,15 @@ def ending_of(path: Path) -> str:
     if path.is_dir():
         return FOLDER
     if not path.is_file():
-        raise InputError(f"{path}: expected a scan file, found none; check the path")
+        content = "a link that leads nowhere" if is_dead_link(path) else "none"
+        raise InputError(f"{path}: expected a scan file, found {content}; check the path")
 
-    ending = _begins_as(path)
+    try:
+        ending = _begins_as(path)
+    except OSError as error:
+        raise InputError(
+            f"{path}: expected a file that can be read, found {error.strerror}; check it"
+        ) from None
     if ending is not None:
         return ending
 
@@ -405,6 +434,11 @@ def _named_ending(path: Path) -> str | None:
         if path.name.lower().endswith(ending):
             return ending
     return None
+
+
+def is_dead_link(path: Path) -> bool:
+    """Return whether a path is that of a link to something that does not exist."""
+    return path.is_symlink() and not path.exists()
 
 
 def is_bag_folder(path: Path) -> bool:

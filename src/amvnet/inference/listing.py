@@ -1,0 +1,401 @@
+"""List the scans of a user's inputs: datasets, scan files, bags, and folders of these."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, overload
+
+import numpy as np
+
+from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
+from amvnet.data.datasets.open import open_if_dataset
+from amvnet.data.datasets.own import OwnScans
+from amvnet.data.formats.detect import NamedScan, list_scans, scan_stem
+from amvnet.data.formats.raw import NUSCENES_ENDING
+from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.labels import label_bags
+from amvnet.data.labels.readers import read_scan_labels
+from amvnet.data.labels.writers import KINDS, label_points, write_scan_labels
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.errors import InputError
+from amvnet.files import inside
+from amvnet.inference.reading import FileReader, LoadedScan, normalised_by
+from amvnet.progress import Say, say_nothing
+from amvnet.scan import Scan
+from amvnet.sensors.normalise import Normaliser
+
+SHOWN = 8  # endings of files that are left out
+
+
+@dataclass(frozen=True)
+class ScanOptions:
+    """Which scans of the inputs to use.
+
+    Attributes:
+        sequences: of datasets, these sequences or scenes; None means those of `split`.
+        split: of datasets, the official split.
+        topic: of bags; None means the only topic with scans.
+        layout: of rows of numbers without names, what they hold.
+    """
+
+    sequences: Sequence[str] | None = None
+    split: str = "all"
+    topic: str | None = None
+    layout: RowLayout = UNKNOWN
+
+
+class InputScan(Protocol):
+    """One scan of the inputs, not read yet."""
+
+    @property
+    def name(self) -> str:
+        """The name for messages, unique among the scans of one input."""
+
+    @property
+    def title(self) -> str:
+        """A short name for people who look at the scan."""
+
+    @property
+    def source(self) -> str:
+        """The recording that it is from: a bag, a folder, a sequence."""
+
+    @property
+    def path(self) -> Path:
+        """The file that the scan is read from."""
+
+    @property
+    def scores_path(self) -> Path:
+        """The path of the `.npz` of its scores, relative to a folder of predictions."""
+
+    @property
+    def is_normalised(self) -> bool:
+        """Whether `ring` is the row of each point in the range image, for `Segmenter.by_ring`."""
+
+    def labels_path(self, kind: str) -> Path:
+        """Return the path of the file of its labels, relative to a folder of predictions.
+
+        Args:
+            kind: the format for scan files; datasets have their own. Of bags, the file is a part of
+                the bag.
+        """
+
+    def load(self, labels: bool = False) -> LoadedScan:
+        """Read the scan.
+
+        Args:
+            labels: whether to read the ground truth too, if there is any.
+
+        Raises:
+            InputError: if it cannot be read.
+        """
+
+    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+        """Read the (N,) train ids of the scan's points.
+
+        Args:
+            path: a folder of predictions; for scan files, also a label file.
+            count: N.
+            taxonomy: turns the raw ids of scan files into train ids; datasets have their own.
+
+        Raises:
+            InputError: if they cannot be read.
+        """
+
+    def write_labels(
+        self,
+        folder: Path,
+        loaded: LoadedScan,
+        ids: np.ndarray,
+        *,
+        kind: str,
+        taxonomy: Taxonomy,
+        uncertain: np.ndarray | None = None,
+    ) -> Path:
+        """Write labels into a folder of predictions.
+
+        Args:
+            folder: the folder.
+            loaded: what `load` returned.
+            ids: (N,) train ids.
+            kind: the format for scan files; datasets have their own.
+            taxonomy: turns the train ids of scan files into raw ids; datasets have their own.
+            uncertain: (N,) bool, the uncertain points; None if unknown.
+
+        Returns:
+            The path of the file.
+        """
+
+
+@dataclass(frozen=True)
+class DatasetScan:
+    """A scan of a dataset.
+
+    Attributes:
+        dataset: has the scan.
+        record: its files.
+        written: the classes of the labels that are written; None means those of the dataset.
+    """
+
+    dataset: Dataset
+    record: ScanRecord
+    written: Taxonomy | None = None
+
+    @property
+    def name(self) -> str:
+        return self.record.name
+
+    @property
+    def title(self) -> str:
+        if "/" in self.record.name:
+            return self.record.name
+        # The name is a token of nuScenes. The file's name is easier to read: it ends in the time.
+        time = scan_stem(self.record.points_path).split("__")[-1]
+        return f"{self.record.sequence}/{time}"
+
+    @property
+    def source(self) -> str:
+        return self.record.sequence
+
+    @property
+    def path(self) -> Path:
+        return self.record.points_path
+
+    @property
+    def scores_path(self) -> Path:
+        return Path(self.record.prediction).with_suffix(".npz")
+
+    @property
+    def is_normalised(self) -> bool:
+        return self.dataset.is_normalised
+
+    def labels_path(self, kind: str) -> Path:
+        return Path(self.record.prediction)
+
+    def load(self, labels: bool = False) -> LoadedScan:
+        return LoadedScan(self.dataset.read(self.record, labels=labels), self.source)
+
+    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+        return self.dataset.read_prediction(self.record, path)
+
+    def write_labels(
+        self,
+        folder: Path,
+        loaded: LoadedScan,
+        ids: np.ndarray,
+        *,
+        kind: str,
+        taxonomy: Taxonomy,
+        uncertain: np.ndarray | None = None,
+    ) -> Path:
+        return self.dataset.write_prediction(self.record, folder, ids, self.written)
+
+
+@dataclass(frozen=True)
+class FileScan:
+    """A scan in a file or a bag."""
+
+    scan: NamedScan
+    reader: FileReader
+
+    @property
+    def name(self) -> str:
+        return self.scan.name
+
+    @property
+    def title(self) -> str:
+        return self.scan.name
+
+    @property
+    def source(self) -> str:
+        return self.scan.source
+
+    @property
+    def path(self) -> Path:
+        return self.scan.path
+
+    @property
+    def scores_path(self) -> Path:
+        return Path(f"{self.scan.name}.npz")
+
+    @property
+    def is_normalised(self) -> bool:
+        return self.reader.is_normalising
+
+    def labels_path(self, kind: str) -> Path:
+        if kind in label_bags.KINDS:
+            return label_bags.part_path(self.scan.name, kind)
+        return Path(f"{self.scan.name}.{kind}")
+
+    def load(self, labels: bool = False) -> LoadedScan:
+        return self.reader.read(self.scan)
+
+    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+        if path.is_dir():
+            stem = path / self.scan.name
+            paths = [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]
+            path = next(filter(Path.is_file, paths), paths[0])
+        return read_scan_labels(path, count, taxonomy)
+
+    def write_labels(
+        self,
+        folder: Path,
+        loaded: LoadedScan,
+        ids: np.ndarray,
+        *,
+        kind: str,
+        taxonomy: Taxonomy,
+        uncertain: np.ndarray | None = None,
+    ) -> Path:
+        assert loaded.file_xyz is not None
+        if kind in label_bags.KINDS:
+            assert loaded.message is not None  # predict checks that the scan is from a bag
+            points = label_points(loaded.file_xyz, ids, taxonomy, uncertain)
+            return label_bags.write_part(folder, self.scan.name, kind, loaded.message, points)
+        return write_scan_labels(
+            inside(folder, self.scan.name),
+            kind,
+            loaded.file_xyz,
+            ids,
+            taxonomy,
+            uncertain=uncertain,
+        )
+
+
+def list_inputs(
+    inputs: Sequence[str],
+    options: ScanOptions = ScanOptions(),
+    taxonomy: Taxonomy | None = None,
+    normaliser: Normaliser | None = None,
+    say: Say = say_nothing,
+) -> tuple[list[InputScan], Taxonomy]:
+    """List the scans of all inputs, in their order.
+
+    Args:
+        inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, a folder of these, or
+            a pattern as `find_scans` takes it.
+        options: which scans of the inputs to use.
+        taxonomy: the classes, of weights or as the user names them. If None, they are those of the
+            datasets; scan files have nuScenes' if they end in `.pcd.bin`, else SemanticKITTI's.
+        normaliser: normalises scan files to weights; None reads them as they are.
+        say: is told which files of folders are left out.
+
+    Returns:
+        The scans, and the classes of their labels.
+
+    Raises:
+        InputError: if an input is missing or has no scan, or the inputs have different classes.
+    """
+    reader = FileReader(normaliser)
+    scans: list[InputScan] = []
+    taxonomies: list[Taxonomy] = []
+    for text in inputs:
+        dataset = open_if_dataset(text, taxonomy)
+        if dataset is not None:
+            if isinstance(dataset, OwnScans) and normaliser is not None:
+                dataset = normalised_by(normaliser, dataset)
+            for record in choose_records(dataset, options.sequences, options.split):
+                scans.append(DatasetScan(dataset, record))
+            taxonomies.append(dataset.taxonomy)
+            continue
+
+        files = list(list_scans(text, options.topic, options.layout))
+        for scan in files:
+            reader.expect(scan)
+            scans.append(FileScan(scan, reader))
+        is_nuscenes = files[0].ending == NUSCENES_ENDING
+        taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
+        _say_left_out(text, files, say)
+
+    if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
+        raise InputError(
+            "expected inputs with the same classes, found different ones; "
+            "take them one after the other"
+        )
+    return scans, taxonomies[0]
+
+
+def _say_left_out(text: str, scans: Sequence[NamedScan], say: Say) -> None:
+    """Say how many files of a folder of scans are no scans, without what `predict` writes."""
+    folder = Path(text)
+    paths = {scan.path for scan in scans}
+    if not folder.is_dir() or not any(path.parent == folder for path in paths):
+        return
+
+    endings: Counter[str] = Counter()
+    for path in folder.iterdir():
+        is_written = path.name.endswith((".label", ".uncertain.npy")) or path.suffix == ".npz"
+        if path.is_file() and not path.name.startswith(".") and not is_written:
+            endings[path.suffix] += path not in paths
+    count = endings.total()
+    if count:
+        names = [ending or "without an ending" for ending, found in endings.items() if found]
+        files = (
+            "1 file that is no scan is" if count == 1 else f"{count} files that are no scans are"
+        )
+        say(f"{text}: {files} left out ({', '.join(sorted(names)[:SHOWN])})")
+
+
+class Scans(Sequence[Scan]):
+    """The scans of a file, a bag, a folder or a dataset; each is read when it is asked for."""
+
+    def __init__(self, path: Path | str, scans: Sequence[InputScan]) -> None:
+        self.path = path
+        self._scans = scans
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    @overload
+    def __getitem__(self, index: int) -> Scan: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Scans: ...
+
+    def __getitem__(self, index: int | slice) -> Scan | Scans:
+        if isinstance(index, slice):
+            return Scans(self.path, self._scans[index])
+        return self._scans[index].load(labels=True).scan
+
+    def __repr__(self) -> str:
+        return f"<Scans of {self.path}: {len(self)}>"
+
+
+def read(path: Path | str, topic: str | None = None) -> Scan:
+    """Read the only scan of a file.
+
+    Its points are as they are in the file, with intensities scaled to [0, 1]. To segment it as
+    `amvnet predict` does, give the path to a `Segmenter`, which normalises the scan to its weights.
+
+    Args:
+        path: a scan file of any supported format, or a bag.
+        topic: of bags; None means the only topic with scans.
+
+    Raises:
+        InputError: if the file is missing, broken, of another format, or holds several scans.
+    """
+    scans = read_all(path, topic)
+    if len(scans) > 1:
+        raise InputError(
+            f"{path}: expected one scan, found {len(scans)}; read them with amvnet.read_all"
+        )
+    return scans[0]
+
+
+def read_all(path: Path | str, topic: str | None = None) -> Scans:
+    """Return the scans of a file, a bag, a folder of these, or a dataset, with their labels if any.
+
+    Args:
+        path: as INPUT of `amvnet predict`.
+        topic: of bags; None means the only topic with scans.
+
+    Returns:
+        A sequence that reads each scan when it is asked for, as `read` does.
+
+    Raises:
+        InputError: if there is no scan.
+    """
+    scans, _ = list_inputs([str(path)], ScanOptions(topic=topic))
+    return Scans(path, scans)

@@ -1,0 +1,163 @@
+"""Read the scans of the inputs, normalised to what some weights expect."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.open import open_with_classes
+from amvnet.data.datasets.own import OwnScans
+from amvnet.data.formats.cloud import Cloud, Message
+from amvnet.data.formats.detect import NamedScan
+from amvnet.errors import InputError
+from amvnet.progress import Say, say_nothing
+from amvnet.scan import Scan
+from amvnet.sensors.intensity import trained_intensity
+from amvnet.sensors.lidars import Sensor, make_sensor, sensor_from
+from amvnet.sensors.normalise import Expectation, Normaliser
+from amvnet.sensors.record import is_trained_as_is, trained_sensor
+from amvnet.weights.file import Weights
+
+
+@dataclass(frozen=True)
+class LoadedScan:
+    """A scan in memory.
+
+    Attributes:
+        scan: as the segmenter takes it.
+        sensor: a title of what recorded it: the bag, folder or sequence, and what is unlike its
+            first scan.
+        file_xyz: (N, 3) the coordinates as they are in the scan's file; None for a scan of a
+            dataset.
+        message: of a bag, where the scan is from.
+    """
+
+    scan: Scan
+    sensor: str = ""
+    file_xyz: np.ndarray | None = None
+    message: Message | None = None
+
+
+class FileReader:
+    """Reads scan files, normalised to what some weights expect.
+
+    Scans that were read to measure their sensor are kept until they are asked for, so that each
+    file is read once.
+
+    Args:
+        normaliser: normalises the scans; None reads them as they are.
+    """
+
+    def __init__(self, normaliser: Normaliser | None) -> None:
+        self.normaliser = normaliser
+        self._kept: dict[tuple[str, str], Cloud] = {}  # by source and name, of one source
+
+    @property
+    def is_normalising(self) -> bool:
+        """Whether `ring` of a scan is the row of each point in the range image."""
+        return self.normaliser is not None and self.normaliser.expected is not None
+
+    def expect(self, scan: NamedScan) -> None:
+        """Announce a scan; call this for the scans of a source in their order."""
+        if self.normaliser is not None:
+            self.normaliser.expect(scan.source, partial(self._read_and_keep, scan))
+
+    def read(self, scan: NamedScan) -> LoadedScan:
+        """Read a scan.
+
+        Raises:
+            InputError: if it cannot be read, or no point is usable.
+        """
+        if self.normaliser is None:
+            cloud = scan.read()
+            normalised = cloud.to_scan()
+            title = scan.source
+        else:
+            if self.is_normalising:
+                self.normaliser.measure(scan.source)
+            kept = self._kept.pop((scan.source, scan.name), None)
+            cloud = scan.read() if kept is None else kept
+            normalised, title = self.normaliser.assign(cloud, scan.source)
+
+        file_xyz = cloud.xyz if cloud.file_xyz is None else cloud.file_xyz
+        return LoadedScan(normalised, title, file_xyz, cloud.message)
+
+    def _read_and_keep(self, scan: NamedScan) -> Cloud:
+        """Read one of the first scans of a source, and forget those of others."""
+        if any(source != scan.source for source, _ in self._kept):
+            self._kept.clear()
+        cloud = scan.read()
+        self._kept[scan.source, scan.name] = cloud
+        return cloud
+
+
+def normaliser_for(
+    weights: Weights, sensor: Sensor | None = None, say: Say = say_nothing
+) -> Normaliser:
+    """Return what normalises scan files for some weights.
+
+    Args:
+        sensor: what is known of the sensor; the rest is measured.
+        say: is told what was assumed of the sensor.
+    """
+    expected = Expectation(
+        weights.model.range_view,
+        trained_sensor(weights.training, weights.sensor),
+        intensity=trained_intensity(weights.training, weights.sensor),
+        as_is=is_trained_as_is(weights.training),
+    )
+    return Normaliser(expected, sensor, say)
+
+
+def open_for_weights(spec: str, weights: Weights, dataset: Dataset | None = None) -> Dataset:
+    """Open a dataset whose scans are read as some weights expect them.
+
+    The scans of the benchmarks are as they are; a user's own are normalised as `predict` does.
+
+    Args:
+        spec: as `open_dataset` takes it.
+        weights: the weights.
+        dataset: the dataset, if it is open.
+
+    Raises:
+        InputError: as `open_with_classes`.
+    """
+    dataset = dataset or open_with_classes(spec, weights.taxonomy)
+    if isinstance(dataset, OwnScans):
+        return normalised_by(normaliser_for(weights), dataset)
+    return dataset
+
+
+def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
+    """Return a user's own scans, normalised as those of its folders would be.
+
+    Args:
+        normaliser: as for scan files.
+        dataset: the scans. What its file says of the sensor counts, unless the normaliser knows
+            more.
+
+    Raises:
+        InputError: if the file describes an impossible sensor.
+    """
+    if dataset.description.sensor is not None and normaliser.sensor == Sensor():
+        normaliser = normaliser.for_sensor(_described_sensor(dataset))
+
+    for source, scans in dataset.recordings().items():
+        for scan in scans:
+            normaliser.expect(source, scan.read)
+    is_normalised = normaliser.expected is not None
+    return dataclasses.replace(dataset, normalise=normaliser, is_normalised=is_normalised)
+
+
+def _described_sensor(dataset: OwnScans) -> Sensor:
+    """Return what the file of a dataset says of the sensor."""
+    sensor = dataset.description.sensor
+    try:
+        return sensor_from(sensor) if isinstance(sensor, Mapping) else make_sensor(sensor)
+    except InputError as error:
+        raise InputError(f"{dataset.spec}: sensor: {error}") from None

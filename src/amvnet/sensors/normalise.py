@@ -1,0 +1,377 @@
+"""Normalise the scans of any sensor to what weights expect: axes, height, intensities, rows."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from amvnet.config.schema import RangeViewConfig
+from amvnet.data.formats.cloud import Cloud, usual_scale
+from amvnet.errors import InputError
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.range_view import RangeView
+from amvnet.progress import Say, say_nothing
+from amvnet.scan import Scan
+from amvnet.sensors.frame import Frame
+from amvnet.sensors.intensity import IntensityMap, TrainedIntensity, intensity_map
+from amvnet.sensors.lasers import MEASURES, SensorGeometry, elevations
+from amvnet.sensors.lidars import SENSORS, Sensor
+from amvnet.sensors.measure import (
+    MEASURED,
+    Estimate,
+    Gauge,
+    Recording,
+    level_scan,
+    median_of,
+    raise_points,
+)
+
+HIGHEST = 4.5  # metres: no vehicle carries its sensor higher; the coordinates may be in feet
+OUTSIDE = 0.16  # share of points outside a field of view from which on it is too narrow
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """The scans that some weights expect.
+
+    Attributes:
+        view: the range view of the weights.
+        sensor: the one that they were trained for, as far as it is known (`trained_sensor`).
+        intensity: the intensities that they were trained with; None if unknown.
+        as_is: whether they were trained on scans that were not normalised. Scans of the same field
+            of view then have their rows as in the training, however many points are outside.
+    """
+
+    view: RangeViewConfig
+    sensor: Sensor
+    intensity: TrainedIntensity | None = None
+    as_is: bool = False
+
+    @property
+    def lasers(self) -> SensorGeometry:
+        """The geometry of the sensor."""
+        return SensorGeometry().override(self.sensor)
+
+
+def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> Scan:
+    """Return a scan as some weights expect it; its points keep their order and number.
+
+    Intensities are brought to the distribution of the training, the axes are turned level, and the
+    scan is moved up or down until its sensor is as high over the ground as that of the training.
+    `ring` becomes the row of each point in the range image, 0 the lowest, for `Segmenter.by_ring`.
+    The row follows the elevation at which the sensor saw the point, before the move.
+
+    Args:
+        cloud: the contents of the scan's file.
+        estimate: what was measured of its sensor.
+        sensor: what is known of it, which counts more.
+        expected: what the weights expect.
+
+    Raises:
+        InputError: if no point is usable.
+    """
+    to_intensity = _intensity_map(cloud, estimate.quantiles, sensor, expected)
+    intensity = to_intensity(cloud.intensity, len(cloud.xyz))
+    scan = level_scan(cloud, estimate.frame.complete(sensor), intensity)
+
+    to_sensor, to_trained = Gauge(sensor, expected.sensor.height).rises(estimate.frame)
+    seen = raise_points(scan, to_sensor)
+    moved = raise_points(scan, to_trained)
+
+    valid = scan.valid
+    lasers = estimate.lasers.override(sensor)
+    view = _row_view(seen.points[valid], lasers, expected)
+    return dataclasses.replace(moved, ring=_rows(seen, valid, view, expected))
+
+
+def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
+    """Return a line on what is assumed of a scan, and whether the weights know such a sensor."""
+    lasers = estimate.lasers.override(sensor)
+    assumed = [cloud.note] if cloud.note else []
+    assumed += [
+        _intensity_map(cloud, estimate.quantiles, sensor, expected).text,
+        *_describe_frame(estimate.frame, sensor),
+        _describe_height(estimate.frame, Gauge(sensor, expected.sensor.height)),
+        describe_lasers(lasers),
+    ]
+    line = f"{cloud.name}: assumed {', '.join(assumed)}"
+
+    trained = expected.sensor
+    is_named = bool(sensor.name) and sensor.name == trained.name
+    if expected.lasers.field_of_view is None or is_named or lasers.is_like(expected.lasers):
+        return line
+
+    sheet = SENSORS.get(trained.name)
+    name = trained.name if sheet and sheet.beams == trained.beams else "a sensor"
+    return (
+        f"{line}; the weights were trained for {name} ({describe_lasers(expected.lasers)}) "
+        "and have seen no such sensor"
+    )
+
+
+class Normaliser:
+    """Normalises the scans of recordings, each by what is measured of its first scans.
+
+    Args:
+        expected: what the weights expect; None turns scans only as the sensor says, for people to
+            look at.
+        sensor: what is known of the sensor of the scans; the rest is measured.
+        say: is told once for each sensor of a recording what was assumed.
+    """
+
+    def __init__(
+        self,
+        expected: Expectation | None = None,
+        sensor: Sensor | None = None,
+        say: Say = say_nothing,
+    ) -> None:
+        self.expected = expected
+        self.sensor = sensor or Sensor()
+        self._say = say
+        self._first: dict[str, list[Callable[[], Cloud]]] = {}
+        self._recordings: dict[str, Recording] = {}
+        self._said: set[str] = set()  # of which sensors
+
+    def expect(self, source: str, read: Callable[[], Cloud]) -> None:
+        """Announce the next scan of a source, before any is normalised.
+
+        The first ones are measured even if another scan is normalised before them, as after an
+        interruption or in one of several processes.
+
+        Args:
+            source: name of the bag or folder.
+            read: reads the scan.
+        """
+        first = self._first.setdefault(source, [])
+        if len(first) < MEASURED:
+            first.append(read)
+
+    def __call__(self, cloud: Cloud, source: str) -> Scan:
+        """Return a scan as the weights expect it; its points keep their order and number.
+
+        Args:
+            source: name of the bag or folder that the scan is from.
+
+        Raises:
+            InputError: if no point is usable, or the unit of the coordinates is in doubt.
+        """
+        scan, _ = self.assign(cloud, source)
+        return scan
+
+    def assign(self, cloud: Cloud, source: str) -> tuple[Scan, str]:
+        """Return the scan, and a title of its sensor: the source, and whether it is the usual one.
+
+        Args:
+            source: as of a call.
+
+        Raises:
+            InputError: as of a call.
+        """
+        if self.expected is None:
+            return self._turn(cloud, source), source
+
+        index, estimate = self.measure(source).estimate(cloud)
+        title = source
+        if index is None:
+            title = f"{source}, scans unlike the first ones"
+        elif index > 0:
+            lasers = describe_lasers(estimate.lasers.override(self.sensor))
+            title = f"{source}, another sensor or scale of intensity ({lasers})"
+
+        is_new = title not in self._said
+        if estimate.is_steady or is_new:
+            self._check_height(cloud, estimate.frame)
+        scan = normalise(cloud, estimate, self.sensor, self.expected)
+        if is_new:
+            self._said.add(title)
+            line = describe(cloud, estimate, self.sensor, self.expected)
+            unlike = "; another sensor or scale of intensity than in the first scan"
+            self._say(line if index == 0 else f"{line}{unlike} of {source}")
+        return scan, title
+
+    def measure(self, source: str) -> Recording:
+        """Return what is measured of a source: the first time, of the scans that were announced."""
+        if source not in self._recordings:
+            assert self.expected is not None
+            gauge = Gauge(self.sensor, self.expected.sensor.height)
+            self._recordings[source] = Recording(gauge)
+            self._recordings[source].learn(self._first.pop(source, []))
+        return self._recordings[source]
+
+    def for_sensor(self, sensor: Sensor) -> Normaliser:
+        """Return a normaliser to the same weights for scans of a described sensor."""
+        return Normaliser(self.expected, sensor, self._say)
+
+    def target(self) -> dict[str, float]:
+        """Return what weights that are trained on the normalised scans should carry of the sensor.
+
+        The height is that which the scans are moved to. The lasers are those of the scans, but if
+        the rows of the range image are lasers, those that decide the rows.
+        """
+        assert self.expected is not None
+        medians = [median for each in self._recordings.values() for median in each.medians]
+        lasers = self.expected.lasers
+        height = self.expected.sensor.height
+        if medians:
+            measured = median_of(medians)
+            height = measured.frame.height if height is None else height
+            if self.expected.view.rows != "ring" or lasers.field_of_view is None:
+                lasers = measured.lasers.override(self.sensor)
+
+        values = {key: getattr(lasers, key) for key in MEASURES} | {"height": height}
+        return {key: value for key, value in values.items() if value is not None}
+
+    def _check_height(self, cloud: Cloud, frame: Frame) -> None:
+        """Raise InputError if the ground is too far below the sensor for coordinates in metres."""
+        is_known = self.sensor.height is not None or self.sensor.unit is not None
+        if not is_known and frame.height is not None and frame.height > HIGHEST:
+            raise InputError(
+                f"{cloud.name}: expected a sensor at most {HIGHEST:g} m over the ground, found "
+                f"{frame.height:.1f}; give --unit ft if these are feet, else --height"
+            )
+
+    def _turn(self, cloud: Cloud, source: str) -> Scan:
+        """Return a scan turned as the sensor says, and otherwise as it is."""
+        xyz = self.sensor.to_level(cloud.xyz)
+        scale = self.sensor.intensity_scale or cloud.intensity_scale()
+        scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
+
+        if source not in self._said:
+            self._said.add(source)
+            has_intensity = cloud.intensity is not None and scale is not None
+            intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
+            axes = f"axes {self.sensor.axes or 'x-forward'}"
+            assumed = [cloud.note, intensity, axes] if cloud.note else [intensity, axes]
+            self._say(f"{cloud.name}: assumed {', '.join(assumed)}")
+        return scan
+
+
+def _intensity_map(
+    cloud: Cloud, quantiles: np.ndarray | None, sensor: Sensor, expected: Expectation
+) -> IntensityMap:
+    """Return how the intensities of a scan become those of the training.
+
+    Args:
+        quantiles: of the intensities of the recording; None if it has none.
+    """
+    known_scale = sensor.intensity_scale
+    scale = known_scale or cloud.full or 1.0
+    if known_scale is None and cloud.full is None and quantiles is not None:
+        assert cloud.intensity is not None
+        scale = usual_scale(quantiles[-1], is_integer=cloud.intensity.dtype.kind in "iu")
+    return intensity_map(quantiles, scale, expected.intensity, known_scale is not None)
+
+
+def _row_view(
+    points: np.ndarray, lasers: SensorGeometry, expected: Expectation
+) -> RangeViewConfig | None:
+    """Return the range view that gives (P, 4) points their rows by elevation.
+
+    It is that of the weights, but with the sensor's field of view if too many points are outside.
+    None if the rows are lasers and their elevations are unknown.
+    """
+    view = _trained_view(lasers, expected)
+    if view is None or (expected.as_is and lasers.has_ends_of(expected.lasers)):
+        return view
+
+    elevation = elevations(points[:, :3].astype(np.float64))
+    is_outside = (elevation > view.fov_up) | (elevation < view.fov_down)
+    ends = lasers.field_of_view
+    if is_outside.mean() < OUTSIDE or ends is None:
+        return view
+    return _by_elevation(view, ends, view.height)
+
+
+def _trained_view(lasers: SensorGeometry, expected: Expectation) -> RangeViewConfig | None:
+    """Return the range view of the weights with rows by elevation.
+
+    If the rows are lasers, the highest one gets the first row and the lowest one the last. None if
+    their elevations are unknown.
+    """
+    view = expected.view
+    if view.rows != "ring":
+        return view
+
+    ends = expected.lasers.field_of_view
+    if ends is None and lasers.beams == view.height:
+        ends = lasers.field_of_view
+    return None if ends is None else _by_elevation(view, ends, view.height - 1)
+
+
+def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) -> RangeViewConfig:
+    """Return the view with rows by elevation, for lasers between two elevations.
+
+    Its field of view is wider by half a step at each end, so that the lasers lie inside.
+
+    Args:
+        ends: elevations of the highest and the lowest laser, degrees.
+        steps: how many steps the elevations between them are divided into.
+    """
+    top, bottom = ends
+    half = (top - bottom) / (2 * steps)
+    return dataclasses.replace(view, rows="elevation", fov_up=top + half, fov_down=bottom - half)
+
+
+def _rows(
+    scan: Scan, valid: np.ndarray, view: RangeViewConfig | None, expected: Expectation
+) -> np.ndarray | None:
+    """Return each point's (N,) row in the range image, 0 the lowest; 0 for lost points.
+
+    None if the weights need rings, and neither the scan nor its elevations tell them.
+    """
+    ring = scan.ring if expected.view.rows == "ring" else None
+    # Lasers that no data sheet describes need not be evenly spaced.
+    is_trusted = ring is not None and expected.sensor.name not in SENSORS
+    if view is None or is_trusted:
+        return ring
+
+    batch = PointBatch.of([scan])
+    rows = view.height - 1 - RangeView(view).rows(batch).numpy()
+    if ring is not None and np.median(np.abs(ring[valid] - rows)) < 1:  # most rings are the rows
+        return ring
+
+    all_rows = np.zeros(len(scan), dtype=np.int64)
+    all_rows[valid] = rows
+    return all_rows
+
+
+def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
+    """Return what was guessed of the frame, each as a text with its option."""
+    texts = []
+    if sensor.unit is None and frame.unit != "m":
+        texts.append(f"--unit {frame.unit}")
+    if sensor.axes is None and frame.axes != "x-forward":
+        texts.append(f"--axes {frame.axes}")
+    if frame.pitch or frame.roll:
+        texts.append(
+            f"a tilt of {frame.tilt:.0f} degrees (levelled, --rotate "
+            f"0,{frame.pitch:.1f},{frame.roll:.1f})"
+        )
+    return texts
+
+
+def _describe_height(frame: Frame, gauge: Gauge) -> str:
+    """Return how high the sensor is, and how far scans are moved for that."""
+    height = gauge.sensor.height if gauge.sensor.height is not None else frame.height
+    if height is None:
+        return "no ground to measure the height by (give --height; --axes if z is not up)"
+
+    if gauge.is_on_ground(frame):
+        text = f"the ground {-(frame.height or 0):+.2f} m from the origin"
+    else:
+        text = f"sensor {height:.2f} m over the ground"
+    _, rise = gauge.rises(frame)
+    if rise:
+        text += f" (moved by {rise:+.2f} m to {gauge.usual_height:.2f} m)"
+    return text
+
+
+def describe_lasers(lasers: SensorGeometry) -> str:
+    """Return the number of lasers and the field of view, for people."""
+    count = "lasers" if lasers.beams is None else f"{lasers.beams} lasers"
+    if lasers.fov_up is None or lasers.fov_down is None:
+        return count if lasers.beams else "field of view not found"
+    return f"{count} from {lasers.fov_up:+.0f} to {lasers.fov_down:+.0f} degrees"
