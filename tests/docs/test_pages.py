@@ -1,0 +1,26 @@
+"""Every command of every page has a verb and options that there are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from amvnet.cli.main import VERBS
+from amvnet.cli.parser import join_negative_values, make_parser
+from amvnet.config.schema import Recipe
+
+from fixtures.worlds import commands_of
+
+ROOT = Path(__file__).parents[2]
+PAGES = ("README.md", *sorted(f"docs/{path.name}" for path in (ROOT / "docs").glob("*.md")))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_can_be_parsed(page: str) -> None:
+    for words in commands_of(page):
+        if "amvnet" not in words:
+            continue
+        verb, *arguments = words[words.index("amvnet") + 1 :]
+        recipe = Recipe() if VERBS[verb].takes_recipe else None
+        make_parser(verb, VERBS[verb], recipe).parse_args(join_negative_values(arguments))
