@@ -22,7 +22,7 @@ from amvnet import files
 from amvnet.data.class_maps import class_map
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud, Message
-from amvnet.data.formats.detect import NamedScan
+from amvnet.data.formats.find import NamedScan
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
 from amvnet.files import atomic_write

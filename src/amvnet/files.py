@@ -16,6 +16,8 @@ from amvnet.errors import InputError, shown
 
 LARGEST_YAML = 50_000  # bytes; PyYAML takes a second for as many
 DEEPEST_YAML = 50  # levels
+LONGEST_INTEGER = 40  # characters
+INTEGER = "tag:yaml.org,2002:int"
 PARTS = f".{'[0-9a-f]' * 32}.part*"  # names of files that `atomic_write` has not finished
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # characters that names of files must not have
 LONGEST_NAME = 255  # bytes, in most file systems
@@ -181,16 +183,28 @@ def read_yaml(path: Path, content: str) -> Any:
 
 
 class _BoundedLoader(yaml.SafeLoader):
-    """PyYAML's safe loader, but for values of limited depth: deep ones take seconds."""
+    """PyYAML's safe loader without what can take hours or any amount of memory.
+
+    Values have a limited depth, numbers have a limited length, and there are no aliases: ten lines
+    of them stand for billions of values.
+    """
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            alias = self.peek_event()
+            raise yaml.YAMLError(f"the alias *{alias.anchor[:50]}, write its value out")
         if self._depth == DEEPEST_YAML:
             raise yaml.YAMLError(f"more than {DEEPEST_YAML} levels")
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
+
+    def construct_scalar(self, node: Any) -> Any:
+        if node.tag == INTEGER and len(node.value) > LONGEST_INTEGER:
+            raise yaml.YAMLError(f"a number of {len(node.value)} digits")
+        return super().construct_scalar(node)

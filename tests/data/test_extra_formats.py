@@ -16,8 +16,10 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from amvnet.data.formats.detect import list_scans, read_cloud
+from amvnet.data.formats.find import list_scans
 from amvnet.data.formats.livox import TYPES as LIVOX
+from amvnet.data.formats.packets import Capture
+from amvnet.data.formats.registry import read_cloud
 from amvnet.inference.reading import FileReader
 
 from fixtures.scan_writers import some_points
@@ -278,26 +280,25 @@ def test_a_capture_of_another_sensor_says_what_converts_it(
 
 @pytest.mark.parametrize(
     ("package", "extra", "content"),
-    [
-        ("pyarrow", "datasets", b"ARROW1\0\0"),
-        ("pye57", "e57", b"ASTM-E57"),
-        ("velodyne_decoder", "packets", None),
-    ],
+    [("pyarrow", "datasets", b"ARROW1\0\0"), ("pye57", "e57", b"ASTM-E57")],
 )
 def test_a_missing_extra_is_named(
-    tmp_path: Path,
-    package: str,
-    extra: str,
-    content: bytes | None,
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, package: str, extra: str, content: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a"
-    if content is None:
-        write_capture(path, [vlp16_packet(0, 0)])
-    else:
-        path.write_bytes(content)
+    path.write_bytes(content)
     monkeypatch.setitem(sys.modules, package, None)
     fails(lambda: read_cloud(path), path, f'pip install "amvnet[{extra}]"')
+
+
+def test_the_missing_extra_of_captures_is_named_only_if_it_would_help(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "velodyne_decoder", None)
+    path = write_capture(tmp_path / "a.pcap", [vlp16_packet(0, 0)])
+    fails(lambda: Capture(path), path, 'pip install "amvnet[packets]"')
+    write_capture(path, [bytes(3392)], 7502)
+    fails(lambda: Capture(path), path, "ouster-cli")
 
 
 @pytest.mark.parametrize(

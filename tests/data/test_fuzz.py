@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.rosbag2 import StoragePlugin
 
-from amvnet.data.formats.detect import list_scans
+from amvnet.data.formats.find import list_scans
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 

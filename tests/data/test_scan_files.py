@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from amvnet import read as read_scan
-from amvnet.data.formats.detect import find_scans
+from amvnet.data.formats.find import find_scans
 from amvnet.data.labels.ids import write_ids
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
 from amvnet.files import atomic_write

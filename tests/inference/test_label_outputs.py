@@ -17,7 +17,8 @@ from pypcd4 import PointCloud
 from rosbags.highlevel import AnyReader
 
 from amvnet.cli.commands import predict as verbs
-from amvnet.data.formats.detect import list_scans, read_cloud
+from amvnet.data.formats.find import list_scans
+from amvnet.data.formats.registry import read_cloud
 from amvnet.data.labels import label_bags
 from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI

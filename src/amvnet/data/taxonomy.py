@@ -263,9 +263,13 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
         return _from_config(path.stem, config)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (KeyError, TypeError, ValueError) as error:
+    except KeyError as error:
         raise InputError(
             f"{path}: expected tables that fit each other, found no entry {error}; complete them"
+        ) from None
+    except (TypeError, ValueError, OverflowError) as error:  # OverflowError: .inf as an id
+        raise InputError(
+            f"{path}: expected whole numbers as ids and colours, found {shown(error)}; correct them"
         ) from None
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
 from amvnet.data.datasets.open import open_if_dataset
 from amvnet.data.datasets.own import OwnScans
-from amvnet.data.formats.detect import NamedScan, list_scans, scan_stem
+from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels import label_bags

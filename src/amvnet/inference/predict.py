@@ -9,8 +9,7 @@ from itertools import groupby
 from typing import Any
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.data.formats.bags import Bag
-from amvnet.data.formats.detect import BY_ENDING_OR_FOLDER
+from amvnet.data.formats.detect import BAGS, FOLDER
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.data.labels import label_bags
 from amvnet.errors import InputError
@@ -122,7 +121,7 @@ def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
     for scan in scans:
         if not isinstance(scan, FileScan):
             continue
-        if BY_ENDING_OR_FOLDER[scan.scan.ending].open is not Bag:
+        if scan.scan.ending not in (FOLDER, *BAGS):
             raise InputError(
                 f"{scan.path}: expected a bag for --format {output.kind}, found another file; "
                 "choose another format, such as ply"

@@ -13,7 +13,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_with_classes
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.cloud import Cloud, Message
-from amvnet.data.formats.detect import NamedScan
+from amvnet.data.formats.find import NamedScan
 from amvnet.errors import InputError
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan

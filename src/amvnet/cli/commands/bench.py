@@ -91,7 +91,7 @@ def bench(
 
 def _job(segmenter: Segmenter, scan: Path, folder: Path, name: str, share: float | None) -> Job:
     """Return a job that reads a scan's file and writes its labels into a folder."""
-    from amvnet.data.formats.detect import read_cloud
+    from amvnet.data.formats.registry import read_cloud
     from amvnet.data.labels.ids import write_ids
     from amvnet.inference.timing import Job
 

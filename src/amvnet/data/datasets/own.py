@@ -15,7 +15,7 @@ import numpy as np
 
 from amvnet.data.datasets.base import OnDisk, ScanRecord
 from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.detect import NamedScan, list_scans, scan_stem
+from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_label_field, read_scan_labels

@@ -12,7 +12,6 @@ from amvnet.data.formats.cloud import (
     check_point_count,
     make_cloud,
     reading,
-    require,
     require_columns,
 )
 from amvnet.errors import InputError
@@ -34,7 +33,7 @@ def read_feather(path: Path) -> Cloud:
     the calibration of the log is there, they are moved to the LiDARs.
 
     Raises:
-        InputError: if the file is not Feather, is truncated, has no x, y, z, or pyarrow is missing.
+        InputError: if the file is not Feather, is truncated, or has no x, y, z.
     """
     table = _read_columns(path, None)
     cloud = make_cloud(table, str(path))
@@ -70,7 +69,6 @@ def _read_columns(path: Path, names: tuple[str, ...] | None) -> dict[str, np.nda
     Args:
         names: of the columns; None for those of a scan, by the keys of `COLUMN_NAMES`.
     """
-    require("the package pyarrow", "datasets", path, "pyarrow")
     with reading(path, EXPECTED, ADVICE):
         import pyarrow
 

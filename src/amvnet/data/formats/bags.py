@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import quote
 
-from amvnet.data.formats.cloud import Cloud, Message, reading, require
+from amvnet.data.formats.cloud import Cloud, Message, reading
+from amvnet.data.formats.detect import FOLDER
 from amvnet.data.formats.livox import TYPES as LIVOX
 from amvnet.data.formats.livox import read_custom_message, read_header
 from amvnet.data.formats.pointcloud2 import Origin, read_message
+from amvnet.data.formats.reader_process import size_of
 from amvnet.errors import InputError
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -35,7 +37,6 @@ PACKETS = {
 }
 LISTED = 10  # topics in a message
 
-METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
 MIN_MESSAGE = 16  # bytes of a bag for each message, compressed ones too
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
@@ -59,13 +60,13 @@ class Bag:
         self.path = path
         self._ending = ending
 
-        with reading(path, EXPECTED, ADVICE), _open_reader(path, ending) as reader:
+        with reading(path, EXPECTED, ADVICE), closing(_open_reader(path, ending)) as reader:
             counts = _count_messages(reader)
             without_scans = _describe_others(reader)
             self.topic = _choose_topic(counts, topic, path, without_scans)
         self._count = counts[self.topic]
 
-        if not 0 < self._count <= _size(path) // MIN_MESSAGE:
+        if not 0 < self._count <= size_of(path) // MIN_MESSAGE:
             raise InputError(
                 f"{path}: expected scans under {self.topic}, found {self._count} messages; {ADVICE}"
             )
@@ -99,7 +100,7 @@ class Bag:
         raise InputError(f"{name}: expected {self._count} scans, found {self._next}; {ADVICE}")
 
     def _read_messages(self) -> Iterator[Decode]:
-        with _open_reader(self.path, self._ending) as reader:
+        with closing(_open_reader(self.path, self._ending)) as reader:
             # A ROS 2 bag serialises in the same way in every storage format.
             is_ros1 = self._ending == ".bag"
             deserialise = _deserialiser(is_ros1)
@@ -112,25 +113,28 @@ class Bag:
                 yield partial(read, data, self.topic, time)
 
 
-@contextmanager
-def _open_reader(path: Path, ending: str) -> Iterator[Any]:
-    """Open a bag with rosbags.
+def _open_reader(path: Path, ending: str) -> Any:
+    """Open a bag with rosbags, by its content and not by its name."""
+    from rosbags.rosbag1 import Reader
+    from rosbags.rosbag2.reader import DirectoryReader
+    from rosbags.rosbag2.storage_mcap import McapReader
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-    rosbags tells the storage format from the file's name. If the name has another ending, a link
-    with the right one is opened.
-    """
-    require("the package rosbags", "formats", path, "rosbags")
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
+    def open_database(path: Path) -> Sqlite3Reader:
+        # rosbags makes a URI of the path, in which #, ? and % have a meaning.
+        return Sqlite3Reader(Path(quote(str(path))))
 
-    with ExitStack() as stack:
-        if ending in (".mcap", ".db3") and path.suffix != ending:
-            folder = Path(stack.enter_context(TemporaryDirectory()))
-            link = folder / f"bag{ending}"
-            link.symlink_to(path.absolute())
-            path = link
-        reader = Reader1(path) if ending == ".bag" else Reader2(path)
-        yield stack.enter_context(reader)
+    readers: dict[str, Callable[[Path], Any]] = {
+        ".bag": Reader,
+        ".mcap": McapReader,
+        ".db3": open_database,
+        FOLDER: DirectoryReader,
+    }
+    reader = readers[ending](path)
+    if ending == FOLDER:
+        reader.STORAGE_PLUGINS = {"mcap": McapReader, "sqlite3": open_database}
+    reader.open()
+    return reader
 
 
 def _deserialiser(is_ros1: bool) -> Callable[[bytes, str], Any]:
@@ -217,15 +221,3 @@ def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, without
             f"{path}: expected one topic with {KINDS}, found {listing}; choose one with --topic"
         )
     return next(iter(counts))
-
-
-def _size(path: Path) -> int:
-    """Return the bytes of a file, or of the files in a folder."""
-    if not path.is_dir():
-        return path.stat().st_size
-
-    size = 0
-    for entry in path.iterdir():
-        if entry.is_file():
-            size += entry.stat().st_size
-    return size

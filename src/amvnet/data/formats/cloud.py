@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +16,7 @@ from amvnet.scan import FARTHEST, Scan
 # Points of one scan: 40 times as many as the largest sensors record. A header that claims more is
 # broken.
 MAX_POINTS = 10_000_000
+MAX_BYTES = 32 * MAX_POINTS  # of the points of a packed file
 MOST_RINGS = 256  # a column with larger values does not hold ring indices
 
 # The largest intensities that sensors write: fractions, 8 bits, 16 bits.
@@ -195,8 +195,7 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
 def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
     """Turn every error of a reader in this block into an InputError of one line.
 
-    Readers raise all kinds of exceptions on broken bytes. An InputError passes unchanged. Warnings
-    are ignored.
+    Readers raise all kinds of exceptions on broken bytes. An InputError passes unchanged.
 
     Args:
         path: the file, or another name of the input.
@@ -211,29 +210,27 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         return f"{path}: expected {expected}, found a broken one ({reason}); {advice}"
 
-    with warnings.catch_warnings(action="ignore"), one_line_errors(message):
+    with one_line_errors(message):
         yield
 
 
-def require(packages: str, extra: str, path: Path | str, *modules: str) -> None:
-    """Check that the packages that read a format are installed.
+def require(path: Path | str, extra: str, *packages: str) -> None:
+    """Check that the packages that read a file are installed.
 
     Args:
-        packages: their names in the message, such as "the package pyarrow".
+        path: the file.
         extra: the extra of this package that installs them.
-        path: the file to read.
-        modules: what they are imported as.
+        packages: what they are imported as.
 
     Raises:
-        InputError: if one cannot be imported.
+        InputError: if one is missing.
     """
-    try:
-        for module in modules:
-            import_module(module)
-    except ImportError:
+    missing = [package for package in packages if find_spec(package) is None]
+    if missing:
         raise InputError(
-            f'{path}: expected {packages} to read it, found none; run pip install "amvnet[{extra}]"'
-        ) from None
+            f"{path}: expected the package {' and '.join(missing)} to read it, found none; "
+            f'run pip install "amvnet[{extra}]"'
+        )
 
 
 def find_columns(names: Sequence[str]) -> dict[str, int]:
@@ -297,7 +294,10 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     """
     axes = (columns["x"], columns["y"], columns["z"])
     is_float32 = all(axis.dtype.kind not in "iu" and axis.dtype.itemsize <= 4 for axis in axes)
-    xyz = np.stack(axes, axis=1).astype(np.float32 if is_float32 else np.float64)
+    xyz = np.empty((len(axes[0]), 3), np.float32 if is_float32 else np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):  # of signalling NaN
+        for column, axis in enumerate(axes):
+            xyz[:, column] = axis
 
     return Cloud(xyz, columns.get("intensity"), ring_indices(columns.get("ring")), name)
 

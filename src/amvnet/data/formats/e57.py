@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, reading, require
+from amvnet.data.formats.cloud import Cloud, check_point_count, reading
 from amvnet.errors import InputError
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -26,7 +26,7 @@ class E57:
         topic: not used.
 
     Raises:
-        InputError: if the file is broken or has no scan, or pye57 is missing.
+        InputError: if the file is broken or has no scan.
     """
 
     def __init__(self, path: Path, ending: str = ".e57", topic: str | None = None) -> None:
@@ -61,7 +61,6 @@ class E57:
 
 
 def _open(path: Path) -> Any:
-    require("the package pye57", "e57", path, "pye57")
     import pye57
 
     return pye57.E57(str(path))

@@ -7,27 +7,32 @@ from __future__ import annotations
 
 import math
 import zipfile
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO, cast
 
 import numpy as np
 
 from amvnet.data.formats.cloud import (
+    MAX_BYTES,
     Cloud,
     check_point_count,
+    find_columns,
     make_cloud,
     reading,
     require_columns,
     ring_indices,
 )
-from amvnet.data.formats.raw import ring_column
-from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, named_cloud
+from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
-COLUMNS = ("x", "y", "z", "intensity")
 KEYS = ("points", "xyz", "scan", "arr_0")  # names of the array to read, if there are several
-RANGE_TOLERANCE = 0.05  # metres by which a column of distances may differ from them
+FEW = 10  # an array with as few rows and more columns is transposed
+BLOCK = 1 << 20  # bytes read at once
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # in which NumPy packs archives
 ADVICE = "save it again with np.save"
+ARCHIVE_ADVICE = "save it again with np.savez"
 
 
 def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
@@ -39,22 +44,42 @@ def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     Raises:
         InputError: if it is not an array of numbers, has an unsuitable shape or is truncated.
     """
-    with reading(path, "a plain NumPy array", ADVICE), path.open("rb") as file:
-        return _to_cloud(_load(file, path.stat().st_size, path), path, layout)
+    with reading(path, "a plain NumPy array", ADVICE):
+        return _to_cloud(read_array(path), path, layout)
 
 
 def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read the only array of an archive, or the one named `points`, `xyz`, `scan` or `arr_0`.
+    """Read the points of an archive.
+
+    They are its only array, or the one named `points`, `xyz`, `scan` or `arr_0`, with arrays named
+    `intensity` and `ring` next to it; or arrays named `x`, `y`, `z` and so on.
 
     Raises:
-        InputError: as `read_npy`, or if there is no such array.
+        InputError: as `read_npy`, or if there are no such arrays.
     """
-    advice = "save it again with np.savez"
-    with reading(path, "a NumPy archive", advice), zipfile.ZipFile(path) as archive:
-        member = archive.getinfo(_choose_member(archive.namelist(), path))
-        with archive.open(member) as file:
-            array = _load(cast(BinaryIO, file), member.file_size, path)
-            return _to_cloud(array, path, layout)
+    with reading(path, "a NumPy archive", ARCHIVE_ADVICE):
+        names = member_names(path)
+        arrays = find_columns(names)
+        if {"x", "y", "z"} <= set(arrays):
+            columns = {key: read_array(path, names[index]).ravel() for key, index in arrays.items()}
+            lengths = {names[arrays[key]]: len(values) for key, values in columns.items()}
+            if len(set(lengths.values())) > 1:
+                raise InputError(
+                    f"{path}: expected columns of one length, found {lengths}; {ARCHIVE_ADVICE}"
+                )
+            return make_cloud(columns, str(path))
+
+        points = _choose_member(names, path)
+        cloud = _to_cloud(read_array(path, points), path, layout)
+        extra = {}
+        for key in {"intensity", "ring"} & set(arrays):
+            values = read_array(path, names[arrays[key]]).ravel()
+            # An array of another size describes something else, such as the lasers.
+            if len(values) == len(cloud.xyz):
+                extra[key] = values
+        intensity = extra.get("intensity") if cloud.intensity is None else cloud.intensity
+        ring = ring_indices(extra.get("ring")) if cloud.ring is None else cloud.ring
+        return replace(cloud, intensity=intensity, ring=ring)
 
 
 def member_names(path: Path) -> list[str]:
@@ -63,11 +88,8 @@ def member_names(path: Path) -> list[str]:
     Raises:
         InputError: if the file is no archive.
     """
-    with (
-        reading(path, "a NumPy archive", "save it again with np.savez"),
-        zipfile.ZipFile(path) as archive,
-    ):
-        return list(_members(archive.namelist()))
+    with reading(path, "a NumPy archive", ARCHIVE_ADVICE), zipfile.ZipFile(path) as archive:
+        return [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
 
 
 def read_array(path: Path, key: str | None = None) -> np.ndarray:
@@ -75,7 +97,7 @@ def read_array(path: Path, key: str | None = None) -> np.ndarray:
 
     Args:
         path: a `.npy` or `.npz` file.
-        key: the name of the array in an archive; None means the one that `read_npz` reads.
+        key: the name of the array in an archive; None means the one with the points.
 
     Raises:
         InputError: as `read_npy`.
@@ -84,34 +106,28 @@ def read_array(path: Path, key: str | None = None) -> np.ndarray:
         if not zipfile.is_zipfile(path):
             with path.open("rb") as file:
                 return _load(file, path.stat().st_size, path)
+
+        name = _choose_member(member_names(path), path) if key is None else key
         with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-            name = _choose_member(names, path) if key is None else _members(names)[key]
-            member = archive.getinfo(name)
+            member = archive.getinfo(f"{name}.npy")
+            if member.compress_type not in METHODS:
+                raise InputError(
+                    f"{path}: expected an archive of NumPy, found one packed in another way; "
+                    f"{ARCHIVE_ADVICE}"
+                )
             with archive.open(member) as unpacked:
                 return _load(cast(BinaryIO, unpacked), member.file_size, path)
 
 
-def _members(names: list[str]) -> dict[str, str]:
-    """Return the members of an archive that are arrays, by the names of the arrays."""
-    members = {}
-    for name in names:
-        if name.endswith(".npy"):
-            members[name.removesuffix(".npy")] = name
-    return members
-
-
-def _choose_member(names: list[str], path: Path) -> str:
-    """Return the name of the array to read, given those of all members of an archive."""
-    members = _members(names)
-
-    if len(members) == 1:
-        return next(iter(members.values()))
+def _choose_member(names: Sequence[str], path: Path) -> str:
+    """Return the name of the array of points, given those of all arrays of an archive."""
+    if len(names) == 1:
+        return names[0]
     for key in KEYS:
-        if key in members:
-            return members[key]
+        if key in names:
+            return key
 
-    listing = ", ".join(list(members)[:10])[:200] or "none"
+    listing = ", ".join(names[:10])[:200] or "none"
     raise InputError(
         f"{path}: expected an array named {KEYS[0]}, found {listing!a}; "
         "save the scan under that name"
@@ -134,15 +150,19 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
         )
 
     length = math.prod(shape) * dtype.itemsize
-    if length > size:
+    if not 0 <= length <= min(size, MAX_BYTES):
         raise InputError(
-            f"{path}: expected {length} bytes for its shape {shape}, found {size}; {ADVICE}"
+            f"{path}: expected at most {min(size, MAX_BYTES)} bytes, found {length} for the shape "
+            f"{shape} of its array; {ADVICE}"
         )
-
     point_axes = shape[:1] if len(shape) < 3 else shape[:-1]
     check_point_count(math.prod(point_axes), path)
-    flat = np.frombuffer(file.read(length), dtype)
-    return flat.reshape(shape, order="F" if fortran_order else "C")
+
+    data = np.empty(length, np.uint8)
+    for start in range(0, length, BLOCK):
+        stop = min(start + BLOCK, length)
+        data[start:stop] = np.frombuffer(file.read(stop - start), np.uint8)
+    return data.view(dtype).reshape(shape, order="F" if fortran_order else "C")
 
 
 def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
@@ -153,25 +173,21 @@ def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
             f"{path}: expected numbers of shape (N, 3), (N, 4), (N, 5) or (H, W, C), "
             f"found shape {array.shape}; save such an array"
         )
+    if array.shape[0] <= FEW < array.shape[-1]:
+        raise InputError(
+            f"{path}: expected a row per point, found shape {array.shape}, which is transposed; "
+            "save numpy.moveaxis(array, 0, -1)"
+        )
 
     table = array.reshape(-1, array.shape[-1])
     if layout.columns:
         return named_cloud(list(table.T), layout.columns, str(path), describe(layout.columns))
-    columns = dict(zip(COLUMNS, table.T, strict=False))
-    cloud = make_cloud(columns, str(path))
 
-    # A column after the intensity can be the distance, the ring or anything else.
-    ring = None
-    fifth = ""
-    if len(table) and table.shape[1] > len(COLUMNS):
-        if _is_distance(table):
-            fifth = "range"
-        else:
-            ring = _read_ring(table, array.ndim == 3, path)
-            fifth = "" if ring is None else "ring"
-
-    note = _note(array.shape, fifth)
-    return Cloud(cloud.xyz, cloud.intensity, ring, cloud.name, note=note)
+    names = name_columns(table)
+    note = describe(names) if "_" in names else ""
+    if array.ndim == 3:
+        note = f"range image of {array.shape[0]} x {array.shape[1]} row by row, {describe(names)}"
+    return named_cloud(list(table.T), names, str(path), note)
 
 
 def _from_named_columns(array: np.ndarray, names: tuple[str, ...], path: Path) -> Cloud:
@@ -179,47 +195,9 @@ def _from_named_columns(array: np.ndarray, names: tuple[str, ...], path: Path) -
     columns = {}
     for key, index in require_columns(names, path).items():
         columns[key] = records[names[index]]
+        if columns[key].ndim > 1 or columns[key].dtype.kind not in "fiu":
+            raise InputError(
+                f"{path}: expected a number per point in the column {names[index]!a}, found "
+                f"{array.dtype[index]}; {ADVICE}"
+            )
     return make_cloud(columns, str(path))
-
-
-def _read_ring(table: np.ndarray, is_image: bool, path: Path) -> np.ndarray | None:
-    """Return the ring indices in the fifth column of a table, (N,) int64.
-
-    The fifth of five columns must be a ring. In a range image or before more columns it can be
-    anything, and None is returned if it does not look like a ring.
-    """
-    if table.shape[1] == 5 and not is_image:
-        return ring_column(table[:, 4], path)
-    ring = ring_indices(table[:, 4])
-    return ring if ring is not None and ring.any() else None
-
-
-def _is_distance(table: np.ndarray) -> bool:
-    """Return whether the fifth column of a table is the distance of its points."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        distance = np.linalg.norm(table[:, :3].astype(np.float64), axis=1)
-        error = np.abs(distance - table[:, 4])
-
-    is_finite = np.isfinite(error)
-    if not is_finite.any() or not table[is_finite, 4].any():
-        return False
-    return bool((error[is_finite] < RANGE_TOLERANCE).all())
-
-
-def _note(shape: tuple[int, ...], fifth: str) -> str:
-    """Return a note on how an array of this shape was read, empty if that is obvious.
-
-    Args:
-        fifth: what the fifth column holds; empty if unknown.
-    """
-    count = shape[-1]
-    names = list(COLUMNS[:count])
-    if fifth:
-        names.append(fifth)
-
-    note = f"columns {' '.join(names)}"
-    if count > len(names):
-        note += f", {count - len(names)} more left out"
-    if len(shape) == 3:
-        return f"range image of {shape[0]} x {shape[1]} row by row, {note}"
-    return note if count > 5 or fifth == "range" else ""

@@ -92,7 +92,7 @@ class Capture:
 
     def _decode(self) -> Iterator[Any]:
         """Yield the records of each scan."""
-        require("the package velodyne-decoder", "packets", self.path, "velodyne_decoder")
+        require(self.path, "packets", "velodyne_decoder")
         import velodyne_decoder
 
         for _, records in velodyne_decoder.read_pcap(str(self.path), as_pcl_structs=True):

@@ -10,12 +10,14 @@ import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
 from amvnet.data.formats.cloud import (
+    MAX_BYTES,
     Cloud,
     check_point_count,
     make_cloud,
@@ -202,8 +204,9 @@ def read_text(
     """
     indices, dtypes = zip(*columns.values(), strict=True)
     table = np.zeros((0, len(columns)))
-    if count:
-        table = np.loadtxt(file, usecols=indices, max_rows=count, comments=None, ndmin=2)
+    lines = islice(filter(bytes.strip, file), count)
+    for first in lines:  # NumPy warns if there is none
+        table = np.loadtxt(chain([first], lines), usecols=indices, comments=None, ndmin=2)
 
     if len(table) < count:
         raise InputError(
@@ -245,10 +248,9 @@ def _read_compressed(file: BinaryIO, header: Header, columns: Columns, path: Pat
     packed_size, size = struct.unpack("<II", file.read(8))
     count = check_point_count(header.points, path, file.tell() + packed_size)
     can_unpack = size * REPETITION_CODE <= packed_size * LONGEST_REPETITION
-    if size != count * header.row or not can_unpack:
-        raise InputError(
-            f"{path}: expected {count * header.row} bytes of points, found {size}; {ADVICE}"
-        )
+    if size != count * header.row or size > MAX_BYTES or not can_unpack:
+        expected = min(count * header.row, MAX_BYTES)
+        raise InputError(f"{path}: expected {expected} bytes of points, found {size}; {ADVICE}")
 
     # One column follows the other. Within a column, the values of a point are adjacent, and the
     # first of them is used.
@@ -260,7 +262,7 @@ def _read_compressed(file: BinaryIO, header: Header, columns: Columns, path: Pat
     return arrays
 
 
-def unpack_lzf(data: bytes, size: int) -> bytes:
+def unpack_lzf(data: bytes, size: int) -> bytearray:
     """Return the `size` bytes that LZF packed into `data`.
 
     Raises:
@@ -280,29 +282,24 @@ def unpack_lzf(data: bytes, size: int) -> bytes:
 
         # A back reference: 3 bits of length, followed by a byte to add if all three are set, and
         # 13 bits of distance.
-        length = control >> 5
-        if length == 7:
+        length = (control >> 5) + 2
+        if length == 9:
             length += data[position]
             position += 1
-        start = len(output) - ((control & 31) << 8) - data[position] - 1
+        distance = ((control & 31) << 8) + data[position] + 1
         position += 1
-        _repeat(output, start, length + 2)
+
+        start = len(output) - distance
+        if start < 0:
+            raise ValueError("a repetition of bytes before the first")
+        pattern = output[start : start + length]
+        if distance < length:  # the repetition repeats itself
+            pattern = (pattern * (length // distance + 1))[:length]
+        output += pattern
 
     if len(output) != size:
         raise ValueError(f"{len(output)} unpacked bytes instead of {size}")
-    return bytes(output)
-
-
-def _repeat(output: bytearray, start: int, length: int) -> None:
-    """Append the `length` bytes from `start` on; at the end of `output`, start over.
-
-    Raises:
-        ValueError: if `start` is negative.
-    """
-    if start < 0:
-        raise ValueError("a repetition of bytes before the first")
-    pattern = output[start : start + length]
-    output += (pattern * (length // len(pattern) + 1))[:length]
+    return output
 
 
 READERS = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}

@@ -15,6 +15,7 @@ from amvnet.data.formats.rows import (
     ENOUGH,
     UNKNOWN,
     RowLayout,
+    are_rings,
     guess_columns,
     guess_dtype,
     guess_rows,
@@ -174,8 +175,10 @@ def columns_of(path: Path) -> int | None:
         return None
 
     values = np.fromfile(path, dtype=np.float32, count=SAMPLE_VALUES)
-    if size % (4 * NUSCENES_COLUMNS) == 0 and _is_nuscenes(values.reshape(-1, NUSCENES_COLUMNS)):
-        return NUSCENES_COLUMNS
+    if size % (4 * NUSCENES_COLUMNS) == 0:
+        table = values.reshape(-1, NUSCENES_COLUMNS)
+        if _is_nuscenes(table, _has_nuscenes_name(path)):
+            return NUSCENES_COLUMNS
     if size % (4 * KITTI_COLUMNS) == 0 and _is_kitti(values.reshape(-1, KITTI_COLUMNS)):
         return KITTI_COLUMNS
     return None
@@ -185,11 +188,14 @@ def _has_nuscenes_name(path: Path) -> bool:
     return path.name.lower().endswith(NUSCENES_ENDING)
 
 
-def _is_nuscenes(table: np.ndarray) -> bool:
+def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     """Return whether (N, 5) values can be x, y, z, intensity and ring.
 
     The ring holds whole numbers, at least two different ones, and the coordinates do not.
     Intensities are never negative.
+
+    Args:
+        is_named: whether the name says it, so that the last column is no label.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]
@@ -197,7 +203,9 @@ def _is_nuscenes(table: np.ndarray) -> bool:
 
     if not (ring == np.round(ring)).all() or not 0 <= ring.min() < ring.max() < MOST_RINGS:
         return False
-    return bool((intensity >= 0).all()) and not np.array_equal(xyz, np.round(xyz))
+    if not (intensity >= 0).all() or np.array_equal(xyz, np.round(xyz)):
+        return False
+    return is_named or are_rings(xyz, ring)
 
 
 def _is_kitti(table: np.ndarray) -> bool:

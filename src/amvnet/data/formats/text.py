@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from io import BytesIO, TextIOWrapper
+from io import StringIO
 from itertools import islice
 from pathlib import Path
 
@@ -22,6 +23,8 @@ USED = 7  # columns without names that are looked at
 COMMENTS = ("#", "//", "%")
 # Numbers are ASCII; comments and names of columns may be in any encoding.
 ENCODING = "utf-8-sig"
+UNDECODED = "\ufffd"  # what bytes that are no text become
+CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
 # Separators of the values, and decimal marks, in the order in which they are tried; None is any
 # white space.
 SEPARATORS: tuple[tuple[str | None, str], ...] = (
@@ -46,6 +49,7 @@ class TextTable:
         separator: between the values of a line; None for any white space.
         decimal: the decimal mark, "." or ",".
         skipped: lines before the first point.
+        encoding: of the text.
         count: the number of columns.
         names: those of the columns; empty if there are none.
     """
@@ -54,6 +58,7 @@ class TextTable:
     decimal: str
     skipped: int
     count: int
+    encoding: str
     names: tuple[str, ...] = ()
 
 
@@ -114,28 +119,37 @@ def read_column(path: Path, choose: Callable[[Sequence[str]], str]) -> np.ndarra
 
 
 def find_table(path: Path) -> TextTable | None:
-    """Return how the lines of a file are to be read; None if it is no text with points."""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
-    lines = _decode(head)
-    if len(head) == HEAD:
-        lines = lines[:-1]  # the last line may be cut
+    """Return how the lines of a text file are to be read; None if it is no text with points."""
+    text, encoding = _read_head(path)
+    lines = StringIO(text, newline=None).readlines()
 
     for separator, decimal in SEPARATORS:
-        table = _match(lines, separator, decimal)
+        table = _match(lines, separator, decimal, encoding)
         if table is not None:
             return table
     return None
 
 
-def _decode(head: bytes) -> list[str]:
-    """Return the lines of the beginning of a file; none if it is no text."""
-    if re.search(rb"[\x00-\x08\x0e-\x1f]", head):
-        return []
-    return TextIOWrapper(BytesIO(head), ENCODING, errors="replace").readlines()
+def is_text(path: Path) -> bool:
+    """Return whether a file begins as text does, and not as numbers in binary."""
+    text, _ = _read_head(path)
+    return bool(text.split()) and UNDECODED not in text
 
 
-def _match(lines: list[str], separator: str | None, decimal: str) -> TextTable | None:
+def _read_head(path: Path) -> tuple[str, str]:
+    """Return the whole lines at the beginning of a file, and its encoding; no lines if binary."""
+    with path.open("rb") as file:
+        head = file.read(HEAD)
+    encoding = "utf-16" if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else ENCODING
+    text = head.decode(encoding, errors="replace")
+    if len(head) == HEAD:
+        text = text[: text.rfind("\n") + 1]
+    return ("", encoding) if CONTROL.search(text) else (text, encoding)
+
+
+def _match(
+    lines: list[str], separator: str | None, decimal: str, encoding: str
+) -> TextTable | None:
     """Return the table that starts after some lines, if it has these separators."""
     names: tuple[str, ...] = ()
     for skipped, line in enumerate(lines):
@@ -150,7 +164,9 @@ def _match(lines: list[str], separator: str | None, decimal: str) -> TextTable |
                 if len(row) != len(values) or not _are_numbers(row, names, decimal):
                     return None
             is_named = len(names) == len(values)
-            return TextTable(separator, decimal, skipped, len(values), names if is_named else ())
+            return TextTable(
+                separator, decimal, skipped, len(values), encoding, names if is_named else ()
+            )
 
         candidates = tuple(map(_clean_name, _split(_uncomment(line), separator)))
         if {"x", "y", "z"} <= set(find_columns(candidates)):
@@ -198,7 +214,7 @@ def _are_numbers(values: list[str], names: tuple[str, ...], decimal: str) -> boo
 
 def _read_values(path: Path, table: TextTable, indices: range | list[int]) -> np.ndarray:
     """Return some columns of all points, (N, columns) float64."""
-    with path.open(encoding=ENCODING, errors="replace") as file:
+    with path.open(encoding=table.encoding, errors="replace") as file:
         lines: Iterator[str] = islice(file, table.skipped, None)
         if table.decimal == ",":
             lines = (line.replace(",", ".") for line in lines)

@@ -1,0 +1,228 @@
+"""Find scan files and bags, and list the scans that they hold."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.detect import (
+    ENDINGS,
+    METADATA,
+    PACKED,
+    TEXT,
+    ending_of,
+    is_dead_link,
+    named_ending,
+)
+from amvnet.data.formats.registry import RECORDINGS, RecordedScans, read_file
+from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.formats.text import find_table
+from amvnet.errors import InputError
+
+POSE_COLUMNS = 12  # of poses, as of KITTI: a 3 x 4 matrix in each line of a text file
+KITTI_RAW = "velodyne_points/data"  # the folder of the scans of a drive of KITTI's raw data
+RAW_DRIVES = ("", "*_sync/", "*_extract/", "*/*_sync/", "*/*_extract/")  # where it may lie
+ARGOVERSE = "sensors/lidar"  # the folder of the scans of a log of Argoverse 2
+
+
+@dataclass(frozen=True)
+class NamedScan:
+    """A scan in a file or a bag, not read yet.
+
+    Attributes:
+        name: unique among the scans of one input: `000000` for the file `000000.bin`,
+            `drive/000000` for the first scan of the bag `drive.bag`.
+        source: the same for all scans of one recording: the bag, or the folder and the ending.
+        path: the file or the bag.
+        ending: that the file should have, by its content (`ending_of`); empty if it is broken.
+        read: reads it.
+    """
+
+    name: str
+    source: str
+    path: Path
+    ending: str
+    read: Callable[[], Cloud]
+
+
+def find_scans(path: Path | str) -> list[Path]:
+    """Return the scan files and bags that a text names, sorted by name.
+
+    Args:
+        path: a file, a folder of them, a folder of drives of KITTI's raw data or of logs of
+            Argoverse 2, or a pattern such as `drive/*.bin` or `drives/**/*.pcd`. Hidden files are
+            left out, and text files too if a folder has other scans.
+
+    Raises:
+        InputError: if nothing has this name, or there is no scan.
+    """
+    path = Path(path)
+    if path.is_file() or is_bag_folder(path) or is_dead_link(path):
+        return [path]
+    if path.is_dir():
+        paths = _scans_of_folder(path)
+    elif glob.has_magic(str(path)):
+        paths = _matches(str(path))
+    else:
+        raise InputError(
+            f"{path}: expected a scan file or a folder of scans, found nothing; check the path"
+        )
+
+    if not paths:
+        raise InputError(
+            f"{path}: expected scan files ({', '.join(ENDINGS)}), found none in it; "
+            f"{_advice_to_find(path)}"
+        )
+    return paths
+
+
+def list_scans(
+    path: Path | str, topic: str | None = None, layout: RowLayout = UNKNOWN
+) -> Iterator[NamedScan]:
+    """Yield the scans that a text names, as `find_scans` finds them; those of a bag in its order.
+
+    A link that leads nowhere, and one of several files whose format cannot be told, is yielded as
+    one scan, which cannot be read.
+
+    Args:
+        topic: of bags; None means the only topic with scans.
+        layout: what rows of numbers without names hold, as far as the user says it.
+
+    Raises:
+        InputError: if there is no scan, or the only file has an unknown format or is a bag that
+            cannot be read.
+    """
+    files = find_scans(path)
+    folder = Path(os.path.commonpath([file.parent for file in files]))
+    for file in files:
+        # Files of several folders can have the same names.
+        name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
+        name = name.replace(f"/{KITTI_RAW}/", "/").replace(f"/{ARGOVERSE}/", "/")
+        try:
+            scans = _scans_of(file, name, topic, layout)
+        except InputError as error:
+            if len(files) == 1 and not is_dead_link(file):
+                raise
+            scans = [NamedScan(name, str(file), file, "", partial(_refuse, str(error)))]
+        yield from scans
+
+
+def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> list[NamedScan]:
+    """Return the scans of a file or a bag."""
+    ending = ending_of(file)
+    if ending not in RECORDINGS:
+        source = str(file.parent / f"*{ending}")
+        return [NamedScan(name, source, file, ending, partial(read_file, file, ending, layout))]
+
+    recording = RecordedScans(file, ending, topic)
+    scans = []
+    for index in range(len(recording)):
+        read = partial(recording.read, index)
+        scans.append(NamedScan(f"{name}/{index:06d}", str(file), file, ending, read))
+    return scans
+
+
+def _refuse(message: str) -> Cloud:
+    raise InputError(message)
+
+
+def _scans_of_folder(folder: Path) -> list[Path]:
+    """Return the scans that a folder stands for."""
+    # The other files of a log are tables, too.
+    if (folder / ARGOVERSE).is_dir():
+        return _scans_in(folder / ARGOVERSE)
+    return _scans_in(folder) or _drives_in(folder)
+
+
+def _scans_in(folder: Path) -> list[Path]:
+    """Return the scans of a folder; its text files only if there are no others."""
+    paths = sorted(filter(is_scan_file, folder.iterdir()))
+    if paths:
+        return paths
+    texts = [path for path in sorted(folder.iterdir()) if path.name.lower().endswith(TEXT)]
+    return [path for path in texts if _is_text_scan(path)]
+
+
+def _drives_in(folder: Path) -> list[Path]:
+    """Return the scans of the recordings in a folder: drives of KITTI, logs of Argoverse 2."""
+    patterns = [drives + KITTI_RAW for drives in RAW_DRIVES]
+    paths: list[Path] = []
+    for pattern in (*patterns, f"*/{ARGOVERSE}"):
+        for data in sorted(folder.glob(pattern)):
+            paths += _scans_in(data)
+    return paths
+
+
+def _matches(pattern: str) -> list[Path]:
+    """Return the scans that match a pattern, and those of the folders that match."""
+    paths: list[Path] = []
+    unnamed: list[Path] = []
+    for text in sorted(glob.glob(pattern, recursive=True)):
+        path = Path(text)
+        if is_scan_file(path) or _is_text_scan(path):
+            paths.append(path)
+        elif path.is_dir() and "**" not in pattern:
+            paths += _scans_of_folder(path)
+        elif path.is_file():
+            unnamed.append(path)
+    return paths or unnamed
+
+
+def _advice_to_find(path: Path) -> str:
+    """Return what to do if there is no scan in a folder."""
+    for pattern in ("*/*", "*/*/*"):
+        for deeper in sorted(path.glob(pattern)):
+            if is_scan_file(deeper) and not deeper.parent.name.startswith("."):
+                return f"give the folder of scans, such as {deeper.parent}"
+    return "give the folder of scans"
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Return whether a folder is a ROS 2 bag."""
+    if not (path / METADATA).is_file():
+        return False
+    return any(path.glob("*.db3*")) or any(path.glob("*.mcap*"))
+
+
+def is_scan_file(path: Path) -> bool:
+    """Return whether a name in a folder is that of a scan or a bag, and not of predictions.
+
+    Text files hold anything, so their names do not tell.
+    """
+    if path.name.startswith(".") or path.name.endswith(".uncertain.npy"):
+        return False
+    if path.suffix == ".npz" and path.with_suffix(".label").exists():
+        return False
+    if path.is_dir():
+        return is_bag_folder(path)
+    # A packed file counts if its name says that it is a scan, such as scan.bin.gz.
+    name = path.name.lower()
+    ending = named_ending(path)
+    if ending in PACKED:
+        ending = named_ending(Path(name.removesuffix(ending)))
+        return ending is not None and ending not in (*PACKED, *TEXT)
+    return ending is not None and ending not in TEXT
+
+
+def _is_text_scan(path: Path) -> bool:
+    """Return whether a path is that of a text file with points, and not with poses."""
+    is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
+    if not is_text or not path.is_file():
+        return False
+    table = find_table(path)
+    return table is not None and (bool(table.names) or table.count != POSE_COLUMNS)
+
+
+def scan_stem(path: Path) -> str:
+    """Return a scan file's name without its ending, also without `.pcd.bin` and `.bin.gz`."""
+    name = path.absolute().name if path.name in ("", "..") else path.name
+    if path.is_dir():
+        return name
+    ending = named_ending(Path(name)) or path.suffix
+    stem = name[: len(name) - len(ending)]
+    return scan_stem(Path(stem)) if ending in PACKED and named_ending(Path(stem)) else stem

@@ -1,0 +1,234 @@
+"""Read files in a process of its own, with limited memory, time and disk space.
+
+The libraries for packed and indexed formats take whatever a file claims or unpacks to, and some
+abort their process on broken bytes. One such process serves all files, one after the other.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from signal import SIGXCPU
+from tempfile import mkdtemp
+from threading import Lock
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+
+from amvnet.data.formats.cloud import reading
+from amvnet.errors import InputError
+
+try:
+    import resource
+except ImportError:  # Windows has no limits
+    resource = None  # type: ignore[assignment]
+
+# Limits, to which the bytes of a file add.
+MEMORY = 700 << 20  # bytes of the process
+MEMORY_PER_BYTE = 10
+MOST_MEMORY = 4 << 30
+SECONDS = 5.0  # of the processor
+BYTES_PER_SECOND = 3e6
+DISK = 64 << 20  # bytes of a temporary file
+DISK_PER_BYTE = 20
+
+PATIENCE = 0.2  # seconds to wait for the process to end by itself
+ADVICE = "copy the file again, or write it again"
+CODE = f"from {__name__} import serve; serve()"
+
+
+def call(function: str, path: Path, *arguments: Any) -> dict[str, Any]:
+    """Call a function that reads a file, in the process with limits.
+
+    Args:
+        function: its module and its name, such as `package.module:name`. It returns a dictionary
+            of arrays and of values that JSON can hold.
+        path: its first argument: the file, or a folder of files.
+        arguments: its other arguments, values that JSON can hold.
+
+    Raises:
+        InputError: if the function raises it, or needs more than the limits.
+    """
+    global _process
+    request = {
+        "function": function,
+        "arguments": [str(path), *arguments],
+        "folder": os.sep if path.is_absolute() else os.getcwd(),
+        "size": size_of(path),
+    }
+    with _lock:
+        if _process is None:
+            _process = _Process()
+        try:
+            values = _process.exchange(request)
+        except BaseException as error:  # an interruption, too: the reply would be that of the next
+            reason = _process.stop()
+            _process = None
+            if not isinstance(error, (OSError, EOFError)):
+                raise
+            raise InputError(
+                f"{path}: expected a file that can be read, found one that {reason}; {ADVICE}"
+            ) from None
+
+    if "error" in values:
+        raise InputError(values["error"])
+    return values
+
+
+def size_of(path: Path) -> int:
+    """Return the bytes of a file, or of the files in a folder."""
+    if not path.is_dir():
+        return path.stat().st_size
+    return sum(entry.stat().st_size for entry in path.iterdir() if entry.is_file())
+
+
+class _Process:
+    """The process, seen from the one that needs it."""
+
+    def __init__(self) -> None:
+        self._folder = mkdtemp(prefix="amvnet-")
+        environment = dict(os.environ, TMPDIR=self._folder)
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+        # With one thread, because each would use up some of the memory.
+        environment["OMP_NUM_THREADS"] = "1"
+        environment["OPENBLAS_NUM_THREADS"] = "1"
+
+        # In a session of its own, so that Ctrl-C reaches only this process, which then stops it.
+        # It ends by itself if this process ends.
+        self._popen = subprocess.Popen(
+            [sys.executable, "-P", "-c", CODE],
+            env=environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            bufsize=0,
+            start_new_session=True,
+        )
+        self._replies = os.fdopen(os.dup(cast(BinaryIO, self._popen.stdout).fileno()), "rb")
+
+    def exchange(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Send a request and return the reply.
+
+        Raises:
+            EOFError, OSError: if the process has ended.
+        """
+        cast(BinaryIO, self._popen.stdin).write(json.dumps(request).encode() + b"\n")
+        line = self._replies.readline()
+        if not line.endswith(b"\n"):
+            raise EOFError
+        values: dict[str, Any] = json.loads(line)
+
+        for name, (dtype, shape) in values.pop("arrays").items():
+            array = np.empty(shape, dtype)
+            if array.size and self._replies.readinto(array.data.cast("B")) < array.nbytes:
+                raise EOFError
+            values[name] = array
+        return values
+
+    def stop(self) -> str:
+        """End the process, and return in words why it ended if it did so by itself."""
+        cast(BinaryIO, self._popen.stdin).close()
+        try:
+            code = self._popen.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self._popen.kill()
+            code = self._popen.wait()
+        cast(BinaryIO, self._popen.stdout).close()
+        self._replies.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+        return "takes too long" if code == -SIGXCPU else "stops its reader"
+
+
+_process: _Process | None = None
+_lock = Lock()
+
+
+def _forget() -> None:
+    """Leave the process to the one that forked this one."""
+    global _process, _lock
+    _process = None
+    _lock = Lock()
+
+
+@atexit.register
+def _stop() -> None:
+    if _process is not None:
+        _process.stop()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
+
+
+# --- within the process ---
+
+
+def serve() -> None:
+    """Answer the requests that come by standard input, until it ends."""
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print must not get between the replies
+    if resource is not None:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+    for line in sys.stdin.buffer:
+        request = json.loads(line)
+        os.chdir(request["folder"])  # of the other process, which may have changed since the last
+        _set_limits(request["size"])
+        try:
+            with reading(request["arguments"][0], "a file that can be read", ADVICE):
+                values = _function(request["function"])(*request["arguments"])
+        except InputError as error:
+            values = {"error": str(error)}
+        _send(replies, values)
+        del values  # before the next file takes memory
+
+
+def _function(name: str) -> Callable[..., dict[str, Any]]:
+    module, _, function = name.partition(":")
+    return cast("Callable[..., dict[str, Any]]", getattr(import_module(module), function))
+
+
+def _set_limits(size: int) -> None:
+    """Limit this process for a file of `size` bytes."""
+    if resource is None:
+        return
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    seconds = usage.ru_utime + usage.ru_stime + SECONDS + size / BYTES_PER_SECOND
+    _limit(resource.RLIMIT_DATA, min(MEMORY + MEMORY_PER_BYTE * size, MOST_MEMORY))
+    _limit(resource.RLIMIT_CPU, math.ceil(seconds))
+    _limit(resource.RLIMIT_FSIZE, DISK + DISK_PER_BYTE * size)
+
+
+def _limit(kind: int, value: int) -> None:
+    _, most = resource.getrlimit(kind)
+    if most != resource.RLIM_INFINITY:
+        value = min(value, most)
+    with suppress(ValueError, OSError):  # some systems refuse it
+        resource.setrlimit(kind, (value, most))
+
+
+def _send(replies: BinaryIO, values: dict[str, Any]) -> None:
+    """Write a line of JSON, followed by the bytes of the arrays."""
+    arrays = {}
+    others = {}
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            arrays[name] = np.ascontiguousarray(value)
+        else:
+            others[name] = value
+
+    shapes = {name: (array.dtype.str, array.shape) for name, array in arrays.items()}
+    replies.write(json.dumps({**others, "arrays": shapes}).encode() + b"\n")
+    for array in arrays.values():
+        if array.size:
+            replies.write(array.data.cast("B"))
+    replies.flush()

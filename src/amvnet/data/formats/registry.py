@@ -1,0 +1,201 @@
+"""The readers of all formats, and where they run: in this process, or in the one with limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, Protocol
+from uuid import uuid4
+
+from amvnet.data.formats.arrow import read_feather
+from amvnet.data.formats.bags import Bag
+from amvnet.data.formats.cloud import Cloud, Message, require
+from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, PACKED, TEXT, ending_of
+from amvnet.data.formats.e57 import E57
+from amvnet.data.formats.las import read_las
+from amvnet.data.formats.numpy_files import read_npy, read_npz
+from amvnet.data.formats.packed import unpacked
+from amvnet.data.formats.packets import Capture
+from amvnet.data.formats.pcd import read_pcd
+from amvnet.data.formats.ply import read_ply
+from amvnet.data.formats.raw import read_raw
+from amvnet.data.formats.reader_process import call
+from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.formats.text import read_text_cloud
+from amvnet.errors import InputError
+
+OPEN_FILES = 4  # that the process with limits keeps open
+
+
+class Recording(Protocol):
+    """The scans of one file, in order of time."""
+
+    def __len__(self) -> int:
+        """Return the number of scans."""
+
+    def read(self, index: int) -> Cloud:
+        """Read the scan at this index, from 0.
+
+        Raises:
+            InputError: if it is broken.
+        """
+
+
+# Readers of one scan, by the endings of files. Those of rows need to know what the rows hold.
+ROW_READERS: dict[str, Callable[[Path, RowLayout], Cloud]] = {
+    NUSCENES_ENDING: read_raw,
+    ".bin": read_raw,
+    ".npy": read_npy,
+    ".npz": read_npz,
+    **dict.fromkeys(TEXT, read_text_cloud),
+}
+CLOUD_READERS: dict[str, Callable[[Path], Cloud]] = {
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+    ".las": read_las,
+    ".laz": read_las,
+    ".feather": read_feather,
+}
+RECORDINGS: dict[str, Callable[[Path, str, str | None], Recording]] = {
+    **dict.fromkeys((FOLDER, *BAGS), Bag),
+    ".e57": E57,
+    ".pcap": Capture,
+    ".pcapng": Capture,
+}
+SCANS = (*ROW_READERS, *CLOUD_READERS)  # endings of files of one scan
+
+# The extra of this package that reads a file, and the packages that it installs.
+PACKAGES = {
+    **dict.fromkeys((".las", ".laz"), ("formats", "laspy", "lazrs")),
+    **dict.fromkeys((FOLDER, *BAGS), ("formats", "rosbags")),
+    ".feather": ("datasets", "pyarrow"),
+    ".e57": ("e57", "pye57"),
+}
+WITH_LIMITS = (*PACKAGES, *PACKED)  # of the files of one scan
+
+
+def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
+    """Read the only scan of a file.
+
+    Args:
+        layout: what rows of numbers without names hold, as far as the user says it.
+
+    Raises:
+        InputError: if the file is missing, of another format, broken, or a bag of several scans.
+    """
+    path = Path(path)
+    ending = ending_of(path)
+    if ending not in RECORDINGS:
+        return read_file(path, ending, layout)
+
+    scans = RecordedScans(path, ending)
+    if len(scans) > 1:
+        raise InputError(
+            f"{path}: expected one scan, found {len(scans)}; segment it with amvnet predict"
+        )
+    return scans.read(0)
+
+
+def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
+    """Read a file of one scan.
+
+    Args:
+        ending: as `ending_of` returns it.
+        layout: as `read_cloud`.
+
+    Raises:
+        InputError: as `read_cloud`.
+    """
+    if ending not in WITH_LIMITS:
+        return _read(path, ending, layout)
+    if ending in PACKAGES:
+        require(path, *PACKAGES[ending])
+    what = (ending, layout.columns, layout.dtypes)
+    return _to_cloud(call(f"{__name__}:read_with_limits", path, *what))
+
+
+class RecordedScans:
+    """The scans of one file of several, read in the process with limits.
+
+    Args:
+        path: the file, or the folder of a ROS 2 bag.
+        ending: as `ending_of` returns it.
+        topic: of bags; None means the only topic with scans.
+
+    Raises:
+        InputError: if the file is broken, has no scan, or needs a package that is missing.
+    """
+
+    def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
+        if ending in PACKAGES:
+            require(path, *PACKAGES[ending])
+        self.path = path
+        self._what = (ending, topic, uuid4().hex)
+        self._count: int = call(f"{__name__}:count_with_limits", path, *self._what)["count"]
+
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self, index: int) -> Cloud:
+        """Read the scan at this index, from 0. In order is fastest.
+
+        Raises:
+            InputError: if it is broken.
+        """
+        what = (*self._what, index)
+        return _to_cloud(call(f"{__name__}:read_recorded_with_limits", self.path, *what))
+
+
+def _read(path: Path, ending: str, layout: RowLayout) -> Cloud:
+    """Read a file of one scan in this process."""
+    if ending in PACKED:
+        with unpacked(path) as inner:
+            return _read(inner, _ending_of_one(inner), layout)
+    if ending in ROW_READERS:
+        return ROW_READERS[ending](path, layout)
+    return CLOUD_READERS[ending](path)
+
+
+def _ending_of_one(path: Path) -> str:
+    ending = ending_of(path)
+    if ending in RECORDINGS or ending in PACKED:
+        raise InputError(
+            f"{path}: expected one scan, found a packed {ending} file; unpack the file first"
+        )
+    return ending
+
+
+def _to_cloud(values: dict[str, Any]) -> Cloud:
+    """Return the cloud that came from the process with limits."""
+    if values["message"] is not None:
+        values["message"] = Message(**values["message"])
+    return Cloud(**values)
+
+
+# --- within the process with limits ---
+
+
+def read_with_limits(
+    path: str, ending: str, columns: list[str], dtypes: list[str]
+) -> dict[str, Any]:
+    """Return the attributes of the cloud in a file."""
+    return vars(_read(Path(path), ending, RowLayout(tuple(columns), tuple(dtypes))))
+
+
+def count_with_limits(path: str, *what: str) -> dict[str, int]:
+    """Return the number of scans in a file."""
+    return {"count": len(_open(path, *what))}
+
+
+def read_recorded_with_limits(path: str, *what: Any) -> dict[str, Any]:
+    """Return the attributes of a cloud in a file of several, and of its message."""
+    *which, index = what
+    cloud = _open(path, *which).read(index)
+    return {**vars(cloud), "message": cloud.message and vars(cloud.message)}
+
+
+@lru_cache(OPEN_FILES)
+def _open(path: str, ending: str, topic: str | None, _key: str) -> Recording:
+    """Open a file; the key is another each time that it is opened, as it may have changed."""
+    return RECORDINGS[ending](Path(path), ending, topic)
