@@ -9,18 +9,19 @@ from contextlib import redirect_stdout, suppress
 from typing import Any
 
 from amvnet.cli.main import main
+from amvnet.cli.recipe_options import HELP_ALL
 
 PAGE = "command_line.md"
 PLACE = "<!-- the help of every verb -->"
 WIDTH = 100  # columns
 
 
-def help_of(*words: str) -> str:
-    """Return what `amvnet WORDS --help` prints."""
+def help_of(*words: str, option: str = "--help") -> str:
+    """Return what `amvnet WORDS --help` prints, or another option."""
     os.environ["COLUMNS"] = str(WIDTH)
     printed = io.StringIO()
     with redirect_stdout(printed), suppress(SystemExit):
-        main([*words, "--help"])
+        main([*words, option])
     return printed.getvalue().strip()
 
 
@@ -33,7 +34,10 @@ def reference() -> str:
     """Return a section with the help of each verb, in Markdown."""
     sections = []
     for verb in verbs():
-        sections.append(f"## amvnet {verb}\n\n```text\n{help_of(verb)}\n```")
+        text = help_of(verb)
+        if HELP_ALL in text:
+            text = help_of(verb, option=HELP_ALL)
+        sections.append(f"## amvnet {verb}\n\n```text\n{text}\n```")
     return "\n\n".join(sections)
 
 

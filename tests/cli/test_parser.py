@@ -6,13 +6,16 @@ import dataclasses
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from amvnet.cli.completion import SHELLS
 from amvnet.cli.main import VERBS, main
 from amvnet.cli.parser import join_negative_values, make_parser
-from amvnet.cli.recipe_options import field_texts, with_options
+from amvnet.cli.recipe_options import OFTEN_SET, add_recipe, field_texts, with_options
 from amvnet.config.schema import ModelConfig, Recipe
+from amvnet.models.methods import EngineName
 
 from fixtures.worlds import refusal, run_cli
 
@@ -72,7 +75,7 @@ def test_the_help_of_train_has_every_value_of_the_recipe_with_its_meaning(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with pytest.raises(SystemExit):
-        main(["train", "simulated-compact", "--help"])
+        main(["train", "simulated-compact", "--help-all"])
     text = " ".join(capsys.readouterr().out.split())
     assert "--training.rv.epochs EPOCHS Passes over the training scans. (default: 10)" in text
     assert "--model.range_view: The range image" in text
@@ -81,8 +84,49 @@ def test_the_help_of_train_has_every_value_of_the_recipe_with_its_meaning(
         assert words in text.replace("- ", "-")
 
 
+@pytest.mark.parametrize("verb", ["train", "ablate"])
+def test_help_shows_what_people_set(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for recipe in ([], ["nuscenes"]):
+        with pytest.raises(SystemExit):
+            main([verb, *recipe, "--help"])
+        lines = capsys.readouterr().out.splitlines()
+        assert len(lines) < 100
+        flags = [line.split()[0] for line in lines if line.startswith("  --")]
+        assert len(flags) <= 30
+        assert set(OFTEN_SET) <= set(flags)
+        assert "--help-all" in flags
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_a_shell_completes_verbs_options_and_values(
+    shell: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("shtab")
+    assert main(["--completion", shell]) == 0
+    script = capsys.readouterr().out
+    for verb in VERBS:
+        assert verb in script
+    for word in ("save", "training.rv.epochs", "int8", "nuscenes-compact"):
+        assert word in script
+
+
+def test_bash_completes_an_option_and_its_values(tmp_path: Path) -> None:
+    pytest.importorskip("shtab")
+    run = f"source <({sys.executable} -m amvnet --completion bash); "
+    run += "COMP_WORDS=(amvnet predict --engine ''); COMP_CWORD=3; "
+    run += "_shtab_amvnet amvnet '' --engine; echo ${COMPREPLY[@]}"
+    done = subprocess.run(["bash", "-c", run], capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == list(get_args(EngineName))
+
+
+def test_completion_for_another_shell_is_refused() -> None:
+    assert "bash, zsh" in refusal("--completion dosshell")
+    assert "bash, zsh" in refusal("--completion")
+
+
 def test_values_of_the_command_line_replace_those_of_the_recipe() -> None:
-    parser = make_parser("train", VERBS["train"], Recipe())
+    parser = make_parser("train", VERBS["train"])
+    add_recipe(parser, Recipe())
     words = ["simulated", "--data", "x", "--out", "o", "--training.rv.lr", "2e-3"]
     words += ["--model.range_net.gru", "false", "--model.point_head.hidden", "[8,4]"]
     recipe = with_options(Recipe(), vars(parser.parse_args(words)))

@@ -77,7 +77,8 @@ USAGE = f"""usage: amvnet VERB ...
   bench      time per stage on this machine
   info       what a weights file is, or what is installed
 
-`amvnet VERB --help` says more. Version {__version__}."""
+`amvnet VERB --help` says more. `amvnet --completion bash` prints what completes all of it
+(also for zsh, fish and tcsh; pip install "amvnet[completion]"). Version {__version__}."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -127,6 +128,11 @@ def _run_in_one_line(arguments: Sequence[str]) -> int:
         return DONE
 
     try:
+        if arguments[0] == "--completion":
+            from amvnet.cli.completion import completion
+
+            stdout.write(completion(VERBS, " ".join(arguments[1:])))
+            return DONE
         run(arguments[0], arguments[1:])
     except InputError as error:
         complain(str(error))
@@ -173,16 +179,18 @@ def run(verb: str, arguments: Sequence[str]) -> None:
 
 def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
     """Parse the arguments of a verb with a recipe, and set the values of their options in it."""
-    from amvnet.cli.recipe_options import with_options
+    from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
     from amvnet.config.recipes import load_recipe
     from amvnet.config.schema import Recipe
 
     # The help shows the values of the recipe that is named first, else the paper's.
-    asks_for_help = "-h" in arguments or "--help" in arguments
+    asks_for_help = bool({"-h", "--help", HELP_ALL} & set(arguments))
     names_recipe = bool(arguments) and not arguments[0].startswith("-")
     shown = load_recipe(arguments[0]) if asks_for_help and names_recipe else Recipe()
 
-    values = vars(make_parser(verb, VERBS[verb], shown).parse_args(list(arguments)))
+    parser = make_parser(verb, VERBS[verb])
+    add_recipe(parser, shown, shows_all=HELP_ALL in arguments)
+    values = vars(parser.parse_args(list(arguments)))
     values["recipe"] = with_options(load_recipe(values["recipe"]), values)
     return values
 

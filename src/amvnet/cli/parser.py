@@ -8,16 +8,13 @@ import re
 from argparse import BooleanOptionalAction
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 import docstring_parser
 from jsonargparse import ArgumentParser
 
 from amvnet.cli.console import say_lines
 from amvnet.errors import InputError, did_you_mean
-
-if TYPE_CHECKING:
-    from amvnet.config.schema import Recipe
 
 # The groups of a verb's options in its help; the others come before them.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -158,8 +155,8 @@ def expected_words(kind: Any) -> str:
     return "another value"
 
 
-def make_parser(verb: str, command: Command, recipe: Recipe | None = None) -> Parser:
-    """Return the parser of a verb; the values of a recipe, if any, become options too."""
+def make_parser(verb: str, command: Command) -> Parser:
+    """Return the parser of a verb, without the values of a recipe."""
     docs = docstring_parser.parse(command.run.__doc__ or "")
     help_texts = {param.arg_name: param.description or "" for param in docs.params}
     metavars = [str(options["metavar"]) for options in command.positional.values()]
@@ -186,11 +183,6 @@ def make_parser(verb: str, command: Command, recipe: Recipe | None = None) -> Pa
         target = parser if title is None else groups[title]
         _add_option(target, parameter, hints[name], help_texts.get(name, ""))
         parser.kinds[flag_of(name)] = hints[name]
-
-    if recipe is not None:
-        from amvnet.cli.recipe_options import add_recipe
-
-        parser.kinds.update(add_recipe(parser, recipe))
     return parser
 
 

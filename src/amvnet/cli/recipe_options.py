@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import dataclasses
 import functools
@@ -22,34 +23,52 @@ if TYPE_CHECKING:
     from amvnet.cli.parser import Parser
 
 PARTS = ("model", "training")  # of a recipe, whose values are options
+HELP_ALL = "--help-all"
+# The values that people set; --help shows these, and --help-all the others too.
+OFTEN_SET = (
+    "--model.assertion.threshold",
+    "--training.rv.epochs",
+    "--training.rv.batch",
+    "--training.rv.lr",
+    "--training.bev.epochs",
+    "--training.bev.batch",
+    "--training.bev.lr",
+    "--training.head.epochs",
+    "--training.head.lr",
+    "--training.seed",
+    "--training.workers",
+    "--training.precision",
+    "--training.accelerator",
+)
 
 
-def add_recipe(parser: Parser, recipe: Recipe) -> dict[str, Any]:
-    """Add the values of a recipe as options, one group for each of its parts.
+def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = True) -> None:
+    """Add the values of a recipe as options.
 
     Args:
         parser: where to add them.
         recipe: has the values that the help shows.
-
-    Returns:
-        The types of the options' values, by flag.
+        shows_all: whether the help has all values, one group for each part of the recipe, or only
+            those in `OFTEN_SET`.
     """
-    kinds: dict[str, Any] = {}
+    parser.add_argument(HELP_ALL, action="help", help="show every value of the recipe and exit")
+    often_set = parser.add_argument_group("values of the recipe that are set often")
     for name in PARTS:
         for path, config in _walk(getattr(recipe, name), name):
             values = _leaves(config)
-            if not values:
-                continue
-            group = parser.add_argument_group(f"--{path}", _first_line(type(config)))
+            group = often_set
+            if values and shows_all:
+                group = parser.add_argument_group(f"--{path}", _first_line(type(config)))
             texts = field_texts(type(config))
             hints = get_type_hints(type(config))
             for key, value in values.items():
                 flag = f"--{path}.{key}"
                 text = f"{texts[key]} (default: {_to_text(value)})".replace("%", "%%")
+                if not shows_all and flag not in OFTEN_SET:
+                    text = argparse.SUPPRESS
                 metavar = metavar_of(key, hints[key])
                 group.add_argument(flag, type=str, default=None, metavar=metavar, help=text)
-                kinds[flag] = hints[key]
-    return kinds
+                parser.kinds[flag] = hints[key]
 
 
 def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
