@@ -54,7 +54,7 @@ def without_memory() -> None:
 
 
 def without_folding() -> None:
-    amvnet.inference.segmenter.fold_batch_norms = lambda module: None
+    amvnet.inference.segmenter.freeze = lambda module: None
 
 
 def without_convolved_rows() -> None:

@@ -178,10 +178,10 @@ def test_tokens_write_nothing_elsewhere(token: str, link: str, is_mapped: bool) 
 
 
 @settings(deadline=None, max_examples=100)
-@given(name=NAMES, link=LINKS, benchmark=st.sampled_from(list(MAKERS)))
-def test_records_write_nothing_elsewhere(name: str, link: str, benchmark: str) -> None:
-    with surroundings(link, make=MAKERS[benchmark]) as base:
-        dataset = open_dataset(f"{benchmark}:{base}/data")
+@given(name=NAMES, link=LINKS, layout=st.sampled_from(list(MAKERS)))
+def test_records_write_nothing_elsewhere(name: str, link: str, layout: str) -> None:
+    with surroundings(link, make=MAKERS[layout]) as base:
+        dataset = open_dataset(f"{layout}:{base}/data")
         first = dataset.records(dataset.sequences("all"))[0]
         record = replace(first, prediction=name.replace("BASE", str(base)))
         ids = np.ones(len(dataset.read(record)), np.uint8)

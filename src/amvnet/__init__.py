@@ -65,6 +65,7 @@ def load(
     keep_memory: bool = False,
     tta: TtaName | None = None,
     tau: float | None = None,
+    graphs: bool = True,
 ) -> Segmenter:
     """Return a segmenter with trained weights.
 
@@ -83,6 +84,7 @@ def load(
         tta: test-time augmentation: "flips", "yaw" or "both", see `Segmenter`.
         tau: the cosine similarity up to which points are uncertain, in [0, 1]; None means as the
             weights say.
+        graphs: on a GPU, capture the networks as CUDA graphs, see `Segmenter`.
 
     Raises:
         InputError: if there are no such weights, they lack a part that the method needs, or the
@@ -98,6 +100,7 @@ def load(
         keep_memory=keep_memory,
         tta=tta,
         tau=tau,
+        graphs=graphs,
     )
     if engine != "torch":
         import_module("amvnet.export.engines").use_engine(segmenter, engine)

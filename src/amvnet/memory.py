@@ -1,18 +1,23 @@
-"""Keep the memory of this process from one scan to the next, and measure its peak."""
+"""Keep the memory of this process from one scan to the next, and measure what there is."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import resource
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 # Options of glibc's mallopt, from malloc.h.
 M_TRIM_THRESHOLD = -1  # free bytes from which on they are returned to the system
 M_MMAP_MAX = -4  # blocks that may each have a mapping of their own
 M_ARENA_MAX = -8  # heaps that the process may have
 DEFAULTS = {M_MMAP_MAX: 65536, M_TRIM_THRESHOLD: 128 * 1024}  # of glibc
+
+MEMINFO = Path("/proc/meminfo")
+CONTROL_GROUP = Path("/sys/fs/cgroup")  # of this process, in a container
 
 
 def keep_freed_memory() -> bool:
@@ -55,6 +60,23 @@ def _set_options(options: Mapping[int, int]) -> bool:
     except (OSError, AttributeError):  # musl has no mallopt
         return False
     return all(mallopt(option, value) for option, value in options.items())
+
+
+def available_memory() -> int:
+    """Return the bytes that this process can still take, of the machine or its control group.
+
+    On systems other than Linux, half of the machine's memory stands for it.
+    """
+    total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    available = total // 2
+    with suppress(OSError, ValueError, StopIteration):
+        lines = MEMINFO.read_text().splitlines()
+        line = next(line for line in lines if line.startswith("MemAvailable:"))
+        available = int(line.split()[1]) * 1024  # of "MemAvailable:  123 kB"
+    with suppress(OSError, ValueError):  # "max" is no number
+        limit = int((CONTROL_GROUP / "memory.max").read_text())
+        available = min(available, limit - int((CONTROL_GROUP / "memory.current").read_text()))
+    return available
 
 
 def peak_memory() -> int:

@@ -97,11 +97,11 @@ def test_a_recipes_stages_fit_each_other(name: str) -> None:
     assert len(net.widths) == len(net.blocks) == len(net.height_strides)
 
 
-@pytest.mark.parametrize("benchmark", ["semantickitti", "nuscenes"])
+@pytest.mark.parametrize("recipe", ["semantickitti", "nuscenes"])
 @pytest.mark.parametrize("size", ["", "-compact"])
-def test_the_pure_recipes_have_no_option_of_the_plus_recipes(benchmark: str, size: str) -> None:
-    pure = load_recipe(f"{benchmark}{size}").model
-    plus = load_recipe(f"{benchmark}-plus{size}").model
+def test_the_pure_recipes_have_no_option_of_the_plus_recipes(recipe: str, size: str) -> None:
+    pure = load_recipe(f"{recipe}{size}").model
+    plus = load_recipe(f"{recipe}-plus{size}").model
     assert pure.point_head == PointHeadConfig()
     assert plus.point_head.share == 0.5
     assert dataclasses.replace(plus, point_head=pure.point_head) == pure

@@ -19,7 +19,7 @@ from amvnet.export import engines, int8
 from amvnet.export.engines import OnnxGraph, cache_folder, exported, use_engine
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import expand_to_scan
-from amvnet.inference.segmenter import MOST_AT_ONCE, Segmenter
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models import layers
 from amvnet.models.layers import ConvBlock
 from amvnet.models.methods import MethodName
@@ -146,7 +146,7 @@ def test_onnx_segments_scans_in_parallel_with_one_thread_each() -> None:
     pytest.importorskip("onnxruntime")
     segmenter = Segmenter(fresh_weights())
     use_engine(segmenter, "onnx")
-    assert segmenter.at_once == min(torch.get_num_threads(), MOST_AT_ONCE)
+    assert segmenter.at_once == torch.get_num_threads()
 
     scans = [random_points(seed) for seed in range(6)]
     expected = [segmenter(points).labels for points in scans]

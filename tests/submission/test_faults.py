@@ -205,12 +205,12 @@ def is_refused_officially(case: Case, path: Path) -> bool:
         return True  # it cannot be read
 
 
-@pytest.mark.parametrize(("benchmark", "name"), BROKEN)
+@pytest.mark.parametrize(("layout", "name"), BROKEN)
 def test_a_broken_rule_is_named_in_one_line(
-    benchmark: str, name: str, cases: dict[str, Case], tmp_path: Path
+    layout: str, name: str, cases: dict[str, Case], tmp_path: Path
 ) -> None:
-    case = cases[benchmark]
-    fault = FAULTS[benchmark][name]
+    case = cases[layout]
+    fault = FAULTS[layout][name]
     path = case.pack(tmp_path / "s.zip", fault.entries(case))
 
     error = refused(case, path)
@@ -219,13 +219,13 @@ def test_a_broken_rule_is_named_in_one_line(
     assert is_refused_officially(case, path) == fault.official
 
 
-@pytest.mark.parametrize("benchmark", FAULTS)
+@pytest.mark.parametrize("layout", FAULTS)
 def test_kinds_of_faults_have_messages_of_their_own(
-    benchmark: str, cases: dict[str, Case], tmp_path: Path
+    layout: str, cases: dict[str, Case], tmp_path: Path
 ) -> None:
-    case = cases[benchmark]
+    case = cases[layout]
     messages = set()
-    for fault in FAULTS[benchmark].values():
+    for fault in FAULTS[layout].values():
         error = refused(case, case.pack(tmp_path / "s.zip", fault.entries(case)))
         messages.add(re.sub(r"\d+|'[^']*'|\S*/\S*", "#", error))  # without numbers and names
     assert len(messages) >= 12

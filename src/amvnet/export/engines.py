@@ -17,6 +17,7 @@ from amvnet.errors import InputError
 from amvnet.export.int8 import SIMULATED
 from amvnet.export.onnx import OPSET, check_libraries, export
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.graphs import without_graphs
 from amvnet.models.methods import METHODS, ONNX_ENGINES, EngineName
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.precision import InPrecision
@@ -120,7 +121,7 @@ def _compiled(function: Runner, shape: tuple[int, ...], device: str) -> Any:
 
 def _range_net(segmenter: Segmenter) -> nn.Module:
     net = segmenter.model.range_net
-    return net.net if isinstance(net, InPrecision) else net
+    return without_graphs(net.net if isinstance(net, InPrecision) else net)
 
 
 def _set_range_net(segmenter: Segmenter, net: nn.Module) -> None:

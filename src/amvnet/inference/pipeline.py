@@ -81,7 +81,7 @@ class ExecutionOptions:
     Attributes:
         batch: scans that go through the networks together; the labels are the same up to rounding.
         at_once: on a CPU, scans that are segmented at the same time, each with its share of the
-            threads. None means as many as there are threads, at most 4; 1 on a GPU, or with an
+            threads. None means as many as there are threads and memory for; 1 on a GPU, or with an
             engine other than torch, which shares out the threads itself.
         resume: leave out the scans that an earlier run into the same folder has done.
         processes: those that share the scans.

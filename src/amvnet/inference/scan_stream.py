@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -40,6 +41,8 @@ def stream_groups(
     Yields:
         The result of each group, in order. An exception of `compute` is raised in its turn.
     """
+    # Few scans share the threads of all that could be computed at the same time.
+    at_once = max(min(at_once, math.ceil(len(records) / batch)), 1)
     with ThreadPoolExecutor(1) as reader, computing_threads(at_once) as computer:
         loads = ((record, reader.submit(load, record)) for record in records)
         reading = deque(islice(loads, max(AHEAD, batch * at_once)))

@@ -26,10 +26,11 @@ from amvnet.inference.segmentation import (
     unpack,
 )
 from amvnet.inference.symmetries import SYMMETRIES, Score, average
-from amvnet.memory import keep_freed_memory, return_freed_memory
+from amvnet.memory import available_memory, keep_freed_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.assertion import Disagreement
-from amvnet.models.layers import fold_batch_norms
+from amvnet.models.graphs import Captured
+from amvnet.models.layers import freeze
 from amvnet.models.methods import (
     METHODS,
     ONNX_ENGINES,
@@ -38,6 +39,7 @@ from amvnet.models.methods import (
     Precision,
     TtaName,
 )
+from amvnet.models.polar_net import PolarNet
 from amvnet.models.precision import InPrecision, choose_device, choose_precision
 from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
@@ -47,7 +49,7 @@ from amvnet.sensors.intensity import check_intensity, match_scan, trained_intens
 from amvnet.threads import BusyMachine, survive_forks
 from amvnet.weights.file import Weights, load
 
-MOST_AT_ONCE = 4  # scans: bounds the memory on a processor with many cores
+EACH = 2**30  # bytes that a scan may take; one of 120,000 points takes half, at the paper's size
 LARGE = 1_000_000  # points, from which on freed memory is returned: it would not be used again
 
 
@@ -69,6 +71,8 @@ class Segmenter:
             scan in x and y, "yaw" turns by quarters (4 passes of the networks each), or "both" (8).
         tau: points whose class probabilities by the two networks have a cosine similarity of at
             most this are uncertain, in [0, 1]; None means as the weights say.
+        graphs: on a GPU, capture the networks as CUDA graphs (`models.graphs`), once for each
+            number of scans in a batch.
 
     Attributes:
         weights, device, precision, tta, tau: as given, the weights as `Weights`; device and
@@ -92,6 +96,7 @@ class Segmenter:
         keep_memory: bool = False,
         tta: TtaName | None = None,
         tau: float | None = None,
+        graphs: bool = True,
     ) -> None:
         self.weights = weights if isinstance(weights, Weights) else load(weights)
         self.method = _check_method(method, self.weights)
@@ -113,8 +118,8 @@ class Segmenter:
 
         self.model: AMVNet = self.weights.build().to(device)
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        fold_batch_norms(self.model)
-        _set_up_networks(self.model, device, precision)
+        freeze(self.model)
+        _set_up_networks(self.model, device, precision, graphs)
 
         if tau is not None:
             self.model.assertion = Disagreement(tau)
@@ -127,13 +132,14 @@ class Segmenter:
     def at_once(self) -> int:
         """Scans to segment at the same time, each with its share of torch's threads.
 
-        If it was not set, it is the best number for the device and the engine.
+        If it was not set, it is the best number for the device and the engine: on a CPU, one for
+        each thread, if the memory suffices.
         """
         if self._at_once is not None:
             return self._at_once
         if self.device != "cpu" or self.engine == "compile":
             return 1
-        return min(torch.get_num_threads(), MOST_AT_ONCE)
+        return max(min(torch.get_num_threads(), available_memory() // EACH), 1)
 
     @at_once.setter
     def at_once(self, count: int) -> None:
@@ -333,10 +339,7 @@ class Segmenter:
         if self._are_fractions:
             scans = [check_intensity(scan) for scan in scans]
         scans = [match_scan(scan, self.intensity) for scan in scans]
-        batch = PointBatch.of(scans)
-        if _is_gpu(self.device):
-            batch = batch.pin_memory()
-        return batch.to(self.device)
+        return PointBatch.of(scans, self.device)
 
 
 def check_scan(points: np.ndarray | Scan) -> Scan:
@@ -394,12 +397,16 @@ def _is_gpu(device: str) -> bool:
     return torch.device(device).type == "cuda"
 
 
-def _set_up_networks(model: AMVNet, device: str, precision: Precision) -> None:
+def _set_up_networks(model: AMVNet, device: str, precision: Precision, graphs: bool) -> None:
     """Let the two networks compute in a precision, and at the same time if that is faster."""
     if _is_gpu(device):
         model.arrange = TwoStreams(device)
     elif device == "cpu":
         model.arrange = side_by_side
+    if _is_gpu(device) and graphs:
+        assert isinstance(model.polar_net, PolarNet)
+        model.range_net = Captured(model.range_net)
+        model.polar_net.run_unet = Captured(model.polar_net.unet)
     if precision != "float32" or _is_gpu(device):
         model.range_net = InPrecision(model.range_net, device, precision)
         model.polar_net = InPrecision(model.polar_net, device, precision)

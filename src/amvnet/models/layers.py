@@ -26,6 +26,8 @@ class RingConv2d(nn.Conv2d):
         super().__init__(channels, out, kernel, stride, padding=(kernel // 2, 0), bias=False)
         self.strides = stride
         self.wrap = kernel // 2
+        # Of `upsampled_conv`, by scale, made from the weight; None while that may still change.
+        self.kernels: dict[tuple[int, int], Tensor] | None = None
 
     def forward(self, input: Tensor) -> Tensor:
         padded = wrap_width(input, self.wrap, self.wrap)
@@ -168,11 +170,20 @@ def upsample(x: Tensor, like: Tensor) -> Tensor:
     return F.interpolate(x, size=like.shape[-2:], mode="nearest")
 
 
-def fold_batch_norms(module: nn.Module) -> None:
-    """Fold the batch norms of a module in evaluation mode into the layers before them.
+def freeze(module: nn.Module) -> None:
+    """Prepare a module in evaluation mode whose parameters do not change any more.
 
-    The outputs stay the same up to rounding, and are faster to compute.
+    Batch norms are folded into the layers before them, so that the outputs stay the same up to
+    rounding and are faster to compute. What depends on parameters alone is computed once.
     """
+    fold_batch_norms(module)
+    for layer in module.modules():
+        if isinstance(layer, RingConv2d):
+            layer.kernels = {}
+
+
+def fold_batch_norms(module: nn.Module) -> None:
+    """Fold the batch norms of a module in evaluation mode into the layers before them."""
     for layers in list(module.modules()):
         if not isinstance(layers, nn.Sequential):
             continue

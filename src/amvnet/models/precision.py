@@ -31,7 +31,9 @@ class InPrecision(nn.Module):
         dtype = getattr(torch, self.precision) if is_lower else None
         # Of the whole process: on a CPU, several threads would set it back in the wrong order.
         tf32 = _tf32_as_set() if self.kind == "cuda" else nullcontext()
-        with tf32, torch.autocast(self.kind, dtype, enabled=is_lower):
+        # A graph must not use weights that autocast has converted and kept before its capture.
+        # Each weight is used once, so that keeping them would save nothing.
+        with tf32, torch.autocast(self.kind, dtype, enabled=is_lower, cache_enabled=False):
             return self.net(view).float()
 
 

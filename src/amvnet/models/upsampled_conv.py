@@ -33,28 +33,41 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     if not is_multiple:
         return convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
 
-    coarse_weight = convolution.weight[:, : coarse.shape[1]]
     fine_weight = convolution.weight[:, coarse.shape[1] :]
     wrapped = wrap_width(fine, 1, 1)
     result = convolve(wrapped, fine_weight, convolution.bias, stride=(1, 1), padding=(1, 0))
-    return result.add_(_convolve_upsampled(coarse, coarse_weight, scale))
+    kernels = _kernels(convolution, coarse.shape[1], scale)
+    return result.add_(_convolve_upsampled(coarse, kernels, scale))
 
 
-def _convolve_upsampled(x: Tensor, weight: Tensor, scale: tuple[int, int]) -> Tensor:
-    """Convolve (B, C, h, w) upsampled, by (C', C, 3, 3), into (B, C', h * scale, w * scale).
+def _kernels(convolution: RingConv2d, channels: int, scale: tuple[int, int]) -> Tensor:
+    """Return the kernels (s * s * C', C, taps, taps) for upsampled maps of C `channels`.
+
+    Those of a frozen convolution are kept. An exporter has to see how they are made.
+    """
+    may_keep = not torch.is_grad_enabled() and not torch.compiler.is_compiling()
+    kept = convolution.kernels if may_keep else None
+    if kept is not None and scale in kept:
+        return kept[scale]
+
+    # The sums of weights are exact enough only in the weights' own type.
+    weight = convolution.weight[:, :channels]
+    with torch.autocast(weight.device.type, enabled=False):
+        row_taps, column_taps = (_taps(size, weight) for size in scale)
+        kernels = torch.einsum("pak,qbl,oikl->pqoiab", row_taps, column_taps, weight).flatten(0, 2)
+    if kept is not None:
+        kept[scale] = kernels
+    return kernels
+
+
+def _convolve_upsampled(x: Tensor, kernels: Tensor, scale: tuple[int, int]) -> Tensor:
+    """Convolve (B, C, h, w) upsampled, by `_kernels`, into (B, C', h * scale, w * scale).
 
     The width is continued circularly. Fine cell s * t + p, with p from -1 to s - 2, sees the coarse
     cells t - 1 and t. So there is one kernel of 2 taps for each p. The fine cells of all t in a row
     begin one cell before the first.
     """
     rows, columns = scale
-
-    # The sums of weights are exact enough only in the weights' own type.
-    with torch.autocast(x.device.type, enabled=False):
-        row_taps = _taps(rows, weight)
-        column_taps = _taps(columns, weight)
-        kernels = torch.einsum("pak,qbl,oikl->pqoiab", row_taps, column_taps, weight).flatten(0, 2)
-
     output = convolve(wrap_width(x, 1, 1), kernels, None, stride=(1, 1), padding=(1, 0))
     output = output.permute(0, 2, 3, 1)  # (B, h + 1, w + 1, s * s * C')
     b, h, w, _ = output.shape

@@ -70,8 +70,8 @@ def evaluate(
             (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
             here that changes none.
         precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
-        at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
-            most 4.
+        at_once: scans that are segmented at the same time on a CPU; default: one per
+            core, if the memory suffices.
     """
     from amvnet.data.datasets.base import choose_records
     from amvnet.data.datasets.select import labelled_records

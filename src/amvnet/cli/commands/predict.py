@@ -77,8 +77,8 @@ def predict(
             here that changes none.
         precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
         batch: scans that go through the networks at a time; more than one suits a GPU.
-        at_once: scans that are segmented at the same time on a CPU; default: one per thread, at
-            most 4.
+        at_once: scans that are segmented at the same time on a CPU; default: one per
+            core, if the memory suffices.
         topic: of bags, the topic of the scans; default: the only one with scans.
         columns: of .bin, .npy and text files, what their columns hold, in order: x,y,z,intensity,
             ring, and any other name for a column to leave out; default: as the values suggest.

@@ -21,9 +21,11 @@ def occurring(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     Returns:
         The indices that occur (M,), ascending, and the tensors `indices` as indices into these.
     """
-    occurs = torch.zeros(count, dtype=torch.bool, device=indices[0].device)
+    device = indices[0].device
+    occurs = torch.zeros(count, dtype=torch.bool, device=device)
+    true = torch.ones((), dtype=torch.bool, device=device)  # Python's True would be copied there
     for index in indices:
-        occurs[index.flatten()] = True
+        occurs[index.flatten()] = true
 
     rank = occurs.cumsum(0) - 1  # position of an index among those that occur
     return occurs.nonzero()[:, 0], [rank[index] for index in indices]
@@ -81,32 +83,27 @@ class PointBatch:
         return [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
 
     @classmethod
-    def of(cls, scans: Sequence[Scan]) -> PointBatch:
+    def of(cls, scans: Sequence[Scan], device: torch.device | str = "cpu") -> PointBatch:
         """Return a batch of the valid points (`Scan.valid`) of one or more scans, in order.
 
-        The batch has ring indices only if every scan has them.
+        The batch has ring indices only if every scan has them. On their way to a GPU, points are
+        copied once, into pinned memory, which torch reuses for the next batch.
         """
-        parts = []
-        rings = []
-        for scan in scans:
-            valid = scan.valid
-            parts.append(scan.points[valid])
-            if scan.ring is not None:
-                rings.append(scan.ring[valid])
-
-        points = np.concatenate(parts).astype(np.float32, copy=False)
-        sizes = tuple(len(part) for part in parts)
-        scan_index = np.repeat(np.arange(len(scans)), sizes)
-
+        valid = [scan.valid for scan in scans]
+        sizes = tuple(int(np.count_nonzero(mask)) for mask in valid)
+        count = sum(sizes)
+        is_pinned = torch.device(device).type == "cuda"
+        points = torch.empty(count, 4, pin_memory=is_pinned)
+        scan_index = torch.empty(count, dtype=torch.int64, device=device)
         ring = None
-        if len(rings) == len(scans):
-            ring = torch.from_numpy(np.concatenate(rings).astype(np.int64))
+        if all(scan.ring is not None for scan in scans):
+            ring = torch.empty(count, dtype=torch.int64, pin_memory=is_pinned)
 
-        return cls(
-            points=torch.from_numpy(points),
-            scan=torch.from_numpy(scan_index),
-            count=len(scans),
-            ring=ring,
-            names=tuple(scan.name for scan in scans),
-            sizes=sizes,
-        )
+        batch = cls(points, scan_index, len(scans), ring, tuple(s.name for s in scans), sizes)
+        for index, (scan, mask, part) in enumerate(zip(scans, valid, batch.slices(), strict=True)):
+            which = slice(None) if mask.all() else mask  # a slice is not copied first
+            points.numpy()[part] = scan.points[which]
+            scan_index[part].fill_(index)
+            if ring is not None and scan.ring is not None:
+                ring.numpy()[part] = scan.ring[which]
+        return batch.to(device)

@@ -157,7 +157,10 @@ class PolarView:
         voxel, height_offset = _cells(z, c.z_min, c.z_max, c.vertical)
 
         polar = torch.stack([radius_offset, angle_offset, height_offset, radius, angle, z], dim=1)
-        features = torch.cat([polar.to(batch.points.dtype), batch.points[:, [0, 1, 3]]], dim=1)
+        # Not by a list of columns, which would have to be copied to a GPU.
+        xy = batch.points[:, :2]
+        intensity = batch.points[:, 3:]
+        features = torch.cat([polar.to(batch.points.dtype), xy, intensity], dim=1)
 
         pillar = (batch.scan * c.radial + radial_cell) * c.angular + angular_cell
         pillars = batch.count * c.radial * c.angular
@@ -165,9 +168,10 @@ class PolarView:
         seen = occupied
         seen_slot = slot
         if c.nearest > 0:
-            is_far = batch.points[:, :3].norm(dim=1) >= c.nearest
-            features = features[is_far]
-            seen, (seen_slot,) = occurring(pillars, pillar[is_far])
+            # The processor waits once for a GPU, to know how many these are.
+            far = (batch.points[:, :3].norm(dim=1) >= c.nearest).nonzero()[:, 0]
+            features = features.index_select(0, far)
+            seen, (seen_slot,) = occurring(pillars, pillar.index_select(0, far))
 
         return PolarGrid(
             features=features,
