@@ -155,23 +155,3 @@ def test_an_error_of_the_disk_without_a_reason_says_what_is_known(
     assert code == 1
     assert "None" not in line
     assert "1000 requested and 0 written" in line
-
-
-@pytest.mark.parametrize("verb", ["predict", "view", "fuse"])
-def test_other_formats_are_refused_before_torch_is_imported(verb: str, tmp_path: Path) -> None:
-    picture = tmp_path / "scan.jpg"
-    picture.write_bytes(b"\xff\xd8\xff\xe0 a photograph")
-    words = {
-        "predict": ["--weights", "sim-hdl64e", "--out", str(tmp_path / "out")],
-        "view": ["--weights", "sim-hdl64e", "--html", str(tmp_path / "page.html")],
-        "fuse": ["--scores-a", ".", "--scores-b", ".", "--out", str(tmp_path / "out")],
-    }[verb]
-    code = (
-        "import sys; from amvnet.cli.main import main; code = main(sys.argv[1:]); "
-        "print(code, 'torch' in sys.modules)"
-    )
-    process = subprocess.run(
-        [sys.executable, "-c", code, verb, str(picture), *words], capture_output=True, text=True
-    )
-    assert process.stdout == "2 False\n"
-    assert "found another format" in process.stderr

@@ -87,7 +87,9 @@ class FixedScores(Segmenter):
         self.rv = rv.astype(np.float32)
         self.bev = bev.astype(np.float32)
 
-    def __call__(self, points: np.ndarray | Scan | Path | str) -> Segmentation:
+    def __call__(
+        self, points: np.ndarray | Scan | Path | str, columns: str | None = None
+    ) -> Segmentation:
         labels = self.rv.argmax(axis=1) + 1
         uncertain = np.zeros(len(labels), bool)
         return Segmentation(labels, uncertain, scores=self.rv, rv=self.rv, bev=self.bev)

@@ -63,20 +63,6 @@ def parse_classes(name: str | None) -> ClassMap | None:
     return None if name is None else class_map(name)
 
 
-def refuse_other_formats(inputs: Sequence[str]) -> None:
-    """Check that input files have a known format, before torch is imported.
-
-    Raises:
-        InputError: if one has not.
-    """
-    from amvnet.data.datasets.own import is_description
-    from amvnet.data.formats.detect import ending_of
-
-    for text in inputs:
-        if Path(text).is_file() and not is_description(text):
-            ending_of(Path(text))
-
-
 def make_segmenter(
     weights: Weights,
     device: str,

@@ -332,9 +332,7 @@ def _say_left_out(text: str, scans: Sequence[NamedScan], say: Say) -> None:
     count = endings.total()
     if count:
         names = [ending or "without an ending" for ending, found in endings.items() if found]
-        files = (
-            "1 file that is no scan is" if count == 1 else f"{count} files that are no scans are"
-        )
+        files = "1 other file is" if count == 1 else f"{count} other files are"
         say(f"{text}: {files} left out ({', '.join(sorted(names)[:SHOWN])})")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -14,14 +15,17 @@ from amvnet.data.datasets.open import open_with_classes
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.cloud import Cloud, Message
 from amvnet.data.formats.find import NamedScan
+from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import trained_intensity
+from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
 from amvnet.sensors.lidars import Sensor, make_sensor, sensor_from
 from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
+
+MOST_COLUMNS = 64  # of an array of points; one with more is transposed
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,46 @@ class FileReader:
         cloud = scan.read()
         self._kept[scan.source, scan.name] = cloud
         return cloud
+
+
+def array_scan(
+    points: np.ndarray, columns: str | None = None, trained: TrainedIntensity | None = None
+) -> Scan:
+    """Return the scan of an array, whose columns are those that a file of them would have.
+
+    Args:
+        points: (N, 3 or more): x, y, z in metres, intensity in [0, 1], ring.
+        columns: their names in order, separated by commas; others than x, y, z, intensity and ring
+            are left out. None means these in this order, the ring if the values suggest it.
+        trained: fills in the intensities if there are none, which a warning says.
+
+    Raises:
+        InputError: if the shape is another one, or names of columns are missing.
+    """
+    array = np.asarray(points)
+    is_transposed = array.ndim == 2 and len(array) < MOST_COLUMNS < array.shape[1]
+    if array.ndim != 2 or array.shape[1] < 3 or is_transposed:
+        advice = "transpose it" if is_transposed else "reshape it"
+        raise InputError(
+            "scan: expected points of shape (N, 3 or more) with columns x, y, z, intensity, "
+            f"found {array.shape}; {advice}"
+        )
+
+    names = parse_layout(columns, None).columns or name_columns(array)
+    cloud = named_cloud(list(array.T), names, "scan")
+    intensity = cloud.intensity
+    if intensity is None:
+        intensity = np.zeros(len(array)) if trained is None else trained.filler(len(array))
+        warnings.warn(
+            f"the scan has no intensity: {describe_filler(trained)}; give a fourth column",
+            stacklevel=3,
+        )
+
+    table = np.empty((len(array), 4), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: not valid
+        table[:, :3] = cloud.xyz
+        table[:, 3] = intensity
+    return Scan(table, ring=cloud.ring)
 
 
 def normaliser_for(

@@ -16,7 +16,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import normaliser_for
+from amvnet.inference.reading import array_scan, normaliser_for
 from amvnet.inference.segmentation import (
     Origin,
     Segmentation,
@@ -45,7 +45,12 @@ from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import Voting
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
+from amvnet.sensors.intensity import (
+    TrainedIntensity,
+    check_intensity,
+    match_scan,
+    trained_intensity,
+)
 from amvnet.threads import BusyMachine, survive_forks
 from amvnet.weights.file import Weights, load
 
@@ -162,18 +167,25 @@ class Segmenter:
     def __repr__(self) -> str:
         return f"<Segmenter {self.method} on {self.device}, {self.precision}: {self.weights!r}>"
 
-    def __call__(self, points: np.ndarray | Scan | Path | str) -> Segmentation:
+    def __call__(
+        self, points: np.ndarray | Scan | Path | str, columns: str | None = None
+    ) -> Segmentation:
         """Segment one scan.
 
         Args:
-            points: (N, 4) x, y, z in metres and intensity in [0, 1]; or a `Scan`; or the path of a
-                scan file, which is normalised to the weights as `amvnet predict` does.
+            points: (N, 4) x, y, z in metres and intensity in [0, 1]; or an array with other columns
+                (`array_scan`); or a `Scan`; or the path of a scan file, which is normalised to the
+                weights as `amvnet predict` does.
+            columns: of an array, what its columns hold, such as "x,y,z,intensity,ring"; None means
+                what their number and values suggest.
 
         Raises:
             InputError: if there is no valid point, more than a few intensities are out of range,
                 the model needs a ring index and there is none, or a file cannot be read or holds
                 several scans.
         """
+        if isinstance(points, np.ndarray):
+            points = array_scan(points, columns, self.intensity)
         if not isinstance(points, Path | str):
             return self.many([points])[0]
 
@@ -190,7 +202,7 @@ class Segmenter:
         Raises:
             InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
-        checked = [check_scan(points) for points in scans]
+        checked = [check_scan(points, self.intensity) for points in scans]
         uses_team = self.device == "cpu" and self.engine not in ONNX_ENGINES
         is_large = sum(map(len, checked)) >= LARGE
         memory = return_freed_memory() if self._keeps_memory and is_large else nullcontext()
@@ -342,13 +354,17 @@ class Segmenter:
         return PointBatch.of(scans, self.device)
 
 
-def check_scan(points: np.ndarray | Scan) -> Scan:
-    """Make a `Scan` of points (N, 4), and check that at least one point is valid.
+def check_scan(points: np.ndarray | Scan, trained: TrainedIntensity | None = None) -> Scan:
+    """Make a `Scan` of an array of points, and check that at least one point is valid.
+
+    Args:
+        points: a scan, or an array as `array_scan` takes it.
+        trained: the intensities of the training, for an array that has none.
 
     Raises:
         InputError: if there is no point, or none is valid.
     """
-    scan = points if isinstance(points, Scan) else Scan(np.asarray(points, dtype=np.float32))
+    scan = points if isinstance(points, Scan) else array_scan(points, trained=trained)
     if not scan.valid.any():
         problem = "none finite" if len(scan) else "none"
         raise InputError(

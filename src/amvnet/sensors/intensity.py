@@ -250,13 +250,13 @@ def intensity_map(
         is_given: whether the user gave the scale.
     """
     if quantiles is None:
-        return IntensityMap(f"no intensity ({_describe_filler(trained)})", trained=trained)
+        return IntensityMap(f"no intensity ({describe_filler(trained)})", trained=trained)
 
     linear = IntensityMap(f"intensity 0 to {scale:g}", scale)
     if is_given:
         return linear
     if is_constant(quantiles):
-        text = f"intensity {quantiles[5]:g} everywhere, so none ({_describe_filler(trained)})"
+        text = f"intensity {quantiles[5]:g} everywhere, so none ({describe_filler(trained)})"
         return IntensityMap(text, trained=trained)
     if trained is not None and trained.is_matched:  # by the segmenter, scan by scan
         return dataclasses.replace(linear, text=f"{linear.text}, spread as in the training")
@@ -271,7 +271,8 @@ def intensity_map(
     return IntensityMap(text, matched=matching(quantiles, trained.quantiles))
 
 
-def _describe_filler(trained: TrainedIntensity | None) -> str:
+def describe_filler(trained: TrainedIntensity | None) -> str:
+    """Return what stands in for missing intensities."""
     if trained is None:
         return "0 instead"
     if trained.is_optional:

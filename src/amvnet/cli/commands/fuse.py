@@ -10,7 +10,6 @@ from amvnet.cli.options import (
     Split,
     parse_names,
     parse_scores,
-    refuse_other_formats,
 )
 from amvnet.errors import InputError
 
@@ -57,7 +56,6 @@ def fuse(
         dtype: of .bin files, the type of the numbers, as of predict.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
-    refuse_other_formats(inputs)
     from amvnet.data.formats.rows import parse_layout
     from amvnet.data.taxonomy import taxonomy_named
     from amvnet.inference.fuse_files import fuse_files

@@ -12,7 +12,6 @@ from amvnet.cli.options import (
     make_segmenter,
     parse_classes,
     parse_names,
-    refuse_other_formats,
 )
 from amvnet.models.methods import EngineName, MethodName, Precision, TtaName
 
@@ -98,7 +97,6 @@ def predict(
             sensor is at the origin.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
-    refuse_other_formats(inputs)
     from amvnet.data.formats.rows import parse_layout
     from amvnet.inference.listing import ScanOptions
     from amvnet.inference.pipeline import ExecutionOptions, OutputOptions

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, make_segmenter, parse_names, refuse_other_formats
+from amvnet.cli.options import Split, make_segmenter, parse_names
 from amvnet.errors import InputError
 from amvnet.models.methods import EngineName, Precision
 
@@ -76,7 +76,6 @@ def view(
         at_once: scans that are segmented at the same time on a CPU; default: one per
             core, if the memory suffices.
     """
-    refuse_other_formats(inputs)
     from amvnet.data.formats.rows import parse_layout
     from amvnet.files import make_folder
     from amvnet.inference.listing import ScanOptions

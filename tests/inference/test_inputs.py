@@ -1,0 +1,312 @@
+"""The scans of any inputs are listed, read once, and normalised by what their own sensor shows."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amvnet.data.formats import find
+from amvnet.data.formats.cloud import Cloud
+from amvnet.inference.journal import Entry
+from amvnet.inference.listing import list_inputs
+from amvnet.inference.predict import ADVICE, report
+from amvnet.inference.reading import array_scan, normaliser_for
+from amvnet.inference.segmenter import Segmenter
+from amvnet.scan import Scan
+from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
+from amvnet.sensors.measure import MEASURED
+from amvnet.viewing.frames import LabelSource, choose_frames
+from amvnet.weights.file import Weights, save
+
+from fixtures.sensors import LASERS, place
+from fixtures.worlds import fails, files, fresh_weights, refusal, run_cli, street, succeed
+
+
+def weights_for(sensor: str = "hdl64e") -> Weights:
+    return replace(fresh_weights(), sensor=sensor)
+
+
+def write(folder: Path, name: str, sensor: str, height: float, seed: int = 0) -> Path:
+    """Write a scan of a sensor to a file."""
+    folder.mkdir(exist_ok=True)
+    points, _ = place(LASERS[sensor], height, seed=seed)
+    path = folder / f"{name}.npy"
+    np.save(path, points)
+    return path
+
+
+def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]]:
+    """Return the normalised scans of a folder, the titles of their sensors, and what was said."""
+    lines: list[str] = []
+    inputs, _ = list_inputs(
+        [str(folder)], normaliser=normaliser_for(weights_for(), say=lines.append)
+    )
+    loaded = {scan.name: scan.load() for scan in inputs}
+    scans = {name: item.scan for name, item in loaded.items()}
+    return scans, {name: item.sensor for name, item in loaded.items()}, lines
+
+
+# ---- two sensors in one folder
+
+
+@pytest.mark.parametrize(("first", "second"), [("vlp16", "os1-64"), ("os1-64", "hdl32e")])
+def test_two_sensors_in_a_folder_are_normalised_as_in_two(
+    tmp_path: Path, first: str, second: str
+) -> None:
+    for seed in range(MEASURED):
+        sensor, height, name = (first, 0.9, "a") if seed < 3 else (second, 1.3, "b")
+        write(tmp_path / "both", f"{name}{seed}", sensor, height, seed)
+        write(tmp_path / name, f"{name}{seed}", sensor, height, seed)
+
+    scans, titles, lines = normalised(tmp_path / "both")
+    for folder in ("a", "b"):
+        for name, expected in normalised(tmp_path / folder)[0].items():
+            np.testing.assert_array_equal(scans[name].points, expected.points)
+            np.testing.assert_array_equal(scans[name].ring, expected.ring)
+    assert titles["a0"] == titles["a2"] != titles["b3"] == titles["b4"]
+    assert len(lines) == 2
+    assert "another sensor" in lines[1]
+    assert "b3" in lines[1]
+
+
+def test_a_scan_of_another_sensor_after_the_first_ones_is_told(tmp_path: Path) -> None:
+    for seed in range(MEASURED + 2):
+        write(tmp_path / "both", f"a{seed}", "os1-64", 1.0, seed)
+    write(tmp_path / "both", "b", "vlp16", 2.5)
+    write(tmp_path / "alone", "b", "vlp16", 2.5)
+
+    scans, titles, lines = normalised(tmp_path / "both")
+    expected = normalised(tmp_path / "alone")[0]["b"]
+    np.testing.assert_array_equal(scans["b"].points, expected.points)
+    assert len(set(titles.values())) == 2
+    assert len(lines) == 2
+    assert "another sensor" in lines[1]
+
+
+def test_a_sensor_that_misses_points_is_still_the_same_one(tmp_path: Path) -> None:
+    """Not even half of the points, as in a tunnel or in rain, make another sensor."""
+    for seed in range(MEASURED + 3):
+        path = write(tmp_path / "drive", str(seed), "os1-64", 1.0, seed)
+        points = np.load(path)
+        is_lost = np.random.default_rng(seed).random(len(points)) < 0.6
+        np.save(path, points[~is_lost] if seed > MEASURED else points)
+
+    _, titles, lines = normalised(tmp_path / "drive")
+    assert len(set(titles.values())) == 1
+    assert len(lines) == 1
+
+
+# ---- how sure the labels are
+
+
+def said(entries: list[Entry], usual: float = 0.1) -> list[str]:
+    lines: list[str] = []
+    report(entries, usual, lines.append)
+    return lines
+
+
+def entry(sensor: str, share: float, points: int = 1000) -> Entry:
+    return Entry(sensor, "", sensor, points, round(share * points))
+
+
+def test_each_recording_is_judged_by_its_own_share() -> None:
+    """A good drive does not hide the other sensor in it, nor a bag that is tilted."""
+    good = entry("drive", 0.1, 10_000)
+    assert said([good, good]) == ["10.0% of the points are uncertain (usual: 10.0%)"]
+
+    lines = said([good, entry("drive, another sensor", 0.8), entry("a.bag", 0.9), good])
+    assert lines[0].startswith("16.8%")
+    assert "warning: drive, another sensor: do not rely on these labels: 80.0%" in lines[1]
+    assert "warning: a.bag: do not rely on these labels: 90.0%" in lines[2]
+    assert lines[3] == f"warning: {ADVICE}"
+    assert len(lines) == 4
+
+
+def test_one_doubtful_recording_is_one_line() -> None:
+    (line,) = said([entry("drive", 0.8)])
+    assert line.startswith("warning: do not rely")
+    assert line.endswith(ADVICE)
+    assert said([]) == said([Entry("drive", "", "drive", 0, 0)]) == []
+
+
+def test_many_doubtful_recordings_are_few_lines() -> None:
+    lines = said([entry(str(index), 0.9) for index in range(50)])
+    assert len(lines) == 12
+    assert "40 more" in lines[-1]
+
+
+def test_recordings_of_a_run_are_judged_on_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The scans of one folder are those of the training, the others stand on their side."""
+    weights = weights_for()
+    points = {"level": street(0)[0], "side": street(0)[0][:, [1, 2, 0, 3]]}
+    shares = {}
+    for name, table in points.items():
+        (tmp_path / name).mkdir()
+        table.tofile(tmp_path / name / f"{name}.bin")
+        scan = normaliser_for(weights)(Cloud(table[:, :3], table[:, 3], name=name), name)
+        result = Segmenter(weights).by_ring()(scan)
+        shares[name] = f"{result.uncertain.mean():.1%}"
+
+    path = save(weights, tmp_path / "w.safetensors")
+    inputs = f"{tmp_path}/level {tmp_path}/side"
+    succeed(f"predict {inputs} --weights {path} --out {tmp_path}/out")
+    lines = capsys.readouterr().out.splitlines()
+    for name, share in shares.items():
+        (line,) = [line for line in lines if line.startswith(f"warning: {tmp_path}/{name}/")]
+        assert share in line
+
+
+# ---- listing
+
+
+def test_a_dead_link_is_a_broken_scan(tmp_path: Path) -> None:
+    path = save(weights_for(), tmp_path / "w.safetensors")
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    for name in "ac":
+        street(ord(name), 300)[0].tofile(scans / f"{name}.bin")
+    (scans / "b.bin").symlink_to(tmp_path / "nothing.bin")
+
+    for inputs in ([scans], sorted(scans.iterdir())):
+        out = tmp_path / f"out{len(inputs)}"
+        code, error = run_cli("predict", *inputs, "--weights", path, "--out", out)
+        assert code == 3
+        assert "b.bin: expected a scan file, found a link that leads nowhere" in error
+        assert files(out) == {"a.label", "c.label"}
+
+    line = refusal(f"predict {scans}/b.bin --weights {path} --out {tmp_path}/out")
+    assert "leads nowhere" in line
+
+
+def test_files_of_a_folder_that_are_no_scans_are_counted_in_one_line(tmp_path: Path) -> None:
+    street(0, 300)[0].tofile(tmp_path / "a.bin")
+    (tmp_path / "a.label").write_bytes(b"1234")
+    (tmp_path / ".hidden").write_text("")
+    lines: list[str] = []
+    list_inputs([str(tmp_path)], say=lines.append)
+    assert lines == []
+
+    for name in ("readme.md", "a.jpg", "b.jpg"):
+        (tmp_path / name).write_text("no scan")
+    inputs, _ = list_inputs([str(tmp_path)], say=lines.append)
+    assert [scan.name for scan in inputs] == ["a"]
+    assert lines == [f"{tmp_path}: 3 other files are left out (.jpg, .md)"]
+
+
+def test_each_file_is_read_once_and_its_format_detected_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts: Counter[str] = Counter()
+
+    def count(function: Any, name: str) -> Any:
+        def counted(path: Path, *arguments: Any) -> Any:
+            counts[f"{name} {path.name}"] += 1
+            return function(path, *arguments)
+
+        return counted
+
+    monkeypatch.setattr(find, "read_file", count(find.read_file, "read"))
+    monkeypatch.setattr(find, "ending_of", count(find.ending_of, "detect"))
+    names = [f"{index}.bin" for index in range(MEASURED + 2)]
+    (tmp_path / "scans").mkdir()
+    for index, name in enumerate(names):
+        street(index, 300)[0].tofile(tmp_path / "scans" / name)
+    path = save(weights_for(), tmp_path / "w.safetensors")
+    succeed(f"predict {tmp_path}/scans --weights {path} --out {tmp_path}/out")
+    succeed(f"predict {tmp_path}/scans/0.bin --weights {path} --out {tmp_path}/one")
+
+    for name in names:
+        times = 2 if name == "0.bin" else 1  # 0.bin is in both runs
+        assert counts[f"read {name}"] == times
+        assert counts[f"detect {name}"] == times
+
+
+# ---- rows
+
+
+def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> None:
+    """Of every fourth laser, rows by elevation or by ring give other labels."""
+    weights = weights_for()
+    segmenter = Segmenter(weights)
+    points, laser = place(LASERS["os1-64"], 1.0)
+    points = points[laser % 4 == 0]
+    np.save(tmp_path / "a.npy", points)
+
+    scan = normaliser_for(weights)(Cloud(points[:, :3], points[:, 3], name="a"), "a")
+    expected = segmenter.by_ring()(scan).labels
+    assert np.mean(segmenter(replace(scan, ring=None)).labels != expected) > 0.02
+
+    path = save(weights, tmp_path / "w.safetensors")
+    succeed(f"predict {tmp_path}/a.npy --weights {path} --out {tmp_path}")
+    raw = np.fromfile(tmp_path / "a.label", np.uint32)
+    np.testing.assert_array_equal(raw, weights.taxonomy.to_raw(expected))
+
+    (frame,) = choose_frames([str(tmp_path / "a.npy")], 1, LabelSource(segmenter)).each()
+    np.testing.assert_array_equal(frame.labels["amvnet"], expected)
+    np.testing.assert_array_equal(segmenter(tmp_path / "a.npy").labels, expected)
+
+
+# ---- arrays
+
+POINTS = np.clip(street(5, 400)[0], [-99, -99, -99, 0], [99, 99, 99, 1]).astype(np.float32)
+RING = np.arange(len(POINTS)) % 32
+TRAINED = TrainedIntensity(np.linspace(0.1, 0.9, len(PROBABILITIES)).tolist())
+
+
+@pytest.mark.parametrize(
+    ("array", "columns"),
+    [
+        (POINTS.astype(np.float64), None),
+        (np.column_stack([POINTS, RING]), None),
+        (np.column_stack([POINTS, np.linspace(0, 0.1, len(POINTS)), RING]), None),
+        (np.column_stack([RING, POINTS]), "ring,x,y,z,intensity"),
+        (POINTS[:, [3, 2, 1, 0]], "intensity,z,y,x"),
+    ],
+)
+def test_an_array_is_taken_with_any_columns(array: np.ndarray, columns: str | None) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scan = array_scan(array, columns)
+    np.testing.assert_array_equal(scan.points, POINTS)
+    has_ring = array.shape[1] == 5
+    np.testing.assert_array_equal(scan.ring, RING if has_ring else None)
+
+    expected = Segmenter(weights_for())(POINTS).labels
+    labels = Segmenter(weights_for())(array, columns=columns).labels
+    np.testing.assert_array_equal(labels, expected)
+
+
+def test_an_array_without_intensity_gets_those_that_the_weights_need_and_a_warning() -> None:
+    with pytest.warns(UserWarning, match="no intensity: drawn at random"):
+        scan = array_scan(POINTS[:, :3], trained=TRAINED)
+    np.testing.assert_array_equal(scan.points[:, :3], POINTS[:, :3])
+    np.testing.assert_array_equal(scan.points[:, 3], TRAINED.filler(len(POINTS)))
+
+    with pytest.warns(UserWarning, match="no intensity"):
+        labels = Segmenter(weights_for())(POINTS[:, :3]).labels
+    assert labels.all()
+
+
+@pytest.mark.parametrize(
+    ("array", "columns", "word"),
+    [
+        (POINTS.T, None, "transpose"),
+        (POINTS[:, :2], None, "(N, 3 or more)"),
+        (POINTS[None], None, "(N, 3 or more)"),
+        (POINTS[:, 0], None, "(N, 3 or more)"),
+        (POINTS, "x,y,intensity", "x, y and z"),
+        (POINTS, "x,y,z,intensity,ring", "5 columns"),
+    ],
+)
+def test_an_array_of_another_shape_is_refused(
+    array: np.ndarray, columns: str | None, word: str
+) -> None:
+    fails(lambda: array_scan(array, columns), "expected", word)
