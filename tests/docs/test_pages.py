@@ -1,7 +1,8 @@
-"""Every command of every page has a verb and options that there are."""
+"""Commands of the pages have verbs and options that there are; the README names all extras."""
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -24,3 +25,10 @@ def test_every_command_can_be_parsed(page: str) -> None:
         verb, *arguments = words[words.index("amvnet") + 1 :]
         recipe = Recipe() if VERBS[verb].takes_recipe else None
         make_parser(verb, VERBS[verb], recipe).parse_args(join_negative_values(arguments))
+
+
+def test_the_readme_names_every_extra() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    readme = (ROOT / "README.md").read_text()
+    for extra in project["optional-dependencies"]:
+        assert f"`{extra}`" in readme
