@@ -12,8 +12,10 @@ import pytest
 
 from amvnet.cli.completion import SHELLS
 from amvnet.cli.main import VERBS, main
-from amvnet.cli.parser import join_negative_values, make_parser
-from amvnet.cli.recipe_options import OFTEN_SET, add_recipe, field_texts, with_options
+from amvnet.cli.options import ScanChoice
+from amvnet.cli.parser import Command, join_negative_values, make_parser, run_with
+from amvnet.cli.recipe_options import OFTEN_SET, add_recipe, with_options
+from amvnet.config.field_texts import field_texts
 from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.models.methods import EngineName
 
@@ -155,3 +157,26 @@ def test_an_error_of_the_disk_without_a_reason_says_what_is_known(
     assert code == 1
     assert "None" not in line
     assert "1000 requested and 0 written" in line
+
+
+def test_fields_of_a_dataclass_are_options_and_reach_the_verb_in_it() -> None:
+    calls: list[tuple[int, ScanChoice]] = []
+
+    def verb(count: int, choice: ScanChoice) -> None:
+        """Do nothing.
+
+        Args:
+            count: a number.
+            choice: which scans.
+        """
+        calls.append((count, choice))
+
+    parser = make_parser("verb", Command(verb, {}))
+    values = vars(parser.parse_args(["--count", "3", "--split", "val", "--topic", "/a"]))
+    run_with(verb, values)
+    assert calls == [(3, ScanChoice(split="val", topic="/a"))]
+
+    help_text = " ".join(parser.format_help().split())
+    for field, text in field_texts(ScanChoice).items():
+        assert f"--{field}" in help_text
+        assert " ".join(text.split()) in help_text

@@ -333,6 +333,7 @@ def test_a_broken_folder_is_one_line(
         ("intensity", {"quantiles": [10**400] * 11}, ("quantiles", "export again")),
         ("intensity", [0.5] * 11, ("quantiles", "export again")),
         ("intensity", {"quantiles": [0.0] * 11}, ("quantiles", "export again")),
+        ("assertion", {"threshold": -5.0}, ("threshold", "-5")),
         ("point_head neighbours", 3, ("point_head", "export again")),
     ],
 )

@@ -25,7 +25,7 @@ from amvnet.cli.commands.submit import submit
 from amvnet.cli.commands.train import train
 from amvnet.cli.commands.view import view
 from amvnet.cli.console import complain, say, say_lines, stdout
-from amvnet.cli.parser import Command, join_negative_values, make_parser
+from amvnet.cli.parser import Command, join_negative_values, make_parser, run_with
 from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean
 from amvnet.threads import wait_passively
@@ -174,7 +174,7 @@ def run(verb: str, arguments: Sequence[str]) -> None:
         values = _parse_with_recipe(verb, arguments)
     else:
         values = vars(make_parser(verb, VERBS[verb]).parse_args(arguments))
-    VERBS[verb].run(**values)
+    run_with(VERBS[verb].run, values)
 
 
 def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:

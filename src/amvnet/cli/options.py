@@ -1,8 +1,9 @@
-"""Parse what verbs are given in words, and join the processes that share them."""
+"""Options that verbs share, what they are given in words, and the processes that share them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -21,8 +22,10 @@ if TYPE_CHECKING:
     from amvnet.data.class_maps import ClassMap
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.distributed import Processes
+    from amvnet.inference.listing import ScanOptions
     from amvnet.inference.score_files import ScorePair, Which
     from amvnet.inference.segmenter import Segmenter
+    from amvnet.sensors.lidars import Sensor
     from amvnet.weights.file import Weights
 
 # Those from the fifth on are nuScenes' own.
@@ -32,6 +35,70 @@ Split = Literal[
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 SHOWN = 20  # names of sequences in a line
+
+
+@dataclass(frozen=True)
+class ScanChoice:
+    """The options that say which scans of the inputs to read, and how files hold them."""
+
+    split: Split = "all"
+    """of datasets, the official split."""
+    sequences: str | None = None
+    """of datasets, these sequences or scenes instead, separated by commas."""
+    topic: str | None = None
+    """of bags, the topic of the scans; default: the only one with scans."""
+    columns: str | None = None
+    """of .bin, .npy and text files, what their columns hold, in order: x,y,z,intensity,ring, and
+    any other name for a column to leave out; default: as the values suggest."""
+    dtype: str | None = None
+    """of .bin files, the type of the numbers: float32, float64, ..., or one for each of the
+    columns, separated by commas; default: as the values suggest."""
+
+    def parse(self) -> ScanOptions:
+        """Return the options as the inputs take them.
+
+        Raises:
+            InputError: if a value cannot be parsed.
+        """
+        from amvnet.data.formats.rows import parse_layout
+        from amvnet.inference.listing import ScanOptions
+
+        layout = parse_layout(self.columns, self.dtype)
+        return ScanOptions(parse_names(self.sequences), self.split, self.topic, layout)
+
+
+@dataclass(frozen=True)
+class SensorChoice:
+    """The options that say what is known of the sensor of scan files; the rest is measured."""
+
+    sensor: str | None = None
+    """of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured."""
+    height: float | None = None
+    """of scan files, the sensor's height over the ground in metres; default: measured."""
+    intensity_scale: float | None = None
+    """of scan files, the largest possible intensity; default: 1, 255 or 65535, as the values
+    suggest, and spread as in the training of the weights."""
+    unit: str | None = None
+    """of scan files, m, cm, mm or ft; default: m, or mm if they are certainly that."""
+    axes: str | None = None
+    """of scan files, x-forward (y left), y-forward (x right), z-forward (y down), z-down (y right)
+    or y-up (x right); default: by the ground."""
+    rotate: str | None = None
+    """of scan files, the rotation that levels them: yaw,pitch,roll in degrees; default: by the
+    ground."""
+    offset: str | None = None
+    """of scan files, what to add to x,y,z after the rotation, in metres, so that the sensor is at
+    the origin."""
+
+    def parse(self) -> Sensor:
+        """Return what is known of the sensor.
+
+        Raises:
+            InputError: if there is no such sensor or file, or a value is impossible.
+        """
+        from amvnet.sensors.lidars import make_sensor
+
+        return make_sensor(**asdict(self))
 
 
 def join_processes(cuda: bool = False) -> Processes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import inspect
 import re
 from argparse import BooleanOptionalAction
@@ -14,6 +15,7 @@ import docstring_parser
 from jsonargparse import ArgumentParser
 
 from amvnet.cli.console import say_lines
+from amvnet.config.field_texts import field_texts
 from amvnet.errors import InputError, did_you_mean
 
 # The groups of a verb's options in its help; the others come before them.
@@ -47,11 +49,29 @@ NEGATIVE = re.compile(r"-\.?\d")  # the beginning of a value that argparse takes
 
 
 @dataclass(frozen=True)
+class Parameter:
+    """One parameter of a verb: an argument or an option of the command line.
+
+    Attributes:
+        name: as in Python, with underscores.
+        kind: its type.
+        default: its default value, or `inspect.Parameter.empty`.
+        text: its help.
+    """
+
+    name: str
+    kind: Any
+    default: Any
+    text: str
+
+
+@dataclass(frozen=True)
 class Command:
     """One verb of the command line.
 
     Attributes:
-        run: does the work; its signature and docstring define the options.
+        run: does the work; its signature and docstring define the options. A parameter that is a
+            dataclass stands for an option per field, with the line under the field as its help.
         positional: the parameters that are positional on the command line, and for each the
             keyword arguments of argparse's `add_argument`.
     """
@@ -157,21 +177,18 @@ def expected_words(kind: Any) -> str:
 
 def make_parser(verb: str, command: Command) -> Parser:
     """Return the parser of a verb, without the values of a recipe."""
-    docs = docstring_parser.parse(command.run.__doc__ or "")
-    help_texts = {param.arg_name: param.description or "" for param in docs.params}
+    parameters = _parameters_of(command.run)
     metavars = [str(options["metavar"]) for options in command.positional.values()]
     parser = Parser(
         prog=f"amvnet {verb}",
         usage=" ".join(["amvnet", verb, *metavars, "[options]"]),
-        description=docs.short_description,
+        description=docstring_parser.parse(command.run.__doc__ or "").short_description,
         allow_abbrev=False,
     )
 
     for name, options in command.positional.items():
-        parser.add_argument(name, help=help_texts.get(name), **options)
+        parser.add_argument(name, help=parameters[name].text, **options)
 
-    hints = get_type_hints(command.run)
-    parameters = dict(inspect.signature(command.run).parameters)
     grouped = {name: title for title, names in GROUPS.items() for name in names}
     groups: dict[str, Any] = {}
     for name, parameter in sorted(parameters.items(), key=lambda item: item[0] in grouped):
@@ -181,20 +198,56 @@ def make_parser(verb: str, command: Command) -> Parser:
         if title is not None and title not in groups:
             groups[title] = parser.add_argument_group(title)
         target = parser if title is None else groups[title]
-        _add_option(target, parameter, hints[name], help_texts.get(name, ""))
-        parser.kinds[flag_of(name)] = hints[name]
+        _add_option(target, parameter)
+        parser.kinds[flag_of(name)] = parameter.kind
     return parser
 
 
-def _add_option(target: Any, parameter: inspect.Parameter, kind: Any, help_text: str) -> None:
-    """Add one parameter of a verb's function as an option.
+def _parameters_of(run: Callable[..., None]) -> dict[str, Parameter]:
+    """Return the parameters of a verb by name, with the fields of those that are dataclasses."""
+    docs = docstring_parser.parse(run.__doc__ or "")
+    texts = {param.arg_name: param.description or "" for param in docs.params}
+    hints = get_type_hints(run)
 
-    Args:
-        target: the parser, or a group of it.
-    """
+    parameters = {}
+    for name, parameter in inspect.signature(run).parameters.items():
+        kind = hints[name]
+        if not _is_bundle(kind):
+            parameters[name] = Parameter(name, kind, parameter.default, texts.get(name, ""))
+            continue
+        kinds = get_type_hints(kind)
+        texts_of_fields = field_texts(kind)
+        for field in dataclasses.fields(kind):
+            text = " ".join(texts_of_fields[field.name].split())
+            parameters[field.name] = Parameter(field.name, kinds[field.name], field.default, text)
+    return parameters
+
+
+def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
+    """Run a verb with the values of its options, some of which are fields of dataclasses."""
+    hints = get_type_hints(run)
+    arguments = {}
+    for name in inspect.signature(run).parameters:
+        kind = hints[name]
+        if _is_bundle(kind):
+            own = {field.name: values[field.name] for field in dataclasses.fields(kind)}
+            arguments[name] = kind(**own)
+        else:
+            arguments[name] = values[name]
+    run(**arguments)
+
+
+def _is_bundle(kind: Any) -> bool:
+    """Return whether a type is a dataclass, whose fields are options."""
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
+
+
+def _add_option(target: Any, parameter: Parameter) -> None:
+    """Add one parameter of a verb as an option to the parser, or to a group of it."""
     flag = flag_of(parameter.name)
+    kind = parameter.kind
     default = parameter.default
-    text = help_text.replace("%", "%%")
+    text = parameter.text.replace("%", "%%")
     if kind is bool:
         action = BooleanOptionalAction if default else "store_true"
         target.add_argument(flag, action=action, default=default, help=text)

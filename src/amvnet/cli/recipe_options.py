@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import ast
 import dataclasses
-import functools
-import inspect
-import sys
 from collections.abc import Iterator, Mapping
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, get_type_hints
 
 import yaml
 
 from amvnet.cli.parser import metavar_of
+from amvnet.config.field_texts import field_texts
 from amvnet.config.nested import replace_values
 from amvnet.config.schema import Recipe
 from amvnet.errors import InputError
@@ -144,19 +140,3 @@ def _to_text(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ",".join(map(str, value)) + "]"
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def field_texts(cls: type) -> dict[str, str]:
-    """Return the line of documentation under each field of a dataclass."""
-    texts: dict[str, str] = {}
-    for field, text in pairwise(_class_bodies(cls.__module__)[cls.__name__]):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-            texts[field.target.id] = text.value.value  # type: ignore[attr-defined,union-attr]
-    return texts
-
-
-@functools.cache
-def _class_bodies(module: str) -> dict[str, list[ast.stmt]]:
-    """Return the statements of each class of a module, by name."""
-    tree = ast.parse(inspect.getsource(sys.modules[module]))
-    return {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}

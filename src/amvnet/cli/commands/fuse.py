@@ -7,8 +7,7 @@ from typing import Literal
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
-    Split,
-    parse_names,
+    ScanChoice,
     parse_scores,
 )
 from amvnet.errors import InputError
@@ -19,17 +18,13 @@ def fuse(
     scores_a: Path,
     scores_b: Path,
     out: Path,
+    choice: ScanChoice,
     head: str | None = None,
     tau: float | None = None,
     key_a: str | None = None,
     key_b: str | None = None,
     logits: Literal["a", "b", "both"] | None = None,
-    split: Split = "all",
-    sequences: str | None = None,
     taxonomy: str | None = None,
-    topic: str | None = None,
-    columns: str | None = None,
-    dtype: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Fuse the scores of any two models: labels by the point head, or by the ensemble.
@@ -40,6 +35,7 @@ def fuse(
             each scan, where predict --scores writes its own.
         scores_b: folder of the other model's.
         out: folder for the labels.
+        choice: which scans of the inputs.
         head: weights with a point head, trained with these scores or with networks; without, the
             ensemble is used.
         tau: points whose scores have a cosine similarity of at most this are uncertain; default:
@@ -47,19 +43,12 @@ def fuse(
         key_a: which array of each .npz in --scores-a; not needed if there is one.
         key_b: which array of each .npz in --scores-b.
         logits: which of the two are scores before softmax.
-        split: of datasets, the official split.
-        sequences: of datasets, these sequences or scenes instead, separated by commas.
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the
             head's or the inputs'.
-        topic: of bags, the topic of the scans; default: the only one with scans.
-        columns: of .bin, .npy and text files, what their columns hold, as of predict.
-        dtype: of .bin files, the type of the numbers, as of predict.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
-    from amvnet.data.formats.rows import parse_layout
     from amvnet.data.taxonomy import taxonomy_named
     from amvnet.inference.fuse_files import fuse_files
-    from amvnet.inference.listing import ScanOptions
     from amvnet.inference.pipeline import OutputOptions
     from amvnet.weights.file import load
 
@@ -77,7 +66,7 @@ def fuse(
             inputs,
             pair,
             OutputOptions(out, overwrite=overwrite),
-            ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
+            choice.parse(),
             head=weights,
             tau=tau,
             taxonomy=classes,

@@ -7,11 +7,11 @@ from typing import Literal
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
-    Split,
+    ScanChoice,
+    SensorChoice,
     join_processes,
     make_segmenter,
     parse_classes,
-    parse_names,
 )
 from amvnet.models.methods import EngineName, MethodName, Precision, TtaName
 
@@ -22,11 +22,11 @@ def predict(
     inputs: list[str],
     weights: str,
     out: Path,
+    choice: ScanChoice,
+    known: SensorChoice,
     method: MethodName = "amvnet",
     tta: TtaName | None = None,
     tau: float | None = None,
-    split: Split = "all",
-    sequences: str | None = None,
     scores: bool = False,
     resume: bool = False,
     format: FormatName = "label",
@@ -37,16 +37,6 @@ def predict(
     precision: Precision = "auto",
     batch: int = 1,
     at_once: int | None = None,
-    topic: str | None = None,
-    columns: str | None = None,
-    dtype: str | None = None,
-    sensor: str | None = None,
-    height: float | None = None,
-    intensity_scale: float | None = None,
-    unit: str | None = None,
-    axes: str | None = None,
-    rotate: str | None = None,
-    offset: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Segment datasets, scans, bags, or folders of scans.
@@ -55,13 +45,13 @@ def predict(
         inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
         weights: a weights file, or the name of a built-in one.
         out: folder for the labels.
+        choice: which scans of the inputs.
+        known: what is known of the sensor of scan files.
         method: the whole of AMVNet, or a part of it.
         tta: test-time augmentation, the mean of the networks' probabilities over flips or quarter
             turns (yaw) of the scan, 4 times the work of the networks, or over both, 8 times.
         tau: points whose probabilities by the two networks have a cosine similarity of at most this
             go to the head, in [0, 1]; fewer points take less time; default: that of the weights.
-        split: of datasets, the official split.
-        sequences: of datasets, these sequences or scenes instead, separated by commas.
         scores: also write the probabilities of both networks.
         resume: continue an earlier run into the folder: segment only the scans that are new or were
             not done, with the same weights and options.
@@ -78,43 +68,15 @@ def predict(
         batch: scans that go through the networks at a time; more than one suits a GPU.
         at_once: scans that are segmented at the same time on a CPU; default: one per
             core, if the memory suffices.
-        topic: of bags, the topic of the scans; default: the only one with scans.
-        columns: of .bin, .npy and text files, what their columns hold, in order: x,y,z,intensity,
-            ring, and any other name for a column to leave out; default: as the values suggest.
-        dtype: of .bin files, the type of the numbers: float32, float64, ..., or one for each of the
-            columns, separated by commas; default: as the values suggest.
-        sensor: of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default:
-            measured.
-        height: of scan files, the sensor's height over the ground in metres; default: measured.
-        intensity_scale: of scan files, the largest possible intensity; default: 1, 255 or 65535,
-            as the values suggest, and spread as in the training of the weights.
-        unit: of scan files, m, cm, mm or ft; default: m, or mm if they are certainly that.
-        axes: of scan files, x-forward (y left), y-forward (x right), z-forward (y down), z-down
-            (y right) or y-up (x right); default: by the ground.
-        rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees; default:
-            by the ground.
-        offset: of scan files, what to add to x,y,z after the rotation, in metres, so that the
-            sensor is at the origin.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
-    from amvnet.data.formats.rows import parse_layout
-    from amvnet.inference.listing import ScanOptions
     from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
     from amvnet.inference.predict import predict as predict_inputs
-    from amvnet.sensors.lidars import make_sensor
     from amvnet.weights.file import load
 
     class_map = parse_classes(classes)
     processes = join_processes()
-    given_sensor = make_sensor(
-        sensor,
-        height=height,
-        intensity_scale=intensity_scale,
-        unit=unit,
-        axes=axes,
-        rotate=rotate,
-        offset=offset,
-    )
+    sensor = known.parse()
     segmenter = make_segmenter(
         load(weights),
         device,
@@ -132,9 +94,9 @@ def predict(
             inputs,
             segmenter,
             OutputOptions(out, format, scores, uncertain, overwrite),
-            options=ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype)),
+            options=choice.parse(),
             execution=ExecutionOptions(batch, at_once, resume, processes),
-            sensor=given_sensor,
+            sensor=sensor,
             classes=class_map,
             progress=step,
             say=say,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, make_segmenter, parse_names
+from amvnet.cli.options import ScanChoice, SensorChoice, make_segmenter
 from amvnet.errors import InputError
 from amvnet.models.methods import EngineName, Precision
 
@@ -17,25 +17,15 @@ if TYPE_CHECKING:
 
 def view(
     inputs: list[str],
+    choice: ScanChoice,
+    known: SensorChoice,
     labels: Path | None = None,
     weights: str | None = None,
     html: Path | None = None,
     save: Path | None = None,
     scans: int = 5,
-    split: Split = "all",
-    sequences: str | None = None,
     taxonomy: str | None = None,
     device: str = "auto",
-    topic: str | None = None,
-    columns: str | None = None,
-    dtype: str | None = None,
-    sensor: str | None = None,
-    height: float | None = None,
-    intensity_scale: float | None = None,
-    unit: str | None = None,
-    axes: str | None = None,
-    rotate: str | None = None,
-    offset: str | None = None,
     engine: EngineName = "auto",
     precision: Precision = "auto",
     at_once: int | None = None,
@@ -44,6 +34,8 @@ def view(
 
     Args:
         inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
+        choice: which scans of the inputs.
+        known: what is known of the sensor of scan files.
         labels: a folder of labels as predict writes them, in any of its formats, or the label file
             of one scan.
         weights: instead, a weights file, or the name of a built-in one: the labels of every method
@@ -51,24 +43,8 @@ def view(
         html: write a page for a browser instead of opening a window.
         save: write a recording of Rerun instead of opening a window.
         scans: at most this many, evenly spaced.
-        split: of datasets, the official split.
-        sequences: of datasets, these sequences or scenes instead, separated by commas.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
         device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
-        topic: of bags, the topic of the scans; default: the only one with scans.
-        columns: of .bin, .npy and text files, what their columns hold, as of predict.
-        dtype: of .bin files, the type of the numbers, as of predict.
-        sensor: of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default:
-            measured.
-        height: of scan files, the sensor's height over the ground in metres; default: measured.
-        intensity_scale: of scan files, the largest possible intensity; default: as the values
-            suggest.
-        unit: of scan files, m, cm, mm or ft; default: as of predict.
-        axes: of scan files, x-forward (y left), y-forward (x right), z-forward (y down), z-down
-            (y right) or y-up (x right); default: as of predict.
-        rotate: of scan files, the rotation that levels them: yaw,pitch,roll in degrees; default: as
-            of predict.
-        offset: of scan files, what to add to x,y,z after the rotation, in metres.
         engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
             (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
             here that changes none.
@@ -76,25 +52,14 @@ def view(
         at_once: scans that are segmented at the same time on a CPU; default: one per
             core, if the memory suffices.
     """
-    from amvnet.data.formats.rows import parse_layout
     from amvnet.files import make_folder
-    from amvnet.inference.listing import ScanOptions
-    from amvnet.sensors.lidars import make_sensor
     from amvnet.viewing.frames import LabelSource, choose_frames
     from amvnet.viewing.rerun_log import check_rerun, check_window
     from amvnet.weights.file import load
 
     if labels is not None and weights is not None:
         raise InputError("expected --labels or --weights, found both; give one of them")
-    given_sensor = make_sensor(
-        sensor,
-        height=height,
-        intensity_scale=intensity_scale,
-        unit=unit,
-        axes=axes,
-        rotate=rotate,
-        offset=offset,
-    )
+    sensor = known.parse()
     if save is not None:
         check_rerun()
     elif html is None:
@@ -108,8 +73,8 @@ def view(
     if weights is not None:
         segmenter = make_segmenter(load(weights), device, engine, precision, at_once)
     source = LabelSource(segmenter, labels, taxonomy)
-    options = ScanOptions(parse_names(sequences), split, topic, parse_layout(columns, dtype))
-    frames = choose_frames(inputs, scans, source, options, given_sensor, say)
+    options = choice.parse()
+    frames = choose_frames(inputs, scans, source, options, sensor, say)
     _show(frames, _title(inputs, weights), html, save)
 
 
