@@ -105,7 +105,7 @@ def test_the_scores_of_predict_give_its_labels(world: Path, tmp_path: Path, meth
 
 def test_the_head_and_tau_count(world: Path, tmp_path: Path) -> None:
     options = (*KEY_OPTIONS, "--head", world / "w.safetensors", "--tau")
-    run_fuse(world, tmp_path / "none", *options, -1)
+    run_fuse(world, tmp_path / "none", *options, 0)
     run_fuse(world, tmp_path / "all", *options, 1)
 
     without_head = read_labels(tmp_path / "none")
