@@ -22,6 +22,7 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity, check_quantiles, match_scan
 
 DESCRIPTION = "amvnet.json"  # in the folder of the graphs
+LONGEST_NAME = 200  # characters of the name of a graph's file
 FORMAT = 2
 POLAR = ("polar_points", "polar_pillars", "polar_map", "polar_scores")
 # The graphs that each method needs
@@ -367,7 +368,7 @@ def _is_complete(graph: Any) -> bool:
     """Return whether a graph's description has a file of the folder, and inputs with names."""
     if not isinstance(graph, dict) or not isinstance(graph.get("file"), str):
         return False
-    if Path(graph["file"]).name != graph["file"]:
+    if Path(graph["file"]).name != graph["file"] or len(graph["file"]) > LONGEST_NAME:
         return False
 
     inputs = graph.get("inputs")

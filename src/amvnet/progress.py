@@ -27,6 +27,11 @@ class Tenths:
         return True
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things in words: "1 scan", "2 scans"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def no_progress(done: int, total: int) -> None:
     """Report nothing."""
 

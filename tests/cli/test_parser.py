@@ -22,6 +22,7 @@ from amvnet.models.methods import EngineName
 from fixtures.worlds import refusal, run_cli
 
 TRAIN = "train simulated-compact --data x --out o"
+HUGE = "9" * 9000
 PREDICT = "predict a.bin --weights x --out o"
 
 # A command with a mistake, and what its line has to name.
@@ -43,6 +44,10 @@ WRONG_VALUES = {
     TRAIN + " --model.range_net.widths [16,16]": "--model.range_net: expected as many widths",
     TRAIN + " --training.rv.lr {": "--training.rv.lr: expected a value",
     "train simulated-compact --data x": "expected --out, found none",
+    "simulate o --seed " + HUGE: "--seed: expected a whole number, found one of 9000 digits",
+    PREDICT + " --height " + HUGE: "--height: expected a number, found one of 9000 digits",
+    TRAIN + " --training.seed " + HUGE: "--training.seed: expected a value, found '999",
+    TRAIN + " --training.seed " + "[" * 5000: "--training.seed: expected a value, found '[[[",
 }
 
 
@@ -50,6 +55,7 @@ WRONG_VALUES = {
 def test_one_line_names_the_option_and_what_was_meant(command: str, words: str) -> None:
     line = refusal(command)
     assert words in line
+    assert len(line) < 1000
     assert line.count("--help") <= 1
     assert "?" not in line[:-2]  # nothing after a question
     assert "class" not in line.replace("class_weights", "")

@@ -9,6 +9,7 @@ import pytest
 
 from amvnet.cli.main import VERBS
 from amvnet.cli.parser import join_negative_values, make_parser
+from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
 
 from fixtures.worlds import commands_of
@@ -23,8 +24,12 @@ def test_every_command_can_be_parsed(page: str) -> None:
         if "amvnet" not in words:
             continue
         verb, *arguments = words[words.index("amvnet") + 1 :]
-        recipe = Recipe() if VERBS[verb].takes_recipe else None
-        make_parser(verb, VERBS[verb], recipe).parse_args(join_negative_values(arguments))
+        if verb.startswith("--") or arguments[-1:] in (["--help"], [HELP_ALL]):
+            continue
+        parser = make_parser(verb, VERBS[verb])
+        if VERBS[verb].takes_recipe:
+            add_recipe(parser, Recipe())
+        parser.parse_args(join_negative_values(arguments))
 
 
 def test_the_readme_names_every_extra() -> None:

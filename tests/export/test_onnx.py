@@ -320,6 +320,7 @@ def test_a_broken_folder_is_one_line(
         ("graphs polar_map", {}, ("polar_map", "export again")),
         ("graphs polar_map inputs", [{"name": 1, "shape": 2}], ("polar_map", "export again")),
         ("graphs polar_map file", "../polar_map.onnx", ("polar_map", "export again")),
+        ("graphs polar_map file", "a" * 5000, ("polar_map", "export again")),
         ("range_view height", -4, ("height",)),
         ("range_view height", 10**12, ("height",)),
         ("polar_view radial", 10**12, ("radial",)),

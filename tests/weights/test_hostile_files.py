@@ -12,6 +12,7 @@ import math
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from amvnet.config.nested import to_dict
 from amvnet.config.schema import Recipe
 from amvnet.data.taxonomy import taxonomy_from_yaml
 from amvnet.sensors.lidars import make_sensor
-from amvnet.weights.file import FORMAT, Weights
+from amvnet.weights.card import model_card
+from amvnet.weights.file import FORMAT, Weights, load
 
 from fixtures.worlds import fails, fresh_weights
 
@@ -329,3 +331,32 @@ def test_hostile_recipes_are_refused(good: Path, tmp_path: Path) -> None:
     options = ["--data", "semantickitti:none", "--out", str(tmp_path / "out")]
     paths = hostile_recipes(tmp_path)
     run(good, {path.name: ["train", str(path), *options] for path in paths})
+
+
+# ---- what is said of files that are not hostile but unlucky, and of records that are deep
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5, 0.999])
+def test_truncated_weights_are_called_truncated(share: float, good: Path, tmp_path: Path) -> None:
+    content = good.read_bytes()
+    path = tmp_path / "w.safetensors"
+    path.write_bytes(content[: int(share * len(content))])
+    fails(lambda: load(path), path, "truncated", "copy or download it again")
+
+
+def test_another_file_is_not_called_truncated(tmp_path: Path) -> None:
+    path = tmp_path / "w.safetensors"
+    for content in (b"", b"{}", b"PK\x03\x04" + bytes(100), bytes(100), b"\xff" * 100):
+        path.write_bytes(content)
+        fails(lambda: load(path), path, "something else")
+
+
+def test_a_card_abridges_what_is_long_or_deep() -> None:
+    deep: object = "deep"
+    for level in range(400):
+        deep = {"a": deep} if level % 2 else [deep]
+    record = {"deep": deep, "many": list(range(10**5)), "ends": ["x" * 10**6] * 20}
+    weights = replace(fresh_weights(), training={"range_net": record})
+    text = model_card(weights, "w")
+    assert "100000, from 0 to 99999" in text
+    assert "..." in text

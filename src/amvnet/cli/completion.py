@@ -52,7 +52,7 @@ def completion(verbs: Mapping[str, Command], shell: str) -> str:
     return str(shtab.complete(top, shell))
 
 
-def _complete(action: Any, choices: Sequence[str], files: Mapping[str, str]) -> None:
+def _complete(action: Any, choices: Sequence[str], files: Any) -> None:
     """Complete the value of an argument: one of some names, or else a file."""
     if choices:
         action.choices = choices

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import say, silence
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
 from amvnet.models.methods import (
     METHODS,
     EngineName,
@@ -17,6 +18,7 @@ from amvnet.models.methods import (
     TtaName,
     widest_method,
 )
+from amvnet.progress import counted
 
 if TYPE_CHECKING:
     from amvnet.data.class_maps import ClassMap
@@ -182,7 +184,7 @@ def describe_records(records: Sequence[ScanRecord]) -> str:
     if len(names) > SHOWN:
         text += f" and {len(names) - SHOWN} more"
 
-    return f"{len(records)} scans of {text}"
+    return f"{counted(len(records), 'scan')} of {text}"
 
 
 def parse_names(text: str | None) -> list[str] | None:
@@ -227,8 +229,10 @@ def parse_numbers(text: str) -> list[int]:
         InputError: if one is no such number.
     """
     names = parse_names(text) or []
-    if not all(name.isdecimal() and int(name) for name in names):
-        raise InputError(f"expected numbers of neighbours with commas, found {text!r}; say 5,10,15")
+    if not all(re.fullmatch("0*[1-9][0-9]{0,5}", name) for name in names):
+        raise InputError(
+            f"expected numbers of neighbours with commas, found {shown(text)}; say 5,10,15"
+        )
     return sorted({int(name) for name in names})
 
 

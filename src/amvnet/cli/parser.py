@@ -16,7 +16,7 @@ from jsonargparse import ArgumentParser
 
 from amvnet.cli.console import say_lines
 from amvnet.config.field_texts import field_texts
-from amvnet.errors import InputError, did_you_mean
+from amvnet.errors import InputError, did_you_mean, shown
 
 # The groups of a verb's options in its help; the others come before them.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -131,14 +131,15 @@ class Parser(ArgumentParser):
             return f"expected {', '.join(flags)}, found none; add what is missing"
 
         wrong = re.match(r'Parser key "([\w.-]+)"', line)
-        values = re.findall(r"(?:Got|Given) value: (\S+)", line)
+        values = re.findall(r"(?:Got|Given) value: (\S+)|value has (\d+ digits)", line)
         if wrong is None or not values or flag_of(wrong[1]) not in self.kinds:
             return line
         flag = flag_of(wrong[1])
         kind = self.kinds[flag]
-        return f"{flag}: expected {expected_words(kind)}, found {values[-1]!r}" + did_you_mean(
-            values[-1], literals(kind)
-        )
+        value, digits = values[-1]
+        found = f"one of {digits}" if digits else shown(value)
+        similar = did_you_mean(value, literals(kind))
+        return f"{flag}: expected {expected_words(kind)}, found {found}{similar}"
 
     def _unknown_words(self, words: str) -> str:
         word = words.split()[0]

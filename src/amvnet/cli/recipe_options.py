@@ -13,7 +13,7 @@ from amvnet.cli.parser import metavar_of
 from amvnet.config.field_texts import field_texts
 from amvnet.config.nested import replace_values
 from amvnet.config.schema import Recipe
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
 
 if TYPE_CHECKING:
     from amvnet.cli.parser import Parser
@@ -112,8 +112,8 @@ def _items(values: Any) -> Iterator[tuple[str, Any]]:
 def _read_value(text: str, flag: str) -> Any:
     try:
         return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise InputError(f"{flag}: expected a value, found {text!r}; correct it") from None
+    except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: thousands of digits
+        raise InputError(f"{flag}: expected a value, found {shown(text)}; correct it") from None
 
 
 def _walk(config: Any, path: str) -> Iterator[tuple[str, Any]]:

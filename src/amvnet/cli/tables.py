@@ -14,6 +14,7 @@ from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.inference.timing import MEAN, STAGES
 from amvnet.models.methods import title_of
+from amvnet.progress import counted
 from amvnet.weights.file import built_in
 
 PACKAGES = (
@@ -44,7 +45,7 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     """
     methods = report["methods"]
     figures = list(methods.values())
-    title = f"{report['dataset']}: {report['scans']} scans, {report['points']:,} points"
+    title = f"{report['dataset']}: {counted(report['scans'], 'scan')}, {report['points']:,} points"
     if "tta" in report:
         title += f", test-time augmentation: {report['tta']}"
     if "tau" in report:

@@ -18,6 +18,7 @@ TITLES = {
     "point_head": "Point head",
 }
 LISTED = 12  # longest list that is printed in full
+DEEPEST = 6  # levels of a value that are printed
 # Columns of the table: key of the validation metric, and title.
 METRICS = {"val/miou": "mIoU", "val/miou_present": "mIoU, classes present", "val/acc": "accuracy"}
 # Keys of the training record that describe the data, and their titles.
@@ -174,13 +175,17 @@ def _list(rows: Iterable[tuple[str, str]]) -> str:
     return "\n".join(f"- {key}: {value}" for key, value in rows)
 
 
-def _plain(value: Any) -> str:
-    """Return a value of the training record as text; long lists are abridged."""
+def _plain(value: Any, depth: int = 0) -> str:
+    """Return a value of the training record as text; long lists and deep values are abridged."""
+    if isinstance(value, Mapping | list) and depth == DEEPEST:
+        return "..."
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_plain(item)}" for key, item in value.items())
+        items = [f"{key} {_plain(item, depth + 1)}" for key, item in value.items()]
+        return ", ".join(items)
     if isinstance(value, list):
         if len(value) > LISTED:
-            return f"{len(value)}, from {value[0]} to {value[-1]}"
-        return ", ".join(map(str, value))
+            ends = [_plain(item, depth + 1) for item in (value[0], value[-1])]
+            return f"{len(value)}, from {ends[0]} to {ends[1]}"
+        return ", ".join(_plain(item, depth + 1) for item in value)
 
     return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -9,6 +9,7 @@ from amvnet.cli.console import progress, say
 from amvnet.cli.options import Split, make_segmenter, parse_names, parse_numbers, parse_taus
 from amvnet.errors import InputError
 from amvnet.models.methods import EngineName, Precision
+from amvnet.progress import counted
 
 
 def analyze(
@@ -97,4 +98,4 @@ def analyze(
         used = analysis.tau if study.name == "taus" else loaded.model.point_head.neighbours
         title = "tau, a head for each" if study.name == "taus" else "neighbours"
         written += charts.write_sweep(sweep, title, used, data, out / study.name)
-    say(f"{len(written)} files in {out}")
+    say(f"{counted(len(written), 'file')} in {out}")

@@ -11,6 +11,7 @@ from amvnet.cli.options import (
     parse_scores,
 )
 from amvnet.errors import InputError
+from amvnet.progress import counted
 
 
 def fuse(
@@ -72,4 +73,5 @@ def fuse(
             taxonomy=classes,
             progress=step,
         )
-    say(f"{written} label files in {out}; the two models disagree on {uncertain:.1%} of the points")
+    files = counted(written, "label file")
+    say(f"{files} in {out}; the two models disagree on {uncertain:.1%} of the points")

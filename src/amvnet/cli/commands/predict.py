@@ -14,6 +14,7 @@ from amvnet.cli.options import (
     parse_classes,
 )
 from amvnet.models.methods import EngineName, MethodName, Precision, TtaName
+from amvnet.progress import counted
 
 FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
 
@@ -101,4 +102,4 @@ def predict(
             progress=step,
             say=say,
         )
-    say(f"{written} label files in {out}")
+    say(f"{counted(written, 'label file')} in {out}")

@@ -7,6 +7,7 @@ from pathlib import Path
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import Split, make_segmenter, parse_names
 from amvnet.models.methods import EngineName, Precision
+from amvnet.progress import counted
 
 
 def rank(
@@ -67,7 +68,8 @@ def rank(
         with progress("scoring") as step:
             ranking = rank_records(dataset, records, segmenter, step)
         scans = write_ranking(ranking, dataset.taxonomy, out)
-        say(f"{len(ranking.clusters)} clusters in {out}, {len(records)} scans in {scans}")
+        clusters = counted(len(ranking.clusters), "cluster")
+        say(f"{clusters} in {out}, {counted(len(records), 'scan')} in {scans}")
         if pictures is not None:
             drawn = draw(ranking, dataset, segmenter, pictures)
-            say(f"{len(drawn)} pictures in {pictures}")
+            say(f"{counted(len(drawn), 'picture')} in {pictures}")

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
+from amvnet.progress import counted
 
 
 def simulate(
@@ -41,4 +42,4 @@ def simulate(
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=step,
         )
-    say(f"{sequences * scans} scans in {out}")
+    say(f"{counted(sequences * scans, 'scan')} in {out}")

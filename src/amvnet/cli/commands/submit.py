@@ -8,6 +8,7 @@ from typing import Literal
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import open_data, parse_names
 from amvnet.errors import InputError
+from amvnet.progress import counted
 
 
 def submit(
@@ -62,9 +63,11 @@ def submit(
             "expected either --predictions and --out, or --check, found others; "
             "give one or the other"
         )
+    packed = counted(submission.predictions, "prediction")
+    fit = "keeps" if submission.predictions == 1 else "keep"
     say(
-        f"{check or out}: {submission.predictions} predictions of {rules.description} "
-        f"keep to the rules of {rules.taxonomy.name}"
+        f"{check or out}: {packed} of {rules.description} {fit} to the rules of "
+        f"{rules.taxonomy.name}"
     )
     for note in submission.notes:
         say(f"note: {note}")

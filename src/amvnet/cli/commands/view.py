@@ -10,6 +10,7 @@ from amvnet.cli.console import progress, say
 from amvnet.cli.options import ScanChoice, SensorChoice, make_segmenter
 from amvnet.errors import InputError
 from amvnet.models.methods import EngineName, Precision
+from amvnet.progress import counted
 
 if TYPE_CHECKING:
     from amvnet.viewing.frames import Frame, Frames
@@ -95,9 +96,9 @@ def _show(chosen: Frames, title: str, html: Path | None, save: Path | None) -> N
             write_page(html, frames, chosen.taxonomy, title)
 
     if save is not None:
-        say(f"{len(chosen)} scans in {save}; open it with: rerun {save}")
+        say(f"{counted(len(chosen), 'scan')} in {save}; open it with: rerun {save}")
     if html is not None:
-        say(f"{len(chosen)} scans in {html}; open it in a browser")
+        say(f"{counted(len(chosen), 'scan')} in {html}; open it in a browser")
 
 
 def _title(inputs: list[str], weights: str | None) -> str:

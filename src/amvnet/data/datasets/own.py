@@ -274,6 +274,11 @@ class OwnScans(OnDisk):
         """Whether the labels are in the files of the scans."""
         return self.description.labels is not None and self.description.labels.file is None
 
+    def place_of_labels(self, record: ScanRecord) -> Path | None:
+        """Return where the labels of a scan would be; None if the description names no labels."""
+        scan = self._scans[record.name]
+        return self._place_of_labels(scan.path, scan.name)
+
     def _labels_path(self, scan: NamedScan) -> Path | None:
         """Return the file of a scan's labels; None if it has none."""
         path = self._place_of_labels(scan.path, scan.name)

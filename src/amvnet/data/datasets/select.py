@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,8 +48,12 @@ def labelled_records(dataset: Dataset, records: Sequence[ScanRecord]) -> list[Sc
         return list(records)
     labelled = [record for record in records if record.labels_path is not None]
     if not labelled:
+        place = dataset.place_of_labels(records[0])
+        found = "no labels in the description" if place is None else f"no {os.path.normpath(place)}"
+        if len(records) > 1:
+            found += f" and none for the other scans ({len(records) - 1})"
         raise InputError(
-            f"{dataset.spec}: expected labelled scans, found no label file of {len(records)}; "
+            f"{dataset.spec}: expected labelled scans, found {found}; "
             "correct labels in the file, or name other sequences"
         )
     return labelled

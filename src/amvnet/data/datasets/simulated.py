@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import os
+import re
 import shutil
 import time
 import uuid
@@ -20,7 +21,7 @@ import numpy as np
 from amvnet.data.datasets.base import OnDisk, ScanRecord
 from amvnet.data.formats.raw import FULL_INTENSITY
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
-from amvnet.errors import InputError, one_line_errors
+from amvnet.errors import InputError, one_line_errors, shown
 from amvnet.files import make_folder
 from amvnet.scan import Scan
 from lidarstreets import SimulationError, drive_street
@@ -146,9 +147,9 @@ class SimulatedStreets(OnDisk):
         return self.taxonomy is NUSCENES
 
     def _number(self, sequence: str) -> int:
-        if not sequence.isdecimal() or int(sequence) > LAST_STREET:
+        if not re.fullmatch("[0-9]{1,9}", sequence) or int(sequence) > LAST_STREET:
             raise InputError(
-                f"{self.spec}: expected streets 0 to {LAST_STREET}, found {sequence!r}; "
+                f"{self.spec}: expected streets 0 to {LAST_STREET}, found {shown(sequence)}; "
                 "give their numbers"
             )
         return int(sequence)
