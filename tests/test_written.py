@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shlex
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -241,3 +243,25 @@ def test_a_command_that_fails_lists_nothing(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No space"):
         failing(fail, tmp_path)
     assert not (tmp_path / RECORD).exists()
+
+
+CLAIM = """
+import sys
+from pathlib import Path
+from amvnet.written import WrittenFiles
+
+for index in range(50):
+    path = Path(f"{sys.argv[2]}-{index}")
+    (Path(sys.argv[1]) / path).write_text("labels")
+    WrittenFiles(Path(sys.argv[1])).finish([path])
+"""
+
+
+def test_processes_that_write_into_one_folder_keep_each_others_entries(tmp_path: Path) -> None:
+    pytest.importorskip("fcntl")
+    processes = [
+        subprocess.Popen([sys.executable, "-c", CLAIM, tmp_path, name]) for name in ("a", "b", "c")
+    ]
+    assert [process.wait() for process in processes] == [0, 0, 0]
+    written = [Path(f"{name}-{index}") for name in ("a", "b", "c") for index in range(50)]
+    WrittenFiles(tmp_path).check(written)

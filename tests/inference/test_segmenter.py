@@ -178,8 +178,8 @@ def test_a_scan_without_points_is_refused(points: np.ndarray, method: MethodName
         Segmenter(WEIGHTS, method=method)(points.astype(np.float32))
 
 
-@pytest.mark.parametrize("shape", [(5,), (5, 3), (5, 5)])
-def test_points_of_other_columns_are_refused(segmenter: Segmenter, shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize("shape", [(5,), (5, 2), (4, 100), (1, 5, 4)])
+def test_points_of_other_shapes_are_refused(segmenter: Segmenter, shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError):
         segmenter(np.ones(shape, np.float32))
 

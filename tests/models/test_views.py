@@ -425,3 +425,13 @@ def test_the_views_without_the_cars_own_body_are_those_of_the_other_points(
     points = grid.to_points(grid.at_pillars(scores))
     assert points.shape == (len(far_points), 3)
     assert torch.equal(points[far_points], expected.to_points(expected.at_pillars(scores)))
+
+
+def test_a_point_exactly_at_the_least_distance_is_seen() -> None:
+    """The vehicle's own body is nearer than this."""
+    own_body = float(np.nextafter(np.float32(5), np.float32(0)))
+    batch = PointBatch.of([scan_of((5, 0, 0), (-own_body, 0, 0))])
+    image = RangeView(replace(SPHERICAL, nearest=5.0)).project(batch)
+    assert image.nearest[image.nearest >= 0].tolist() == [0]
+    grid = PolarView(replace(POLAR, nearest=5.0)).project(batch)
+    assert len(grid.features) == len(grid.seen) == 1

@@ -172,3 +172,13 @@ def test_the_window_goes_around_the_sensor() -> None:
     expected = vote(batch, f)
     for turn in TURNS:
         assert torch.allclose(vote(turn(batch), f), expected)
+
+
+def test_a_point_exactly_at_the_cutoff_votes() -> None:
+    batch = batch_of([at_pixel(4, 7, 10), at_pixel(4, 8, 12)])
+    distance = batch.points[:, :3].norm(dim=1)
+    next_to_it = PUBLISHED.weights()[13]  # to the right of the middle of a 5 x 5 window
+    difference = ((distance[1] - distance[0]) * next_to_it).numpy()
+    for cutoff, does_vote in ((difference, True), (np.nextafter(difference, 0), False)):
+        shares = vote(batch, scores_of([1, 2]), Voting(cutoff=float(cutoff)))
+        assert (shares[0, 2] > 0) == does_vote

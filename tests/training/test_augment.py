@@ -516,3 +516,14 @@ def from_other_scan(mixed: Scan, scan: Scan, other: Scan) -> np.ndarray:
         assert label == source.labels[index]
         assert ring == source.ring[index]
     return np.array(is_foreign)
+
+
+def test_lost_returns_are_not_pasted(random_scan: RandomScan) -> None:
+    scan = random_scan(50, seed=0)
+    other = random_scan(60, seed=1)
+    points = other.points.copy()
+    points[::3, :3] = np.nan
+    labels = np.ones(len(other), np.uint8)
+    pasted = paste(scan, Scan(points, labels, other.ring), [1], np.random.default_rng(0))
+    assert pasted.valid[len(scan) :].all()
+    assert (len(pasted) - len(scan)) % 40 == 0
