@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import reprlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -84,3 +85,35 @@ def one_line_errors(
         if passes or not is_bad_input:
             raise
         raise InputError(message(error)) from error
+
+
+# What PyTorch, CUDA, the loader of libraries and the system say.
+NO_MEMORY = re.compile(
+    r"out of memory|(can't|cannot) allocate|failed to map segment", re.IGNORECASE
+)
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error says that there is no memory left, of the CPU or a GPU."""
+    return isinstance(error, MemoryError) or bool(NO_MEMORY.search(str(error)))
+
+
+@contextmanager
+def memory_for(content: str) -> Iterator[None]:
+    """Turn an error that says that there is no memory left into an `InputError`.
+
+    Args:
+        content: what the memory is for, such as the name of a scan.
+
+    Raises:
+        InputError: if there is no memory left for the block.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError, ImportError, OSError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise InputError(
+            f"{content}: expected enough memory, found none left; close other programs, or take "
+            "fewer points"
+        ) from None

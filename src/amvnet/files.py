@@ -171,15 +171,29 @@ def read_yaml(path: Path, content: str) -> Any:
     try:
         size = path.stat().st_size
         if size <= LARGEST_YAML:
-            return yaml.load(path.read_text(encoding="utf-8"), _BoundedLoader)
+            return parse_yaml(path.read_text(encoding="utf-8"), expected)
     except OSError as error:
         raise InputError(f"{expected}, found {error.strerror}; check the path") from None
     except UnicodeDecodeError:
         raise InputError(f"{expected}, found bytes that are not text; give another file") from None
+    raise InputError(f"{expected} of at most {LARGEST_YAML} bytes, found {size}; give another file")
+
+
+def parse_yaml(text: str, expected: str) -> Any:
+    """Return the value of a YAML text. Nothing is executed.
+
+    Args:
+        text: the text.
+        expected: the beginning of error messages.
+
+    Raises:
+        InputError: if the text is not YAML, has aliases or is nested deeply.
+    """
+    try:
+        return yaml.load(text, _BoundedLoader)
     except (yaml.YAMLError, ValueError) as error:  # ValueError: numbers and dates
         reason = " ".join(str(error).split())
-        raise InputError(f"{expected}, found {reason}; correct the file") from None
-    raise InputError(f"{expected} of at most {LARGEST_YAML} bytes, found {size}; give another file")
+        raise InputError(f"{expected}, found {reason[:300]}; correct it") from None
 
 
 class _BoundedLoader(yaml.SafeLoader):

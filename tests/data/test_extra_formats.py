@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import struct
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from amvnet.data.formats.packets import Capture
 from amvnet.data.formats.registry import read_cloud
 from amvnet.inference.reading import FileReader
 
+from fixtures.extra_writers import vlp16_packet, write_capture, write_e57, write_sweep
 from fixtures.scan_writers import some_points
 from fixtures.worlds import fails
 
@@ -120,29 +120,6 @@ def test_a_bag_of_packets_says_what_turns_them_into_clouds(tmp_path: Path) -> No
 # --- Feather ---
 
 
-def write_sweep(log: Path, points: np.ndarray, lidars: Mapping[str, tuple[float, ...]]) -> Path:
-    """Write a sweep of Argoverse 2, and the positions of the sensors if there are any."""
-    pyarrow = pytest.importorskip("pyarrow")
-    feather = pytest.importorskip("pyarrow.feather")
-    path = log / "sensors/lidar/315966070559696000.feather"
-    path.parent.mkdir(parents=True)
-    columns = {name: points[:, index].astype("f2") for index, name in enumerate("xyz")}
-    columns["intensity"] = np.round(points[:, 3] * 255).astype("u1")
-    columns["laser_number"] = np.arange(len(points)).astype("u1")
-    columns["offset_ns"] = np.arange(len(points)).astype("i4")
-    feather.write_feather(pyarrow.table(columns), path, compression="zstd")
-
-    if lidars:
-        calibration = log / "calibration/egovehicle_SE3_sensor.feather"
-        calibration.parent.mkdir()
-        positions = np.array(list(lidars.values()))
-        table = {"sensor_name": list(lidars), "qw": np.ones(len(lidars))}
-        for axis, values in zip("xyz", positions.T, strict=True):
-            table[f"t{axis}_m"] = values
-        feather.write_feather(pyarrow.table(table), calibration)
-    return path
-
-
 def test_a_sweep_of_argoverse_is_moved_to_its_lidars(tmp_path: Path) -> None:
     points = some_points()
     expected = points[:, :3].astype("f2").astype("f4")
@@ -185,16 +162,6 @@ def test_broken_feather_is_refused(tmp_path: Path) -> None:
 # --- E57 ---
 
 
-def write_e57(path: Path, scans: list[dict[str, np.ndarray]]) -> Path:
-    pye57 = pytest.importorskip("pye57")
-    file = pye57.E57(str(path), mode="w")
-    for fields in scans:
-        # Far from the file's origin: scans are read in the frame of the instrument.
-        file.write_scan_raw(fields, translation=np.array([4e5, 5e6, 100.0]))
-    file.close()
-    return path
-
-
 def test_every_scan_of_e57_is_read(tmp_path: Path) -> None:
     points = some_points().astype(np.float64)
     fields = dict(
@@ -220,30 +187,6 @@ def test_every_scan_of_e57_is_read(tmp_path: Path) -> None:
 # --- captures ---
 
 
-def vlp16_packet(azimuth: int, microseconds: int) -> bytes:
-    """Return a packet of a VLP-16: 12 blocks of two firings, 10 m to everything."""
-    data = b""
-    for block in range(12):
-        data += struct.pack("<HH", 0xEEFF, (azimuth + 40 * block) % 36000)
-        data += struct.pack("<HB", 5000, 77) * 32
-    return data + struct.pack("<IBB", microseconds, 0x37, 0x22)
-
-
-def write_capture(path: Path, packets: list[bytes], port: int = 2368) -> Path:
-    """Write a capture of UDP packets, 1.327 ms apart."""
-    content = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
-    for index, data in enumerate(packets):
-        udp = struct.pack(">HHHH", port, port, 8 + len(data), 0) + data
-        addresses = bytes([192, 168, 1, 201, 255, 255, 255, 255])
-        ip = struct.pack(">BBHHHBBH", 0x45, 0, 20 + len(udp), 0, 0, 64, 17, 0) + addresses + udp
-        frame = bytes(12) + b"\x08\x00" + ip
-        seconds, micros = divmod(index * 1327, 1_000_000)
-        content += struct.pack("<IIII", 1_600_000_000 + seconds, micros, len(frame), len(frame))
-        content += frame
-    path.write_bytes(content)
-    return path
-
-
 def test_a_capture_of_velodyne_is_its_turns(tmp_path: Path) -> None:
     pytest.importorskip("velodyne_decoder")
     packets = [vlp16_packet(480 * index % 36000, index * 1327) for index in range(300)]
@@ -259,6 +202,16 @@ def test_a_capture_of_velodyne_is_its_turns(tmp_path: Path) -> None:
         assert cloud.ring is not None
         assert set(cloud.ring) == set(range(16))
         assert cloud.intensity_scale() == 255
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("name", ["a.pcapng", "a.pcap"])
+def test_a_capture_in_the_newer_format_is_refused_with_the_command_that_converts_it(
+    tmp_path: Path, name: str, order: str
+) -> None:
+    path = tmp_path / name
+    path.write_bytes(struct.pack(f"{order}IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28))
+    fails(lambda: list(list_scans(path)), path, "editcap")
 
 
 @pytest.mark.parametrize(

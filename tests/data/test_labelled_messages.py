@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
+from amvnet.data.formats.cloud import Message
 from amvnet.data.formats.pointcloud2 import (
     CLOUD_TYPE,
     Origin,
@@ -19,6 +22,8 @@ from amvnet.data.formats.pointcloud2 import (
     pack_rgb,
     read_message,
 )
+from amvnet.data.labels import label_bags
+from amvnet.data.labels.writers import LabelledPoints
 
 from fixtures.scan_writers import cloud_message, some_points
 from fixtures.worlds import fails
@@ -115,6 +120,27 @@ def test_lost_points_stay_and_the_message_says_that_there_are_some() -> None:
     message = through_ros2(encode_labels(ORIGIN, np.arange(5), xyz=xyz))
     assert not message.is_dense
     assert np.isnan(column(message, "x")).tolist() == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize("kind", label_bags.KINDS)
+def test_a_run_that_is_killed_while_it_joins_leaves_nothing_to_the_next(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ["drive/000000", "drive/000001"]
+    points = LabelledPoints(np.zeros((5, 3)), np.arange(5), np.zeros((5, 3), np.uint8), None)
+    for time, name in enumerate(names):
+        label_bags.write_part(tmp_path, name, kind, Message("/lidar", time, time, "lidar"), points)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(label_bags, "publish", lambda part, path: os._exit(7))
+        process = os.fork()
+        if not process:
+            label_bags.join_parts(tmp_path, names, kind)
+        assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 7
+    assert list(tmp_path.rglob("*labels*"))
+
+    label_bags.join_parts(tmp_path, names, kind)
+    assert [path.name for path in tmp_path.rglob("*")] == [f"drive.{kind}"]
 
 
 def test_colors_are_packed_as_in_pcl() -> None:

@@ -14,7 +14,7 @@ from amvnet import read as read_scan
 from amvnet.data.formats.find import find_scans
 from amvnet.data.labels.ids import write_ids
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
-from amvnet.files import atomic_write
+from amvnet.files import atomic_write, read_yaml
 
 from fixtures.worlds import fails, label_map
 
@@ -186,3 +186,27 @@ def test_unusable_label_maps_are_named(tmp_path: Path) -> None:
     for content in ("a: [", "[1]", few_labels, large_ids):
         path.write_text(content)
         fails(lambda: taxonomy_from_yaml(path), path)
+
+
+@pytest.mark.parametrize("number", [".inf", ".nan", "9" * 9000, "0x" + "f" * 9000])
+@pytest.mark.parametrize("key", ["learning_map", "learning_map_inv", "color_map", "split"])
+def test_numbers_that_are_no_ids_are_one_line(tmp_path: Path, key: str, number: str) -> None:
+    path = tmp_path / "labels.yaml"
+    places = {
+        "learning_map": {10: "NUMBER"},
+        "learning_map_inv": {**label_map()["learning_map_inv"], 1: "NUMBER"},
+        "color_map": {**label_map()["color_map"], 10: [0, 0, "NUMBER"]},
+        "split": {"train": ["NUMBER"], "valid": [8], "test": []},
+    }
+    text = yaml.safe_dump({**label_map(), key: places[key]}, default_flow_style=True)
+    path.write_text(text.replace("NUMBER", number))
+    fails(lambda: taxonomy_from_yaml(path), path)
+
+
+def test_aliases_in_yaml_are_refused_and_anchors_are_not(tmp_path: Path) -> None:
+    path = tmp_path / "a.yaml"
+    path.write_text("a: &a [1, 2]\n")
+    assert read_yaml(path, "a list") == {"a": [1, 2]}
+    for text in ("a: &a [1]\nb: *a\n", "a: &a {k: 1}\nb: {<<: *a}\n", "&a [*a]"):
+        path.write_text(text)
+        fails(lambda: read_yaml(path, "a list"), path, "*a", "write its value out")

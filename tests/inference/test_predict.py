@@ -132,6 +132,44 @@ def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> N
     assert sum(isinstance(outcome, Entry) for outcome in outcomes) == 7
 
 
+OUT_OF_MEMORY = (
+    MemoryError(),
+    RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to ..."),
+    RuntimeError("CUDA out of memory. Tried to allocate 20.00 MiB"),
+    ImportError("libfoo.so: failed to map segment from shared object"),
+)
+
+
+@pytest.mark.parametrize("error", OUT_OF_MEMORY)
+def test_a_scan_that_takes_all_memory_is_a_broken_one(tmp_path: Path, error: Exception) -> None:
+    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
+        if any(scan_input.name == "3" for scan_input in inputs):
+            raise error
+        return list(map(no_segmentation, scans))
+
+    scans = counted_scans(8, Counter())
+    execution = ExecutionOptions(batch=4)
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
+    outcomes = list(pipeline.stream(scans))
+    (line,) = [outcome for outcome in outcomes if isinstance(outcome, str)]
+    assert line.startswith("3: expected enough memory")
+    assert sum(isinstance(outcome, Entry) for outcome in outcomes) == 7
+
+
+@pytest.mark.parametrize("error", OUT_OF_MEMORY)
+def test_a_verb_without_memory_ends_with_one_line(
+    world: Path, tmp_path: Path, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*arguments: object, **options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(Segmenter, "__init__", fail)
+    assert "memory" in refusal(predict(world, tmp_path))
+    monkeypatch.setattr(Segmenter, "__init__", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        run_cli(*predict(world, tmp_path).split())
+
+
 # ---- interrupted runs
 
 

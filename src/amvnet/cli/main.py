@@ -27,7 +27,7 @@ from amvnet.cli.commands.view import view
 from amvnet.cli.console import complain, say, say_lines, stdout
 from amvnet.cli.parser import Command, join_negative_values, make_parser, run_with
 from amvnet.cli.stopping import stoppable
-from amvnet.errors import InputError, SomeBroken, did_you_mean
+from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.threads import wait_passively
 
 # Exit codes.
@@ -133,7 +133,8 @@ def _run_in_one_line(arguments: Sequence[str]) -> int:
 
             stdout.write(completion(VERBS, " ".join(arguments[1:])))
             return DONE
-        run(arguments[0], arguments[1:])
+        with memory_for(f"amvnet {arguments[0]}"):
+            run(arguments[0], arguments[1:])
     except InputError as error:
         complain(str(error))
         return WRONG_INPUT

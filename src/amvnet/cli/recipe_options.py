@@ -7,13 +7,12 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-import yaml
-
 from amvnet.cli.parser import metavar_of
 from amvnet.config.field_texts import field_texts
 from amvnet.config.nested import replace_values
 from amvnet.config.schema import Recipe
-from amvnet.errors import InputError, shown
+from amvnet.errors import InputError
+from amvnet.files import parse_yaml
 
 if TYPE_CHECKING:
     from amvnet.cli.parser import Parser
@@ -93,7 +92,7 @@ def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
 def _nested_values(values: Any, flag: str) -> Any:
     """Return nested values without those that were left out, read as YAML."""
     if isinstance(values, str):
-        return _read_value(values, flag)
+        return parse_yaml(values, f"{flag}: expected a value")
 
     nested: dict[str, Any] = {}
     for key, value in _items(values):
@@ -107,13 +106,6 @@ def _nested_values(values: Any, flag: str) -> Any:
 
 def _items(values: Any) -> Iterator[tuple[str, Any]]:
     yield from (values if isinstance(values, Mapping) else vars(values)).items()
-
-
-def _read_value(text: str, flag: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError):  # ValueError: thousands of digits
-        raise InputError(f"{flag}: expected a value, found {shown(text)}; correct it") from None
 
 
 def _walk(config: Any, path: str) -> Iterator[tuple[str, Any]]:

@@ -317,6 +317,8 @@ def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
 
     raw_to_train: dict[int | str, int] = {}
     for raw_id, learning_id in config["learning_map"].items():
+        if learning_id not in learning_to_raw:
+            raise KeyError(learning_id)
         raw_to_train[int(raw_id)] = learning_to_train.get(learning_id, 0)
 
     splits = {}

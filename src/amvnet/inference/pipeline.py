@@ -21,7 +21,7 @@ from amvnet.data.labels.label_bags import KINDS as BAG_KINDS
 from amvnet.data.labels.writers import check_kind, write_uncertain
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
-from amvnet.errors import InputError, SomeBroken
+from amvnet.errors import InputError, SomeBroken, memory_for
 from amvnet.files import atomic_write, inside
 from amvnet.inference.journal import Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan
@@ -298,7 +298,8 @@ class Pipeline:
         loaded: list[tuple[InputScan, LoadedScan]] = []
         for scan, load in group:
             try:
-                loaded.append((scan, load.result()))
+                with memory_for(scan.name):
+                    loaded.append((scan, load.result()))
             except InputError as error:
                 outcomes.append((scan, None, error))
         return outcomes + self._segment_loaded(loaded)
@@ -308,7 +309,10 @@ class Pipeline:
         if not loaded:
             return []
         try:
-            results = self.segment([scan for scan, _ in loaded], [item.scan for _, item in loaded])
+            with memory_for(loaded[0][0].name):
+                results = self.segment(
+                    [scan for scan, _ in loaded], [item.scan for _, item in loaded]
+                )
             return [(*pair, result) for pair, result in zip(loaded, results, strict=True)]
         except InputError as error:
             if len(loaded) == 1:

@@ -18,7 +18,7 @@ from amvnet.config.schema import ModelConfig, TrainingConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.joined import Joined, own_records
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
+from amvnet.files import atomic_write, parse_yaml
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.training.fit import LAST
 from amvnet.training.run_plan import RunPlan
@@ -75,8 +75,8 @@ def _write_yaml(path: Path, tree: dict[str, Any]) -> None:
 def _entries(path: Path) -> dict[str, Any]:
     """Return the entries of a YAML file of a run; none if it cannot be read."""
     try:
-        entries = yaml.safe_load(path.read_text())
-    except (OSError, ValueError, RecursionError, yaml.YAMLError):
+        entries = parse_yaml(path.read_text(), f"{path}: expected the record of a run")
+    except (OSError, ValueError):
         return {}
     return entries if isinstance(entries, dict) else {}
 

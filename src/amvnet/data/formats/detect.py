@@ -7,6 +7,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from amvnet.data.formats.packets import PCAPNG
 from amvnet.data.formats.raw import NUSCENES_ENDING, columns_of
 from amvnet.data.formats.rows import guess_rows
 from amvnet.data.formats.text import ADVICE as TEXT_ADVICE
@@ -75,7 +76,7 @@ FORMATS = (
     ),
     Format((".e57",), "every scan, in the frame of the instrument", "e57"),
     Format(
-        (".pcap", ".pcapng"),
+        (".pcap",),
         "the packets of a Velodyne, a scan per turn; of other sensors, an error with the command "
         "that converts it",
         "packets",
@@ -85,6 +86,7 @@ ENDINGS = tuple(ending for kind in FORMATS for ending in kind.endings)
 
 # Kinds of files that are known, but not read: what they are, and what to do.
 UNREADABLE = {
+    ".pcapng": ("a capture in the newer format", "run Wireshark's editcap -F pcap OLD NEW.pcap"),
     ".tfrecord": (
         "Waymo's records",
         "they need TensorFlow; convert them to KITTI's .bin, for example with OpenPCDet or "
@@ -129,7 +131,7 @@ BEGINNINGS = {
     b"\xa1\xb2\xc3\xd4": ".pcap",
     b"\x4d\x3c\xb2\xa1": ".pcap",
     b"\xa1\xb2\x3c\x4d": ".pcap",
-    b"\x0a\x0d\x0d\x0a": ".pcapng",
+    PCAPNG: ".pcap",
 }
 HEAD = 4096  # bytes in which the beginning must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file

@@ -23,6 +23,7 @@ ADVICE = "capture it again"
 FULL_INTENSITY = 255.0
 
 PACKET_BYTES = 1206  # of Velodyne's data packets
+PCAPNG = b"\x0a\x0d\x0d\x0a"  # first bytes, whatever the byte order
 HEAD = 1 << 20  # bytes of a capture that are looked at
 LEAST = 16  # bytes of a packet's header in a capture
 
@@ -100,9 +101,18 @@ class Capture:
 
 
 def _maker_of(path: Path) -> str:
-    """Return the maker of the sensor whose packets are most frequent; empty if unknown."""
+    """Return the maker of the sensor whose packets are most frequent; empty if unknown.
+
+    Raises:
+        InputError: if the capture is a pcapng.
+    """
     with path.open("rb") as file:
         head = file.read(HEAD)
+    if head.startswith(PCAPNG):
+        raise InputError(
+            f"{path}: expected a capture in the format pcap, found pcapng; convert it with "
+            "Wireshark's editcap -F pcap OLD NEW.pcap"
+        )
 
     makers = Counter(map(_maker_of_packet, _packets(head)))
     del makers[""]
@@ -110,16 +120,7 @@ def _maker_of(path: Path) -> str:
 
 
 def _packets(head: bytes) -> Iterator[bytes]:
-    """Yield the packets of a capture, from the link layer on; those of pcapng too."""
-    if head.startswith(b"\x0a\x0d\x0d\x0a"):
-        position = 0
-        while position + 28 <= len(head):
-            kind, length = struct.unpack_from("<II", head, position)
-            if kind == 6:  # an enhanced packet block
-                yield head[position + 28 : position + length]
-            position += max(length, 12)
-        return
-
+    """Yield the packets of a capture, from the link layer on."""
     order = ">" if head[:1] == b"\xa1" else "<"
     position = 24
     while position + LEAST <= len(head):

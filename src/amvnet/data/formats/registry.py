@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -61,7 +62,6 @@ RECORDINGS: dict[str, Callable[[Path, str, str | None], Recording]] = {
     **dict.fromkeys((FOLDER, *BAGS), Bag),
     ".e57": E57,
     ".pcap": Capture,
-    ".pcapng": Capture,
 }
 SCANS = (*ROW_READERS, *CLOUD_READERS)  # endings of files of one scan
 
@@ -151,7 +151,8 @@ def _read(path: Path, ending: str, layout: RowLayout) -> Cloud:
     """Read a file of one scan in this process."""
     if ending in PACKED:
         with unpacked(path) as inner:
-            return _read(inner, _ending_of_one(inner), layout)
+            cloud = _read(inner, _ending_of_one(inner), layout)
+            return replace(cloud, name=str(path))
     if ending in ROW_READERS:
         return ROW_READERS[ending](path, layout)
     return CLOUD_READERS[ending](path)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -22,6 +21,7 @@ from amvnet.files import atomic_write, inside, make_folder, publish
 
 Kind = Literal["bag", "mcap"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+JOINED = "joined"  # folder of a bag that is being written
 SUFFIX = "/labels"  # after the topic of the scans
 
 
@@ -123,15 +123,20 @@ def _write_bag(path: Path, parts: Sequence[Path], kind: str) -> None:
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as Writer2
 
-    make_folder(path.parent)
-    with TemporaryDirectory(dir=path.parent, prefix=".") as temporary:
-        bag = Path(temporary) / "labels.bag"
+    # Next to the parts, so that the next run replaces what a run that was killed has left.
+    folder = parts[0].parent / JOINED
+    shutil.rmtree(folder, ignore_errors=True)
+    make_folder(folder)
+    try:
+        bag = folder / "labels.bag"
         if kind == "bag":
             _write_messages(Writer1(bag), parts, kind)
         else:
             _write_messages(Writer2(bag, version=9, storage_plugin=StoragePlugin.MCAP), parts, kind)
             (bag,) = bag.glob("*.mcap")
         publish(bag, path)
+    finally:
+        shutil.rmtree(folder)
 
 
 def _write_messages(writer: Any, parts: Sequence[Path], kind: str) -> None:
