@@ -46,8 +46,12 @@ WRONG_VALUES = {
     "train simulated-compact --data x": "expected --out, found none",
     "simulate o --seed " + HUGE: "--seed: expected a whole number, found one of 9000 digits",
     PREDICT + " --height " + HUGE: "--height: expected a number, found one of 9000 digits",
-    TRAIN + " --training.seed " + HUGE: "--training.seed: expected a value, found '999",
-    TRAIN + " --training.seed " + "[" * 5000: "--training.seed: expected a value, found '[[[",
+    TRAIN
+    + " --training.seed "
+    + HUGE: "--training.seed: expected a value, found a number of 9000 digits",
+    TRAIN
+    + " --training.seed "
+    + "[" * 5000: "--training.seed: expected a value, found more than 50 levels",
 }
 
 
