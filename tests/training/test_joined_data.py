@@ -17,9 +17,14 @@ from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
+from amvnet.inference.reading import open_for_weights
+from amvnet.sensors.record import AS_IS
+from amvnet.sensors.record import KEY as SENSOR
+from amvnet.training.loaders import sensor_record
 from amvnet.training.run_plan import without_mean
 from amvnet.weights.file import load, save
 
+from fixtures.own_scans import make_own_scans
 from fixtures.worlds import (
     GOLDEN,
     NO_PICTURES,
@@ -104,6 +109,21 @@ def test_scans_that_are_normalised_are_not_mixed_with_others(tmp_path: Path) -> 
     own = replace(open_own(tmp_path / "own.yaml"), is_normalised=True)
     with pytest.raises(InputError, match="found both"):
         join(scans, [Part(own, own.records(own.sequences("all")))])
+
+
+def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought_to(
+    tmp_path: Path,
+) -> None:
+    paths = [make_own_scans(tmp_path / name) for name in "ab"]
+    weights = fresh_weights(open_own(paths[0]).taxonomy)
+    own = [open_for_weights(str(path), weights) for path in paths]
+    records = [dataset.records(dataset.sequences("train")) for dataset in own]
+    scans = join(TrainingScans(own[0], records[0], ()), [Part(own[1], records[1])])
+
+    record = sensor_record(scans.dataset, scans.train)
+
+    assert AS_IS not in record[SENSOR]
+    assert record[SENSOR] == sensor_record(own[0], records[0])[SENSOR]
 
 
 def test_a_share_follows_the_last_at_sign(tmp_path: Path) -> None:

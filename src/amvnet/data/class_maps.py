@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, color_of
 from amvnet.errors import InputError, did_you_mean, shown
 from amvnet.files import read_yaml
 
@@ -116,11 +116,9 @@ def _parse(name: str, tree: Any) -> ClassMap:
             if source in sources:
                 raise InputError(f"expected each class once, found {source} twice; correct the map")
             sources[source] = train_id
-        colors.append(_color(title, values.get("color")))
+        colors.append(color_of(title, values.get("color"), train_id))
         raw_ids.append(_id(title, values.get("id", train_id)))
 
-    if len(set(raw_ids[1:])) < len(raw_ids) - 1 or 0 in raw_ids[1:]:
-        raise InputError(f"expected different ids from 1, found {shown(raw_ids[1:])}; correct them")
     target = Taxonomy(
         name=name if name not in TAXONOMIES else f"own-{name}",
         classes=tuple(map(str, classes)),
@@ -147,16 +145,3 @@ def _id(title: Any, value: Any) -> int:
             f"{title}: expected a whole number as id, found {shown(value)}; correct it"
         )
     return value
-
-
-def _color(title: Any, values: Any) -> tuple[int, int, int]:
-    """Return the colour of a class; grey if it has none."""
-    if values is None:
-        return (150, 150, 150)
-    is_triple = isinstance(values, list) and len(values) == 3
-    if not is_triple or any(type(value) is not int for value in values):
-        raise InputError(
-            f"{title}: expected a color such as [255, 0, 0], found {shown(values)}; correct it"
-        )
-    red, green, blue = values
-    return red, green, blue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,6 +18,10 @@ from amvnet.files import read_yaml
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
 MOST_CLASSES = 255  # train ids are uint8
+# The colours of a user's classes without one: each next hue is far from all earlier ones.
+SATURATION = 0.65
+VALUE = 0.95
+GOLDEN_ANGLE = 0.381966  # of the circle of hues
 UNKNOWN = -1  # in lookup tables: no train id belongs to this raw id
 
 # The tables of a YAML label map, and its name for each split.
@@ -61,7 +66,7 @@ class Taxonomy:
         self._check_length("colours", len(self.colors))
         self._check_length("raw ids", len(self.train_to_raw))
         self._check_different("classes", self.classes)
-        self._check_different("raw ids of the classes", self.train_to_raw)
+        self._check_different("ids", self.train_to_raw)
 
         wrong_train_ids = set(self.raw_to_train.values()) - set(range(self.size + 1))
         if wrong_train_ids:
@@ -334,6 +339,32 @@ def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
         splits=splits,
         counts_absent=True,
     )
+
+
+def color_of(title: Any, values: Any, train_id: int) -> tuple[int, int, int]:
+    """Return the colour that a user gives a class, or one unlike the others if there is none.
+
+    Args:
+        title: of the class, for the message.
+        values: of the YAML file; None stands for none.
+        train_id: of the class.
+
+    Raises:
+        InputError: if it is no list of three whole numbers.
+    """
+    if values is None:
+        hue = train_id * GOLDEN_ANGLE % 1
+        red, green, blue = colorsys.hsv_to_rgb(hue, SATURATION, VALUE)
+        return round(255 * red), round(255 * green), round(255 * blue)
+
+    is_triple = isinstance(values, list) and len(values) == 3
+    if not is_triple or any(type(value) is not int for value in values):
+        raise InputError(
+            f"classes: {title}: expected a color such as [255, 0, 0], found {shown(values)}; "
+            "correct it"
+        )
+    red, green, blue = values
+    return red, green, blue
 
 
 def _rgb(values: Iterable[Any]) -> tuple[int, int, int]:

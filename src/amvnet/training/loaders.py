@@ -15,6 +15,7 @@ from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.joined import Joined
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.spacing import evenly_spaced
 from amvnet.distributed import ALONE, Processes
@@ -322,8 +323,9 @@ def sensor_record(
     record: dict[str, Any] = {INTENSITY: mean if is_known else []}
 
     # Scans that are normalised are as the weights will get them: what they are brought to counts.
-    if isinstance(dataset, OwnScans) and dataset.is_normalised:
-        record |= normalised_record(dataset)
+    first = dataset.dataset if isinstance(dataset, Joined) else dataset
+    if isinstance(first, OwnScans) and first.is_normalised:
+        record |= normalised_record(first)
     else:
         record[SENSOR] = {**measure_sensor(scans), AS_IS: True}
     if intensity is not None and intensity.is_matched:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +18,7 @@ from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_label_field, read_scan_labels
-from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, Taxonomy
+from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, Taxonomy, color_of
 from amvnet.errors import InputError, shown
 from amvnet.files import read_yaml
 from amvnet.scan import Scan
@@ -29,9 +28,6 @@ KEYS = ("name", "root", "classes", "ignored", "scans", "labels", "split", "senso
 ROW_KEYS = ("columns", "dtype")
 SPLITS = ("train", "val", "test")
 LARGEST_LIST = 50_000_000  # bytes of a file with names of scans
-SATURATION = 0.65  # of the colours of classes without one
-VALUE = 0.95
-GOLDEN_ANGLE = 0.381966  # of the circle of hues: each next colour is far from all earlier ones
 
 # Turns what a file holds into a scan, given the recording that it is from.
 Normalise = Callable[[Cloud, str], Scan]
@@ -395,7 +391,7 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
         if not ids:
             raise InputError(f"classes: {title}: expected ids, found none; name one or more")
         train_to_raw.append(ids[0])
-        colors.append(_color(title, values.get("color"), train_id))
+        colors.append(color_of(title, values.get("color"), train_id))
         for raw_id in ids:
             _add(raw_to_train, raw_id, train_id)
 
@@ -433,23 +429,6 @@ def _ids(title: str, values: Any) -> list[int]:
                 f"found {shown(raw_id)}; correct them"
             )
     return [raw_id & INSTANCE_MASK for raw_id in ids]
-
-
-def _color(title: str, values: Any, train_id: int) -> tuple[int, int, int]:
-    """Return the colour of a class, or one unlike the others if there is none."""
-    if values is None:
-        hue = train_id * GOLDEN_ANGLE % 1
-        red, green, blue = colorsys.hsv_to_rgb(hue, SATURATION, VALUE)
-        return round(255 * red), round(255 * green), round(255 * blue)
-
-    is_triple = isinstance(values, list) and len(values) == 3
-    if not is_triple or any(type(value) is not int for value in values):
-        raise InputError(
-            f"classes: {title}: expected a color such as [255, 0, 0], found {shown(values)}; "
-            "correct it"
-        )
-    red, green, blue = values
-    return red, green, blue
 
 
 def _parse_labels(entry: Any) -> LabelPlace | None:
