@@ -19,6 +19,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 import amvnet
+from amvnet.data import palette
 
 PANEL = (1000, 560)  # pixels, width and height
 GAP = 8  # pixels between panels
@@ -29,8 +30,6 @@ LEAST = 40  # points of a class in the legend
 BACKGROUND = np.array([13, 16, 22], np.float32)
 INK = (226, 230, 238)
 PLAIN = (74, 82, 96)  # points that a panel says nothing about
-UNCERTAIN = (255, 170, 40)
-WRONG = (255, 72, 66)
 CAR = (196, 204, 216)
 
 DISC = 0.0032  # radius of a point in metres, per metre from the sensor: it fills the gaps of a wall
@@ -146,7 +145,7 @@ def car_points() -> tuple[np.ndarray, np.ndarray]:
 
 def class_colors(taxonomy: Any, labels: np.ndarray) -> np.ndarray:
     """Return (N, 3) colours, the dark ones lifted so that they show on a dark background."""
-    table = np.array(taxonomy.colors, np.float32)
+    table = np.array(palette.class_colors(taxonomy.colors), np.float32)
     weights = np.array([0.3, 0.59, 0.11], np.float32)
     luminance = table @ weights
     share = np.clip((DARKEST - luminance) / (255 - luminance), 0, 1)[:, None]
@@ -204,9 +203,9 @@ def draw(
         ("AMVNet", by_class(labels)),
         (
             f"Uncertain: the two networks disagree on {share:.0%} of the points",
-            highlight(uncertain, UNCERTAIN),
+            highlight(uncertain, palette.UNCERTAIN),
         ),
-        (f"Wrong labels: {1 - right:.1%} of the points", highlight(wrong, WRONG)),
+        (f"Wrong labels: {1 - right:.1%} of the points", highlight(wrong, palette.WRONG)),
     ]
 
     width, height = PANEL

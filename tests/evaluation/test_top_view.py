@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from numpy.typing import ArrayLike
 
+from amvnet.data.palette import UNCERTAIN, WRONG
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
-from amvnet.evaluation.top_view import UNCERTAIN, WRONG, TopView, draw_scan
+from amvnet.evaluation.top_view import TopView, draw_scan
 
 BLOCK = 400  # points of one class in one block, dense enough to fill pixels
 
@@ -23,7 +25,7 @@ def blocks(classes: list[int]) -> tuple[np.ndarray, np.ndarray]:
     return points.astype(np.float32), np.repeat(classes, BLOCK).astype(np.uint8)
 
 
-def has_color(image: np.ndarray, color: tuple[float, ...]) -> bool:
+def has_color(image: np.ndarray, color: ArrayLike) -> bool:
     """Return whether more than 50 pixels have a colour, RGB in [0, 1]."""
     difference = np.abs(image[..., :3] - np.asarray(color)).max(axis=-1)
     return bool((difference < 2 / 255).sum() > 50)
@@ -54,8 +56,8 @@ def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
         assert has_color(image, class_color(class_id))
 
     assert not has_color(image, class_color(7))
-    assert has_color(image, WRONG)
-    assert has_color(image, UNCERTAIN)
+    assert has_color(image, np.divide(WRONG, 255))
+    assert has_color(image, np.divide(UNCERTAIN, 255))
     assert [file.name for file in path.parent.iterdir()] == ["b.png"]
 
 

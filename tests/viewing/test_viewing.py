@@ -19,11 +19,12 @@ import pytest
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.semantickitti import SemanticKitti
+from amvnet.data.palette import WRONG, class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
 from amvnet.viewing import page as pages
 from amvnet.viewing import rerun_log
-from amvnet.viewing.frames import RIGHT, WRONG, Frame
+from amvnet.viewing.frames import RIGHT, Frame
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page
@@ -130,7 +131,7 @@ def test_disagreement_is_one_minus_the_cosine(world: Path, dataset: SemanticKitt
 def test_the_page_names_classes_and_colours_officially(world: Path) -> None:
     about = read_page(world / "p.html").about
     assert about["classes"][1:] == list(SEMANTICKITTI.classes)
-    np.testing.assert_array_equal(about["colors"][1:], SEMANTICKITTI.colors[1:])
+    np.testing.assert_array_equal(about["colors"][1:], class_colors(SEMANTICKITTI.colors)[1:])
 
     keys = [source["key"] for source in about["sources"]]
     assert keys == ["truth", "rv", "bev", "ensemble", "amvnet"]

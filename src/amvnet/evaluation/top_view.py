@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -25,8 +26,6 @@ DOT = 1.1  # area of a point in square typographic points, if REACH metres are s
 Color = tuple[float, float, float]
 IGNORED: Color = (0.8, 0.8, 0.8)
 PLAIN: Color = (0.75, 0.75, 0.75)
-WRONG: Color = (0.9, 0.0, 0.0)
-UNCERTAIN: Color = (0.93, 0.5, 0.0)
 GROUND = "white"
 INK = "black"
 LINES = "0.6"
@@ -110,9 +109,9 @@ def scan_figure(view: TopView) -> Any:
     """Return the Matplotlib figure that `draw_scan` writes."""
     entries = _class_entries(view)
     if view.truth is not None and view.predictions:
-        entries.append(("wrong", WRONG))
+        entries.append(("wrong", _shares(WRONG)))
     if view.uncertain is not None and view.marked:
-        entries.append((view.marked, UNCERTAIN))
+        entries.append((view.marked, _shares(UNCERTAIN)))
     return _figure(view, _grid(view), entries)
 
 
@@ -122,7 +121,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     With truth, its column is the first, and each prediction has a column of its own. Without
     truth there is one row, and the uncertain points are its last panel.
     """
-    palette = np.asarray(view.taxonomy.colors) / 255.0
+    palette = np.asarray(class_colors(view.taxonomy.colors)) / 255.0
     palette[0] = IGNORED
     truth = view.truth
 
@@ -132,7 +131,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     uncertainty = None
     if view.uncertain is not None:
         total = len(view.uncertain)
-        uncertainty = _highlight(view.marked, view.uncertain, total, UNCERTAIN)
+        uncertainty = _highlight(view.marked, view.uncertain, total, _shares(UNCERTAIN))
     if truth is None:
         return [[*predictions]] if uncertainty is None else [[*predictions, uncertainty]]
 
@@ -140,7 +139,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     errors = []
     for title, ids in view.predictions.items():
         wrong = (ids != truth) & labelled
-        errors.append(_highlight(f"errors of {title}", wrong, labelled.sum(), WRONG))
+        errors.append(_highlight(f"errors of {title}", wrong, labelled.sum(), _shares(WRONG)))
 
     first_row: list[_Panel | None] = [_Panel("truth", palette[truth], labelled), *predictions]
     if uncertainty is None and not errors:
@@ -158,6 +157,12 @@ def _highlight(title: str, mask: np.ndarray, total: int, color: Color) -> _Panel
     return _Panel(f"{title} ({share:.1%})", colors, mask)
 
 
+def _shares(color: tuple[int, int, int]) -> Color:
+    """Return a colour in [0, 1]."""
+    red, green, blue = color
+    return red / 255, green / 255, blue / 255
+
+
 def _class_entries(view: TopView) -> list[tuple[str, Color]]:
     """Return (name, colour) of the classes that appear, for the legend; "ignored" comes last."""
     taxonomy = view.taxonomy
@@ -169,8 +174,7 @@ def _class_entries(view: TopView) -> list[tuple[str, Color]]:
     entries: list[tuple[str, Color]] = []
     for class_id in class_ids:
         if class_id > 0:
-            red, green, blue = taxonomy.colors[class_id]
-            color = (red / 255, green / 255, blue / 255)
+            color = _shares(class_colors(taxonomy.colors)[class_id])
             entries.append((taxonomy.classes[class_id - 1], color))
     if 0 in class_ids:
         entries.append(("ignored", IGNORED))

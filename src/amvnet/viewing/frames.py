@@ -27,9 +27,7 @@ from amvnet.sensors.normalise import Normaliser
 # black, which would hide them.
 UNLABELLED = (128, 136, 148)
 RIGHT = (78, 92, 112)
-WRONG = (255, 64, 54)
 UNSCORED = (40, 47, 58)
-UNCERTAIN = (238, 128, 0)
 
 
 @dataclass(frozen=True)

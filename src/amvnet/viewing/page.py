@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.files import atomic_write
 from amvnet.models.methods import METHODS, title_of
-from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, UNSCORED, WRONG, Frame
+from amvnet.viewing.frames import RIGHT, UNLABELLED, UNSCORED, Frame
 
 # Points of one scan. Of larger scans the page shows every second or third point, so that phones
 # keep up.
@@ -32,7 +33,7 @@ STOPS = 17  # colours between which the page interpolates a ramp
 # The colour map of Matplotlib for each ramp, and the part of it that is used, in [0, 1].
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
 # From no disagreement to full disagreement of the networks, RGB in 0..255.
-UNCERTAINTY_RAMP = (RIGHT, (128, 104, 92), (190, 110, 50), UNCERTAIN, (255, 190, 60))
+UNCERTAINTY_RAMP = (RIGHT, (122, 104, 132), (190, 124, 158), UNCERTAIN, (255, 205, 220))
 # In this order: later scripts use what earlier ones define.
 SCRIPTS = (
     "scans.js",
@@ -179,7 +180,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     return {
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
-        "colors": [UNLABELLED, *taxonomy.colors[1:]],
+        "colors": [UNLABELLED, *class_colors(taxonomy.colors)[1:]],
         "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
         "present": sorted(present),
         "sources": sources,

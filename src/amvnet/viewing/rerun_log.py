@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.methods import title_of
-from amvnet.viewing.frames import RIGHT, UNCERTAIN, UNLABELLED, WRONG, Frame
+from amvnet.viewing.frames import RIGHT, UNLABELLED, Frame
 
 TIMELINE = "scan"
 DOT = 1.2  # radius of a point on the screen, in Rerun's ui points
@@ -116,7 +117,7 @@ def log(stream: Any, frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
     """
     rerun = check_rerun()
     names = ("unlabelled", *taxonomy.classes)
-    colors = (UNLABELLED, *taxonomy.colors[1:])
+    colors = (UNLABELLED, *class_colors(taxonomy.colors)[1:])
     classes = []
     for class_id, (name, color) in enumerate(zip(names, colors, strict=True)):
         classes.append(rerun.AnnotationInfo(id=class_id, label=name, color=color))
