@@ -130,8 +130,7 @@ analyze city64 --split all --weights sim-hdl64e --out figures/analysis
 fuse city64 --scores-a labels/64/rv --scores-b labels/64/bev --out fused/ensemble
 fuse city64 --scores-a labels/64/amvnet --scores-b labels/64/amvnet --key-a rv --key-b bev \
     --head sim-hdl64e --tau 0.7 --out fused/head
-rank city64 --weights sim-hdl64e --out rank/next.csv
-rank city32 --weights sim-hdl32e --by labels --out rank/suspects.csv --pictures rank/suspects
+rank city32 --weights sim-hdl32e --out rank/suspects.csv --pictures rank/suspects
 
 # What others read
 view city64 --weights sim-hdl64e --scans 2 --html pages/weights.html

@@ -190,6 +190,9 @@ def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
     fails(lambda: only_scan(site.parent), path, "found 5")
     np.save(site / "a.half.npy", np.full(60, 0.5))
     fails(lambda: read_labels(site / "a.half.npy", 60), "whole numbers")
+    for large in (np.inf, 2.0**40):
+        np.save(site / "a.large.npy", np.full(60, large))
+        fails(lambda: read_labels(site / "a.large.npy", 60), "32 bits")
     fails(lambda: read_labels(site / "none.npy", 60), "no file")
     np.save(site / "evil.npy", np.array([{}], object), allow_pickle=True)
     fails(lambda: read_labels(site / "evil.npy", 1), "evil.npy")
