@@ -1,7 +1,5 @@
 """Weighted random choice."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TypeVar
 

@@ -1,14 +1,12 @@
 """Where the sensor drives in a street: in a lane, out of a side road or through a car park."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidarstreets.sites.areas import AISLE, Area, add_lot, has_room
-from lidarstreets.sites.site import Site
+from lidarstreets.sites.areas import AISLE, add_lot, has_room
+from lidarstreets.sites.site import Plot, Site
 from lidarstreets.streets.ground import Ground
 from lidarstreets.streets.plans import SideRoad
 
@@ -23,8 +21,7 @@ LONGEST_DETOUR = 50.0
 # Radians from scan to scan by which the phases of the sensor's sway and of its turn change.
 SWAY_STEP = 0.7
 TURN_STEP = 1.3
-# Metres: half the width of a car that drives at the edge of the road.
-HALF_CAR = 1.0
+HALF_CAR = 1.0  # metres: half the width of a car that drives at the edge of the road
 
 
 @dataclass(frozen=True)
@@ -122,16 +119,16 @@ def _through_car_park(
     """Draw a car park and a course along its aisle, or return None if there is no room."""
     ground = site.ground
     side = int(rng.choice([-1, 1]))
-    stop = drive.margin + scans * drive.spacing + 10
-    area = Area(side, drive.margin - 18, stop, depth=rng.uniform(16, 26))
-    if not has_room(site, area):
+    area = Plot(site, side, drive.margin - 18, scans * drive.spacing + 28)
+    depth = rng.uniform(16, 26)
+    if not has_room(area, depth):
         return None
 
     t = side * (ground.front(side) + AISLE)
     course = Course(ground, drive.margin, drive.spacing, t, sway=0.5)
     site.course = replace(course, sway=0.0).places(scans)
-    add_lot(site, area)
-    ground.reserved.append((side, area.start, area.stop))
+    add_lot(area, depth)
+    ground.reserved.append((side, area.x, area.end))
     return course
 
 

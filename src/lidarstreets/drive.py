@@ -1,7 +1,5 @@
 """Drives the sensor along simulated streets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace

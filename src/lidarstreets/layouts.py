@@ -1,12 +1,11 @@
 """Writes simulated scans in the layouts of SemanticKITTI and nuScenes-lidarseg."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
 import threading
 import uuid
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -19,6 +18,7 @@ from lidarstreets.errors import SimulationError
 from lidarstreets.materials import MOVING, Label
 
 Row = dict[str, Any]
+Tables = defaultdict[str, list[Row]]
 CLASS_MASK = np.uint32(0xFFFF)
 
 # From the LiDAR's axes (forward, left, up) to a camera's (right, down, forward), for calib.txt.
@@ -29,22 +29,6 @@ _CAMERA = np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0], [0, 0, 0
 # The LiDAR of nuScenes looks to the right: x is right, y is forward.
 _TO_NUSCENES = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 VERSION = "v1.0-trainval"
-TABLES = (
-    "attribute",
-    "calibrated_sensor",
-    "category",
-    "ego_pose",
-    "instance",
-    "lidarseg",
-    "log",
-    "map",
-    "sample",
-    "sample_annotation",
-    "sample_data",
-    "scene",
-    "sensor",
-    "visibility",
-)
 # Microseconds: time of the first scan of scene 0, and between the first scans of two scenes.
 START = 1_600_000_000_000_000
 SCENE_STEP = 1_000_000_000
@@ -173,7 +157,9 @@ class NuScenesLayout:
     @staticmethod
     def complete(out: Path, sequences: list[Row]) -> None:
         """Write the tables of all scenes, and an empty map."""
-        tables: dict[str, list[Row]] = {name: [] for name in TABLES}
+        tables: Tables = defaultdict(
+            list, attribute=[], instance=[], sample_annotation=[], visibility=[]
+        )
         _add_shared_rows(tables)
         for sequence in sequences:
             _add_scene(tables, sequence)
@@ -189,113 +175,86 @@ LAYOUTS: Mapping[str, type[SemanticKittiLayout] | type[NuScenesLayout]] = {
 }
 
 
-def _add_shared_rows(tables: dict[str, list[Row]]) -> None:
+def _add(tables: Tables, table: str, token: str, **columns: Any) -> None:
+    """Add a row to a table."""
+    tables[table].append({"token": token, **columns})
+
+
+def _add_shared_rows(tables: Tables) -> None:
     """Add the rows that all scenes share: categories, the LiDAR, the log and the map."""
     for index, name in enumerate(_CATEGORIES):
         token = _token("category", index)
-        tables["category"].append({"token": token, "name": name, "description": "", "index": index})
+        _add(tables, "category", token, name=name, description="", index=index)
 
-    tables["sensor"].append(
-        {"token": _token("sensor"), "channel": "LIDAR_TOP", "modality": "lidar"}
-    )
-
+    sensor = _token("sensor")
     half = float(np.sqrt(0.5))
-    tables["calibrated_sensor"].append(
-        {
-            "token": _token("calibrated_sensor"),
-            "sensor_token": _token("sensor"),
-            "translation": [0.0, 0.0, 0.0],
-            "rotation": [half, 0.0, 0.0, -half],
-            "camera_intrinsic": [],
-        }
+    place = {"translation": [0.0, 0.0, 0.0], "rotation": [half, 0.0, 0.0, -half]}
+    calibration = _token("calibrated_sensor")
+    _add(tables, "sensor", sensor, channel="LIDAR_TOP", modality="lidar")
+    _add(
+        tables, "calibrated_sensor", calibration, sensor_token=sensor, **place, camera_intrinsic=[]
     )
 
-    tables["log"].append(
-        {
-            "token": _token("log"),
-            "logfile": "simulated",
-            "vehicle": "simulated",
-            "date_captured": "2020-09-13",
-            "location": "simulated",
-        }
-    )
-    tables["map"].append(
-        {
-            "token": _token("map"),
-            "log_tokens": [_token("log")],
-            "category": "semantic_prior",
-            "filename": "maps/simulated.png",
-        }
-    )
+    log = _token("log")
+    names = dict.fromkeys(("logfile", "vehicle"), "simulated")
+    _add(tables, "log", log, **names, date_captured="2020-09-13", location="simulated")
+    picture = {"category": "semantic_prior", "filename": "maps/simulated.png"}
+    _add(tables, "map", _token("map"), log_tokens=[log], **picture)
 
 
-def _add_scene(tables: dict[str, list[Row]], sequence: Row) -> None:
+def _add_scene(tables: Tables, sequence: Row) -> None:
     """Add the rows of one scene: it, its samples, their scans, poses and labels."""
     name = sequence["scene"]
-    scans = sequence["scans"]
     scene = _token(name)
-    samples = [_token(name, "sample", index) for index in range(len(scans))]
-    tables["scene"].append(
-        {
-            "token": scene,
-            "log_token": _token("log"),
-            "nbr_samples": len(scans),
-            "name": name,
-            "first_sample_token": samples[0],
-            "last_sample_token": samples[-1],
-            "description": "simulated street",
-        }
+
+    # The tokens of the samples and of their scans, with that of none before and after.
+    samples = [""]
+    tokens = [""]
+    for index, scan in enumerate(sequence["scans"]):
+        samples.append(_token(name, "sample", index))
+        tokens.append(scan["token"])
+    samples.append("")
+    tokens.append("")
+
+    _add(
+        tables,
+        "scene",
+        scene,
+        log_token=_token("log"),
+        nbr_samples=len(sequence["scans"]),
+        name=name,
+        first_sample_token=samples[1],
+        last_sample_token=samples[-2],
+        description="simulated street",
     )
 
-    sample_links = _links(samples)
-    scan_links = _links([scan["token"] for scan in scans])
-
-    for index, scan in enumerate(scans):
-        token = scan["token"]
+    for index, scan in enumerate(sequence["scans"]):
+        before, sample, after = samples[index : index + 3]
+        previous, token, following = tokens[index : index + 3]
         time = scan["time"]
         pose = np.array(scan["pose"])
 
-        tables["sample"].append(
-            {
-                "token": samples[index],
-                "timestamp": time,
-                "scene_token": scene,
-                **sample_links[index],
-            }
+        _add(tables, "sample", sample, timestamp=time, scene_token=scene, prev=before, next=after)
+        _add(
+            tables,
+            "sample_data",
+            token,
+            sample_token=sample,
+            ego_pose_token=token,
+            calibrated_sensor_token=_token("calibrated_sensor"),
+            timestamp=time,
+            fileformat="pcd",
+            is_key_frame=True,
+            height=0,
+            width=0,
+            filename=scan["file"],
+            prev=previous,
+            next=following,
         )
-        tables["sample_data"].append(
-            {
-                "token": token,
-                "sample_token": samples[index],
-                "ego_pose_token": token,
-                "calibrated_sensor_token": _token("calibrated_sensor"),
-                "timestamp": time,
-                "fileformat": "pcd",
-                "is_key_frame": True,
-                "height": 0,
-                "width": 0,
-                "filename": scan["file"],
-                **scan_links[index],
-            }
-        )
-        tables["ego_pose"].append(
-            {
-                "token": token,
-                "timestamp": time,
-                "rotation": _quaternion(pose[:3, :3]),
-                "translation": pose[:3, 3].tolist(),
-            }
-        )
-        tables["lidarseg"].append(
-            {"token": token, "sample_data_token": token, "filename": scan["labels"]}
-        )
-
-
-def _links(tokens: list[str]) -> list[Row]:
-    """Return the tokens of the previous and the next row for each row; "" at the ends."""
-    previous = ["", *tokens[:-1]]
-    following = [*tokens[1:], ""]
-    return [{"prev": a, "next": b} for a, b in zip(previous, following, strict=True)]
+        rotation = _quaternion(pose[:3, :3])
+        translation = pose[:3, 3].tolist()
+        _add(tables, "ego_pose", token, timestamp=time, rotation=rotation, translation=translation)
+        _add(tables, "lidarseg", token, sample_data_token=token, filename=scan["labels"])
 
 
 def _quaternion(rotation: np.ndarray) -> list[float]:

@@ -1,7 +1,5 @@
 """Labelled triangle meshes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
@@ -54,7 +52,7 @@ def part(
 
     See `Mesh` for the depth and the tint.
     """
-    triangles = np.concatenate(solids)
+    triangles = np.concatenate([np.zeros((0, 3, 3)), *solids])
     count = len(triangles)
 
     return Mesh(
@@ -70,7 +68,7 @@ def part(
 def join(*meshes: Mesh) -> Mesh:
     """Return several meshes as one; the result is empty if there are none."""
     if not meshes:
-        return part([np.zeros((0, 3, 3))], Surface.ASPHALT, 0)
+        return part([], Surface.ASPHALT, 0)
 
     columns = {}
     for column in fields(Mesh):
@@ -96,11 +94,6 @@ def rolled(mesh: Mesh, roll: float) -> Mesh:
     sin = np.sin(roll)
     rotation = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
     return replace(mesh, triangles=(mesh.triangles @ rotation.T).astype(np.float32))
-
-
-def with_instance(mesh: Mesh, instance: int) -> Mesh:
-    """Return the mesh as one instance."""
-    return replace(mesh, instance=np.full(len(mesh), instance, dtype=np.uint16))
 
 
 def with_random_tint(mesh: Mesh, rng: np.random.Generator) -> Mesh:

@@ -1,57 +1,33 @@
 """Solids that all bodies are built from, as (T, 3, 3) corners of triangles in metres."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 Vector = tuple[float, float, float]
 
-# Corners of the unit box, whose lower face is centred on the origin.
-_BOX_CORNERS = np.array(
-    [
-        (-0.5, -0.5, 0.0),
-        (0.5, -0.5, 0.0),
-        (-0.5, 0.5, 0.0),
-        (0.5, 0.5, 0.0),
-        (-0.5, -0.5, 1.0),
-        (0.5, -0.5, 1.0),
-        (-0.5, 0.5, 1.0),
-        (0.5, 0.5, 1.0),
-    ]
-)
-# Counter-clockwise seen from outside.
-_BOX_FACES = np.array(
-    [
-        (0, 3, 1),
-        (0, 2, 3),
-        (4, 5, 7),
-        (4, 7, 6),
-        (0, 1, 5),
-        (0, 5, 4),
-        (2, 7, 3),
-        (2, 6, 7),
-        (0, 6, 2),
-        (0, 4, 6),
-        (1, 3, 7),
-        (1, 7, 5),
-    ]
-)
+# Corners of the unit box, whose lower face is centred on the origin: z, y, x change ever faster.
+_BOX_CORNERS = np.array(list(product((0.0, 1.0), (-0.5, 0.5), (-0.5, 0.5))))[:, ::-1]
+# Two triangles for each face, counter-clockwise seen from outside.
+_BOX_FACES = np.array([
+    (0, 3, 1), (0, 2, 3),  # bottom
+    (4, 5, 7), (4, 7, 6),  # top
+    (0, 1, 5), (0, 5, 4),  # right
+    (2, 7, 3), (2, 6, 7),  # left
+    (0, 6, 2), (0, 4, 6),  # rear
+    (1, 3, 7), (1, 7, 5),  # front
+])  # fmt: skip
 
 
 def box(
     size: Vector, at: Vector = (0, 0, 0), top: tuple[float, float] = (1, 1), shift: float = 0
 ) -> np.ndarray:
-    """Return the (12, 3, 3) triangles of a box.
+    """Return the (12, 3, 3) triangles of a box whose lower face is centred `at` a place.
 
-    Args:
-        size: edge lengths in metres.
-        at: centre of the lower face.
-        top: factors by which the upper face is narrower in x and y.
-        shift: metres by which the upper face is moved along x.
+    The upper face is narrower by the factors `top` in x and y, and moved by `shift` along x.
     """
     corners = _BOX_CORNERS * np.array(size)
     corners[4:, :2] *= np.array(top)
@@ -104,14 +80,14 @@ def tube(
     high = end_point + circle * end_radius
     next_low = np.roll(low, -1, axis=0)
     next_high = np.roll(high, -1, axis=0)
-    side = [_triangles(low, next_low, next_high), _triangles(low, next_high, high)]
+    side = quads(low, next_low, next_high, high)
     if not closed:
-        return np.concatenate(side)
+        return side
 
     start_points = np.broadcast_to(start_point, low.shape)
     end_points = np.broadcast_to(end_point, high.shape)
     ends = [_triangles(start_points, next_low, low), _triangles(end_points, high, next_high)]
-    return np.concatenate(side + ends)
+    return np.concatenate([side, *ends])
 
 
 def prism(
@@ -119,10 +95,7 @@ def prism(
 ) -> np.ndarray:
     """Return the (4 n, 3, 3) triangles of a side view drawn out across y.
 
-    Args:
-        profile: n corners (x, z) of the side view, which is convex or nearly so.
-        width: width in y.
-        top_width: width at the top, if it differs.
+    The profile has n corners (x, z) and is convex or nearly so. The width may differ at the top.
     """
     if top_width is None:
         top_width = width
@@ -138,24 +111,15 @@ def prism(
     left_middle = np.broadcast_to(left.mean(axis=0), left.shape)
     right_middle = np.broadcast_to(right.mean(axis=0), right.shape)
 
-    return np.concatenate(
-        [
-            _triangles(left, next_left, next_right),
-            _triangles(left, next_right, right),
-            _triangles(left_middle, left, next_left),
-            _triangles(right_middle, right, next_right),
-        ]
-    )
+    side = quads(left, next_left, next_right, right)
+    ends = [_triangles(left_middle, left, next_left), _triangles(right_middle, right, next_right)]
+    return np.concatenate([side, *ends])
 
 
 def loft(rings: np.ndarray) -> np.ndarray:
-    """Return the triangles of the closed body through rings of corners.
+    """Return the (2 n k, 3, 3) triangles of the closed body through (n, k, 3) rings of corners.
 
-    Args:
-        rings: (n, k, 3) corners; seen from the last ring, each runs counter-clockwise.
-
-    Returns:
-        (2 n k, 3, 3) triangles, counter-clockwise seen from outside.
+    If each ring runs counter-clockwise, seen from the last one, so do the triangles from outside.
     """
     following = np.roll(rings, -1, axis=1)
     low = rings[:-1].reshape(-1, 3)
@@ -165,15 +129,9 @@ def loft(rings: np.ndarray) -> np.ndarray:
 
     start = np.broadcast_to(rings[0].mean(axis=0), rings[0].shape)
     end = np.broadcast_to(rings[-1].mean(axis=0), rings[-1].shape)
-
-    return np.concatenate(
-        [
-            _triangles(low, next_low, next_high),
-            _triangles(low, next_high, high),
-            _triangles(start, following[0], rings[0]),
-            _triangles(end, rings[-1], following[-1]),
-        ]
-    )
+    side = quads(low, next_low, next_high, high)
+    ends = [_triangles(start, following[0], rings[0]), _triangles(end, rings[-1], following[-1])]
+    return np.concatenate([side, *ends])
 
 
 def planks(
@@ -199,7 +157,7 @@ def planks(
     b = np.stack([right, y, bottom], axis=1)
     c = np.stack([right, y, top], axis=1)
     d = np.stack([left, y, top], axis=1)
-    return np.concatenate([_triangles(a, b, c), _triangles(a, c, d)])
+    return quads(a, b, c, d)
 
 
 def turned(triangles: np.ndarray, yaw: float) -> np.ndarray:
@@ -235,10 +193,12 @@ def hoop(radius: float, thickness: float, at: Vector, sides: int = 12) -> np.nda
     inner = circle * (radius - thickness)
     next_outer = np.roll(outer, -1, axis=0)
     next_inner = np.roll(inner, -1, axis=0)
-    ring = np.concatenate(
-        [_triangles(outer, next_outer, next_inner), _triangles(outer, next_inner, inner)]
-    )
-    return ring + np.array(at)
+    return quads(outer, next_outer, next_inner, inner) + np.array(at)
+
+
+def quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the (2 n, 3, 3) triangles of n quadrangles, given lists of their corners in order."""
+    return np.concatenate([_triangles(a, b, c), _triangles(a, c, d)])
 
 
 def _triangles(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
@@ -269,8 +229,7 @@ def hull(
 
     Args:
         rng: draws the bumps.
-        centre: centre of the hull in metres.
-        radii: half axes of the hull in metres.
+        centre, radii: centre and half axes of the hull in metres.
         taper: share by which it is narrower at the top and wider at the bottom.
         square: exponent of the shape; below 1 it is closer to a box.
         fine: 320 triangles instead of 80.

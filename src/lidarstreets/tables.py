@@ -1,7 +1,5 @@
 """Read the tables of numbers that lie next to the code."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 from typing import Any

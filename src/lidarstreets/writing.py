@@ -1,7 +1,5 @@
 """Write simulated sequences on several processes, and continue where a call was stopped."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os
@@ -42,7 +40,7 @@ class Sequence:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The settings that, with its number, determine the bytes of the sequence."""
+        """What determines the bytes of the sequence, together with its number."""
         return {"sensor": self.sensor, "seed": self.seed, "scans": self.scans}
 
     @property
@@ -108,11 +106,7 @@ def simulate(
 
 
 def _is_complete(sequence: Sequence) -> bool:
-    """Return whether an earlier call has completed a sequence.
-
-    Raises:
-        SimulationError: if it has other settings.
-    """
+    """Return whether an earlier call has completed a sequence; raise if it has other settings."""
     if not sequence.marker.is_file():
         return False
 

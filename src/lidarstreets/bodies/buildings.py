@@ -3,8 +3,6 @@
 The front of a building faces -y; its walls begin below the ground, so that a slope leaves no gap.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.bodies.facades import FOOT, Facade, draw_facade, plain_wall, wall
@@ -21,7 +19,8 @@ def building(
     parts = [_walls(rng, facade, width, depth, height)]
     parts.append(part([_roof(rng, width, depth, height, flat)], Surface.ROOF_TILE, Label.BUILDING))
 
-    details = [_chimney(rng, width, height, depth)]
+    chimney_x = rng.uniform(-0.3, 0.3) * width
+    details = [box((0.7, 0.7, 1.4), (chimney_x, 0.5, height + depth * 0.2))]
     if not flat and rng.random() < 0.3:
         dormers = box((1.6, depth * 0.5, 1.5), (0, -depth * 0.22, height))
         details.append(copies(dormers, x=np.array([-0.25, 0.25]) * width))
@@ -63,11 +62,6 @@ def _roof(
     ridge = 1.0 if rng.random() < 0.6 else 0.55  # share of the width
     eaves = rng.uniform(0.3, 1.2)
     return box((width + eaves, depth + eaves, rise), (0, 0, height), top=(ridge, 0.02))
-
-
-def _chimney(rng: np.random.Generator, width: float, height: float, depth: float) -> np.ndarray:
-    x = rng.uniform(-0.3, 0.3) * width
-    return box((0.7, 0.7, 1.4), (x, 0.5, height + depth * 0.2))
 
 
 def shed(rng: np.random.Generator) -> Mesh:
@@ -171,12 +165,8 @@ def greenhouse(rng: np.random.Generator) -> Mesh:
     half = rng.uniform(1.2, 3.5)
     height = rng.uniform(1.5, 2.4)
     profile = [
-        (-half, -0.3),
-        (half, -0.3),
-        (half, height),
-        (0, height + half * 0.5),
-        (-half, height),
-    ]
+        (-half, -0.3), (half, -0.3), (half, height), (0, height + half * 0.5), (-half, height),
+    ]  # fmt: skip
     base = box((2 * half + 0.1, length + 0.1, 0.9), (0, 0, -0.5))
     x = np.array([-half, half])
     frame = tube((0, 0, 0), (0, 0, height), 0.04, sides=4)

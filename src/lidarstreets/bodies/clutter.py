@@ -3,8 +3,6 @@
 They are labelled other-object or other-structure, which a benchmark counts as unlabelled.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.chance import weighted_choice

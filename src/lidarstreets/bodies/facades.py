@@ -3,8 +3,6 @@
 A facade lies along x at y = 0 and faces -y.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

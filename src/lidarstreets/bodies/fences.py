@@ -4,8 +4,6 @@ A `Fence` is one kind with all its measures; its segments lie along x and look a
 can be lined up along a boundary.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -58,15 +56,9 @@ POROUS_THICKNESS = 0.04  # metres: of wire meshes and lattices
 # Section (y, z) of the beam of a guard rail, which has two waves, in metres; its height, and the
 # distance between two beams, one above the other.
 BEAM = (
-    (0.0, 0.0),
-    (-0.06, 0.05),
-    (-0.06, 0.11),
-    (0.0, 0.155),
-    (-0.06, 0.2),
-    (-0.06, 0.26),
-    (0.0, 0.31),
-    (0.02, 0.155),
-)
+    (0.0, 0.0), (-0.06, 0.05), (-0.06, 0.11), (0.0, 0.155), (-0.06, 0.2), (-0.06, 0.26),
+    (0.0, 0.31), (0.02, 0.155),
+)  # fmt: skip
 BEAM_HEIGHT = 0.31
 BEAM_PITCH = 0.42
 
@@ -114,12 +106,7 @@ class Fence:
 
 
 def draw_fence(rng: np.random.Generator, kinds: dict[str, float] | None = None) -> Fence:
-    """Draw a kind of fence and its measures.
-
-    Args:
-        rng: draws them.
-        kinds: shares of the kinds, such as `OPEN_KINDS`; those of gardens if None.
-    """
+    """Draw a kind of fence and its measures; the shares are those of gardens if None."""
     kind = weighted_choice(rng, GARDEN_KINDS if kinds is None else kinds)
     surfaces = KINDS[kind].surfaces
     if surfaces is WOODEN:
@@ -179,7 +166,6 @@ def _boards(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 
 
 def _slats(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    """Return horizontal boards between posts."""
     bottom = np.arange(0.05, fence.height - 0.06, fence.pitch)
     width = fence.pitch * (1 - 0.6 * fence.gap)
     y = rng.normal(scale=fence.uneven, size=len(bottom))
@@ -229,7 +215,6 @@ def _mesh(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 
 
 def _lattice(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    """Return a panel of crossed laths in a frame."""
     frame = _beams(length, np.array([0.12, fence.height - 0.04]), 0.08)
     sheet = _porous(fence, length, 0.1, fence.height, fence.surface, passing=0.25 + 0.8 * fence.gap)
     return join(fence.solid([frame, _posts(length, fence.height, 0.05)]), sheet)
@@ -301,7 +286,6 @@ def _wall_and_railing(fence: Fence, rng: np.random.Generator, length: float) -> 
 
 
 def _panels(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    """Return thin panels of concrete between posts that stick out."""
     panel = box((length, 0.05, fence.height + FOOT), (0, 0, -FOOT))
     posts = copies(box((0.14, 0.16, fence.height + FOOT + 0.08), (0, 0, -FOOT)), x=[-length / 2])
     bands = _beams(length, np.array([0.33, 0.66]) * fence.height, 0.05, -0.03)
@@ -309,7 +293,6 @@ def _panels(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
 
 
 def _screen(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    """Return a smooth privacy screen between posts."""
     panel = planks(0, length, 0.04, fence.height)
     return fence.solid([panel, _posts(length, fence.height + 0.06, 0.05)])
 
@@ -328,13 +311,11 @@ def guard_rail(length: float, height: float = 0.75, beams: int = 1) -> Mesh:
 
 
 def _crash_barrier(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    """Return a guard rail with one beam or two."""
     beams = 2 if fence.kind == "double guard rail" else 1
     return guard_rail(length, fence.height, beams)
 
 
 def _wire_rope(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    """Return four ropes between posts along a road."""
     ropes = _beams(length, fence.height * np.array([0.55, 0.7, 0.85, 1.0]), 0.03)
     return fence.solid([ropes, _posts(length, fence.height, 0.05)])
 

@@ -3,8 +3,6 @@
 Signs face -x: vehicles that drive towards +x see their fronts. Lamps reach towards +y.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -117,11 +115,8 @@ def flag_pole(rng: np.random.Generator) -> Mesh:
     )
 
 
-# Outlines of the faces of signs: sides, as many as the corners of a disc need, and radius.
-_ROUND = (12, 0.33)
-_TRIANGLE = (3, 0.46)
-_OCTAGON = (8, 0.42)
-_DIAMOND = (4, 0.42)
+# Sides and radii of the faces of signs: discs (twice as many), triangles, octagons, diamonds.
+_OUTLINES = ((12, 0.33), (12, 0.33), (3, 0.46), (8, 0.42), (4, 0.42))
 
 
 def _face(rng: np.random.Generator, height: float, x: float = -0.06) -> Mesh:
@@ -129,8 +124,7 @@ def _face(rng: np.random.Generator, height: float, x: float = -0.06) -> Mesh:
     kind = rng.random()
     scale = rng.uniform(0.7, 1.3)
     if kind < 0.6:
-        outlines = (_ROUND, _ROUND, _TRIANGLE, _OCTAGON, _DIAMOND)
-        sides, radius = outlines[rng.integers(len(outlines))]
+        sides, radius = _OUTLINES[rng.integers(len(_OUTLINES))]
         middle = height + radius * scale
         disc = tube((x, 0, middle), (x + 0.02, 0, middle), radius * scale, sides=sides)
         dull = disc + np.array([0.021, 0, 0])
@@ -243,15 +237,9 @@ def railway_mast(rng: np.random.Generator) -> Mesh:
 def barrier(length: float) -> Mesh:
     """Return a segment of the concrete barrier that closes off a work zone."""
     profile: Sequence[tuple[float, float]] = [
-        (-0.3, 0),
-        (0.3, 0),
-        (0.3, 0.08),
-        (0.12, 0.35),
-        (0.08, 0.8),
-        (-0.08, 0.8),
-        (-0.12, 0.35),
+        (-0.3, 0), (0.3, 0), (0.3, 0.08), (0.12, 0.35), (0.08, 0.8), (-0.08, 0.8), (-0.12, 0.35),
         (-0.3, 0.08),
-    ]
+    ]  # fmt: skip
     along_street = prism(profile, length)[..., [1, 0, 2]]  # the profile lies across the street
 
     return part([along_street], Surface.PLASTER, Label.BARRIER)

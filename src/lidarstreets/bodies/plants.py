@@ -3,8 +3,6 @@
 Banks and rows of plants lie along x.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,8 +29,7 @@ SECTIONS = {
         (-0.3, 0),
     ),
 }
-# Metres by which plants reach below the ground, so that a slope leaves no gap.
-FOOT = 0.3
+FOOT = 0.3  # metres by which plants reach below the ground, so that a slope leaves no gap
 
 
 def foliage(
@@ -55,13 +52,8 @@ def bank(
 ) -> np.ndarray:
     """Return the (T, 3, 3) triangles of a closed bank of leaves along x.
 
-    Args:
-        rng: draws the unevenness.
-        length: metres.
-        section: one of `SECTIONS`.
-        size: width and height in metres.
-        uneven: standard deviation of the corners in metres.
-        step: metres between two rings of corners.
+    Its `section` is one of `SECTIONS`, `size` its width and height, `uneven` the standard deviation
+    of the corners, and `step` the distance between two rings of corners, all in metres.
     """
     width, height = size
     corners = np.array(SECTIONS[section]) * (width, height)
@@ -120,11 +112,6 @@ def draw_hedge(rng: np.random.Generator, height: float) -> Hedge:
     )
 
 
-def hedge(rng: np.random.Generator, length: float, height: float) -> Mesh:
-    """Return a hedge of a random kind."""
-    return draw_hedge(rng, height).segment(rng, length)
-
-
 def bush(rng: np.random.Generator, radius: float) -> Mesh:
     """Return a bush, from knee-high to taller than a person: dense, or thin down to bare twigs."""
     height = radius * rng.uniform(0.7, 1.6)
@@ -178,11 +165,6 @@ def turf(
     return part([blades], Surface.GRASS, Label.TERRAIN, rng.uniform(0.3, 1.6), tint=tint)
 
 
-def thicket(rng: np.random.Generator, length: float, height: float) -> Mesh:
-    """Return a strip of undergrowth of a random kind; see `draw_thicket`."""
-    return draw_thicket(rng).segment(rng, length, height)
-
-
 @dataclass(frozen=True)
 class Thicket:
     """A kind of undergrowth or wood edge; lengths are in metres.
@@ -213,7 +195,7 @@ class Thicket:
             radii = (1.0, size[0] * 0.6, height * 0.4)
             leaves.append(hull(rng, (x, 0, height * 0.6), radii, fine=False))
 
-        stems = [np.zeros((0, 3, 3))]
+        stems = []
         for _ in range(rng.poisson(self.stems * length)):
             x = rng.uniform(-length / 2, length / 2)
             y = rng.uniform(-0.5, 0.5) * size[0]

@@ -1,7 +1,5 @@
 """Meshes of trees: stems, boughs and crowns."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.bodies.plants import bank, foliage
@@ -63,7 +61,6 @@ def _stem(
 
 
 def _ivy(rng: np.random.Generator, fork: Vector, radius: float) -> Mesh:
-    """Return ivy around a stem of a radius, up to a fork."""
     half = max(fork[2], 0.6) * rng.uniform(0.3, 0.6)
     wide = radius * rng.uniform(1.3, 2.0) + 0.05
     return foliage([hull(rng, (0, 0, half * 0.8), (wide, wide, half), fine=False)], 0.05)
@@ -129,7 +126,6 @@ def _bare_boughs(
 
 
 def _distant_crown(rng: np.random.Generator, fork: Vector, height: float, spread: float) -> Mesh:
-    """Return a crown that is one hull."""
     half = (height - fork[2] * 0.8) / 2
     crown = hull(rng, (*fork[:2], height - half), (spread, spread, half), fine=False)
     return foliage([crown], rng.uniform(0.1, 1.2), rng.normal(scale=0.4))

@@ -91,12 +91,8 @@ class GroundAppearance(Protocol):
 class Rays:
     """The shots of one rotation that the car does not block, in the sensor's frame.
 
-    They are sorted by laser from the top down, then by azimuth from +x.
-
-    Attributes:
-        direction: (R, 3) float32 unit vectors.
-        ring: (R,) uint8 index of the laser, 0 = lowest.
-        time: (R,) float32 seconds from the moment when the sensor looks ahead.
+    They are (R,) rows, sorted by laser from the top down, then by azimuth from +x: unit vectors,
+    indices of the lasers (0 = lowest), and seconds from the moment when the sensor looks ahead.
     """
 
     direction: np.ndarray
@@ -114,8 +110,7 @@ class Hits:
         cosine: (N,) of the angle between ray and surface normal.
         surface: (N,) rows of the reflection table.
         tint: (N,) as in `Mesh`.
-        label: (N,) class ids.
-        instance: (N,) instance ids.
+        label, instance: (N,) class and instance ids.
         ring: (N,) index of the laser, 0 = lowest.
         shift: (N, 3) metres that the sensor had moved when it fired.
     """
@@ -180,12 +175,10 @@ def _is_hidden(sensor: LidarModel) -> np.ndarray:
 
 
 class _NearestHits:
-    """The nearest hit of each ray over all scenes.
+    """The nearest hit of each of R rays over all scenes; all columns are (R,).
 
-    Attributes:
-        distance: (R,) float32 metres; infinite if a ray hits nothing.
-        facing: (R,) product of ray and normal; negative if the ray comes from outside.
-        surface, label, instance, depth, tint: (R,) as in `Mesh`, of the triangle that is hit.
+    Those of `Mesh` are of the triangle that is hit. The distance is infinite if there is none, and
+    `facing`, the product of ray and normal, is negative if the ray comes from outside.
     """
 
     def __init__(
@@ -231,13 +224,8 @@ def trace(
 ) -> Hits:
     """Return what each shot of one rotation hits first, or where it ends in foliage.
 
-    Args:
-        scenes: everything that can be hit, in the street's frame.
-        sensor: the LiDAR that fires.
-        pose: (4, 4) from the sensor's frame to the street's, when the sensor looks ahead.
-        ground: appearance of the triangles of class 0.
-        rng: draws how deep pulses enter foliage.
-        speed: of the sensor along its x axis, metres per second.
+    The pose is the (4, 4) transform from the sensor's frame to that of the street and its scenes,
+    when the sensor looks ahead; the speed is along its x axis in metres per second.
     """
     rays = rays_of(sensor)
     rotation = pose[:3, :3].astype(np.float32)

@@ -1,7 +1,5 @@
 """Which pulses of a LiDAR return, at which range, and how bright."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.materials import REFLECTIONS, Label
@@ -19,8 +17,7 @@ RELIEF_SPREAD = 0.65
 # Metres: smallest and mean distance by which a ghost, a mirrored body, lies behind the mirror.
 GHOST_NEAREST = 0.5
 GHOST_MEAN = 6.0
-# Degrees between neighbouring shots of one laser, at most.
-NEIGHBOUR_ANGLE = 0.5
+NEIGHBOUR_ANGLE = 0.5  # degrees between neighbouring shots of one laser, at most
 
 
 def laser_gains(sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:
@@ -37,12 +34,6 @@ def receive(
     hits: Hits, sensor: LidarModel, gains: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the points that the sensor measures, with noise, intensity and lost returns.
-
-    Args:
-        hits: what the shots of one rotation hit.
-        sensor: the LiDAR that fired them.
-        gains: (L,) as from `laser_gains`.
-        rng: draws the noise and the losses.
 
     Returns:
         (N, 4) float32 x, y, z, intensity; (N,) uint32 class ids with the instance in the upper

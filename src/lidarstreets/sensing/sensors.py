@@ -1,7 +1,5 @@
 """The LiDARs that can be simulated, each a table of numbers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,8 +25,6 @@ class LidarModel:
     max_range: float
     # Standard deviation of the range in metres.
     range_noise: float
-    # Share of the returns that are lost, whatever they hit.
-    drop: float
     # Range in metres at which half of the returns of a white surface hit head-on are lost.
     reach: float
     # Share of the returns at a depth edge that lie between the two surfaces.
@@ -45,14 +41,16 @@ class LidarModel:
     rotation_period: float
     # Direction of the rotation, seen from above.
     counter_clockwise: bool
-    # True if the motion of the sensor during a rotation is removed from the points.
-    motion_corrected: bool
     # True if lost returns are written too, as points within a metre of the sensor.
     keeps_lost_returns: bool
     # Layout of the files: semantickitti or nuscenes.
     layout: str
     # What the car and its racks hide: azimuth from and to, elevation from and to, in degrees.
     shadow: tuple[tuple[float, float, float, float], ...]
+    # Share of the returns that are lost, whatever they hit.
+    drop: float = 0.01
+    # True if the motion of the sensor during a rotation is removed from the points.
+    motion_corrected: bool = True
     # Angles in degrees between the device and the car: nose up, and left side up.
     pitch: float = 0.0
     roll: float = 0.0
@@ -61,10 +59,10 @@ class LidarModel:
     # degrees, and of the logarithms of `range_noise`, `drop` and `gain_spread`; `gain` varies
     # by a quarter of it.
     height_spread: float = 0.0
-    mounting_spread: float = 0.0
-    elevation_spread: float = 0.0
-    laser_spread: float = 0.0
-    response_spread: float = 0.0
+    mounting_spread: float = 0.6
+    elevation_spread: float = 0.15
+    laser_spread: float = 0.04
+    response_spread: float = 0.35
 
 
 # Degrees, from the top down: medians over the points of KITTI's scans, laser by laser.
@@ -77,6 +75,13 @@ _HDL64E_ELEVATIONS = (
     -19.58, -20.07, -20.71, -21.17, -21.59, -22.01, -22.67, -23.13, -23.64,
 )  # fmt: skip
 
+_HDL64E_SHADOW = (
+    (-14, 14, -90, -20.9), (-22, 22, -90, -21.9), (28, 32, -90, -22.9), (132, 142, -90, -19.7),
+    (159, 167, -90, -13.0), (196, 206, -90, -13.0), (160, 208, -90, -18.1),
+    (140, 224, -90, -22.4), (230, 240, -90, -19.7), (284, 304, -22.4, -15.8),
+    (328, 332, -90, -21.9), (336, 340, -90, -21.9),
+)  # fmt: skip
+
 # The shadow is that of KITTI's car.
 HDL64E = LidarModel(
     elevations=_HDL64E_ELEVATIONS,
@@ -85,7 +90,6 @@ HDL64E = LidarModel(
     min_range=1.5,
     max_range=80.0,
     range_noise=0.0085,
-    drop=0.01,
     reach=560.0,
     mixed=0.06,
     gain=1.0,
@@ -94,29 +98,18 @@ HDL64E = LidarModel(
     gain_spread=0.12,
     rotation_period=0.1,
     counter_clockwise=True,
-    motion_corrected=True,
     keeps_lost_returns=False,
     layout="semantickitti",
     height_spread=0.06,
-    mounting_spread=0.6,
-    elevation_spread=0.15,
-    laser_spread=0.04,
-    response_spread=0.35,
-    shadow=(
-        (-14, 14, -90, -20.9),
-        (-22, 22, -90, -21.9),
-        (28, 32, -90, -22.9),
-        (132, 142, -90, -19.7),
-        (159, 167, -90, -13.0),
-        (196, 206, -90, -13.0),
-        (160, 208, -90, -18.1),
-        (140, 224, -90, -22.4),
-        (230, 240, -90, -19.7),
-        (284, 304, -22.4, -15.8),
-        (328, 332, -90, -21.9),
-        (336, 340, -90, -21.9),
-    ),
+    shadow=_HDL64E_SHADOW,
 )
+
+_HDL32E_SHADOW = (
+    (-50, 50, -90, -23.5), (-52, 55, -90, -26), (-50, 62, -90, -27.5), (-60, 85, -90, -29),
+    (-80, 90, -90, -30), (120, 230, -90, -30), (125, 230, -90, -29), (132, 222, -90, -27.5),
+    (137, 220, -90, -26), (146, 213, -90, -23.5), (150, 205, -90, -22), (160, 195, -90, -21),
+    (170, 190, -90, -18),
+)  # fmt: skip
 
 # The lasers are evenly spaced. Noise, intensity and shadow are those of nuScenes, whose scans have
 # a point for every shot.
@@ -127,7 +120,6 @@ HDL32E = LidarModel(
     min_range=1.0,
     max_range=100.0,
     range_noise=0.005,
-    drop=0.01,
     reach=230.0,
     mixed=0.05,
     gain=0.85,
@@ -136,29 +128,10 @@ HDL32E = LidarModel(
     gain_spread=0.05,
     rotation_period=0.05,
     counter_clockwise=False,
-    motion_corrected=True,
     keeps_lost_returns=True,
     layout="nuscenes",
     height_spread=0.10,
-    mounting_spread=0.6,
-    elevation_spread=0.15,
-    laser_spread=0.04,
-    response_spread=0.35,
-    shadow=(
-        (-50, 50, -90, -23.5),
-        (-52, 55, -90, -26),
-        (-50, 62, -90, -27.5),
-        (-60, 85, -90, -29),
-        (-80, 90, -90, -30),
-        (120, 230, -90, -30),
-        (125, 230, -90, -29),
-        (132, 222, -90, -27.5),
-        (137, 220, -90, -26),
-        (146, 213, -90, -23.5),
-        (150, 205, -90, -22),
-        (160, 195, -90, -21),
-        (170, 190, -90, -18),
-    ),
+    shadow=_HDL32E_SHADOW,
 )
 
 SENSORS: dict[str, LidarModel] = {"hdl64e": HDL64E, "hdl32e": HDL32E}

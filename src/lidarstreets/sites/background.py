@@ -1,15 +1,12 @@
 """Closes off the view: behind the plots, at the ends of a street and along its side roads."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.bodies import buildings, plants, trees
 from lidarstreets.mesh import Mesh
 from lidarstreets.sites.boundaries import SEGMENT, draw_boundary
 from lidarstreets.sites.land import plant_thickets
-from lidarstreets.sites.plot import Plot
-from lidarstreets.sites.site import Site
+from lidarstreets.sites.site import Plot, Site
 from lidarstreets.streets.plans import SideRoad
 from lidarstreets.streets.styles import width_of
 

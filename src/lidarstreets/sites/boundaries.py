@@ -1,14 +1,12 @@
 """Hedges, walls and fences along the borders of plots and along streets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
 from lidarstreets.bodies.fences import Fence, draw_fence, gate
 from lidarstreets.bodies.plants import Hedge, draw_hedge
-from lidarstreets.sites.plot import Plot
+from lidarstreets.sites.site import Plot
 
 # Metres: length of a segment of a boundary, and width of the drive to a garage.
 SEGMENT = 2.5
@@ -32,12 +30,7 @@ class Boundary:
 
 
 def draw_boundary(rng: np.random.Generator, kinds: dict[str, float] | None = None) -> Boundary:
-    """Draw a kind of boundary.
-
-    Args:
-        rng: draws it.
-        kinds: shares of the fences, as for `draw_fence`; only fences are drawn if it is given.
-    """
+    """Draw a kind of boundary; only fences, if their shares are given as for `draw_fence`."""
     missing = float(rng.choice([0.0, 0.03, 0.2], p=[0.6, 0.3, 0.1]))
     hedge_height = float(rng.uniform(0.4, 1.4) if rng.random() < 0.4 else rng.uniform(1.2, 3.0))
     if kinds is None and rng.random() < HEDGE:
@@ -60,11 +53,8 @@ def line_up(
 ) -> None:
     """Put the segments of a boundary in a straight line.
 
-    Args:
-        plot: gives the side of the street.
-        boundary: the kind of the boundary.
-        start, end: x along the street and distance from its middle line.
-        gap: x from and to of a drive that no segment closes off.
+    `start` and `end` are x along the street and the distance from its middle line, `gap` is from
+    and to, the x of a drive that no segment closes off.
     """
     rng = plot.rng
     line = np.array(end) - np.array(start)
@@ -88,13 +78,7 @@ def line_up(
 
 
 def enclose(plot: Plot, drive_x: float | None, depth: float) -> None:
-    """Put boundaries around a plot: along its front, at a side and perhaps at the back.
-
-    Args:
-        plot: the plot.
-        drive_x: where a drive begins that crosses the front, if there is one.
-        depth: metres from the front of the plot to its back.
-    """
+    """Put boundaries around a plot, with a gap for a drive that begins at `drive_x`."""
     rng = plot.rng
     boundary = draw_boundary(rng)
     front = plot.front + rng.choice([0.15, 0.5, 1.0, 2.5], p=[0.4, 0.4, 0.12, 0.08])

@@ -1,12 +1,10 @@
 """People, riders and parked two-wheelers along a street."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
 
-from lidarstreets.bodies import vehicles
+from lidarstreets.bodies.vehicles import people, two_wheelers
 from lidarstreets.bodies.vehicles.two_wheelers import fallen_bicycle
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
@@ -27,8 +25,7 @@ OCCASIONS = {
 # Occasions per person that `Style.people` counts, and parked two-wheelers per such person.
 PEOPLE_FACTOR = 2.0
 TWO_WHEELER_FACTOR = 0.8
-# Metres: nobody is nearer to the end of a street.
-END_MARGIN = 2.0
+END_MARGIN = 2.0  # metres: nobody is nearer to the end of a street
 
 
 def add_people(site: Site) -> None:
@@ -62,21 +59,21 @@ def _add_occasion(site: Site, occasion: str, side: int, x: float) -> None:
     turn = rng.uniform(0, 2 * np.pi)
 
     if occasion == "ride":
-        make = vehicles.bicyclist if rng.random() < 0.8 else vehicles.motorcyclist
-        on_path = make is vehicles.bicyclist and rng.random() < 0.35
+        make = two_wheelers.bicyclist if rng.random() < 0.8 else two_wheelers.motorcyclist
+        on_path = make is two_wheelers.bicyclist and rng.random() < 0.35
         edge = side * (front - rng.uniform(0.3, 1.5)) if on_path else side * (style.road / 2 - 0.3)
         site.put_moving(make(rng), x, edge, -side * rng.uniform(2.5, 7))
     elif occasion == "walk":
         speed = rng.choice([-1, 1]) * rng.uniform(0.7, 2.5)
         for index in range(int(rng.choice([1, 1, 1, 2, 3]))):
-            site.put_moving(vehicles.person(rng), x + 0.3 * index, t + 0.6 * index, speed)
+            site.put_moving(people.person(rng), x + 0.3 * index, t + 0.6 * index, speed)
     elif occasion == "stand":
-        site.put(vehicles.person(rng), x, t, turn, thing=True, margin=-np.inf)
+        site.put(people.person(rng), x, t, turn, thing=True, margin=-np.inf)
     elif occasion == "meet":
-        for person in vehicles.people_group(rng):
+        for person in people.people_group(rng):
             site.put(person, x, t, turn, thing=True, margin=-np.inf)
     elif occasion == "cross":
-        walker = vehicles.person(rng)
+        walker = people.person(rng)
         across = rng.uniform(-1, 1) * style.road / 2
         yaw = side * np.pi / 2 + rng.normal(scale=0.4)
         site.put(walker, x, across, yaw, thing=True, margin=-np.inf)
@@ -87,10 +84,10 @@ def _add_occasion(site: Site, occasion: str, side: int, x: float) -> None:
         site.put(seat, x, bench_t, facing)
         sitters = int(rng.integers(1, 3))
         for offset in (-0.5, 0.4)[:sitters]:
-            site.put(vehicles.sitter(rng), x + offset, bench_t, facing, thing=True)
+            site.put(people.sitter(rng), x + offset, bench_t, facing, thing=True)
     else:  # stand by a car
         door_t = side * (style.road / 2 - 0.3 + rng.uniform(0.0, 0.8))
-        site.put(vehicles.person(rng), x, door_t, turn, thing=True, margin=-np.inf)
+        site.put(people.person(rng), x, door_t, turn, thing=True, margin=-np.inf)
 
 
 def park_two_wheelers(site: Site) -> None:
@@ -102,7 +99,7 @@ def park_two_wheelers(site: Site) -> None:
     for side, x in _random_places(site, rate):
         front = ground.front(side)
         kerb = ground.kerb_t(side)
-        make = vehicles.bicycle if rng.random() < 0.62 else vehicles.motorcycle
+        make = two_wheelers.bicycle if rng.random() < 0.62 else two_wheelers.motorcycle
         way = rng.random()
         if way < 0.45:  # along a wall, a hedge or a fence
             t = side * (front + rng.uniform(-0.5, 0.3))
@@ -121,7 +118,7 @@ def park_two_wheelers(site: Site) -> None:
 def put_rack(site: Site, make: Maker, x: float, t: float, places: int) -> None:
     """Put two-wheelers side by side at a rack, some of its places empty."""
     rng = site.rng
-    pitch = rng.uniform(0.45, 0.8) if make is vehicles.bicycle else rng.uniform(0.8, 1.2)
+    pitch = rng.uniform(0.45, 0.8) if make is two_wheelers.bicycle else rng.uniform(0.8, 1.2)
     yaw = np.pi / 2 + rng.normal(scale=0.3)
 
     hoops = []

@@ -1,16 +1,15 @@
 """Fills plots with houses: single ones in gardens, and rows along the sidewalk."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 
-from lidarstreets.bodies import buildings, clutter, furniture, plants, trees, vehicles
+from lidarstreets.bodies import buildings, clutter, furniture, plants, trees
+from lidarstreets.bodies.vehicles import cars, two_wheelers
 from lidarstreets.materials import Label
 from lidarstreets.sites.boundaries import DRIVE_WIDTH, draw_boundary, enclose, line_up
 from lidarstreets.sites.land import plant_bushes, plant_thickets
-from lidarstreets.sites.plot import Plot
+from lidarstreets.sites.site import Plot
 
 
 def fill_house(plot: Plot) -> None:
@@ -42,7 +41,6 @@ def fill_house(plot: Plot) -> None:
 
 
 def _plant_garden(plot: Plot, depth: float) -> None:
-    """Plant bushes, trees and perhaps thickets in a front garden."""
     rng = plot.rng
     green = plot.style.green
 
@@ -67,7 +65,6 @@ def _plant_garden(plot: Plot, depth: float) -> None:
 
 
 def _furnish(plot: Plot, setback: float) -> None:
-    """Put bins, sheds, greenhouses and garden furniture on a plot."""
     rng = plot.rng
     front = plot.front
 
@@ -96,7 +93,7 @@ def _add_drive(plot: Plot, x: float, depth: float) -> None:
 
     middle = x + DRIVE_WIDTH / 2
     if rng.random() < 0.4:
-        car = vehicles.car(rng)
+        car = cars.car(rng)
         distance = front + min(3.0, depth / 2)
         plot.put(car, middle, distance, plot.side * np.pi / 2, thing=True, margin=3.0)
     if rng.random() < 0.4:
@@ -140,10 +137,9 @@ def fill_row(plot: Plot) -> None:
 
 
 def _park_two_wheelers(plot: Plot) -> None:
-    """Put up to three bicycles or motorcycles side by side at the front of a plot."""
     rng = plot.rng
 
-    make = vehicles.bicycle if rng.random() < 0.75 else vehicles.motorcycle
+    make = two_wheelers.bicycle if rng.random() < 0.75 else two_wheelers.motorcycle
     for index in range(int(rng.integers(1, 4))):
         two_wheeler = make(rng)
         x = plot.x + plot.width * 0.3 + 0.6 * index

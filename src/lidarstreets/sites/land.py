@@ -1,7 +1,5 @@
 """Fills plots with open land: woods, meadows, fields, orchards, allotments, parks, railways."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -11,7 +9,7 @@ from lidarstreets.bodies.fences import OPEN_KINDS
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label
 from lidarstreets.sites.boundaries import draw_boundary, line_up
-from lidarstreets.sites.plot import Plot
+from lidarstreets.sites.site import Plot
 
 MEADOW_TILE = 5.0  # metres: side of a patch of uncut grass, which lies flat on the ground
 # Functions that fill a plot, and their shares.
@@ -38,7 +36,6 @@ def fill_field(plot: Plot) -> None:
 
 
 def _wood(plot: Plot) -> None:
-    """Plant trees and undergrowth."""
     rng = plot.rng
     front = plot.front
 
@@ -80,7 +77,6 @@ def _wood_edge(plot: Plot) -> None:
 
 
 def _orchard(plot: Plot) -> None:
-    """Plant fruit trees or vines in rows."""
     rng = plot.rng
     front = plot.front
 
@@ -98,7 +94,6 @@ def _orchard(plot: Plot) -> None:
 
 
 def _park(plot: Plot) -> None:
-    """Lay out lawns with paths, single trees, benches and bushes."""
     rng = plot.rng
     front = plot.front
 
@@ -146,7 +141,6 @@ def _meadow(plot: Plot) -> None:
 
 
 def _put_hall(plot: Plot) -> None:
-    """Put a barn, a hall or a church at the back of a plot."""
     rng = plot.rng
     kind = rng.random()
     if kind < 0.6:
@@ -160,7 +154,6 @@ def _put_hall(plot: Plot) -> None:
 
 
 def _crop_field(plot: Plot) -> None:
-    """Plant maize or vines in rows, or leave stubble."""
     rng = plot.rng
     front = plot.front
 
@@ -175,7 +168,6 @@ def _crop_field(plot: Plot) -> None:
 
 
 def _allotments(plot: Plot) -> None:
-    """Lay out small gardens with sheds, fences, greenhouses and beds."""
     rng = plot.rng
     front = plot.front
 
@@ -196,7 +188,6 @@ def _allotments(plot: Plot) -> None:
 
 
 def _railway(plot: Plot) -> None:
-    """Lay a railway line along the street: ballast, masts and a fence."""
     rng = plot.rng
     track = plot.front + rng.uniform(4, 14)
 
@@ -212,7 +203,6 @@ def _railway(plot: Plot) -> None:
 
 
 def _playground(plot: Plot) -> None:
-    """Put playground equipment or school buildings behind a fence."""
     rng = plot.rng
     front = plot.front
 
@@ -228,7 +218,6 @@ def _playground(plot: Plot) -> None:
 
 
 def _building_site(plot: Plot) -> None:
-    """Put heaps, containers and pallets behind a fence."""
     rng = plot.rng
     front = plot.front
 
@@ -247,7 +236,6 @@ def _fence_off(plot: Plot, distance: float) -> None:
 
 
 def _grow_grass(plot: Plot, distance: float) -> None:
-    """Grow a strip of weeds or reeds along a plot."""
     for x in np.arange(plot.x, plot.end, 3.0):
         plot.put(plants.tall_grass(plot.rng, 3.0), x, distance)
 
@@ -265,20 +253,13 @@ def _lay_turf(plot: Plot, near: float, far: float) -> None:
 
 
 def _ground_tint(plot: Plot, x: float, distance: float) -> float:
-    """Return the tint of the grass at a place."""
     ground = plot.site.ground
     px, py, _ = ground.pose_at(x, plot.side * distance)
     return float(ground.tint(np.array([px]), np.array([py]), np.array([Label.TERRAIN]))[0])
 
 
 def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> None:
-    """Plant undergrowth in a line along the street, its height changing slowly, with gaps.
-
-    Args:
-        plot: the land.
-        distance: metres from the middle line of the street.
-        height: metres at the start; drawn if None.
-    """
+    """Plant undergrowth along a street, its height (drawn if None) changing slowly, with gaps."""
     rng = plot.rng
     thicket = plants.draw_thicket(rng)
     change = rng.choice([0.1, 0.5])

@@ -1,7 +1,5 @@
 """Puts lamps, signs, trees, crash barriers and other furniture along a road and on its islands."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.bodies import clutter, fences, furniture, plants, trees
@@ -63,7 +61,6 @@ def fill_roadside(site: Site, side: int) -> None:
 
 
 def _put_guard_rail(site: Site, side: int) -> None:
-    """Put a crash barrier along one side of most fast roads."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -86,7 +83,6 @@ def _put_on_street(site: Site, mesh: Mesh, x: float, t: float, yaw: float) -> No
 
 
 def _plant_parking_islands(site: Site, side: int) -> None:
-    """Plant trees on the islands between parking bays."""
     style = site.ground.style
     t = side * (style.road / 2 + style.parking[int(side > 0)] * 0.6)
     for x in np.arange(1.0, site.ground.length, style.parking_period):
@@ -120,21 +116,15 @@ def fill_islands(site: Site) -> None:
             elif rng.random() < 0.3:
                 site.put(furniture.lamp(rng), x, middle)
             elif rng.random() < 0.4:
-                site.put(plants.hedge(rng, 4.0, rng.uniform(0.6, 1.4)), x, middle)
+                hedge = plants.draw_hedge(rng, rng.uniform(0.6, 1.4))
+                site.put(hedge.segment(rng, 4.0), x, middle)
 
     if ground.plan.roundabout is not None:
         _fill_roundabout(site, ground.plan.roundabout)
 
 
 def _put_barriers(site: Site, x: tuple[float, float], t: float, kind: str) -> None:
-    """Put a crash barrier along the middle of the road between two x.
-
-    Args:
-        site: the street.
-        x: from and to, along the street.
-        t: of the barrier.
-        kind: "rail" for steel on both sides, otherwise concrete.
-    """
+    """Put a crash barrier at t between two x: of steel on both sides if "rail", else concrete."""
     rail = fences.guard_rail(BARRIER_STEP + RAIL_OVERLAP)
     concrete = furniture.barrier(BARRIER_STEP + CONCRETE_OVERLAP)
     for middle in np.arange(x[0], x[1], BARRIER_STEP):
@@ -146,7 +136,6 @@ def _put_barriers(site: Site, x: tuple[float, float], t: float, kind: str) -> No
 
 
 def _fill_roundabout(site: Site, roundabout: Roundabout) -> None:
-    """Plant trees and bushes on the island of the roundabout."""
     rng = site.rng
     reach = roundabout.island - 1.5
 

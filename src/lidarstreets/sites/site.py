@@ -1,14 +1,14 @@
-"""A street and the bodies that have been put into it."""
-
-from __future__ import annotations
+"""A street, the land along it, and the bodies that have been put there."""
 
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lidarstreets.materials import MOVING, Label
-from lidarstreets.mesh import Mesh, place, with_instance, with_labels, with_random_tint
+from lidarstreets.mesh import Mesh, place, with_labels, with_random_tint
 from lidarstreets.streets.ground import Ground
+from lidarstreets.streets.plans import Patch
+from lidarstreets.streets.styles import Style
 
 # Metres: half the length of the longest body that may cover the sensor, the height up to which
 # bodies are in its way, and how near to it bodies that stand and bodies that move may be.
@@ -93,14 +93,9 @@ class Site:
         thing: bool = False,
         margin: float = 0.8,
     ) -> None:
-        """Put a body on the ground, unless a side road is within the margin.
+        """Put a body at street coordinates, unless a side road is within the margin in metres.
 
-        Args:
-            mesh: the body.
-            x, t: street coordinates.
-            yaw: radians, relative to the street.
-            thing: give it an instance id.
-            margin: metres.
+        The yaw is relative to the street. A `thing` gets an instance id.
         """
         if not self.is_free(x, t, margin):
             return
@@ -110,36 +105,104 @@ class Site:
 
     def put_at(self, mesh: Mesh, x: float, y: float, yaw: float, *, thing: bool = False) -> None:
         """Put a body on the ground at x, y, unless it would cover the course of the sensor."""
-        if self.covers_course(mesh, x, y, yaw):
+        if covers(mesh, (x, y, yaw), self.course, CLEARANCE):
             return
 
         z = float(self.ground.height(x, y))
         body = place(with_random_tint(mesh, self.rng), x, y, z, yaw)
         if thing:
-            body = _as_thing(body, self.next_instance())
+            body = self._as_thing(body)
         self.fixed.append(body)
-
-    def covers_course(self, mesh: Mesh, x: float, y: float, yaw: float) -> bool:
-        """Return whether a body that is put at x, y would cover the course of the sensor."""
-        return covers(mesh, (x, y, yaw), self.course, CLEARANCE)
 
     def put_moving(self, mesh: Mesh, x: float, t: float, speed: float) -> None:
         """Add a body that drives or walks; see `Mover`."""
         body = with_labels(with_random_tint(mesh, self.rng), dict(MOVING))
-        body = _as_thing(body, self.next_instance())
-        self.movers.append(Mover(body, x, t, speed))
+        self.movers.append(Mover(self._as_thing(body), x, t, speed))
 
-    def next_instance(self) -> int:
-        """Return a new instance id, from 1."""
+    def _as_thing(self, mesh: Mesh) -> Mesh:
+        """Return the mesh as a new instance, without parts that have no class, such as dogs."""
         self.instances += 1
-        return self.instances
+        instance = np.where(mesh.label == Label.OTHER_OBJECT, 0, self.instances)
+        return replace(mesh, instance=instance.astype(np.uint16))
 
 
-def _as_thing(mesh: Mesh, instance: int) -> Mesh:
-    """Return the mesh as one instance, without its parts that have no class, such as dogs."""
-    thing = with_instance(mesh, instance)
-    is_thing = mesh.label != Label.OTHER_OBJECT
-    return replace(thing, instance=np.where(is_thing, thing.instance, 0).astype(np.uint16))
+@dataclass(frozen=True)
+class Plot:
+    """A stretch of land along one side of a street.
+
+    Attributes:
+        site: the street.
+        side: -1 right, 1 left.
+        x: where the plot begins along the street, metres.
+        width: its width along the street, metres.
+    """
+
+    site: Site
+    side: int
+    x: float
+    width: float
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """The generator of the site, which draws everything."""
+        return self.site.rng
+
+    @property
+    def style(self) -> Style:
+        """The numbers of the street."""
+        return self.site.ground.style
+
+    @property
+    def front(self) -> float:
+        """Distance from the middle line of the street at which the plot begins."""
+        return self.site.ground.front(self.side)
+
+    @property
+    def middle(self) -> float:
+        """Middle of the plot along the street."""
+        return self.x + self.width / 2
+
+    @property
+    def end(self) -> float:
+        """Where the plot ends along the street, metres."""
+        return self.x + self.width
+
+    @property
+    def facing(self) -> float:
+        """Yaw of a body whose front, -y, faces the street."""
+        return 0.0 if self.side > 0 else np.pi
+
+    def random_x(self) -> float:
+        """Draw a place along the street within the plot."""
+        return self.x + self.rng.uniform(0, self.width)
+
+    def put(
+        self,
+        mesh: Mesh,
+        x: float,
+        distance: float,
+        yaw: float = 0.0,
+        *,
+        thing: bool = False,
+        margin: float = 0.8,
+    ) -> None:
+        """Put a body at a distance from the middle line of the street; see `Site.put`."""
+        self.site.put(mesh, x, self.side * distance, yaw, thing=thing, margin=margin)
+
+    def put_as_is(
+        self, mesh: Mesh, x: float, distance: float, yaw: float = 0.0, margin: float = 0.8
+    ) -> None:
+        """Put a piece of a larger body, which has one brightness; see `put`."""
+        t = self.side * distance
+        if self.site.is_free(x, t, margin):
+            px, py, heading = self.site.ground.pose_at(x, t)
+            z = float(self.site.ground.height(px, py))
+            self.site.fixed.append(place(mesh, px, py, z, heading + yaw))
+
+    def pave(self, x: tuple[float, float], distance: tuple[float, float], label: Label) -> None:
+        """Make a rectangle ground of another class; `distance` is from the middle line."""
+        near, far = sorted((self.side * distance[0], self.side * distance[1]))
+        self.site.ground.patches.append(Patch(x, (near, far), label))
 
 
 def covers(

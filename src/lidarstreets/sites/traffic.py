@@ -1,10 +1,9 @@
 """Vehicles along a street: parked at its sides, waiting in side roads, and driving."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from lidarstreets.bodies import clutter, furniture, vehicles
+from lidarstreets.bodies import clutter, furniture
+from lidarstreets.bodies.vehicles import buses, cars, machines, people, trucks, two_wheelers
 from lidarstreets.bodies.vehicles.cars import open_door
 from lidarstreets.chance import weighted_choice
 from lidarstreets.mesh import Mesh, join, place
@@ -13,31 +12,30 @@ from lidarstreets.streets.plans import SideRoad
 
 # Shares of the vehicles that park along the street, and of those that drive.
 PARKED_VEHICLES = {
-    vehicles.car: 0.884,
-    vehicles.truck: 0.04,
-    vehicles.trailer: 0.026,
-    vehicles.motorcycle: 0.042,
-    vehicles.bus: 0.004,
-    vehicles.machine: 0.004,
+    cars.car: 0.884,
+    trucks.truck: 0.04,
+    machines.trailer: 0.026,
+    two_wheelers.motorcycle: 0.042,
+    buses.bus: 0.004,
+    machines.machine: 0.004,
 }
 DRIVING_VEHICLES = {
-    vehicles.car: 0.860,
-    vehicles.truck: 0.075,
-    vehicles.bus: 0.015,
-    vehicles.motorcyclist: 0.04,
-    vehicles.machine: 0.006,
-    vehicles.tram: 0.004,
+    cars.car: 0.860,
+    trucks.truck: 0.075,
+    buses.bus: 0.015,
+    two_wheelers.motorcyclist: 0.04,
+    machines.machine: 0.006,
+    buses.tram: 0.004,
 }
 MOTORWAY_VEHICLES = {
-    vehicles.car: 0.80,
-    vehicles.truck: 0.17,
-    vehicles.bus: 0.02,
-    vehicles.motorcyclist: 0.01,
+    cars.car: 0.80,
+    trucks.truck: 0.17,
+    buses.bus: 0.02,
+    two_wheelers.motorcyclist: 0.01,
 }
 # Metres: smallest distance between two vehicles of one lane, bumper to bumper.
 BUMPER_GAP = 2.0
-# Longest vehicle that parks at an angle to the street, metres.
-LONGEST_ANGLED = 5.8
+LONGEST_ANGLED = 5.8  # longest vehicle that parks at an angle to the street, metres
 
 
 def length_of(mesh: Mesh) -> float:
@@ -59,7 +57,6 @@ def fill_parking_lane(site: Site, side: int) -> None:
 
 
 def _fill_parallel(site: Site, side: int) -> None:
-    """Put vehicles into a parking lane, one behind the other."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -81,7 +78,6 @@ def _fill_parallel(site: Site, side: int) -> None:
 
 
 def _fill_angled(site: Site, side: int, angle: float) -> None:
-    """Put vehicles into parking bays at an angle to the street."""
     rng = site.rng
     ground = site.ground
     style = ground.style
@@ -167,10 +163,7 @@ def _put_on_side_road(site: Site, road: SideRoad, mesh: Mesh, along: float, acro
 def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
     """Add vehicles to all lanes; all in one lane have one speed, so that none hits another.
 
-    Args:
-        site: the street.
-        ego_speed: speed of the car with the sensor, metres per second.
-        ego: x and t of that car at time 0; nothing in its lane starts there.
+    `ego` is x and t of the car with the sensor at time 0: nothing in its lane starts there.
     """
     rng = site.rng
     ground = site.ground
@@ -218,19 +211,19 @@ def fill_bus_stops(site: Site) -> None:
 
     if rng.random() < 0.35:
         t = side * (style.road / 2 - (0.9 if not style.parking[int(side > 0)] else -0.8))
-        site.put(vehicles.bus(rng), x, t, along_road(side), thing=True, margin=8.0)
+        site.put(buses.bus(rng), x, t, along_road(side), thing=True, margin=8.0)
     site.put(clutter.shelter(rng), x, side * (ground.kerb_t(side) + 2.4), facing)
 
     for _ in range(rng.poisson(2.5)):
         stand_x = x + rng.normal(scale=3.0)
-        person = vehicles.person(rng)
+        person = people.person(rng)
         site.put(person, stand_x, stand_t, rng.uniform(0, 2 * np.pi), thing=True)
 
 
 def car_with_trailer(rng: np.random.Generator) -> list[Mesh]:
     """Return a car and the trailer that it pulls."""
-    car = vehicles.car(rng)
-    trailer = vehicles.trailer(rng)
+    car = cars.car(rng)
+    trailer = machines.trailer(rng)
     gap = float(trailer.triangles[..., 0].max()) - float(car.triangles[..., 0].min())
     return [car, place(trailer, x=-gap + 0.1)]
 

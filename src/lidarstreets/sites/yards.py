@@ -1,22 +1,21 @@
 """Fills plots with paved yards: car parks, petrol stations, garages and industrial yards."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from lidarstreets.bodies import buildings, clutter, furniture, trees, vehicles
+from lidarstreets.bodies import buildings, clutter, furniture, trees
 from lidarstreets.bodies.fences import OPEN_KINDS
+from lidarstreets.bodies.vehicles import cars, machines, trucks, two_wheelers
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label
 from lidarstreets.sites.boundaries import draw_boundary, line_up
-from lidarstreets.sites.plot import Plot
+from lidarstreets.sites.site import Plot
 
 # Shares of the vehicles in a car park.
 CAR_PARK_VEHICLES = {
-    vehicles.car: 0.90,
-    vehicles.trailer: 0.05,
-    vehicles.truck: 0.02,
-    vehicles.motorcycle: 0.03,
+    cars.car: 0.90,
+    machines.trailer: 0.05,
+    trucks.truck: 0.02,
+    two_wheelers.motorcycle: 0.03,
 }
 
 
@@ -27,7 +26,6 @@ def fill_yard(plot: Plot) -> None:
 
 
 def _car_park(plot: Plot) -> None:
-    """Put two rows of vehicles on a lot, with bushes or a fence around it."""
     rng = plot.rng
     front = plot.front
 
@@ -39,24 +37,20 @@ def _car_park(plot: Plot) -> None:
         for x in np.arange(plot.x + 3, plot.end - 3, 2.8):
             make = weighted_choice(rng, CAR_PARK_VEHICLES)
             is_taken = rng.random() < chance
-            has_room = make is not vehicles.truck or row > 10  # trucks are too long for the front
+            has_room = make is not trucks.truck or row > 10  # trucks are too long for the front
             if is_taken and has_room:
                 yaw = rng.choice([-1, 1]) * np.pi / 2 + rng.normal(scale=0.03)
                 plot.put(make(rng), x, front + row, yaw, thing=True, margin=3.0)
 
-    if rng.random() < 0.5:
-        boundary = draw_boundary(rng)
-        line_up(plot, boundary, (plot.x, front + 0.3), (plot.end, front + 0.3))
-    if rng.random() < 0.5:
-        boundary = draw_boundary(rng)
-        line_up(plot, boundary, (plot.x, front + 20.5), (plot.end, front + 20.5))
+    for distance in (front + 0.3, front + 20.5):
+        if rng.random() < 0.5:
+            line_up(plot, draw_boundary(rng), (plot.x, distance), (plot.end, distance))
     for x in np.arange(plot.x + 4, plot.end, rng.uniform(8, 14)):
         if rng.random() < 0.4:
             plot.put(trees.random_tree(rng, rng.uniform(3, 7)), x, front + 9.2)
 
 
 def _garage_row(plot: Plot) -> None:
-    """Put a row of garages behind a paved yard."""
     rng = plot.rng
     front = plot.front
 
@@ -66,7 +60,7 @@ def _garage_row(plot: Plot) -> None:
     plot.put(row, plot.middle, distance + 3, plot.facing, margin=plot.width / 2)
 
     for _ in range(rng.poisson(1.5)):
-        car = vehicles.car(rng)
+        car = cars.car(rng)
         yaw = rng.uniform(0, 6)
         plot.put(car, plot.random_x(), front + rng.uniform(2, 5), yaw, thing=True, margin=3.0)
     for _ in range(rng.poisson(1)):
@@ -74,7 +68,6 @@ def _garage_row(plot: Plot) -> None:
 
 
 def _petrol_station(plot: Plot) -> None:
-    """Put pumps under a canopy in front of a shop."""
     rng = plot.rng
     front = plot.front
 
@@ -85,13 +78,12 @@ def _petrol_station(plot: Plot) -> None:
         plot.put(clutter.pump(rng), plot.middle + x, front + 8, np.pi / 2, margin=3.0)
     shop = buildings.building(rng, plot.width * 0.5, 8, 3.5, flat=True)
     plot.put(shop, plot.middle, front + 20, plot.facing, margin=9.0)
-    car = vehicles.car(rng)
+    car = cars.car(rng)
     plot.put(car, plot.middle + 2, front + 8, np.pi / 2, thing=True, margin=3.0)
     plot.put(furniture.sign(rng), plot.x + 1, front + 0.5)
 
 
 def _industrial_yard(plot: Plot) -> None:
-    """Put a hall in a fenced yard with containers, pallets, vehicles and flags."""
     rng = plot.rng
     front = plot.front
 

@@ -1,19 +1,15 @@
 """The ground of one street: its height, class and brightness at any position."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
-
 import numpy as np
 
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, part
-from lidarstreets.streets.brightness import GroundBrightness
-from lidarstreets.streets.markings import is_painted
+from lidarstreets.solids import quads
+from lidarstreets.streets.appearance import GroundBrightness, is_painted
 from lidarstreets.streets.middle_line import MiddleLine, draw_bends
 from lidarstreets.streets.places import Places, is_bay, locate
 from lidarstreets.streets.planning import Planner
-from lidarstreets.streets.plans import strip_at
+from lidarstreets.streets.plans import Patch, strip_at
 from lidarstreets.streets.relief import Relief
 from lidarstreets.streets.styles import Strip, Style, width_of
 
@@ -24,37 +20,16 @@ COARSE_STEP = 4.0
 COARSE_REACH = 110.0
 # Metres by which the coarse grid is lower, so that the fine one covers it.
 COARSE_DROP = 0.3
-# Metres by which the grids go on beyond the ends of the land.
-OVERHANG = 10.0
-# Metres on either side of a kerb over which its height changes.
-KERB_RAMP = 0.03
-# Rise over run from the edge of a road to its crown.
-CROWN_SLOPE = 0.02
-# Metres: height of an island over the road.
-ISLAND_HEIGHT = 0.14
-# Metres along the street from the top of a hump to its foot.
-HUMP_REACH = 1.8
+OVERHANG = 10.0  # metres by which the grids go on beyond the ends of the land
+KERB_RAMP = 0.03  # metres on either side of a kerb over which its height changes
+CROWN_SLOPE = 0.02  # rise over run from the edge of a road to its crown
+ISLAND_HEIGHT = 0.14  # metres: height of an island over the road
+HUMP_REACH = 1.8  # metres along the street from the top of a hump to its foot
 # Height of the kerb at a drive, as a share of its height elsewhere, and metres along the street
 # over which it changes.
 DRIVE_KERB = 0.2
 DRIVE_RAMP = 0.8
-# Metres: vehicles leave their lane this far before the ring of a roundabout.
-SWERVE = 8.0
-
-
-@dataclass(frozen=True)
-class Patch:
-    """A rectangle of other ground off the road, in street coordinates.
-
-    Attributes:
-        x: from and to, along the street.
-        t: from and to, across the street.
-        label: class of the ground.
-    """
-
-    x: tuple[float, float]
-    t: tuple[float, float]
-    label: Label
+SWERVE = 8.0  # metres: vehicles leave their lane this far before the ring of a roundabout
 
 
 class Ground(MiddleLine):
@@ -251,7 +226,7 @@ class Ground(MiddleLine):
         b = corners[1:, :-1][within]
         c = corners[1:, 1:][within]
         d = corners[:-1, 1:][within]
-        return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+        return quads(a, b, c, d)
 
     def _sharpen(self, x: np.ndarray, y: np.ndarray, z: np.ndarray, places: Places) -> None:
         """Move the corners next to a kerb to its two edges, so that it is steep."""

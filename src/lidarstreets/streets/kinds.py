@@ -1,7 +1,5 @@
 """The kinds of streets and the typical numbers of each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +7,35 @@ from lidarstreets.tables import read_table
 
 
 @dataclass(frozen=True)
-class Kind:
+class Surroundings:
+    """The numbers of what lies along a street and moves in it; lengths are in metres."""
+
+    # Chances that a plot has a house, a row of houses, a wood, an open field, a car park.
+    plots: tuple[float, float, float, float, float]
+    # Smallest and largest distance of a house from the front of its plot.
+    setback: tuple[float, float]
+    # Smallest and largest height of the walls of a house.
+    storeys: tuple[float, float]
+    # Chance that a place in the parking lane is taken.
+    parked: float
+    # Distance between trees along the street; infinite if there are none.
+    trees: float
+    # Chance of a hedge, wall or fence along the front of a plot.
+    fenced: float
+    # Driving cars per 100 m of lane.
+    traffic: float
+    # Factor on the speed of the traffic and of the sensor.
+    speed: float
+    # People and cyclists per 100 m of street.
+    people: float
+    # Factor on the number of plants in gardens.
+    green: float
+    # Side roads per 100 m.
+    junctions: float
+
+
+@dataclass(frozen=True)
+class Kind(Surroundings):
     """The typical numbers of one kind of street; `draw_style` varies them for each street."""
 
     # Share of all streets.
@@ -27,20 +53,9 @@ class Kind:
     sides: dict[str, float]
     # Largest height of the banks.
     relief: float
-    # As in `Style`; `parked` and those after it are multiplied by random factors.
-    plots: tuple[float, float, float, float, float]
-    setback: tuple[float, float]
-    storeys: tuple[float, float]
-    parked: float
-    trees: float
-    fenced: float
-    traffic: float
-    people: float
-    green: float
     # Chance that lane markings are painted.
     painted: float
-    speed: float = 1.0
-    junctions: float = 1.0
+    # Chance that all lanes have one direction.
     one_way: float = 0.0
 
 

@@ -1,7 +1,5 @@
 """The middle line of a street, and the coordinates along and across it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.streets.styles import Style

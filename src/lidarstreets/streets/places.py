@@ -1,7 +1,5 @@
 """Where positions lie in a street: their distances from its roads, kerbs and islands."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,10 +10,8 @@ from lidarstreets.streets.plans import Plan, rounded_union
 # Metres: the parking lane ends this far from a side road, over the second distance.
 PARKING_END = 5.0
 PARKING_TAPER = 1.5
-# Metres: length of an island between two parking bays.
-BAY_GAP = 2.0
-# Metres: radius of the kerb between a street and its roundabout.
-ROUNDABOUT_CORNER = 6.0
+BAY_GAP = 2.0  # metres: length of an island between two parking bays
+ROUNDABOUT_CORNER = 6.0  # metres: radius of the kerb between a street and its roundabout
 
 
 @dataclass(frozen=True)
@@ -41,13 +37,7 @@ class Places:
 
 
 def locate(line: MiddleLine, plan: Plan, x: np.ndarray, y: np.ndarray) -> Places:
-    """Return where positions x, y, arrays of one shape, lie in a street.
-
-    Args:
-        line: middle line of the street.
-        plan: side roads, roundabout and islands of the street.
-        x, y: metres.
-    """
+    """Return where positions x, y, arrays of one shape, lie in a street."""
     style = plan.style
     along, t = line.street_coordinates(x, y)
     ends = np.maximum(plan.start - along, along - plan.end)
@@ -90,12 +80,7 @@ def locate(line: MiddleLine, plan: Plan, x: np.ndarray, y: np.ndarray) -> Places
 
 
 def is_bay(along: np.ndarray, period: float) -> np.ndarray:
-    """Return whether the parking lanes are not interrupted by an island at x along the street.
-
-    Args:
-        along: metres.
-        period: metres from island to island; infinite if there are none.
-    """
+    """Return whether no island interrupts the parking lanes at x; there is one each `period`."""
     if not np.isfinite(period):
         return np.ones(np.shape(along), dtype=bool)
 

@@ -1,7 +1,5 @@
 """Draws the plans of streets: where they end, their junctions, islands, humps and crosswalks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -15,8 +13,7 @@ from lidarstreets.streets.styles import Strip, Style
 
 # Metres: the islands of the middle reach this far beyond the simulated land.
 OVERHANG = 50.0
-# Metres: radius of the tightest bend of a side road.
-TIGHTEST_SIDE_ROAD = 45.0
+TIGHTEST_SIDE_ROAD = 45.0  # metres: radius of the tightest bend of a side road
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,6 @@ class Planner:
         return start, end
 
     def _draw_roundabout(self, start: float, end: float) -> Roundabout | None:
-        """Draw a roundabout ahead of or behind the course of the sensor, or none."""
         rng = self.rng
         if self.style.kind in ("motorway", "living") or rng.random() > 0.12:
             return None
@@ -89,7 +85,6 @@ class Planner:
     def _draw_crossings(
         self, start: float, end: float, roundabout: Roundabout | None
     ) -> list[SideRoad]:
-        """Draw the side roads along the street, at its roundabout and at its end."""
         if self.style.kind == "motorway":
             return self._draw_ramps()
 
@@ -115,7 +110,6 @@ class Planner:
         return crossings
 
     def _draw_side_road(self, x: float, side: int) -> SideRoad:
-        """Draw a side road that leaves the street at x."""
         rng = self.rng
         turn = rng.normal(scale=0.15) if rng.random() < 0.5 else rng.uniform(-1.0, 1.0)
         is_drive = rng.random() < 0.2

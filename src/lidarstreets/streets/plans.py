@@ -1,7 +1,5 @@
 """The plan of a street: side roads, roundabouts and islands, each as a distance from its edge."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -116,18 +114,22 @@ class Roundabout:
 
 
 @dataclass(frozen=True)
-class Island:
-    """A raised rectangle with round ends on the road, in street coordinates.
+class Patch:
+    """A rectangle of other ground, in street coordinates.
 
     Attributes:
         x: from and to, along the street.
         t: from and to, across the street.
-        label: class of its surface.
+        label: class of the ground.
     """
 
     x: tuple[float, float]
     t: tuple[float, float]
     label: Label
+
+
+class Island(Patch):
+    """A patch on the road that is raised and has round ends."""
 
     def distance(self, along: np.ndarray, t: np.ndarray) -> np.ndarray:
         """Return the distance from its edge; negative on it."""
@@ -165,11 +167,9 @@ class Plan:
 
 
 def rounded_union(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
-    """Return the distance from the union of two areas whose inner corners are rounded.
+    """Return the distance from the union of two areas whose inner corners have a radius.
 
-    Args:
-        a, b: distances from the edges of the two areas, negative on them.
-        radius: of the corners, metres.
+    The distances from the edges of the two areas are negative on them.
     """
     inside_a = np.maximum(radius - a, 0)
     inside_b = np.maximum(radius - b, 0)
@@ -182,15 +182,9 @@ def rounded_union(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
 def strip_at(
     strips: Sequence[Strip], kerb: np.ndarray, beyond: Label
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return class and distance beyond the strips at distances from the kerb.
+    """Return (N,) classes and distances beyond the last strip at (N,) distances from the kerb.
 
-    Args:
-        strips: from the kerb outwards.
-        kerb: (N,) distances, negative on the road.
-        beyond: class of the ground behind the strips.
-
-    Returns:
-        (N,) uint16 class ids; (N,) distances from the outer edge of the last strip.
+    The strips are from the kerb outwards, with ground of the class `beyond` behind them.
     """
     label = np.full(np.shape(kerb), beyond, dtype=np.uint16)
     outer = width_of(strips)

@@ -1,15 +1,11 @@
 """The relief of the land that a street lies in."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.streets.styles import Style
 
-# Metres behind the pavement beyond which the land no longer rises.
-FARTHEST_RISE = 30.0
-# Steepest mean slope of a street and across it: rise over run.
-STEEPEST = 0.12
+FARTHEST_RISE = 30.0  # metres behind the pavement beyond which the land no longer rises
+STEEPEST = 0.12  # steepest mean slope of a street and across it: rise over run
 
 
 class Relief:
@@ -24,19 +20,15 @@ class Relief:
         wavelengths = np.array([rng.uniform(200, 400), rng.uniform(80, 160), rng.uniform(25, 60)])
         amplitudes = np.array([1.2, 0.4, 0.07]) * rng.uniform(0.1, 1.4, size=3)
         direction = rng.uniform(0, np.pi, size=3)
-        wave_x = 2 * np.pi / wavelengths * np.cos(direction)
-        wave_y = 2 * np.pi / wavelengths * np.sin(direction)
-        self._hills = np.column_stack([amplitudes, wave_x, wave_y, direction * 5])
+        self._hills = _stack_waves(amplitudes, wavelengths, direction, direction * 5)
 
         # Bumps: amplitude, wave vector and phase, from 14 m to 1.3 m long.
         count = 6
         wavelengths = np.geomspace(14, 1.3, count) * rng.uniform(0.8, 1.2, size=count)
         amplitudes = rng.lognormal(np.log(0.035), 0.55) * np.geomspace(1.8, 0.5, count)
         direction = rng.uniform(0, np.pi, size=count)
-        wave_x = 2 * np.pi / wavelengths * np.cos(direction)
-        wave_y = 2 * np.pi / wavelengths * np.sin(direction)
         phase = rng.uniform(0, 2 * np.pi, size=count)
-        self._bumps = np.column_stack([amplitudes, wave_x, wave_y, phase])
+        self._bumps = _stack_waves(amplitudes, wavelengths, direction, phase)
         self._modulation = rng.uniform(0, 2 * np.pi, size=4)
 
     def hills(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -47,12 +39,9 @@ class Relief:
     def beyond(
         self, off: np.ndarray, t: np.ndarray, along: np.ndarray, x: np.ndarray, y: np.ndarray
     ) -> np.ndarray:
-        """Return the height over the hills at distances behind the pavement.
+        """Return the height over the hills at distances `off` behind the pavement; 0 is its edge.
 
-        Args:
-            off: distance from the pavement in metres; 0 and less on it.
-            t, along: street coordinates.
-            x, y: places.
+        `t` and `along` are the street coordinates of the places x, y.
         """
         off = np.clip(off, 0, FARTHEST_RISE)
         z = np.zeros(np.shape(off))
@@ -71,6 +60,15 @@ class Relief:
         patchy = np.sin(0.11 * x + self._modulation[2]) * np.sin(0.13 * y + self._modulation[3])
         bumps = _waves(self._bumps, x, y) * (1 + 0.8 * patchy)
         return z + np.clip(off / 1.5, 0, 1) * bumps
+
+
+def _stack_waves(
+    amplitudes: np.ndarray, wavelengths: np.ndarray, direction: np.ndarray, phase: np.ndarray
+) -> np.ndarray:
+    """Return rows of amplitude, wave vector (x, y) and phase."""
+    wave_x = 2 * np.pi / wavelengths * np.cos(direction)
+    wave_y = 2 * np.pi / wavelengths * np.sin(direction)
+    return np.column_stack([amplitudes, wave_x, wave_y, phase])
 
 
 def _waves(waves: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

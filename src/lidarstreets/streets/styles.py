@@ -1,7 +1,5 @@
 """The numbers that describe one street, and how they are drawn for a street of a kind."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +7,7 @@ import numpy as np
 
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label
-from lidarstreets.streets.kinds import KINDS, Kind
+from lidarstreets.streets.kinds import KINDS, Kind, Surroundings
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ class Bank:
 
 
 @dataclass(frozen=True)
-class Style:
+class Style(Surroundings):
     """The numbers that describe one street.
 
     Lengths are in metres. Pairs with one entry per side of the road are (right, left).
@@ -81,32 +79,10 @@ class Style:
     kerb: float
     # The land on each side.
     bank: tuple[Bank, Bank]
-    # Chances that a plot has a house, a row of houses, a wood, an open field, a car park.
-    plots: tuple[float, float, float, float, float]
-    # Smallest and largest distance of a house from the front of its plot.
-    setback: tuple[float, float]
-    # Smallest and largest height of the walls of a house.
-    storeys: tuple[float, float]
-    # Chance that a place in the parking lane is taken.
-    parked: float
-    # Distance between trees along the street; infinite if there are none.
-    trees: float
-    # Chance of a hedge, wall or fence along the front of a plot.
-    fenced: float
-    # Driving cars per 100 m of lane.
-    traffic: float
-    # Factor on the speed of the traffic and of the sensor.
-    speed: float
-    # People and cyclists per 100 m of street.
-    people: float
-    # Factor on the number of plants in gardens.
-    green: float
     # Distance between lamps or utility poles.
     lamps: float
     # True if lane markings are painted.
     painted: bool
-    # Side roads per 100 m.
-    junctions: float
 
 
 def draw_style(rng: np.random.Generator) -> Style:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lidarstreets.bodies import vehicles
+from lidarstreets.bodies.vehicles import buses, cars, machines, people, trucks, two_wheelers
 from lidarstreets.bodies.vehicles.parts import facing_outwards, glass
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Maker, Mesh
@@ -14,21 +14,21 @@ from lidarstreets.solids import box
 # Per maker: class, smallest and largest length, width and height in metres.
 Limits = tuple[float, float]
 MAKERS: dict[Maker, tuple[Label, Limits, Limits, Limits]] = {
-    vehicles.car: (Label.CAR, (2.4, 6.4), (1.5, 2.7), (1.0, 3.0)),
-    vehicles.van: (Label.CAR, (4.2, 6.4), (1.7, 2.7), (1.7, 3.0)),
-    vehicles.truck: (Label.TRUCK, (5.0, 17.5), (1.9, 3.3), (2.0, 4.5)),
-    vehicles.bus: (Label.BUS, (6.0, 19.0), (2.0, 5.0), (2.6, 4.5)),
-    vehicles.tram: (Label.BUS, (12.0, 40.0), (2.0, 2.8), (3.0, 4.0)),
-    vehicles.trailer: (Label.TRAILER, (2.0, 9.0), (1.1, 2.7), (0.6, 3.0)),
-    vehicles.caravan: (Label.TRAILER, (4.0, 9.0), (1.8, 2.7), (2.0, 2.8)),
-    vehicles.machine: (Label.CONSTRUCTION_VEHICLE, (1.4, 9.5), (0.9, 9.5), (1.2, 5.5)),
-    vehicles.excavator: (Label.CONSTRUCTION_VEHICLE, (1.4, 9.5), (0.9, 9.5), (1.2, 5.5)),
-    vehicles.bicycle: (Label.BICYCLE, (1.2, 2.1), (0.3, 1.0), (0.7, 1.5)),
-    vehicles.motorcycle: (Label.MOTORCYCLE, (1.4, 2.6), (0.4, 1.2), (0.7, 1.8)),
-    vehicles.bicyclist: (Label.BICYCLIST, (1.2, 3.2), (0.4, 1.2), (1.3, 2.2)),
-    vehicles.motorcyclist: (Label.MOTORCYCLIST, (1.4, 2.6), (0.4, 1.2), (1.3, 2.2)),
-    vehicles.person: (Label.PERSON, (0.2, 2.2), (0.2, 1.6), (0.6, 2.6)),
-    vehicles.sitter: (Label.PERSON, (0.5, 1.6), (0.3, 0.8), (1.0, 1.7)),
+    cars.car: (Label.CAR, (2.4, 6.4), (1.5, 2.7), (1.0, 3.0)),
+    cars.van: (Label.CAR, (4.2, 6.4), (1.7, 2.7), (1.7, 3.0)),
+    trucks.truck: (Label.TRUCK, (5.0, 17.5), (1.9, 3.3), (2.0, 4.5)),
+    buses.bus: (Label.BUS, (6.0, 19.0), (2.0, 5.0), (2.6, 4.5)),
+    buses.tram: (Label.BUS, (12.0, 40.0), (2.0, 2.8), (3.0, 4.0)),
+    machines.trailer: (Label.TRAILER, (2.0, 9.0), (1.1, 2.7), (0.6, 3.0)),
+    machines.caravan: (Label.TRAILER, (4.0, 9.0), (1.8, 2.7), (2.0, 2.8)),
+    machines.machine: (Label.CONSTRUCTION_VEHICLE, (1.4, 9.5), (0.9, 9.5), (1.2, 5.5)),
+    machines.excavator: (Label.CONSTRUCTION_VEHICLE, (1.4, 9.5), (0.9, 9.5), (1.2, 5.5)),
+    two_wheelers.bicycle: (Label.BICYCLE, (1.2, 2.1), (0.3, 1.0), (0.7, 1.5)),
+    two_wheelers.motorcycle: (Label.MOTORCYCLE, (1.4, 2.6), (0.4, 1.2), (0.7, 1.8)),
+    two_wheelers.bicyclist: (Label.BICYCLIST, (1.2, 3.2), (0.4, 1.2), (1.3, 2.2)),
+    two_wheelers.motorcyclist: (Label.MOTORCYCLIST, (1.4, 2.6), (0.4, 1.2), (1.3, 2.2)),
+    people.person: (Label.PERSON, (0.2, 2.2), (0.2, 1.6), (0.6, 2.6)),
+    people.sitter: (Label.PERSON, (0.5, 1.6), (0.3, 0.8), (1.0, 1.7)),
 }
 
 
@@ -51,7 +51,7 @@ def test_a_maker_returns_a_plausible_body_on_the_ground(maker: Maker) -> None:
             assert low < size < high
 
 
-@pytest.mark.parametrize("maker", [vehicles.car, vehicles.truck, vehicles.person])
+@pytest.mark.parametrize("maker", [cars.car, trucks.truck, people.person])
 def test_bodies_of_one_kind_differ(maker: Maker) -> None:
     rng = np.random.default_rng(0)
     sizes = np.array([size_of(maker(rng)) for _ in range(30)])
@@ -68,7 +68,7 @@ def test_a_seed_gives_the_same_body() -> None:
 def test_people_of_a_group_stand_close_together() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
-        group = vehicles.people_group(rng)
+        group = people.people_group(rng)
         assert 2 <= len(group) <= 6
         middles = [person.triangles.reshape(-1, 3).mean(axis=0)[:2] for person in group]
         assert np.linalg.norm(np.array(middles), axis=1).max() < 3.5

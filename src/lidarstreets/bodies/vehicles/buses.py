@@ -1,10 +1,8 @@
 """Meshes of buses and trams."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from lidarstreets.bodies.vehicles.parts import draw_paint, glass, lamps, plates, wheels
+from lidarstreets.bodies.vehicles.parts import draw_paint, glass, plates_and_lamps, wheels
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place
 from lidarstreets.solids import box, copies
@@ -71,19 +69,9 @@ def _section(
         painted.append(machinery)
 
     return join(
-        *[
-            part(painted, draw_paint(rng, 0.75), Label.BUS),
-            glass([windows], Label.BUS, bool(rng.random() < 0.5)),
-            part([seats], Surface.CLOTH, Label.BUS),
-            plates(half, floor + 0.3, Label.BUS),
-            lamps(half, width, floor + 0.3, Label.BUS),
-            _bus_wheels(axles, length, width),
-        ]
+        part(painted, draw_paint(rng, 0.75), Label.BUS),
+        glass([windows], Label.BUS, bool(rng.random() < 0.5)),
+        part([seats], Surface.CLOTH, Label.BUS),
+        plates_and_lamps(Label.BUS, half, width, floor + 0.3, floor + 0.3),
+        wheels(Label.BUS, [axle * length for axle in axles], width, 0.48, 0.3),
     )
-
-
-def _bus_wheels(axles: tuple[float, ...], length: float, width: float) -> Mesh:
-    if not axles:
-        return part([np.zeros((0, 3, 3))], Surface.RUBBER, Label.BUS)
-
-    return wheels(Label.BUS, [axle * length for axle in axles], width, 0.48, 0.3)

@@ -1,13 +1,11 @@
 """Meshes of cars and vans."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lidarstreets.bodies.vehicles.parts import draw_paint, glass, lamps, plates, wheels
+from lidarstreets.bodies.vehicles.parts import draw_paint, glass, plates_and_lamps, wheels
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
@@ -121,8 +119,7 @@ def car(rng: np.random.Generator) -> Mesh:
     )
     pieces += [
         part(painted, paint, Label.CAR),
-        plates(shape.half, plate_z, Label.CAR),
-        lamps(shape.half, shape.width, lamp_z, Label.CAR),
+        plates_and_lamps(Label.CAR, shape.half, shape.width, plate_z, lamp_z),
         wheels(Label.CAR, axles, shape.width, radius),
     ]
     return join(*pieces)
@@ -136,20 +133,15 @@ def _lower_body(rng: np.random.Generator, shape: CarShape) -> np.ndarray:
     overhang = rng.uniform(0.03, 0.15)
 
     profile = [
-        (-half + overhang, floor + 0.05),
-        (half - overhang, floor),
-        (half, 0.5),
-        (half - rng.uniform(0.05, 0.2), nose),
-        (shape.front, shape.belt),
+        (-half + overhang, floor + 0.05), (half - overhang, floor), (half, 0.5),
+        (half - rng.uniform(0.05, 0.2), nose), (shape.front, shape.belt),
         (shape.rear - 0.02, shape.belt),
-        (-half + rng.uniform(0.0, 0.12), shape.belt - rng.uniform(0.0, 0.08)),
-        (-half, 0.55),
-    ]
+        (-half + rng.uniform(0.0, 0.12), shape.belt - rng.uniform(0.0, 0.08)), (-half, 0.55),
+    ]  # fmt: skip
     return prism(profile, shape.width, shape.width * rng.uniform(0.88, 0.97))
 
 
 def _cabin(shape: CarShape) -> np.ndarray:
-    """Return the windows of a car: its cabin without the roof."""
     roof_rear, roof_front = shape.roof
     foot = shape.belt + 0.01
     top = shape.height - 0.07
@@ -158,7 +150,6 @@ def _cabin(shape: CarShape) -> np.ndarray:
 
 
 def _roof(rng: np.random.Generator, shape: CarShape) -> np.ndarray:
-    """Return the roof of a car, which bends a little."""
     rear, front = shape.roof
     low = shape.height - 0.06
     middle = rear + (front - rear) * rng.uniform(0.4, 0.7)
@@ -167,7 +158,6 @@ def _roof(rng: np.random.Generator, shape: CarShape) -> np.ndarray:
 
 
 def _pillars(shape: CarShape) -> list[np.ndarray]:
-    """Return the pillars of a cabin: three on each side."""
     roof_rear, roof_front = shape.roof
     pillars = []
     for share in (0.03, 0.5, 0.97):
@@ -187,7 +177,6 @@ def _mirrors(shape: CarShape) -> list[np.ndarray]:
 
 
 def _seats(rng: np.random.Generator, shape: CarShape) -> list[Mesh]:
-    """Return the seats of a car and perhaps those who sit in front."""
     x = shape.rear + (shape.front - shape.rear) * np.array([[0.12], [0.48]])
     side = shape.width * 0.22
     backs = copies(box((0.16, 0.48, 0.5), shift=-0.1), x=x, y=[-side, side], z=shape.belt - 0.25)
@@ -201,7 +190,6 @@ def _seats(rng: np.random.Generator, shape: CarShape) -> list[Mesh]:
 
 
 def _roof_load(rng: np.random.Generator, shape: CarShape) -> list[Mesh]:
-    """Return roof rails, a roof box, a rack or nothing."""
     rear, front = shape.roof
     length = front - rear
     load = rng.random()
@@ -229,19 +217,13 @@ def van(rng: np.random.Generator) -> Mesh:
     door = roof_front - 0.9
 
     lower = [
-        (-half, 0.3),
-        (half - 0.1, 0.25),
-        (half, 0.6),
-        (half - 0.1, belt - 0.25),
-        (front, belt),
+        (-half, 0.3), (half - 0.1, 0.25), (half, 0.6), (half - 0.1, belt - 0.25), (front, belt),
         (-half, belt),
-    ]
+    ]  # fmt: skip
     cab = [
-        (door, belt + 0.01),
-        (front, belt + 0.01),
-        (roof_front, height - 0.08),
+        (door, belt + 0.01), (front, belt + 0.01), (roof_front, height - 0.08),
         (door, height - 0.08),
-    ]
+    ]  # fmt: skip
     roof = box((roof_front + half, width * 0.9, 0.09), ((roof_front - half) / 2, 0, height - 0.08))
     mirror_y = [-width / 2 - 0.1, width / 2 + 0.1]
     mirrors = copies(box((0.14, 0.22, 0.3)), x=front - 0.3, y=mirror_y, z=belt)
@@ -274,8 +256,7 @@ def van(rng: np.random.Generator) -> Mesh:
 
     pieces += [
         part(painted, draw_paint(rng, 0.7), Label.CAR),
-        plates(half, rng.uniform(0.4, 0.8), Label.CAR),
-        lamps(half, width, belt - 0.3, Label.CAR),
+        plates_and_lamps(Label.CAR, half, width, rng.uniform(0.4, 0.8), belt - 0.3),
         wheels(Label.CAR, (-half * 0.62, half * 0.64), width, rng.uniform(0.31, 0.37)),
     ]
     return join(*pieces)

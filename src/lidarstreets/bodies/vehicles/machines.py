@@ -1,7 +1,5 @@
 """Meshes of trailers, caravans and machines, which SemanticKITTI counts as other vehicles."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.bodies.vehicles.parts import draw_paint, glass, lamps, wheels
@@ -146,7 +144,6 @@ def excavator(rng: np.random.Generator) -> Mesh:
 
 
 def _tractor(rng: np.random.Generator) -> Mesh:
-    """Return a farm tractor: large wheels at the back, a bonnet and a tall cabin."""
     size = rng.uniform(0.75, 1.15)
     bonnet = [(0.1, 0.7), (2.0, 0.75), (2.05, 1.3), (1.7, 1.5), (0.1, 1.6)]
     cabin = box((1.4, 1.4, 1.2), (-0.7, 0, 1.55), top=(0.85, 0.85))

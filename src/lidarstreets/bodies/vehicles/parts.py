@@ -1,13 +1,11 @@
 """Parts that several kinds of vehicles share."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 
 from lidarstreets.materials import Label, Surface
-from lidarstreets.mesh import Mesh, part
+from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, tube
 
 # Metres: mean distance that a pulse travels behind clear glass until dirt or a reflection ends it.
@@ -26,15 +24,7 @@ def wheels(
     radius: float,
     thickness: float = 0.22,
 ) -> Mesh:
-    """Return two wheels per axle.
-
-    Args:
-        label: class of the vehicle.
-        axles: x of each axle in metres.
-        width: outer distance between the wheels in metres.
-        radius: of the wheels in metres.
-        thickness: of the wheels in metres.
-    """
+    """Return two wheels per axle, each at an x; `width` is the outer distance between them."""
     tyres = []
     for x in axles:
         for side in (-1, 1):
@@ -65,10 +55,12 @@ def facing_outwards(solid: np.ndarray) -> np.ndarray:
     return turned
 
 
-def plates(half: float, z: float, label: Label) -> Mesh:
-    """Return bright number plates `half` metres in front of and behind the middle of a vehicle."""
-    both = copies(box((0.03, 0.5, 0.11)), x=[-(half + 0.01), half + 0.01], z=z)
-    return part([both], Surface.PLATE, label)
+def plates_and_lamps(
+    label: Label, half: float, width: float, plate_z: float, lamp_z: float
+) -> Mesh:
+    """Return the number plates and the lamps of a vehicle that is 2 `half` long, both bright."""
+    plates = copies(box((0.03, 0.5, 0.11)), x=[-(half + 0.01), half + 0.01], z=plate_z)
+    return join(part([plates], Surface.PLATE, label), lamps(half, width, lamp_z, label))
 
 
 def lamps(half: float, width: float, z: float, label: Label) -> Mesh:

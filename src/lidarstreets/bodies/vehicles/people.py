@@ -1,7 +1,5 @@
 """Meshes of people who stand, walk, run, sit, crouch or ride."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -122,7 +120,6 @@ def person(rng: np.random.Generator) -> Mesh:
 
 
 def _clothes(rng: np.random.Generator, hip_z: float) -> list[Mesh]:
-    """Return a coat, a skirt, a hat, a rucksack or none of them."""
     solids = []
     choice = rng.random()
     if choice < 0.25:
@@ -134,7 +131,7 @@ def _clothes(rng: np.random.Generator, hip_z: float) -> list[Mesh]:
     if rng.random() < 0.12:
         solids.append(tube((0.05, 0, hip_z + 0.78), (0.05, 0, hip_z + 0.84), 0.17, sides=7))
 
-    return [part(solids, Surface.CLOTH, Label.PERSON)] if solids else []
+    return [part(solids, Surface.CLOTH, Label.PERSON)]
 
 
 def _things(rng: np.random.Generator, hip_z: float) -> list[Mesh]:
@@ -194,7 +191,6 @@ def sitter(rng: np.random.Generator, seat: float = 0.45) -> Mesh:
 
 
 def _crouching(rng: np.random.Generator) -> Mesh:
-    """Return a person who crouches, kneels or bends down."""
     hip_z = rng.uniform(0.3, 0.75)
     feet: tuple[Vector, Vector] = ((0.1, -0.15, 0.0), (-0.2, 0.15, 0.0))
     hands: tuple[Vector, Vector] = ((0.5, -0.15, 0.25), (0.5, 0.15, 0.3))
@@ -238,12 +234,7 @@ def rider(
 ) -> Mesh:
     """Return the rider of a two-wheeler.
 
-    Args:
-        rng: draws build, lean, rucksack and helmet.
-        label: class of the rider.
-        seat: x and z of the saddle.
-        grip: x and z of the handlebar.
-        feet: right, left.
+    `seat` and `grip` are x and z of saddle and handlebar, `feet` are right and left.
     """
     hands: tuple[Vector, Vector] = ((grip[0], -0.28, grip[1]), (grip[0], 0.28, grip[1]))
     lean = float(np.clip(rng.uniform(0.05, 0.42), 0.0, 0.45))

@@ -1,7 +1,5 @@
 """Meshes of bicycles, scooters and motorcycles, with and without riders."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarstreets.bodies.vehicles.parts import draw_paint
@@ -10,8 +8,7 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place, rolled, scaled
 from lidarstreets.solids import Vector, box, copies, hoop, tube
 
-# Largest angle in radians at which a parked two-wheeler leans over.
-STAND_LEAN = 0.2
+STAND_LEAN = 0.2  # largest angle in radians at which a parked two-wheeler leans over
 
 
 def bicycle(rng: np.random.Generator, label: Label = Label.BICYCLE) -> Mesh:
@@ -96,12 +93,7 @@ def _bicycle_load(
             box((0.06, 0.32, 0.5), (rear - 0.12, 0, 2 * radius + 0.1)),
         ]
 
-    pieces = []
-    if metal:
-        pieces.append(part(metal, Surface.METAL, label))
-    if plastic:
-        pieces.append(part(plastic, Surface.PLASTIC, label))
-    return pieces
+    return [part(metal, Surface.METAL, label), part(plastic, Surface.PLASTIC, label)]
 
 
 def fallen_bicycle(rng: np.random.Generator) -> Mesh:
@@ -158,9 +150,7 @@ def _motorbike(rng: np.random.Generator, label: Label) -> Mesh:
         part(metal, Surface.METAL, label),
         part([box((0.03, 0.2, 0.14), (rear - 0.3, 0, 0.5))], Surface.PLATE, label),
     ]
-    if boxes:
-        pieces.append(part(boxes, Surface.PLASTIC, label))
-    return join(*pieces)
+    return join(*pieces, part(boxes, Surface.PLASTIC, label))
 
 
 def _scooter(rng: np.random.Generator, label: Label) -> Mesh:
@@ -203,7 +193,6 @@ def _covered(rng: np.random.Generator) -> Mesh:
 
 
 def _thick_wheels(label: Label, radius: float, wheelbase: float) -> Mesh:
-    """Return two tyres with discs."""
     tyres = []
     for x in (-wheelbase / 2, wheelbase / 2):
         tyres.append(tube((x, -0.07, radius), (x, 0.07, radius), radius, sides=10))
