@@ -19,6 +19,7 @@ from amvnet.evaluation.analysis import analyze
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.scan_stream import AHEAD, stream_scans
 from amvnet.inference.segmenter import Segmenter
+from amvnet.memory import available_memory
 from amvnet.ranking.label_errors import rank
 from amvnet.viewing.frames import LabelSource, choose_frames
 from amvnet.weights.file import save
@@ -66,6 +67,67 @@ def test_an_error_comes_in_its_turn() -> None:
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     with pytest.raises(InputError, match="broken"):
         next(results)
+
+
+@pytest.mark.parametrize(
+    ("threads", "at_once", "scans", "each"),
+    [(2, 5, 10, 1), (8, 8, 16, 1), (8, 3, 9, 2), (8, 8, 2, 4), (8, 8, 1, 8), (1, 4, 8, 1)],
+)
+def test_scans_at_the_same_time_share_the_threads(
+    threads: int, at_once: int, scans: int, each: int
+) -> None:
+    """With many scans each has one thread; also if there are more workers than cores."""
+    before = torch.get_num_threads()
+    together = min(at_once, scans)
+    barrier = threading.Barrier(together)
+
+    def compute(n: int, scan: str) -> int:
+        if n < together:
+            barrier.wait(WAIT)  # breaks unless so many are computed at the same time
+        return torch.get_num_threads()
+
+    torch.set_num_threads(threads)
+    try:
+        shares = list(stream_scans(range(scans), str, compute, at_once))
+        assert torch.get_num_threads() == threads
+    finally:
+        torch.set_num_threads(before)
+    assert set(shares) == {each}
+
+
+GIBIBYTE = 2**30
+
+
+@pytest.mark.parametrize(
+    ("threads", "gibibytes", "expected"), [(64, 512, 64), (64, 10.5, 10), (2, 64, 2), (16, 0.2, 1)]
+)
+def test_a_scan_for_each_core_is_computed_if_the_memory_suffices(
+    threads: int, gibibytes: float, expected: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segmenter = Segmenter(fresh_weights())
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    available = int(gibibytes * GIBIBYTE)
+    monkeypatch.setattr("amvnet.inference.segmenter.available_memory", lambda: available)
+    assert segmenter.at_once == expected
+    segmenter.at_once = 3
+    assert segmenter.at_once == 3
+
+
+def test_the_available_memory_is_that_of_the_machine_or_of_the_control_group(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("amvnet.memory.MEMINFO", tmp_path / "meminfo")
+    monkeypatch.setattr("amvnet.memory.CONTROL_GROUP", tmp_path)
+    assert available_memory() > 0  # neither file is there
+
+    (tmp_path / "meminfo").write_text("MemTotal: 9000000 kB\nMemAvailable:    4194304 kB\n")
+    assert available_memory() == 4 * GIBIBYTE
+    (tmp_path / "memory.max").write_text("max\n")
+    (tmp_path / "memory.current").write_text("123\n")
+    assert available_memory() == 4 * GIBIBYTE
+    (tmp_path / "memory.max").write_text(f"{3 * GIBIBYTE}\n")
+    (tmp_path / "memory.current").write_text(f"{GIBIBYTE}\n")
+    assert available_memory() == 2 * GIBIBYTE
 
 
 def test_torch_has_its_threads_back_after_the_stream() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
@@ -307,6 +308,35 @@ def test_rows_by_ring_need_a_ring() -> None:
         segmenter(POINTS)
     ring = np.arange(len(POINTS)) % 32
     assert segmenter(Scan(POINTS, ring=ring)).labels.max() <= 16
+
+
+def test_normalised_scans_are_segmented_by_their_rings_and_others_by_elevation() -> None:
+    """By elevation, the lasers of another sensor would be in other rows."""
+    segmenter = Segmenter(WEIGHTS)
+    for is_normalised, rows in ((True, "ring"), (False, "elevation")):
+        dataset = SimpleNamespace(is_normalised=is_normalised)
+        chosen = segmenter.for_dataset(dataset)  # type: ignore[arg-type]
+        assert chosen.model.range_view.config.rows == rows
+    assert segmenter.model.range_view.config.rows == "elevation"
+
+
+@pytest.mark.parametrize("is_normalised", [True, False])
+def test_a_scan_of_a_file_is_segmented_by_its_rings_if_it_is_normalised(
+    is_normalised: bool,
+) -> None:
+    segmenter = Segmenter(WEIGHTS)
+    height = segmenter.model.range_view.config.height
+    scan = Scan(POINTS, ring=np.random.default_rng(0).integers(0, height, len(POINTS)))
+    loaded = SimpleNamespace(scan=scan, file_xyz=None)
+    source = SimpleNamespace(
+        load=lambda labels: loaded, is_normalised=is_normalised, path=Path("a.bin")
+    )
+    actual = segmenter._segment_input(source, []).scores  # type: ignore[arg-type]
+
+    by_ring = segmenter.by_ring()(scan).scores
+    by_elevation = segmenter(scan).scores
+    assert np.array_equal(actual, by_ring if is_normalised else by_elevation)
+    assert not np.array_equal(by_ring, by_elevation)
 
 
 # ---- fusion of scores

@@ -123,6 +123,18 @@ def test_among_points_in_one_place_neighbours_are_different_others_and_as_near(
             assert distances[index] == distances[as_near]
 
 
+def test_among_equally_near_points_the_choice_does_not_depend_on_the_library(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else labels would: real scans hold many points twice."""
+    places = torch.randn(100, 4, generator=torch.Generator().manual_seed(0))
+    points = places[torch.arange(300) % 100]  # with 15 neighbours, the last is one of several
+    index = torch.arange(300)
+    by_pykdtree = nearest_neighbours(points, index, 15)
+    monkeypatch.setitem(sys.modules, "pykdtree.kdtree", None)
+    assert torch.equal(nearest_neighbours(points, index, 15), by_pykdtree)
+
+
 @pytest.mark.usefixtures("tree")
 def test_with_fewer_points_than_neighbours_the_last_one_is_repeated() -> None:
     points = torch.tensor([[0.0, 0, 0, 9], [5, 0, 0, 9], [1, 0, 0, 9], [3, 0, 0, 9]])

@@ -25,7 +25,7 @@ from amvnet.models.layers import (
 from amvnet.models.point_head import PointHead
 from amvnet.models.polar_net import DropBlock, PolarNet
 from amvnet.models.range_net import RangeNet
-from amvnet.models.upsampled_conv import convolve_joined
+from amvnet.models.upsampled_conv import _kernels, convolve_joined
 from amvnet.scan import Scan
 from amvnet.weights.file import load
 
@@ -362,3 +362,17 @@ def test_dropblock_drops_squares() -> None:
 
 def test_dropblock_takes_maps_smaller_than_its_squares() -> None:
     assert DropBlock(0.5, 7).train()(torch.ones(2, 1, 2, 3)).shape == (2, 1, 2, 3)
+
+
+def test_under_autocast_the_recurrence_and_sums_of_weights_stay_in_float32() -> None:
+    gru = AzimuthGRU(8, 0.5).eval()
+    convolution = RingConv2d(6, 4)
+    x = torch.randn(1, 8, 2, 16)
+    with torch.inference_mode():
+        expected = gru(x)
+        kernels = _kernels(convolution, 4, (1, 2))
+        with torch.autocast("cpu", torch.bfloat16):
+            assert gru(x).dtype == torch.float32
+            assert torch.equal(gru(x), expected)
+            assert _kernels(convolution, 4, (1, 2)).dtype == torch.float32
+            assert torch.equal(_kernels(convolution, 4, (1, 2)), kernels)

@@ -435,3 +435,26 @@ def test_a_point_exactly_at_the_least_distance_is_seen() -> None:
     assert image.nearest[image.nearest >= 0].tolist() == [0]
     grid = PolarView(replace(POLAR, nearest=5.0)).project(batch)
     assert len(grid.features) == len(grid.seen) == 1
+
+
+def test_points_at_the_borders_of_cells_have_the_cells_of_double_precision() -> None:
+    rng = np.random.default_rng(0)
+    columns = math.pi * (1 - 2 * np.arange(SPHERICAL.width) / SPHERICAL.width)
+    sectors = math.pi * (2 * np.arange(POLAR.angular) / POLAR.angular - 1)
+    azimuth = np.repeat(np.concatenate([columns, sectors]), 20)
+    distance = rng.uniform(3, 39, len(azimuth))
+    x = distance * np.cos(azimuth)
+    y = distance * np.sin(azimuth)
+    xyz = np.stack([x, y, rng.uniform(-3, 2, len(x))], axis=1).astype(np.float32)
+    scan = Scan(np.column_stack([xyz, np.full(len(x), 0.5)]).astype(np.float32))
+
+    pixels, _, _ = range_view_by_loop(scan, SPHERICAL)
+    cells, _ = polar_view_by_loop(scan, POLAR)
+    assert project_to_image(scan).pixel.tolist() == pixels
+    grid = project_to_grid(scan)
+    assert grid.pillar.tolist() == [r * POLAR.angular + a for r, a, _ in cells]
+
+    # In single precision, other cells would come out.
+    shares = 0.5 - np.arctan2(xyz[:, 1], xyz[:, 0]) / np.float32(2 * math.pi)
+    single = np.floor(shares * np.float32(SPHERICAL.width)).clip(0, SPHERICAL.width - 1)
+    assert (single != np.array(pixels) % SPHERICAL.width).any()
