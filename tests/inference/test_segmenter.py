@@ -315,7 +315,7 @@ def test_normalised_scans_are_segmented_by_their_rings_and_others_by_elevation()
     segmenter = Segmenter(WEIGHTS)
     for is_normalised, rows in ((True, "ring"), (False, "elevation")):
         dataset = SimpleNamespace(is_normalised=is_normalised)
-        chosen = segmenter.for_dataset(dataset)  # type: ignore[arg-type]
+        chosen = segmenter.for_dataset(dataset)
         assert chosen.model.range_view.config.rows == rows
     assert segmenter.model.range_view.config.rows == "elevation"
 
@@ -331,7 +331,7 @@ def test_a_scan_of_a_file_is_segmented_by_its_rings_if_it_is_normalised(
     source = SimpleNamespace(
         load=lambda labels: loaded, is_normalised=is_normalised, path=Path("a.bin")
     )
-    actual = segmenter._segment_input(source, []).scores  # type: ignore[arg-type]
+    actual = segmenter._segment_input(source, []).scores
 
     by_ring = segmenter.by_ring()(scan).scores
     by_elevation = segmenter(scan).scores
