@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from amvnet import weights as weights
     from amvnet.data.datasets.simulated import simulate
     from amvnet.errors import InputError
-    from amvnet.inference.fusion import fuse
+    from amvnet.inference.fuse import fuse
     from amvnet.inference.listing import read, read_all
     from amvnet.inference.segmentation import Segmentation
     from amvnet.inference.segmenter import Segmenter
@@ -47,7 +47,7 @@ _MODULES = {
     "Segmentation": "amvnet.inference.segmentation",
     "Segmenter": "amvnet.inference.segmenter",
     "Weights": "amvnet.weights.file",
-    "fuse": "amvnet.inference.fusion",
+    "fuse": "amvnet.inference.fuse",
     "push": "amvnet.weights.push",
     "read": "amvnet.inference.listing",
     "read_all": "amvnet.inference.listing",

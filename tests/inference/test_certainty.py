@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from amvnet import Segmenter
-from amvnet.inference.certainty import Verdict, uncertain_share
+from amvnet.inference.segmentation import Verdict, uncertain_share
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 
 from fixtures.worlds import fresh_weights, make_streets, run_cli, street, without

@@ -7,8 +7,6 @@ from enum import Enum
 from statistics import median
 from threading import Lock
 
-from amvnet.inference.certainty import Verdict
-
 
 class Level(Enum):
     """Levels of a DiagnosticStatus, by name."""
@@ -139,6 +137,9 @@ def _judge(period: _Period, usual_uncertain: float) -> tuple[Level, str]:
 
     uncertain = _uncertain(period)
     if uncertain is not None:
+        # Late, so that the node can set the environment before torch reads it.
+        from amvnet.inference.segmentation import Verdict
+
         verdict = Verdict(uncertain, usual_uncertain)
         if verdict.is_doubtful:
             return Level.WARN, f"{verdict}; check sensor, height, unit, axes and intensity_scale"

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.distributed import Processes
     from amvnet.inference.listing import ScanOptions
-    from amvnet.inference.score_files import ScorePair, Which
+    from amvnet.inference.scores import ScorePair, Which
     from amvnet.inference.segmenter import Segmenter
     from amvnet.sensors.lidars import Sensor
     from amvnet.weights.file import Weights
@@ -264,7 +264,7 @@ def parse_scores(
     Raises:
         InputError: if a folder is missing.
     """
-    from amvnet.inference.score_files import ScorePair
+    from amvnet.inference.scores import ScorePair
 
     if a is not None and b is not None:
         return ScorePair.of(a, b, key_a, key_b, logits)

@@ -301,7 +301,8 @@ def list_inputs(
             taxonomies.append(dataset.taxonomy)
             continue
 
-        files = list(list_scans(text, options.topic, options.layout))
+        is_alone = len(inputs) == 1
+        files = list(list_scans(text, options.topic, options.layout, is_alone))
         for scan in files:
             reader.expect(scan)
             scans.append(FileScan(scan, reader))

@@ -13,7 +13,6 @@ from amvnet.data.formats.detect import BAGS, FOLDER
 from amvnet.data.formats.rows import UNKNOWN
 from amvnet.data.labels import label_bags
 from amvnet.errors import InputError
-from amvnet.inference.certainty import Verdict
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import DatasetScan, FileScan, InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import (
@@ -24,7 +23,7 @@ from amvnet.inference.pipeline import (
     check_faults,
 )
 from amvnet.inference.reading import normaliser_for
-from amvnet.inference.segmentation import Segmentation
+from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Say, no_progress, say_nothing

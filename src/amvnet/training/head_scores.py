@@ -12,7 +12,7 @@ from torch import Tensor
 
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
-from amvnet.inference.score_files import SURE, ScorePair
+from amvnet.inference.scores import SURE, ScorePair
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan

@@ -11,7 +11,7 @@ from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
-from amvnet.inference.score_files import ScorePair
+from amvnet.inference.scores import ScorePair
 from amvnet.progress import Say, say_nothing
 from amvnet.training.loggers import LoggerName, check_logger
 from amvnet.weights.file import Weights

@@ -49,7 +49,7 @@ def fuse(
         overwrite: replace files in the folder that amvnet did not write, too.
     """
     from amvnet.data.taxonomy import taxonomy_named
-    from amvnet.inference.fuse_files import fuse_files
+    from amvnet.inference.fuse import fuse_files
     from amvnet.inference.pipeline import OutputOptions
     from amvnet.weights.file import load
 

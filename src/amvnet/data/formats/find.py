@@ -82,7 +82,10 @@ def find_scans(path: Path | str) -> list[Path]:
 
 
 def list_scans(
-    path: Path | str, topic: str | None = None, layout: RowLayout = UNKNOWN
+    path: Path | str,
+    topic: str | None = None,
+    layout: RowLayout = UNKNOWN,
+    is_alone: bool = True,
 ) -> Iterator[NamedScan]:
     """Yield the scans that a text names, as `find_scans` finds them; those of a bag in its order.
 
@@ -92,6 +95,7 @@ def list_scans(
     Args:
         topic: of bags; None means the only topic with scans.
         layout: what rows of numbers without names hold, as far as the user says it.
+        is_alone: whether there are no other inputs, so that a single file is the only one.
 
     Raises:
         InputError: if there is no scan, or the only file has an unknown format or is a bag that
@@ -106,7 +110,7 @@ def list_scans(
         try:
             scans = _scans_of(file, name, topic, layout)
         except InputError as error:
-            if len(files) == 1 and not is_dead_link(file):
+            if is_alone and len(files) == 1 and not is_dead_link(file):
                 raise
             scans = [NamedScan(name, str(file), file, "", partial(_refuse, str(error)))]
         yield from scans
