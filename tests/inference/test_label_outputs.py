@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -438,7 +439,7 @@ def test_parts_of_a_killed_run_on_other_scans_stay_out_of_a_bag(
     options = ("--weights", world / "w.safetensors", "--format", "bag", "--out", out)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(label_bags, "_write_bag", interrupt)
-        assert run_cli("predict", bag, "--topic", "/front", *options)[0] == 1
+        assert run_cli("predict", bag, "--topic", "/front", *options)[0] == 130
 
     assert run_cli("predict", bag, "--topic", "/top", *options) == (0, "")
     assert len(list(list_scans(out / "drive.bag"))) == 2
@@ -462,13 +463,14 @@ def test_bags_that_were_written_before_a_run_was_killed_are_its_own(
     options = ("--weights", world / "w.safetensors", "--format", "bag", "--out", out)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(label_bags, "_write_bag", write_first)
-        assert run_cli("predict", tmp_path / "bags", *options)[0] == 1
+        assert run_cli("predict", tmp_path / "bags", *options)[0] == 130
     assert run_cli("predict", tmp_path / "bags", *options) == (0, "")
     assert {name for name in files(out) if not name.startswith(".")} == {"a.bag", "b.bag"}
 
 
 def interrupt(*_: object) -> None:
-    raise KeyboardInterrupt
+    """Do as Ctrl-C does."""
+    signal.raise_signal(signal.SIGINT)
 
 
 def test_a_bag_of_labels_is_replaced_but_no_other_bag(world: Path, tmp_path: Path) -> None:
