@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from amvnet.data.formats.find import list_scans
 from amvnet.data.formats.livox import TYPES as LIVOX
-from amvnet.data.formats.packets import Capture
+from amvnet.data.formats.packets import open_capture
 from amvnet.data.formats.registry import read_cloud
 from amvnet.inference.reading import FileReader
 
@@ -249,9 +249,9 @@ def test_the_missing_extra_of_captures_is_named_only_if_it_would_help(
 ) -> None:
     monkeypatch.setitem(sys.modules, "velodyne_decoder", None)
     path = write_capture(tmp_path / "a.pcap", [vlp16_packet(0, 0)])
-    fails(lambda: Capture(path), path, 'pip install "amvnet[packets]"')
+    fails(lambda: open_capture(path), path, 'pip install "amvnet[packets]"')
     write_capture(path, [bytes(3392)], 7502)
-    fails(lambda: Capture(path), path, "ouster-cli")
+    fails(lambda: open_capture(path), path, "ouster-cli")
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from pypcd4 import Encoding, PointCloud
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
-from amvnet.data.formats.bags import Bag
+from amvnet.data.formats.bags import open_bag
 from amvnet.data.formats.cloud import MAX_POINTS
 from amvnet.data.formats.find import find_scans, list_scans, scan_stem
 from amvnet.data.formats.pcd import unpack_lzf
@@ -572,7 +572,7 @@ def test_a_bag_is_read_in_constant_memory(tmp_path: Path) -> None:
 
     # The bag as it is read in the process with limits, but in this one.
     tracemalloc.start()
-    bag = Bag(path, ".bag")
+    bag = open_bag(path, ".bag")
     for index in range(30):
         bag.read(index)
     _, peak = tracemalloc.get_traced_memory()

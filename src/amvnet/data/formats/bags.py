@@ -16,6 +16,7 @@ from amvnet.data.formats.livox import TYPES as LIVOX
 from amvnet.data.formats.livox import read_custom_message, read_header
 from amvnet.data.formats.pointcloud2 import Origin, read_message
 from amvnet.data.formats.reader_process import size_of
+from amvnet.data.formats.recording import Decode, Recording
 from amvnet.errors import InputError
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -41,11 +42,9 @@ MIN_MESSAGE = 16  # bytes of a bag for each message, compressed ones too
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
-Decode = Callable[[str], Cloud]  # reads one message, given its name
 
-
-class Bag:
-    """The scans of one topic of a bag, ordered by time. One message at a time is in memory.
+def open_bag(path: Path, ending: str, topic: str | None = None) -> Recording:
+    """Open the scans of one topic of a bag, ordered by time.
 
     Args:
         path: the file, or the folder of a ROS 2 bag.
@@ -55,62 +54,27 @@ class Bag:
     Raises:
         InputError: if the bag cannot be read, or has no such topic, or more than one.
     """
+    with reading(path, EXPECTED, ADVICE), closing(_open_reader(path, ending)) as reader:
+        counts = _count_messages(reader)
+        topic = _choose_topic(counts, topic, path, _describe_others(reader))
 
-    def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
-        self.path = path
-        self._ending = ending
+    count = counts[topic]
+    if not 0 < count <= size_of(path) // MIN_MESSAGE:
+        raise InputError(f"{path}: expected scans under {topic}, found {count} messages; {ADVICE}")
+    return Recording(path, count, partial(_read_messages, path, ending, topic), ADVICE, topic)
 
-        with reading(path, EXPECTED, ADVICE), closing(_open_reader(path, ending)) as reader:
-            counts = _count_messages(reader)
-            without_scans = _describe_others(reader)
-            self.topic = _choose_topic(counts, topic, path, without_scans)
-        self._count = counts[self.topic]
 
-        if not 0 < self._count <= size_of(path) // MIN_MESSAGE:
-            raise InputError(
-                f"{path}: expected scans under {self.topic}, found {self._count} messages; {ADVICE}"
-            )
-
-        # For reading in order without a seek: the index of the next message, and the messages from
-        # there on.
-        self._next = 0
-        self._messages: Iterator[Decode] = iter(())
-
-    def __len__(self) -> int:
-        return self._count
-
-    def read(self, index: int) -> Cloud:
-        """Read the scan at this index, from 0. In order is fastest.
-
-        Raises:
-            InputError: if the message is broken, or the bag ends before it.
-        """
-        if index != self._next or self._next == 0:
-            self._next = 0
-            self._messages = self._read_messages()
-
-        name = f"{self.path} ({self.topic}, {index})"
-        with reading(name, "a message with a cloud", ADVICE):
-            for decode in self._messages:
-                self._next += 1
-                if self._next > index:
-                    if self._next == self._count:
-                        self._messages = iter(())  # closes the bag
-                    return decode(name)
-        raise InputError(f"{name}: expected {self._count} scans, found {self._next}; {ADVICE}")
-
-    def _read_messages(self) -> Iterator[Decode]:
-        with closing(_open_reader(self.path, self._ending)) as reader:
-            # A ROS 2 bag serialises in the same way in every storage format.
-            is_ros1 = self._ending == ".bag"
-            deserialise = _deserialiser(is_ros1)
-            connections = _connections(reader, self.topic)
-            for connection, time, data in reader.messages(connections=connections):
-                if connection.msgtype == CLOUD:
-                    read = partial(_read_pointcloud2, deserialise)
-                else:
-                    read = partial(_read_livox, is_ros1)
-                yield partial(read, data, self.topic, time)
+def _read_messages(path: Path, ending: str, topic: str) -> Iterator[Decode]:
+    with closing(_open_reader(path, ending)) as reader:
+        # A ROS 2 bag serialises in the same way in every storage format.
+        is_ros1 = ending == ".bag"
+        deserialise = _deserialiser(is_ros1)
+        for connection, time, data in reader.messages(connections=_connections(reader, topic)):
+            if connection.msgtype == CLOUD:
+                read = partial(_read_pointcloud2, deserialise)
+            else:
+                read = partial(_read_livox, is_ros1)
+            yield partial(read, data, topic, time)
 
 
 def _open_reader(path: Path, ending: str) -> Any:

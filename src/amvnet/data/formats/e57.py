@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from amvnet.data.formats.cloud import Cloud, check_point_count, reading
+from amvnet.data.formats.recording import Decode, Recording
 from amvnet.errors import InputError
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -17,47 +21,32 @@ EXPECTED = "an E57 file"
 ADVICE = "write the file again"
 
 
-class E57:
-    """The scans of an E57 file, each in the frame of the instrument at its place.
-
-    Args:
-        path: the file.
-        ending: not used.
-        topic: not used.
+def open_e57(path: Path) -> Recording:
+    """Open the scans of an E57 file, each in the frame of the instrument at its place.
 
     Raises:
         InputError: if the file is broken or has no scan.
     """
+    with reading(path, EXPECTED, ADVICE), closing(_open(path)) as file:
+        count = int(file.scan_count)
+    if not count:
+        raise InputError(f"{path}: expected scans, found none; {ADVICE}")
 
-    def __init__(self, path: Path, ending: str = ".e57", topic: str | None = None) -> None:
-        self.path = path
-        with reading(path, EXPECTED, ADVICE):
-            file = _open(path)
-            self._count = int(file.scan_count)
-            file.close()
-        if not self._count:
-            raise InputError(f"{path}: expected scans, found none; {ADVICE}")
+    def scans() -> Iterator[Decode]:
+        for index in range(count):
+            yield partial(_read_scan, path, index)
 
-    def __len__(self) -> int:
-        return self._count
+    return Recording(path, count, scans, ADVICE)
 
-    def read(self, index: int) -> Cloud:
-        """Read the scan at this index, from 0. Points that were not measured become NaN.
 
-        Raises:
-            InputError: if it is broken, or has no coordinates.
-        """
-        name = f"{self.path} ({index})"
-        with reading(name, "a scan of an E57 file", ADVICE):
-            file = _open(self.path)
-            try:
-                # Each number takes a bit at least, in a constant column nothing: only a scan of
-                # equal points is smaller.
-                check_point_count(int(file.get_header(index).point_count), name)
-                fields = file.read_scan_raw(index, ignore_unsupported_fields=True)
-            finally:
-                file.close()
-            return Cloud(_coordinates(fields, name), fields.get("intensity"), None, name)
+def _read_scan(path: Path, index: int, name: str) -> Cloud:
+    """Read the scan at this index. Points that were not measured become NaN."""
+    with closing(_open(path)) as file:
+        # Each number takes a bit at least, in a constant column nothing: only a scan of equal
+        # points is smaller.
+        check_point_count(int(file.get_header(index).point_count), name)
+        fields = file.read_scan_raw(index, ignore_unsupported_fields=True)
+    return Cloud(_coordinates(fields, name), fields.get("intensity"), None, name)
 
 
 def _open(path: Path) -> Any:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from amvnet.data.formats.cloud import (
     Cloud,
@@ -16,6 +19,7 @@ from amvnet.data.formats.cloud import (
     require,
     split_records,
 )
+from amvnet.data.formats.recording import Decode, Recording
 from amvnet.errors import InputError
 
 EXPECTED = "a capture of Velodyne's packets"
@@ -37,67 +41,41 @@ CONVERTERS = {
 }
 
 
-class Capture:
-    """The scans in a capture of a Velodyne's packets, a turn of the sensor each.
+def open_capture(path: Path) -> Recording:
+    """Open the scans in a capture of a Velodyne's packets, a turn of the sensor each.
 
     Lost returns are not in the packets, so not in the scans either. The model is told by the
     packets.
 
-    Args:
-        path: the file.
-        ending: not used.
-        topic: not used.
-
     Raises:
         InputError: if the packets are another sensor's or broken, or velodyne-decoder is missing.
     """
+    maker = _maker_of(path)
+    if maker != "Velodyne":
+        advice = CONVERTERS.get(maker, "convert its packets with the sensor's own software")
+        raise InputError(
+            f"{path}: expected {EXPECTED}, found {maker or 'unknown'} packets; {advice}"
+        )
 
-    def __init__(self, path: Path, ending: str = ".pcap", topic: str | None = None) -> None:
-        self.path = path
-        maker = _maker_of(path)
-        if maker != "Velodyne":
-            advice = CONVERTERS.get(maker, "convert its packets with the sensor's own software")
-            raise InputError(
-                f"{path}: expected {EXPECTED}, found {maker or 'unknown'} packets; {advice}"
-            )
+    with reading(path, EXPECTED, ADVICE):
+        count = sum(1 for _ in _decode(path))
+    if not count:
+        raise InputError(f"{path}: expected scans, found none in its packets; {ADVICE}")
+    return Recording(path, count, partial(_decode, path), ADVICE)
 
-        with reading(path, EXPECTED, ADVICE):
-            self._count = sum(1 for _ in self._decode())
-        if not self._count:
-            raise InputError(f"{path}: expected scans, found none in its packets; {ADVICE}")
-        self._next = 0
-        self._scans: Iterator[Any] = iter(())
 
-    def __len__(self) -> int:
-        return self._count
+def _decode(path: Path) -> Iterator[Decode]:
+    """Yield what reads each scan."""
+    require(path, "packets", "velodyne_decoder")
+    import velodyne_decoder
 
-    def read(self, index: int) -> Cloud:
-        """Read the scan at this index, from 0. In order is fastest.
+    for _, records in velodyne_decoder.read_pcap(str(path), as_pcl_structs=True):
+        yield partial(_read_scan, records)
 
-        Raises:
-            InputError: if the packets are broken.
-        """
-        if index != self._next or self._next == 0:
-            self._next = 0
-            self._scans = self._decode()
 
-        name = f"{self.path} ({index})"
-        with reading(name, EXPECTED, ADVICE):
-            for records in self._scans:
-                self._next += 1
-                if self._next > index:
-                    check_point_count(len(records), name)
-                    cloud = make_cloud(split_records(records), name)
-                    return Cloud(cloud.xyz, cloud.intensity, cloud.ring, name, FULL_INTENSITY)
-        raise InputError(f"{name}: expected {self._count} scans, found {self._next}; {ADVICE}")
-
-    def _decode(self) -> Iterator[Any]:
-        """Yield the records of each scan."""
-        require(self.path, "packets", "velodyne_decoder")
-        import velodyne_decoder
-
-        for _, records in velodyne_decoder.read_pcap(str(self.path), as_pcl_structs=True):
-            yield records
+def _read_scan(records: np.ndarray, name: str) -> Cloud:
+    check_point_count(len(records), name)
+    return replace(make_cloud(split_records(records), name), full=FULL_INTENSITY)
 
 
 def _maker_of(path: Path) -> str:

@@ -11,8 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
-
 from amvnet.data.formats.cloud import (
     Cloud,
     check_point_count,
@@ -20,7 +18,7 @@ from amvnet.data.formats.cloud import (
     reading,
     require_columns,
 )
-from amvnet.data.formats.pcd import HEADER, Arrays, read_rows, read_text
+from amvnet.data.formats.fields import Arrays, Fields, read_header_line
 from amvnet.errors import InputError
 
 TYPES = {
@@ -42,6 +40,7 @@ TYPES = {
     "float64": "f8",
 }
 BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
+KIND = "a PLY file"
 ADVICE = "write the file again"
 
 
@@ -53,38 +52,18 @@ class Element:
         name: its name.
         count: how many rows it has.
         properties: the names of its properties.
-        dtypes: the NumPy types of its properties, without byte order; empty for a list.
+        types: of its properties, as in the file; "list" for a list.
     """
 
     name: str
     count: int
     properties: list[str] = field(default_factory=list)
-    dtypes: list[str] = field(default_factory=list)
+    types: list[str] = field(default_factory=list)
 
-    @property
-    def sizes(self) -> list[int]:
-        """Bytes of each property; only if none is a list."""
-        return [int(dtype[1:]) for dtype in self.dtypes]
-
-    @property
-    def row(self) -> int:
-        """Bytes of one row; only if no property is a list."""
-        return sum(self.sizes)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The layout of the data up to the last vertex.
-
-    Attributes:
-        before: the elements before the vertices.
-        vertex: the vertices.
-        order: the byte order, "<" or ">".
-    """
-
-    before: list[Element]
-    vertex: Element
-    order: str
+    def fields(self, order: str) -> Fields:
+        """Return its fields in a byte order, "<" or ">"; only if none is a list."""
+        dtypes = [order + TYPES[kind] for kind in self.types]
+        return Fields(self.properties, dtypes, [1] * len(dtypes))
 
 
 def read_ply(path: Path) -> Cloud:
@@ -108,19 +87,33 @@ def read_vertices(path: Path, choose: Callable[[Sequence[str]], dict[str, int]])
     Raises:
         InputError: as `read_ply`.
     """
-    with reading(path, "a PLY file", ADVICE), path.open("rb") as file:
+    with reading(path, KIND, ADVICE), path.open("rb") as file:
         encoding, elements = _read_header(file, path)
-        vertex_index = [element.name for element in elements].index("vertex")
-        layout = Layout(elements[:vertex_index], elements[vertex_index], BYTE_ORDERS[encoding])
-
-        if any("" in element.dtypes for element in elements[: vertex_index + 1]):
+        index = [element.name for element in elements].index("vertex")
+        before, vertex = elements[:index], elements[index]
+        if any("list" in element.types for element in elements[: index + 1]):
             raise InputError(
                 f"{path}: expected vertices without lists, found a list; write the points alone"
             )
 
-        columns = choose(layout.vertex.properties)
-        read_columns = _read_ascii if encoding == "ascii" else _read_binary
-        return read_columns(file, layout, columns, path)
+        fields = vertex.fields(BYTE_ORDERS[encoding])
+        chosen = choose(vertex.properties)
+        if encoding == "ascii":
+            # Each value, and each line before the vertices, takes at least one digit and, but for
+            # the last, a separator.
+            lines = sum(element.count for element in before)
+            least = 2 * (lines + vertex.count * fields.values) - 1
+            check_point_count(lines + vertex.count, path, least)
+            for _ in range(lines):
+                file.readline()
+            return fields.read_text(file, vertex.count, chosen, path)
+
+        start = file.tell()
+        for element in before:
+            start += element.count * element.fields("<").record.itemsize
+        check_point_count(vertex.count, path, start + vertex.count * fields.record.itemsize)
+        file.seek(start)
+        return fields.read_binary(file, vertex.count, chosen)
 
 
 def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
@@ -128,8 +121,9 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
     encoding = ""
     elements: list[Element] = []
 
-    words = _read_words(file, path)
+    words: list[str] = []
     while words != ["end_header"]:
+        words = read_header_line(file, path, KIND, "end_header")
         keyword = words[0] if words else ""
         if keyword == "format":
             encoding = words[1]
@@ -140,8 +134,7 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
             elements.append(element)
         elif keyword == "property":
             elements[-1].properties.append(words[-1])
-            elements[-1].dtypes.append("" if words[1] == "list" else TYPES[words[1]])
-        words = _read_words(file, path)
+            elements[-1].types.append(words[1])
 
     if encoding not in BYTE_ORDERS:
         raise InputError(
@@ -149,44 +142,3 @@ def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[Element]]:
             f"found {encoding[:30]!a}; {ADVICE}"
         )
     return encoding, elements
-
-
-def _read_words(file: BinaryIO, path: Path) -> list[str]:
-    """Return the words of the next line of the header."""
-    line = file.readline(HEADER)
-    if not line or file.tell() > HEADER:
-        raise InputError(
-            f"{path}: expected the header of a PLY file, found no end_header; {ADVICE}"
-        )
-    return line.decode("latin-1").split()  # comments may be in any language
-
-
-def _read_ascii(file: BinaryIO, layout: Layout, columns: dict[str, int], path: Path) -> Arrays:
-    vertex = layout.vertex
-    lines_before = sum(element.count for element in layout.before)
-
-    # Each value, and each line before the vertices, takes at least one digit and, but for the
-    # last, a separator.
-    values = lines_before + vertex.count * len(vertex.properties)
-    check_point_count(lines_before + vertex.count, path, 2 * values - 1)
-    for _ in range(lines_before):
-        file.readline()
-
-    positions = {}
-    for key, index in columns.items():
-        positions[key] = (index, layout.order + vertex.dtypes[index])
-    return read_text(file, vertex.count, positions, path)
-
-
-def _read_binary(file: BinaryIO, layout: Layout, columns: dict[str, int], path: Path) -> Arrays:
-    vertex = layout.vertex
-    bytes_before = sum(element.count * element.row for element in layout.before)
-    end = file.tell() + bytes_before + vertex.count * vertex.row
-    check_point_count(vertex.count, path, end)
-    file.seek(bytes_before, 1)
-
-    offsets = np.cumsum([0, *vertex.sizes]).tolist()
-    positions = {}
-    for key, index in columns.items():
-        positions[key] = (layout.order + vertex.dtypes[index], offsets[index])
-    return read_rows(file, vertex.count, vertex.row, positions)

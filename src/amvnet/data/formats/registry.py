@@ -6,41 +6,28 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from uuid import uuid4
 
 from amvnet.data.formats.arrow import read_feather
-from amvnet.data.formats.bags import Bag
+from amvnet.data.formats.bags import open_bag
 from amvnet.data.formats.cloud import Cloud, Message, require
 from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, PACKED, TEXT, ending_of
-from amvnet.data.formats.e57 import E57
+from amvnet.data.formats.e57 import open_e57
 from amvnet.data.formats.las import read_las
 from amvnet.data.formats.numpy_files import read_npy, read_npz
 from amvnet.data.formats.packed import unpacked
-from amvnet.data.formats.packets import Capture
+from amvnet.data.formats.packets import open_capture
 from amvnet.data.formats.pcd import read_pcd
 from amvnet.data.formats.ply import read_ply
 from amvnet.data.formats.raw import read_raw
 from amvnet.data.formats.reader_process import call
+from amvnet.data.formats.recording import Recording
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import read_text_cloud
 from amvnet.errors import InputError
 
 OPEN_FILES = 4  # that the process with limits keeps open
-
-
-class Recording(Protocol):
-    """The scans of one file, in order of time."""
-
-    def __len__(self) -> int:
-        """Return the number of scans."""
-
-    def read(self, index: int) -> Cloud:
-        """Read the scan at this index, from 0.
-
-        Raises:
-            InputError: if it is broken.
-        """
 
 
 # Readers of one scan, by the endings of files. Those of rows need to know what the rows hold.
@@ -59,9 +46,9 @@ CLOUD_READERS: dict[str, Callable[[Path], Cloud]] = {
     ".feather": read_feather,
 }
 RECORDINGS: dict[str, Callable[[Path, str, str | None], Recording]] = {
-    **dict.fromkeys((FOLDER, *BAGS), Bag),
-    ".e57": E57,
-    ".pcap": Capture,
+    **dict.fromkeys((FOLDER, *BAGS), open_bag),
+    ".e57": lambda path, *_: open_e57(path),
+    ".pcap": lambda path, *_: open_capture(path),
 }
 SCANS = (*ROW_READERS, *CLOUD_READERS)  # endings of files of one scan
 

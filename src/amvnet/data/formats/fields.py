@@ -1,0 +1,99 @@
+"""Records of numbers with named fields, as PCD and PLY have them: in text and in binary."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate, chain, islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from amvnet.errors import InputError
+
+HEADER = 65_536  # bytes of the longest header of a file
+Arrays = dict[str, np.ndarray]  # the (N,) values of some fields
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The fields of a record, in order.
+
+    Attributes:
+        names: of the fields; several may have the same.
+        dtypes: their NumPy types, with the byte order.
+        counts: how many values each has.
+    """
+
+    names: Sequence[str]
+    dtypes: Sequence[str]
+    counts: Sequence[int]
+
+    @cached_property
+    def record(self) -> np.dtype:
+        """The NumPy type of a record, with the fields "0", "1", ..."""
+        fields = []
+        for index, (dtype, count) in enumerate(zip(self.dtypes, self.counts, strict=True)):
+            fields.append((str(index), dtype, (count,)))
+        return np.dtype(fields)
+
+    @property
+    def values(self) -> int:
+        """How many values a record has."""
+        return sum(self.counts)
+
+    def read_binary(self, file: BinaryIO, count: int, chosen: dict[str, int]) -> Arrays:
+        """Read some fields of the next records, each field's first value.
+
+        Args:
+            count: of the records; fewer are returned if the file ends before.
+            chosen: the index of each field, by the key that it gets.
+        """
+        records = np.fromfile(file, self.record, count)
+        return {key: records[str(index)][:, 0] for key, index in chosen.items()}
+
+    def read_text(self, file: BinaryIO, count: int, chosen: dict[str, int], path: Path) -> Arrays:
+        """Read some fields of the next lines of numbers, as `read_binary` does.
+
+        Raises:
+            InputError: if there are fewer lines.
+        """
+        positions = list(accumulate(self.counts, initial=0))
+        columns = [positions[index] for index in chosen.values()]
+        table = np.zeros((0, len(columns)))
+        lines = islice(filter(bytes.strip, file), count)
+        for first in lines:  # NumPy warns if there is none
+            table = np.loadtxt(chain([first], lines), usecols=columns, comments=None, ndmin=2)
+
+        if len(table) < count:
+            raise InputError(
+                f"{path}: expected {count} lines of points, found {len(table)}; copy the file again"
+            )
+
+        arrays = {}
+        with np.errstate(invalid="ignore"):
+            for (key, index), values in zip(chosen.items(), table.T, strict=True):
+                # A column with NaN or infinity stays float64, because integers cannot hold these.
+                is_finite = np.isfinite(values).all()
+                arrays[key] = values.astype(self.dtypes[index]) if is_finite else values
+        return arrays
+
+
+def read_header_line(file: BinaryIO, path: Path, kind: str, end: str) -> list[str]:
+    """Return the words of the next line of a header.
+
+    Args:
+        kind: what the file is, such as "a PCD file".
+        end: the line that ends its header.
+
+    Raises:
+        InputError: if the file ends first, or the header is too long.
+    """
+    line = file.readline(HEADER)
+    if not line or file.tell() > HEADER:
+        raise InputError(
+            f"{path}: expected the header of {kind}, found no {end}; write the file again"
+        )
+    return line.decode("latin-1").split()  # comments may be in any encoding
