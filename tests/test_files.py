@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import stat
@@ -312,8 +313,21 @@ def test_the_longest_names_can_be_written(name: str, tmp_path: Path) -> None:
     assert (tmp_path / name).is_file()
 
 
-def test_an_error_of_the_disk_names_the_file_and_not_its_temporary_name(tmp_path: Path) -> None:
+def test_a_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
     path = tmp_path / ("a" * 256)
-    with pytest.raises(OSError, match="too long") as caught, atomic_write(path):
+    with pytest.raises(InputError, match="too long"), atomic_write(path):
         pass
-    assert caught.value.filename == str(path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_error_of_the_disk_names_the_file_and_not_its_temporary_name(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(part: Path, path: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", str(part))
+
+    monkeypatch.setattr(files, "publish", fail)
+    with pytest.raises(OSError, match="No space") as caught, atomic_write(tmp_path / "a"):
+        pass
+    assert caught.value.filename == str(tmp_path / "a")
+    assert not list(tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import uuid
@@ -20,6 +21,8 @@ LONGEST_INTEGER = 40  # characters
 INTEGER = "tag:yaml.org,2002:int"
 PARTS = f".{'[0-9a-f]' * 32}.part*"  # names of files that `atomic_write` has not finished
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")  # characters that names of files must not have
+# Errors of the system that another name for a file avoids.
+REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS, errno.EISDIR, errno.ENAMETOOLONG)
 LONGEST_NAME = 255  # bytes, in most file systems
 LONGEST_ENDING = 20  # characters, of the names of unfinished files
 
@@ -56,11 +59,11 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         if part.stat().st_mode != mode:
             part.chmod(mode)
         publish(part, path)
-    except (PermissionError, IsADirectoryError) as error:
-        raise InputError(
-            f"{path}: expected a file that can be written, found {error.strerror}; give another"
-        ) from None
     except OSError as error:
+        if error.errno in REFUSALS:
+            raise InputError(
+                f"{path}: expected a file that can be written, found {error.strerror}; give another"
+            ) from None
         if error.filename == str(part):
             error.filename = str(path)
         raise
