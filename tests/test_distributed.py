@@ -13,8 +13,8 @@ import torch
 from torch import nn
 
 from amvnet.distributed import Processes
+from amvnet.models.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.training.loaders import EpochSampler
-from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.worlds import NO_PICTURES, files, make_streets, run_cli, without, write_recipe

@@ -13,7 +13,8 @@ import pytest
 from amvnet.cli.main import VERBS, main
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
-from amvnet.training.run import Run
+from amvnet.training import run as training_run
+from amvnet.training.plan import Plan
 from amvnet.weights.file import save
 
 from fixtures.worlds import (
@@ -209,20 +210,20 @@ def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> N
 def test_a_recipe_counts_wherever_it_stands(
     order: str, world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    runs: list[Run] = []
+    plans: list[Plan] = []
 
-    def record(run: Run, *_: object) -> Path:
-        runs.append(run)
+    def record(plan: Plan, *_: object) -> Path:
+        plans.append(plan)
         return tmp_path
 
-    monkeypatch.setattr(Run, "stages", record)
+    monkeypatch.setattr(training_run, "train", record)
     recipe = f"{world}/recipe.yaml"
     options = f"--data {world}/data --out {tmp_path}"
     succeed(f"train {recipe} {options}" if order == "first" else f"train {options} {recipe}")
 
-    (run,) = runs
-    assert run.plan.recipe.model.range_view.width == 64
-    assert run.plan.recipe.training.rv.epochs == 3
+    (plan,) = plans
+    assert plan.recipe.model.range_view.width == 64
+    assert plan.recipe.training.rv.epochs == 3
 
 
 # ---- predict

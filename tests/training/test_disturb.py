@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from amvnet.training.disturb import disturb
+from amvnet.training.augment import disturb
 
 CLASSES = 19
 

@@ -21,7 +21,7 @@ from amvnet.inference.reading import open_for_weights
 from amvnet.sensors.record import AS_IS
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.loaders import sensor_record
-from amvnet.training.run_plan import without_mean
+from amvnet.training.plan import without_mean
 from amvnet.weights.file import load, save
 
 from fixtures.own_scans import make_own_scans

@@ -9,9 +9,14 @@ import pytest
 from matplotlib.figure import Figure
 
 from amvnet.evaluation.top_view import TopView
-from amvnet.training import callbacks, loggers
-from amvnet.training.loggers import LIBRARIES, LoggerName, log_figure, make_logger
-from amvnet.training.run_plan import RunOptions
+from amvnet.training import callbacks
+from amvnet.training.callbacks import (
+    LIBRARIES,
+    LoggerName,
+    check_logger,
+    log_figure,
+    make_logger,
+)
 
 from fixtures.worlds import fails, make_streets, refusal, succeed, write_recipe
 
@@ -33,8 +38,8 @@ def test_a_logger_writes_into_the_folder_of_its_stage(name: LoggerName, tmp_path
 def test_a_missing_library_is_named_before_anything_is_trained(
     name: LoggerName, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(loggers, "find_spec", lambda library: None)
-    fails(lambda: RunOptions(logger=name), f"pip install 'amvnet[{name}]'")
+    monkeypatch.setattr(callbacks, "find_spec", lambda library: None)
+    fails(lambda: check_logger(name), f"pip install 'amvnet[{name}]'")
 
     data = make_streets(tmp_path / "data")
     recipe = tmp_path / "recipe.yaml"

@@ -5,7 +5,7 @@ import torch
 
 from amvnet.config.recipes import load_recipe
 from amvnet.config.schema import TrainingConfig
-from amvnet.training.precision import precision_of
+from amvnet.training.stage import precision_of
 
 
 @pytest.mark.parametrize(

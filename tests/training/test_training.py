@@ -29,9 +29,8 @@ from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import PointGatherer
 from amvnet.training.loaders import count_classes
-from amvnet.training.run_plan import RunPlan
-from amvnet.training.stage_run import NetworkRun
-from amvnet.training.stages import NetworkStage
+from amvnet.training.networks import NetworkStage
+from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights, load, save
 
 from fixtures.worlds import (
@@ -215,7 +214,7 @@ def train_interrupted(stage: str, epoch: int, world: Path, out: Path, *options: 
     on_train_epoch_end = KeepWeights.on_train_epoch_end
 
     def stop(self: KeepWeights, trainer: Any, module: Any) -> None:
-        if self.last.parent.name == stage and trainer.current_epoch == epoch:
+        if self.folder.name == stage and trainer.current_epoch == epoch:
             raise RuntimeError("the power is gone")
         on_train_epoch_end(self, trainer, module)
 
@@ -458,14 +457,14 @@ def test_two_stages_trained_at_the_same_time_are_both_kept(
     """The other stage begins after this one and ends before it, as if by another process."""
     save(fresh_weights(), tmp_path / "start.safetensors")
     options = ["--init", tmp_path / "start.safetensors", "--training.rv.epochs", 1]
-    fit = NetworkRun.fit
+    train_network = training_run.train_network
 
-    def fit_beside(self: NetworkRun) -> None:
-        monkeypatch.setattr(NetworkRun, "fit", fit)
+    def train_beside(plan: Plan, name: str, weights: Weights) -> None:
+        monkeypatch.setattr(training_run, "train_network", train_network)
         train(world, tmp_path / "run", "--stage", "rv", *options)
-        fit(self)
+        train_network(plan, name, weights)
 
-    monkeypatch.setattr(NetworkRun, "fit", fit_beside)
+    monkeypatch.setattr(training_run, "train_network", train_beside)
     weights = train(world, tmp_path / "run", "--stage", "bev", *options)
     for stage in ("rv", "bev"):
         trained = load(tmp_path / "run" / stage / "last.safetensors")
@@ -503,12 +502,12 @@ def test_a_fold_does_not_choose_its_epoch_by_the_scans_that_it_scores(
 ) -> None:
     plans = []
 
-    def stop(plan: RunPlan) -> Path:
+    def stop(plan: Plan, name: str, weights: Weights) -> None:
         plans.append(plan)
         raise InputError("enough")
 
     save(fresh_weights(), tmp_path / "w.safetensors")
-    monkeypatch.setattr(training_run, "train_networks", stop)
+    monkeypatch.setattr(training_run, "train_network", stop)
     options = ("--stage", "head", "--init", tmp_path / "w.safetensors", "--training.keep", "best")
     fail(*train_arguments(world, tmp_path / "run"), *options, "--training.head.folds", 2)
     assert plans[0].recipe.training.keep == "last"

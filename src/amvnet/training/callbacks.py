@@ -1,31 +1,43 @@
-"""Lightning callbacks of a training: weights, curves, seeds, speed, progress and pictures."""
+"""Lightning callbacks and loggers of a training: weights, curves, seeds, speed, pictures."""
 
 from __future__ import annotations
 
 import csv
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import timedelta
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning as L
 import numpy as np
 import torch
+import yaml
 from lightning.pytorch.callbacks import Callback, RichProgressBar
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import InputError
 from amvnet.evaluation.top_view import TopView, scan_figure
 from amvnet.files import atomic_write
 from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.training.loggers import log_figure
+from amvnet.weights.file import Weights, part_state, save
 
 PICTURE_ROUNDS = 10  # about how many times in a training pictures are drawn
 PICTURE_DPI = 60
+SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
+
+LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
+PROJECT = "amvnet"  # the project of Weights & Biases, and the experiment of MLflow
+LIBRARIES = ("wandb", "mlflow")  # loggers that need a library of the same name
+WITH_PICTURES = ("tensorboard", "wandb", "mlflow")
 
 
 class AverageWeights(Callback):
@@ -76,11 +88,13 @@ class AverageWeights(Callback):
             return
 
         decay = min(self.decay, (1 + self.steps) / (10 + self.steps))
-        for name, value in _trained_part(pl_module).state_dict().items():
-            if value.is_floating_point():
-                self.average[name].lerp_(value, 1 - decay)
-            else:
-                self.average[name].copy_(value)
+        weights = _trained_part(pl_module).state_dict()
+        floats = [name for name, value in weights.items() if value.is_floating_point()]
+        torch._foreach_lerp_(
+            [self.average[name] for name in floats], [weights[name] for name in floats], 1 - decay
+        )
+        for name in weights.keys() - floats:
+            self.average[name].copy_(weights[name])
         self.steps = trainer.global_step
 
     def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
@@ -121,16 +135,27 @@ class KeepWeights(Callback):
     Without validation the last weights are kept as the best.
 
     Args:
-        write: writes the trained part of the model to a path, with its validation metrics.
-        folder: receives last.safetensors and best.safetensors.
+        folder: of the stage; receives last.safetensors, best.safetensors and `SETTINGS`.
+        part: name of the trained part.
+        weights: that the stage begins with.
+        settings: of the stage.
+        description: of the training, for the weights files.
     """
 
     def __init__(
-        self, write: Callable[[nn.Module, Path, dict[str, float]], None], folder: Path
+        self,
+        folder: Path,
+        part: str,
+        weights: Weights,
+        settings: dict[str, Any],
+        description: dict[str, Any],
     ) -> None:
-        self.write = write
-        self.best = folder / "best.safetensors"
-        self.last = folder / "last.safetensors"
+        self.folder = folder
+        self.part = part
+        self.weights = weights
+        self.settings = settings
+        self.description = description
+        self.started = time.time()
         self.highest = -1.0  # mIoU of the best weights so far
 
     def state_dict(self) -> dict[str, Any]:
@@ -152,10 +177,22 @@ class KeepWeights(Callback):
             self.highest = max(self.highest, miou)
 
         if trainer.is_global_zero:
-            with _weights_to_keep(trainer, pl_module) as part:
-                self.write(part, self.last, metrics)
-                if is_best:
-                    self.write(part, self.best, metrics)
+            with _weights_to_keep(trainer, pl_module) as module:
+                trained = self._trained(module, metrics)
+            for name in ("last", "best") if is_best else ("last",):
+                save(trained, self.folder / f"{name}.safetensors")
+            with atomic_write(self.folder / SETTINGS) as file:
+                file.write_text(yaml.safe_dump(self.settings, sort_keys=False))
+
+    def _trained(self, module: nn.Module, metrics: dict[str, float]) -> Weights:
+        """Return the weights of the trained part alone."""
+        seconds = round(time.time() - self.started)
+        return dataclasses.replace(
+            self.weights,
+            tensors=part_state(self.part, module),
+            training={self.part: {**self.description, "seconds": seconds}},
+            metrics={self.part: metrics},
+        )
 
 
 class Curves(Callback):
@@ -384,3 +421,63 @@ def _trained_part(module: L.LightningModule) -> nn.Module:
     part = module.trained
     assert isinstance(part, nn.Module)
     return part
+
+
+def check_logger(name: LoggerName) -> None:
+    """Check that the library of a logger is installed.
+
+    Raises:
+        InputError: if it is not.
+    """
+    if name in LIBRARIES and find_spec(name) is None:
+        raise InputError(
+            f"expected {name} for --logger {name}, found none; pip install 'amvnet[{name}]'"
+        )
+
+
+def make_logger(name: LoggerName, folder: Path) -> Logger:
+    """Return the logger of a stage.
+
+    Args:
+        name: which logger.
+        folder: of the stage, in the folder of its run; what the logger writes goes there.
+
+    Raises:
+        InputError: if its library is missing.
+    """
+    check_logger(name)
+    title = f"{folder.parent.name}/{folder.name}"
+    makers: dict[str, Callable[[], Logger]] = {
+        "tensorboard": lambda: TensorBoardLogger(folder, name="", version=""),
+        # In a folder of its own, as metrics.csv in the stage's folder has a row per epoch.
+        "csv": lambda: CSVLogger(folder, name="csv", version=""),
+        "wandb": lambda: _wandb(title, folder),
+        "mlflow": lambda: _mlflow(title, folder),
+    }
+    return makers[name]()
+
+
+def _wandb(title: str, folder: Path) -> Logger:
+    from lightning.pytorch.loggers import WandbLogger
+
+    return WandbLogger(name=title, project=PROJECT, save_dir=folder)
+
+
+def _mlflow(title: str, folder: Path) -> Logger:
+    from lightning.pytorch.loggers import MLFlowLogger
+
+    # The variable MLFLOW_TRACKING_URI of the user counts more than the folder.
+    return MLFlowLogger(PROJECT, run_name=title, save_dir=str(folder / "mlruns"))
+
+
+def log_figure(logger: Logger | None, name: str, figure: Figure, epoch: int) -> None:
+    """Give a picture to a logger; those without pictures leave it out."""
+    writer: Any = getattr(logger, "experiment", None)
+    kind = type(logger).__name__
+    if kind == "TensorBoardLogger":
+        writer.add_figure(name, figure, epoch)
+    elif kind == "WandbLogger":
+        logger.log_image(name, [figure])  # type: ignore[union-attr]
+    elif kind == "MLFlowLogger":
+        run: Any = logger
+        writer.log_figure(run.run_id, figure, f"{name}/{epoch:04d}.png")

@@ -16,19 +16,26 @@ import torch
 from torch import Tensor
 from torch.utils import data
 
-from amvnet.config.schema import ModelConfig, TrainingConfig
-from amvnet.data.datasets.base import Dataset
+from amvnet.config.schema import ModelConfig
+from amvnet.data.datasets.base import ScanRecord
 from amvnet.distributed import ALONE, Processes, device_of
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
+from amvnet.inference.scores import SURE, ScorePair
 from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
-from amvnet.progress import Tenths
+from amvnet.models.views.points import PointBatch
+from amvnet.progress import Say, Tenths, say_nothing
+from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity
-from amvnet.training.disturb import disturb
-from amvnet.training.head_scores import Scorer, ScoreSource
+from amvnet.training.augment import disturb
 from amvnet.training.loaders import ScanSet, collate
+from amvnet.training.plan import Plan
+from amvnet.weights.file import Weights
+
+# Takes a scan and the batch of its P valid points; returns f and g, (P, K).
+Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]
 
 # Features p_i (U, 2 K + 4), features of the neighbours S_i (U, n, 2 K + 4), train ids (U,), and how
 # many uncertain points of its scan each point stands for (U,), as only some are drawn.
@@ -183,6 +190,45 @@ def make_head_loader(
 
 
 @dataclass(frozen=True)
+class ScoredScans:
+    """Scans, and what gives f and g of their points: frozen networks, or two other models' files.
+
+    Attributes:
+        records: the scans.
+        weights: the networks.
+        pair: two other models' scores in files, in place of the networks.
+    """
+
+    records: Sequence[ScanRecord]
+    weights: Weights
+    pair: ScorePair | None = None
+
+    def scorer(self, device: str, by_ring: bool) -> Scorer:
+        """Return what scores a scan on a device.
+
+        Args:
+            by_ring: whether `ring` of the scans is the row of each point in the range image.
+        """
+        if self.pair is not None:
+            return self._read
+        model = self.weights.build().to(device)
+        if by_ring:
+            model.range_view = model.range_view.by_ring()
+
+        def score(record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
+            return model.score(*model.project(batch))
+
+        return score
+
+    def _read(self, record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
+        assert self.pair is not None
+        f, g = self.pair.read(Path(record.prediction), scan, self.weights.taxonomy.size)
+        device = batch.points.device
+        f_valid = torch.from_numpy(f[scan.valid]).clamp_min(SURE).to(device)
+        return f_valid, torch.from_numpy(g[scan.valid]).clamp_min(SURE).to(device)
+
+
+@dataclass(frozen=True)
 class _Job:
     """A scan to score, in one of its views.
 
@@ -193,7 +239,7 @@ class _Job:
         index: of the scan in the source.
     """
 
-    source: ScoreSource
+    source: ScoredScans
     scans: ScanSet
     view: int
     index: int
@@ -204,26 +250,22 @@ class PointGatherer:
     """Scores scans by two networks, and keeps their uncertain points on disk for the head.
 
     Attributes:
-        dataset: reads the scans.
+        plan: of the run; all of its processes must see the folder of the points.
         model: says which points are uncertain, and how the head sees them.
-        training: says how many points are kept, and how scans are augmented.
-        processes: those that share the scans; all must see the folder of the points.
         intensity: of the training of the networks, to which intensities are brought before the
             augmentation; None for other models' scores.
     """
 
-    dataset: Dataset
+    plan: Plan
     model: ModelConfig
-    training: TrainingConfig
-    processes: Processes = ALONE
     intensity: TrainedIntensity | None = None
 
     def gather(
         self,
-        sources: Sequence[ScoreSource],
+        sources: Sequence[ScoredScans],
         folder: Path,
         views: int = 0,
-        say: Callable[[str], None] = lambda line: None,
+        say: Say = say_nothing,
     ) -> HeadPoints:
         """Gather the labelled uncertain points of some scans.
 
@@ -240,11 +282,11 @@ class PointGatherer:
         Raises:
             InputError: if the scans have too few labelled points.
         """
-        if not all(source.augmented for source in sources):
+        if any(source.pair is not None for source in sources):
             views = 0
 
         jobs = self._jobs(sources, views)
-        least = max(2, self.processes.size)  # batch norm needs two, and each process one
+        least = max(2, self._processes.size)  # batch norm needs two, and each process one
 
         assertion = Disagreement(self.model.assertion.threshold)
         points = self._gather(jobs, folder, assertion, say)
@@ -260,14 +302,14 @@ class PointGatherer:
             )
         return points
 
-    def _jobs(self, sources: Sequence[ScoreSource], views: int) -> list[_Job]:
+    def _jobs(self, sources: Sequence[ScoredScans], views: int) -> list[_Job]:
         """List every view of every scan of every source."""
-        augment = self.training.augment if views > 0 else None
+        augment = self.plan.recipe.training.augment if views > 0 else None
 
         jobs = []
         for source in sources:
-            seed = self.training.seed
-            scans = ScanSet(self.dataset, source.records, augment, seed, self.intensity)
+            seed = self.plan.recipe.training.seed
+            scans = ScanSet(self.plan.scans.dataset, source.records, augment, seed, self.intensity)
             for view in range(max(views, 1)):
                 for index in range(len(scans)):
                     jobs.append(_Job(source, scans, view, index))
@@ -278,19 +320,19 @@ class PointGatherer:
         jobs: Sequence[_Job],
         folder: Path,
         assertion: Assertion,
-        say: Callable[[str], None],
+        say: Say,
     ) -> HeadPoints:
         """Gather the points that an assertion finds uncertain."""
-        _make_empty(folder, self.processes)
-        path = folder / str(self.processes.rank)
+        _make_empty(folder, self._processes)
+        path = folder / str(self._processes.rank)
         counts, matrices = self._score_share(jobs, path, assertion, say)
 
-        counts_by_rank = self.processes.gather(counts)
-        certain, uncertain = np.sum(self.processes.gather(matrices), axis=0)
+        counts_by_rank = self._processes.gather(counts)
+        certain, uncertain = np.sum(self._processes.gather(matrices), axis=0)
         labelled = certain[1:].sum() + uncertain.sum()
 
         return HeadPoints(
-            path=_join(folder, counts_by_rank, self._dtype.itemsize, self.processes),
+            path=_join(folder, counts_by_rank, self._dtype.itemsize, self._processes),
             dtype=self._dtype,
             size=sum(map(sum, counts_by_rank)),
             certain=certain,
@@ -302,7 +344,7 @@ class PointGatherer:
         jobs: Sequence[_Job],
         path: Path,
         assertion: Assertion,
-        say: Callable[[str], None],
+        say: Say,
     ) -> tuple[list[int], np.ndarray]:
         """Score this process's share of the scans, and write their points to a file.
 
@@ -310,19 +352,20 @@ class PointGatherer:
             How many points each scan of the share has in the file, and the (2, K + 1, K + 1)
             confusion matrices of the ensemble over their certain and their uncertain points.
         """
-        ids = self.dataset.taxonomy.size + 1
+        ids = self.plan.scans.dataset.taxonomy.size + 1
         matrices = np.zeros((2, ids, ids), dtype=np.int64)
         counts = []
 
-        share = self.processes.share(jobs)
-        most = -(-self.training.head.points // len(jobs))  # points of a scan, rounded up
+        share = self._processes.share(jobs)
+        points = self.plan.recipe.training.head.points
+        most = -(-points // len(jobs))  # of a scan, rounded up
         source = None
         tenths = Tenths()
         with path.open("wb") as file:
             for number, job in enumerate(share, start=1):
                 if job.source is not source:
                     source = job.source
-                    scorer = source.scorer(self._device)
+                    scorer = source.scorer(self._device, self.plan.scans.dataset.is_normalised)
 
                 points, scan_matrices = self._gather_scan(job, scorer, assertion, most)
                 points.tofile(file)
@@ -357,7 +400,7 @@ class PointGatherer:
         matrices = _ensemble_matrices(f, g, labels, uncertain)
 
         candidates = uncertain.nonzero()[:, 0]
-        rng = np.random.default_rng([self.training.seed, job.view, job.index])
+        rng = np.random.default_rng([self.plan.recipe.training.seed, job.view, job.index])
         drawn = np.sort(rng.permutation(len(candidates))[:most])
         index = candidates[torch.from_numpy(drawn).to(device)]
 
@@ -374,19 +417,23 @@ class PointGatherer:
 
     def _disturbed(self, f: Tensor, g: Tensor, points: Tensor, job: _Job) -> tuple[Tensor, Tensor]:
         """Return the scores of both networks, each disturbed with the recipe's probability."""
-        chance = self.training.head.disturb
-        rng = np.random.default_rng([self.training.seed, job.view, job.index, 1])
+        chance = self.plan.recipe.training.head.disturb
+        rng = np.random.default_rng([self.plan.recipe.training.seed, job.view, job.index, 1])
         disturbed_f = disturb(f, points, rng) if rng.random() < chance else f
         disturbed_g = disturb(g, points, rng) if rng.random() < chance else g
         return disturbed_f, disturbed_g
 
     @property
+    def _processes(self) -> Processes:
+        return self.plan.processes
+
+    @property
     def _device(self) -> str:
-        return device_of(self.training.accelerator)
+        return device_of(self.plan.recipe.training.accelerator)
 
     @property
     def _dtype(self) -> np.dtype:
-        return point_dtype(self.dataset.taxonomy.size, self.model.point_head.neighbours)
+        return point_dtype(self.plan.scans.dataset.taxonomy.size, self.model.point_head.neighbours)
 
 
 def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:

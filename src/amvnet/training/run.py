@@ -4,213 +4,288 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
 
+import lightning as L
+import torch
+
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
-from amvnet.training.memory_estimate import check_memory
-from amvnet.training.run_plan import RunOptions, RunPlan
-from amvnet.training.run_record import initial_digests, write_record
-from amvnet.training.stage_run import HeadRun, NetworkRun, StageRun
-from amvnet.weights.file import Weights, save
+from amvnet.training.head import scored_scans, train_head
+from amvnet.training.head_points import ScoredScans
+from amvnet.training.networks import train_network, try_network
+from amvnet.training.plan import Plan
+from amvnet.training.record import (
+    PART_OF,
+    StageFolder,
+    check_begun,
+    initial_digests,
+    sequence_names,
+    stage_settings,
+    write_record,
+)
+from amvnet.weights.file import Weights, load, save
 
-# The stages in order: the part of the weights that each trains, and how.
-STAGES: dict[str, tuple[str, type[StageRun]]] = {
-    "rv": ("range_net", NetworkRun),
-    "bev": ("polar_net", NetworkRun),
-    "head": ("point_head", HeadRun),
-}
 TRIAL_STEPS = 2  # the second of them is timed
 
 
-@dataclass(frozen=True)
-class Run:
-    """A training run in its folder."""
+def train(
+    plan: Plan, stage: StageName | Literal["all"] = "all", init: Weights | None = None
+) -> Path:
+    """Train one stage, or all stages of the recipe.
 
-    plan: RunPlan
+    Args:
+        plan: of the run.
+        stage: name of the stage, or "all".
+        init: weights to begin with.
 
-    def stages(
-        self, stage: StageName | Literal["all"] = "all", init: Weights | None = None
-    ) -> Path:
-        """Train one stage, or all stages of the recipe.
+    Returns:
+        The weights file, with all parts that have been trained so far.
 
-        Args:
-            stage: name of the stage, or "all".
-            init: weights to begin with.
+    Raises:
+        InputError: if the head is to be trained without trained networks, or the folder holds a
+            run that is not to be resumed or was begun with other settings.
+    """
+    names = plan.recipe.stages if stage == "all" else (stage,)
+    if plan.scores is not None and names != ("head",):
+        raise InputError(f"expected --stage head for scores of other models, found {stage}; add it")
 
-        Returns:
-            The weights file, with all parts that have been trained so far.
+    # Check all stages before anything is written, and before hours are spent on the first.
+    if init is not None:
+        _check_init(plan, init, names)
+    weights = _first_weights(plan, init, names)
+    for name in names:
+        check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
+    plan.processes.wait()
+    if plan.processes.first:
+        write_record(plan, stage, init)
 
-        Raises:
-            InputError: if the head is to be trained without trained networks, or the folder holds a
-                run that is not to be resumed or was begun with other settings.
-        """
-        plan = self.plan
-        names = plan.recipe.stages if stage == "all" else (stage,)
-        if plan.scores is not None and names != ("head",):
+    # Save after each stage, so that one that fails does not lose the others.
+    path = plan.out / "weights.safetensors"
+    for name in names:
+        weights = train_stage(plan, name, weights)
+        if plan.processes.first:
+            save(_with_finished(plan, weights), path)
+        plan.processes.wait()
+    return path
+
+
+def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
+    """Train one stage, unless an earlier run has finished it.
+
+    Args:
+        plan: of the run.
+        name: of the stage.
+        weights: to begin with.
+
+    Returns:
+        The weights with the trained part.
+
+    Raises:
+        InputError: if the weights to begin with do not fit the recipe, or a scan is broken.
+    """
+    folder = StageFolder(plan, name)
+    if folder.done_path.is_file() and plan.resume:
+        return folder.finished(weights)
+
+    # The recipe decides the sizes of the part, whatever the weights have.
+    L.seed_everything(plan.recipe.training.seed, verbose=False)
+    weights = weights.resized(PART_OF[name], plan.recipe.model)
+    if name == "head":
+        train_head(plan, weights, _score_sources(plan, weights))
+    else:
+        train_network(plan, name, weights)
+
+    # The first process has written the weights; the others read them too.
+    plan.processes.wait()
+    trained = folder.trained(weights)
+    if plan.processes.first:
+        folder.done_path.write_text("")
+    return trained
+
+
+def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str] = ()) -> Weights:
+    """Return fresh weights with the parts of `init`, and of this folder's finished stages.
+
+    If `init` has other classes, its parts are only taken for the stages that are to be trained.
+    """
+    weights = Weights(plan.recipe.model, plan.scans.dataset.taxonomy, plan.recipe.sensor)
+    for name in _stages_of_folder(plan):
+        part = PART_OF[name]
+        if init is None or part not in init.parts:
+            continue
+        # A new kind of head can be trained on the networks of any weights.
+        if name == "head" and name in trained and not init.fits(part, plan.recipe.model):
+            plan.say("head: new, as that of the initial weights has other sizes")
+            continue
+        if init.taxonomy.classes == weights.taxonomy.classes:
+            weights = weights.replace_part(part, init)
+        elif name in trained:
+            weights = weights.replace_part(part, _for_classes(plan, init, part))
+
+    return _with_finished(plan, weights)
+
+
+def _with_finished(plan: Plan, weights: Weights) -> Weights:
+    """Return the weights with the parts of this folder's finished stages.
+
+    Another process may have finished some of them while this one trained.
+    """
+    for name in _stages_of_folder(plan):
+        weights = StageFolder(plan, name).finished(weights)
+    return weights
+
+
+def _stages_of_folder(plan: Plan) -> Sequence[str]:
+    """Return the names of the stages that the folder can hold."""
+    # A head for other models' scores is of no use to these networks.
+    return list(PART_OF) if plan.scores is None else ["head"]
+
+
+def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
+    """Return initial weights whose last layers are new, for the classes of the dataset."""
+    taxonomy = plan.scans.dataset.taxonomy
+    weights, new = init.for_classes(taxonomy, plan.recipe.training.seed)
+    of_part = [name.removeprefix(f"{part}.") for name in new if name.startswith(f"{part}.")]
+    plan.say(
+        f"{part}: for the classes of {taxonomy.name}, all layers of the initial weights "
+        f"({init.taxonomy.name}) but {', '.join(of_part)}, which are new"
+    )
+    return weights
+
+
+def _check_init(plan: Plan, init: Weights, names: Sequence[str]) -> None:
+    """Check that no part of the initial weights would be ignored.
+
+    A finished stage of this folder, or one that is resumed, goes on from its own weights. If it
+    was begun with the same initial weights, or has become them, nothing is ignored.
+
+    Args:
+        plan: of the run.
+        init: the initial weights.
+        names: of the stages to train.
+
+    Raises:
+        InputError: if a part would be ignored.
+    """
+    empty = Weights(plan.recipe.model, plan.scans.dataset.taxonomy)
+    for name, part in PART_OF.items():
+        folder = StageFolder(plan, name)
+        is_resumed = name in names and folder.is_begun
+        if part not in init.parts or not (folder.is_finished or is_resumed):
+            continue
+
+        digest = init.digest(part)
+        finished = folder.finished(empty)
+        is_the_same = part in finished.parts and finished.digest(part) == digest
+        if not is_the_same and digest not in initial_digests(plan.out, part):
             raise InputError(
-                f"expected --stage head for scores of other models, found {stage}; add it"
+                f"{folder.path}: expected no earlier run of the stage {name} for other "
+                f"weights with {part}, found one; leave out --init, or give another folder"
             )
 
-        # Check all stages before anything is written, and before hours are spent on the first.
-        if init is not None:
-            self._check_init(init, names)
-        weights = self._start(init, names)
-        for name in names:
-            self._stage(name, weights).check_begun()
-        processes = plan.options.processes
-        processes.wait()
-        if processes.first:
-            write_record(plan, stage, init)
 
-        # Save after each stage, so that one that fails does not lose the others.
-        path = plan.out / "weights.safetensors"
-        for name in names:
-            weights = self._stage(name, weights).train()
-            if processes.first:
-                save(self._with_finished(weights), path)
-            processes.wait()
-        return path
+def _score_sources(plan: Plan, weights: Weights) -> list[ScoredScans]:
+    """Return what scores the training scans for the head.
 
-    def _start(self, init: Weights | None, trained: Sequence[str] = ()) -> Weights:
-        """Return fresh weights with the parts of `init`, and of this folder's finished stages.
+    With folds, the scans of each are scored by networks that were trained without them.
 
-        If `init` has other classes, its parts are only taken for the stages that are to be trained.
-        """
-        plan = self.plan
-        weights = Weights(plan.recipe.model, plan.scans.dataset.taxonomy, plan.recipe.sensor)
-        for name in self._of_folder:
-            part, _ = STAGES[name]
-            if init is None or part not in init.parts:
-                continue
-            # A new kind of head can be trained on the networks of any weights.
-            if name == "head" and name in trained and not init.fits(part, plan.recipe.model):
-                plan.options.say("head: new, as that of the initial weights has other sizes")
-                continue
-            if init.taxonomy.classes == weights.taxonomy.classes:
-                weights = weights.replace_part(part, init)
-            elif name in trained:
-                weights = weights.replace_part(part, self._for_classes(init, part))
+    Raises:
+        InputError: if a network is missing, or there are fewer sequences than folds.
+    """
+    scans = plan.scans.train
+    source = scored_scans(plan, weights, scans)
+    folds = plan.recipe.training.head.folds
+    if folds < 2 or plan.scores is not None:
+        return [source]
 
-        return self._with_finished(weights)
-
-    @property
-    def _of_folder(self) -> Sequence[str]:
-        """Return the names of the stages that the folder can hold."""
-        # A head for other models' scores is of no use to these networks.
-        return list(STAGES) if self.plan.scores is None else ["head"]
-
-    def _with_finished(self, weights: Weights) -> Weights:
-        """Return the weights with the parts of this folder's finished stages.
-
-        Another process may have finished some of them while this one trained.
-        """
-        for name in self._of_folder:
-            weights = self._stage(name, weights).finished_weights()
-        return weights
-
-    def _for_classes(self, init: Weights, part: str) -> Weights:
-        """Return initial weights whose last layers are new, for the classes of the dataset."""
-        plan = self.plan
-        taxonomy = plan.scans.dataset.taxonomy
-        weights, new = init.for_classes(taxonomy, plan.recipe.training.seed)
-        of_part = [name.removeprefix(f"{part}.") for name in new if name.startswith(f"{part}.")]
-        plan.options.say(
-            f"{part}: for the classes of {taxonomy.name}, all layers of the initial weights "
-            f"({init.taxonomy.name}) but {', '.join(of_part)}, which are new"
-        )
-        return weights
-
-    def _check_init(self, init: Weights, names: Sequence[str]) -> None:
-        """Check that no part of the initial weights would be ignored.
-
-        A finished stage of this folder, or one that is resumed, goes on from its own weights. If it
-        was begun with the same initial weights, or has become them, nothing is ignored.
-
-        Args:
-            init: the initial weights.
-            names: of the stages to train.
-
-        Raises:
-            InputError: if a part would be ignored.
-        """
-        empty = Weights(self.plan.recipe.model, self.plan.scans.dataset.taxonomy)
-        for name, (part, _) in STAGES.items():
-            stage = self._stage(name, empty)
-            is_resumed = name in names and stage.is_begun
-            if part not in init.parts or not (stage.is_finished or is_resumed):
-                continue
-
-            digest = init.digest(part)
-            finished = stage.finished_weights()
-            is_the_same = part in finished.parts and finished.digest(part) == digest
-            if not is_the_same and digest not in initial_digests(self.plan.out, part):
-                raise InputError(
-                    f"{stage.folder}: expected no earlier run of the stage {name} for other "
-                    f"weights with {part}, found one; leave out --init, or give another folder"
-                )
-
-    def _stage(self, name: str, weights: Weights) -> StageRun:
-        part, kind = STAGES[name]
-        return kind(self.plan, name, (part,), weights, train_networks=train_networks)
-
-    def trials(self, stage: StageName | Literal["all"]) -> Iterator[str]:
-        """Take some steps of each network; yield lines on their memory and time. Write nothing.
-
-        Raises:
-            InputError: if a step clearly needs more memory than is free, or the stage trains none
-                of the networks alone; then no step is taken.
-        """
-        weights = self._start(None)
-        names = [name for name in ("rv", "bev") if stage in (name, "all")]
-        if not names:
-            raise InputError(
-                f"expected --stage rv, bev or all for a dry run, found {stage}; give one of these"
-            )
-
-        plan = self.plan
-        scan = plan.scans.dataset.read(plan.scans.train[0], labels=False)
-        for name in names:
-            processes = plan.options.processes.size
-            yield check_memory(plan.recipe, name, scan, weights.taxonomy.size, processes)
-
-        for name in names:
-            with TemporaryDirectory() as folder:
-                yield self._trial(name, weights, Path(folder))
-
-    def _trial(self, name: str, weights: Weights, folder: Path) -> str:
-        train = self.plan.scans.train
-        batch = getattr(self.plan.recipe.training, name).batch
-        epochs = getattr(self.plan.recipe.training, name).epochs
-
-        # Whole steps, even if there are fewer scans.
-        scans = [train[index % len(train)] for index in range(TRIAL_STEPS * batch)]
-        plan = dataclasses.replace(
-            self.plan,
-            scans=dataclasses.replace(self.plan.scans, train=scans, val=()),
-            out=folder,
-            options=RunOptions(bars=self.plan.options.bars, processes=self.plan.options.processes),
-        )
-        trial = Run(plan)._stage(name, weights)
-        assert isinstance(trial, NetworkRun)
-        speed = trial.trial(TRIAL_STEPS)
-
-        step_seconds = speed.seconds[-1]
-        steps_per_epoch = -(-len(train) // batch)  # rounded up
-        hours = steps_per_epoch * epochs * step_seconds / 3600
-        return (
-            f"{name}: {step_seconds:.3g} s for a step of {batch} scans "
-            f"({batch / step_seconds:.3g} scans/s), "
-            f"memory so far {speed.memory / 2**30:.1f} GiB; "
-            f"{epochs} epochs of {len(train)} scans would take {hours:.3g} h"
+    names = sequence_names(scans)
+    if len(names) < folds:
+        raise InputError(
+            f"expected at least {folds} training sequences for {folds} folds, "
+            f"found {len(names)}; name more, or set --training.head.folds"
         )
 
+    sources = []
+    for index in range(folds):
+        fold = fold_plan(plan, index, left_out=set(names[index::folds]))
+        train(fold, "rv")
+        sources.append(ScoredScans(fold.scans.val, load(train(fold, "bev"))))
+    return sources
 
-def train_networks(plan: RunPlan) -> Path:
-    """Train both networks of a plan; return their weights file."""
-    run = Run(plan)
-    run.stages("rv")
-    return run.stages("bev")
+
+def fold_plan(plan: Plan, index: int, left_out: set[str]) -> Plan:
+    """Return the plan of networks that are trained without some sequences and validated on these.
+
+    Args:
+        plan: of the whole run.
+        index: number of the fold.
+        left_out: names of the sequences.
+    """
+    scans = plan.scans
+    seen = [record for record in scans.train if record.sequence not in left_out]
+    unseen = [record for record in scans.train if record.sequence in left_out]
+
+    # The scans that a fold scores say nothing about which of its epochs to use. Its networks have
+    # no initial weights.
+    training = plan.recipe.training
+    training = dataclasses.replace(
+        training,
+        keep="last",
+        rv=dataclasses.replace(training.rv, initial=0.0),
+        bev=dataclasses.replace(training.bev, initial=0.0),
+    )
+    return dataclasses.replace(
+        plan,
+        recipe=dataclasses.replace(plan.recipe, training=training),
+        scans=dataclasses.replace(scans, train=seen, val=unseen),
+        out=plan.out / "folds" / str(index),
+        resume=True,
+    )
+
+
+def try_out(plan: Plan, stage: StageName | Literal["all"]) -> Iterator[str]:
+    """Take some steps of each network; yield a line on the memory and time of each. Write nothing.
+
+    Raises:
+        InputError: if the stage trains none of the networks, or a GPU's memory does not suffice.
+    """
+    names = [name for name in ("rv", "bev") if stage in (name, "all")]
+    if not names:
+        raise InputError(
+            f"expected --stage rv, bev or all for a dry run, found {stage}; give one of these"
+        )
+    for name in names:
+        with TemporaryDirectory() as folder:
+            yield _try_out(plan, name, Path(folder))
+
+
+def _try_out(plan: Plan, name: str, folder: Path) -> str:
+    train = plan.scans.train
+    config = getattr(plan.recipe.training, name)
+
+    # Whole steps, even if there are fewer scans.
+    scans = [train[index % len(train)] for index in range(TRIAL_STEPS * config.batch)]
+    trial = dataclasses.replace(
+        plan, scans=dataclasses.replace(plan.scans, train=scans, val=()), out=folder, resume=False
+    )
+    try:
+        speed = try_network(trial, name, _first_weights(plan, None), TRIAL_STEPS)
+    except torch.OutOfMemoryError:
+        raise InputError(
+            f"{name}: expected steps that fit into the GPU's memory, found {config.batch} scans "
+            f"in {config.accumulate} parts; set --training.{name}.accumulate to more parts, or "
+            "take a compact recipe"
+        ) from None
+
+    step_seconds = speed.seconds[-1]
+    steps_per_epoch = -(-len(train) // config.batch)  # rounded up
+    hours = steps_per_epoch * config.epochs * step_seconds / 3600
+    return (
+        f"{name}: {step_seconds:.3g} s for a step of {config.batch} scans "
+        f"({config.batch / step_seconds:.3g} scans/s), "
+        f"memory so far {speed.memory / 2**30:.1f} GiB; "
+        f"{config.epochs} epochs of {len(train)} scans would take {hours:.3g} h"
+    )

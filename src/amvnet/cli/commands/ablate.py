@@ -33,19 +33,16 @@ def ablate(
     from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of
     from amvnet.evaluation import charts
-    from amvnet.training.fit import quiet_lightning
-    from amvnet.training.run_plan import RunOptions
-    from amvnet.training.studies import ablate as ablate_recipe
-    from amvnet.training.training_data import open_for_training
+    from amvnet.training.ablation import ablate as ablate_recipe
+    from amvnet.training.plan import Plan, open_for_training
 
-    quiet_lightning()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     dataset = open_for_training(data, None, recipe, out)
     scans = split_records(dataset, parse_names(train_sequences), parse_names(val_sequences))
     say(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
 
-    options = RunOptions(resume=True, say=say, bars=on_terminal(), processes=processes)
-    rows = list(ablate_recipe(recipe, scans, out, options, device))
+    plan = Plan(recipe, scans, out, resume=True, say=say, bars=on_terminal(), processes=processes)
+    rows = list(ablate_recipe(plan, device))
     if processes.first:
         files = charts.write_ablation(rows, out / "ablation")
         say_lines(files[-1].read_text().rstrip())

@@ -57,8 +57,7 @@ def analyze(
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
-    from amvnet.training.fit import quiet_lightning
-    from amvnet.training.studies import HeadStudy
+    from amvnet.training.ablation import HeadStudy
     from amvnet.weights.file import load
 
     if (neighbours is None and taus is None) != (recipe is None):
@@ -76,7 +75,6 @@ def analyze(
     studies: list[tuple[HeadStudy, Sequence[float]]] = []
     if recipe is not None:
         loaded_recipe = load_recipe(recipe)
-        quiet_lightning()
         names = parse_names(train_sequences) or dataset.sequences("train")
         scans = TrainingScans(dataset, labelled_records(dataset, dataset.records(names)), records)
         if taus is not None:

@@ -53,8 +53,7 @@ def train(
         val_sequences: sequences or scenes, separated by commas, to validate on; default: the
             official split.
         with_val: train on these too, as for a benchmark's server; then nothing is validated.
-        dry_run: only estimate the memory, take two steps of each network, and say what these and
-            the training cost.
+        dry_run: only take two steps of each network, and say what these and the training cost.
         logger: where the curves go; wandb and mlflow need their library.
         taxonomy: a semantic-kitti.yaml with other classes.
         scores_a: with --stage head: a folder of another model's scores, to train a head for it and
@@ -67,13 +66,11 @@ def train(
     from amvnet.data.datasets.joined import join
     from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of
-    from amvnet.training.fit import quiet_lightning
-    from amvnet.training.run import Run
-    from amvnet.training.run_plan import RunOptions, RunPlan, sized_by_init, without_mean
-    from amvnet.training.training_data import open_parts
+    from amvnet.training.plan import Plan, open_parts, sized_by_init, without_mean
+    from amvnet.training.run import train as train_stages
+    from amvnet.training.run import try_out
     from amvnet.weights.file import load
 
-    quiet_lightning()
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     weights = None if init is None else load(init)
     recipe = sized_by_init(recipe, weights)
@@ -86,10 +83,19 @@ def train(
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
     scores = parse_scores(scores_a, scores_b, key_a, key_b, logits)
 
-    options = RunOptions(resume, say, on_terminal(), processes, logger)
-    run = Run(RunPlan(recipe, scans, out, options, scores))
+    plan = Plan(
+        recipe,
+        scans,
+        out,
+        resume=resume,
+        say=say,
+        bars=on_terminal(),
+        processes=processes,
+        logger=logger,
+        scores=scores,
+    )
     if dry_run:
-        for line in run.trials(stage):
+        for line in try_out(plan, stage):
             say(line)
         return
-    say(f"weights in {run.stages(stage, weights)}")
+    say(f"weights in {train_stages(plan, stage, weights)}")

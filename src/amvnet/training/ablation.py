@@ -15,8 +15,8 @@ from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Say, say_nothing
-from amvnet.training.run import Run
-from amvnet.training.run_plan import RunOptions, RunPlan
+from amvnet.training.plan import Plan
+from amvnet.training.run import train
 from amvnet.weights.file import Weights
 
 
@@ -42,7 +42,7 @@ class HeadStudy:
 
     def check(self) -> None:
         """Raise InputError if the recipe does not fit the scans."""
-        RunPlan(self.recipe, self.scans, self.out)
+        Plan(self.recipe, self.scans, self.out)
 
     def sweep(
         self, values: Sequence[float], say: Say = say_nothing, device: str = "cpu"
@@ -62,9 +62,9 @@ class HeadStudy:
         training = dataclasses.replace(self.recipe.training, head=head)
         recipe = dataclasses.replace(self.recipe, model=networks.model, training=training)
         out = self.out / self.name / str(value)
-        run = Run(RunPlan(recipe, self.scans, out, RunOptions(resume=True, say=say)))
+        plan = Plan(recipe, self.scans, out, resume=True, say=say)
 
-        segmenter = Segmenter(run.stages("head", networks), device)
+        segmenter = Segmenter(train(plan, "head", networks), device)
         dataset = self.scans.dataset
         evaluation = evaluate(dataset, self.scans.val, label_by_weights(dataset, segmenter))
         uncertain = evaluation.uncertain / max(evaluation.asked, 1)
@@ -87,16 +87,10 @@ class HeadStudy:
         return networks
 
 
-def ablate(
-    recipe: Recipe,
-    scans: TrainingScans,
-    out: Path,
-    options: RunOptions,
-    device: str = "cpu",
-) -> Iterator[tuple[bool, bool, dict[str, Any]]]:
+def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[str, Any]]]:
     """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
 
-    Each is kept in a folder of OUT; a later call continues an interrupted one.
+    Each is kept in a folder of the plan's.
 
     Yields:
         Whether with the GRU, whether with class weights, and the figures of `metrics`.
@@ -106,16 +100,17 @@ def ablate(
     """
     for gru, weighted in ((False, False), (True, False), (False, True), (True, True)):
         name = "rv" + ("-gru" if gru else "") + ("-weights" if weighted else "")
-        options.say(f"{name}:")
-        plan = RunPlan(_ablated(recipe, gru, weighted), scans, out / name, options)
-        path = Run(plan).stages("rv")
+        plan.say(f"{name}:")
+        recipe = _ablated(plan.recipe, gru, weighted)
+        path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name), "rv")
 
-        segmenter = Segmenter(path, options.processes.device(device), "rv")
+        segmenter = Segmenter(path, plan.processes.device(device), "rv")
+        scans = plan.scans
         evaluation = evaluate(
             scans.dataset,
             scans.val,
             label_by_weights(scans.dataset, segmenter),
-            processes=options.processes,
+            processes=plan.processes,
         )
         yield gru, weighted, metrics(evaluation.matrices["rv"][0], scans.dataset.taxonomy)
 

@@ -15,7 +15,7 @@ from amvnet.models.amvnet import build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.training.losses import dice, lovasz_softmax, polar_view_loss, range_view_loss
-from amvnet.training.stages import REGION_LOSSES, PolarStage, RangeStage
+from amvnet.training.networks import REGION_LOSSES, PolarStage, RangeStage
 
 from fixtures.worlds import MODEL, street
 

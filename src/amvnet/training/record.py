@@ -1,4 +1,4 @@
-"""The records in the folder of a run: its recipe, and how each call can be repeated."""
+"""What a run keeps in its folder: its recipe, how to repeat it, and how far each stage is."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import platform
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,61 @@ from amvnet.data.datasets.joined import Joined, own_records
 from amvnet.errors import InputError
 from amvnet.files import atomic_write, parse_yaml
 from amvnet.models.methods import BOTH_NETWORKS
-from amvnet.training.fit import LAST
-from amvnet.training.run_plan import RunPlan
-from amvnet.weights.file import SIZES, Weights
+from amvnet.training.callbacks import SETTINGS
+from amvnet.training.plan import Plan
+from amvnet.weights.file import SIZES, Weights, load
 
-SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
+# The stages in order, and the part of the weights that each trains.
+PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
+LAST = "last.ckpt"  # in a stage's folder: what --resume continues from
 MOST_CHANGES = 6  # settings that a message names
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")
 
 
-def write_record(plan: RunPlan, stage: str, init: Weights | None) -> None:
+@dataclass(frozen=True)
+class StageFolder:
+    """The folder of a stage, which says how far the stage is.
+
+    Attributes:
+        plan: of the run.
+        name: of the stage.
+    """
+
+    plan: Plan
+    name: str
+
+    @property
+    def path(self) -> Path:
+        return self.plan.out / self.name
+
+    @property
+    def weights_path(self) -> Path:
+        """The weights file of the stage that is used in the end: the best or the last."""
+        return self.path / f"{self.plan.recipe.training.keep}.safetensors"
+
+    @property
+    def done_path(self) -> Path:
+        """The file whose existence marks the stage as finished."""
+        return self.path / "done"
+
+    @property
+    def is_begun(self) -> bool:
+        return (self.path / LAST).is_file()
+
+    @property
+    def is_finished(self) -> bool:
+        return self.weights_path.is_file() and self.done_path.is_file()
+
+    def finished(self, weights: Weights) -> Weights:
+        """Return weights with the part that this stage has trained, if it is finished."""
+        return self.trained(weights) if self.is_finished else weights
+
+    def trained(self, weights: Weights) -> Weights:
+        """Return weights with the part that this stage has trained."""
+        return weights.replace_part(PART_OF[self.name], load(self.weights_path))
+
+
+def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
     """Write recipe.yaml, and the entry of a stage (or "all") in run.yaml.
 
     The entry names the data, the versions, the weights to begin with, and the command that repeats
@@ -81,7 +127,7 @@ def _entries(path: Path) -> dict[str, Any]:
     return entries if isinstance(entries, dict) else {}
 
 
-def _repeat_command(plan: RunPlan, stage: str, has_init: bool) -> list[str]:
+def _repeat_command(plan: Plan, stage: str, has_init: bool) -> list[str]:
     """Return the words of the command that repeats a call."""
     scans = plan.scans
     command = ["amvnet", "train", str(plan.out / "recipe.yaml")]
@@ -107,9 +153,7 @@ def _specs(dataset: Dataset) -> list[str]:
     return dataset.specs if isinstance(dataset, Joined) else [dataset.spec]
 
 
-def stage_settings(
-    plan: RunPlan, name: str, parts: Sequence[str], weights: Weights
-) -> dict[str, Any]:
+def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
     """Return what the trained weights of a stage depend on, for YAML.
 
     Paths are left out, so that the data may move to another folder before the stage is resumed.
@@ -117,7 +161,6 @@ def stage_settings(
     Args:
         plan: of the run.
         name: name of the stage.
-        parts: the parts of the weights that the stage trains.
         weights: the weights that the stage begins with.
     """
     recipe = to_dict(plan.recipe)
@@ -125,7 +168,7 @@ def stage_settings(
     train = plan.scans.train
     val = plan.scans.val
     settings: dict[str, Any] = {
-        "model": {key: recipe["model"][key] for part in parts for key in SIZES[part]},
+        "model": {key: recipe["model"][key] for key in SIZES[PART_OF[name]]},
         "training": {key: recipe["training"][key] for key in training_keys},
         "scans": {"train": _digest_of_scans(train), "val": _digest_of_scans(val)},
     }
@@ -135,6 +178,26 @@ def stage_settings(
     elif name == "head":
         settings["networks"] = {network: weights.digest(network) for network in BOTH_NETWORKS}
     return settings
+
+
+def description(plan: Plan, settings: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
+    """Return the record of a stage's training that its weights carry.
+
+    Args:
+        plan: of the run.
+        settings: of the stage.
+        sensor: what was measured of the sensor of the training scans.
+    """
+    scans = plan.scans
+    scores = {"scores": settings["scores"]} if "scores" in settings else {}
+    return {
+        **settings["training"],
+        "sequences": sequence_names(scans.train),
+        "validated_on": sequence_names(scans.val),
+        "scans": len(scans.train),
+        **sensor,
+        **scores,
+    }
 
 
 def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:

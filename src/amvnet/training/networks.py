@@ -1,0 +1,326 @@
+"""The training of the two networks (section 3.1 of the paper)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from amvnet.config.schema import NetworkTraining
+from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.distributed import ALONE, Processes
+from amvnet.errors import InputError
+from amvnet.models.amvnet import AMVNet
+from amvnet.models.views.points import PointBatch, occurring
+from amvnet.models.views.polar_view import PolarGrid, PolarView
+from amvnet.models.views.range_view import RangeView
+from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
+from amvnet.training.callbacks import Speed
+from amvnet.training.loaders import ScanSet, make_loader
+from amvnet.training.losses import (
+    RegionLoss,
+    class_weights,
+    dice,
+    lovasz_softmax,
+    majority_labels,
+    polar_view_loss,
+    range_view_loss,
+)
+from amvnet.training.plan import Plan
+from amvnet.training.record import PART_OF
+from amvnet.training.stage import (
+    Loaders,
+    Stage,
+    build_model,
+    class_weights_of,
+    fit,
+    keep_weights,
+    pictures,
+)
+from amvnet.weights.file import Weights
+
+Batch = tuple[PointBatch, Tensor]  # points, and their (P,) train ids
+REGION_LOSSES: dict[str, RegionLoss | None] = {
+    "default": None,
+    "dice": dice,
+    "lovasz": lovasz_softmax,
+}
+
+
+class NetworkStage(Stage):
+    """The base of the two networks' stages, which learn from batches of scans by AdamW.
+
+    A subclass defines `logits` and `loss`.
+
+    Args:
+        view: projects the points to the input of the network.
+        net: the network.
+
+    The other arguments are those of `Stage`.
+    """
+
+    unit = "scans"
+    config: NetworkTraining
+    view: RangeView | PolarView
+
+    def __init__(
+        self,
+        view: RangeView | PolarView,
+        net: nn.Module,
+        config: NetworkTraining,
+        taxonomy: Taxonomy,
+        weights: np.ndarray | None,
+        processes: Processes = ALONE,
+    ) -> None:
+        super().__init__(config, taxonomy, weights, processes)
+        self.view = view
+        self.trained = net
+        self.accumulate = config.accumulate
+        self.clip = config.clip
+        self.ema = config.ema
+        self.initial = config.initial
+
+    def size_of(self, batch: Batch) -> int:
+        return batch[0].count
+
+    def logits(
+        self, batch: PointBatch, labels: Tensor
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+        """Run the network on a batch of B scans.
+
+        Args:
+            labels: (P,) train ids.
+
+        Returns:
+            The (M, K) logits of each scan that the loss is computed on, the (M,) train ids of each
+            scan that belong to them, and the (P, K) logits of all points.
+        """
+        raise NotImplementedError
+
+    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
+        """Return the loss of one scan, given (M, K) logits and (M,) train ids."""
+        raise NotImplementedError
+
+    @property
+    def region_loss(self) -> RegionLoss | None:
+        """The region loss of the recipe; None for that of the paper."""
+        return REGION_LOSSES[self.config.region_loss]
+
+    def mean_loss(self, logits: Sequence[Tensor], labels: Sequence[Tensor]) -> Tensor:
+        """Return the mean loss of some scans, given (M, K) logits and (M,) train ids of each."""
+        # The mean over scans stays the same if a batch is split, over processes or to save memory.
+        losses = []
+        for scan_logits, scan_labels in zip(logits, labels, strict=True):
+            losses.append(self.loss(scan_logits, scan_labels))
+        return torch.stack(losses).mean()
+
+    def training_step(self, batch: Batch, index: int) -> Tensor:
+        points, labels = batch
+        logits_by_scan, labels_by_scan, _ = self.logits(points, labels)
+        loss = self.mean_loss(logits_by_scan, labels_by_scan)
+
+        self.check_finite(loss, f"at the scans {', '.join(points.names)}")
+        self.log("train/loss", loss, prog_bar=True, batch_size=points.count)
+        return loss * self.share_of_step(points.count, index)
+
+    def validation_step(self, batch: Batch, index: int) -> None:
+        points, labels = batch
+        _, _, logits = self.logits(points, labels)
+        self.count(labels, logits.argmax(dim=1) + 1)
+
+    def share_of_step(self, count: int, index: int) -> float:
+        """Return the factor that makes the gradient of a step the mean over its scans.
+
+        Lightning divides the loss of each part of a batch by the number of parts. In the last batch
+        of an epoch there may be fewer parts, and fewer scans in the last of them.
+
+        Args:
+            count: scans of this part.
+            index: number of the part in the epoch.
+        """
+        parts = self.trainer.accumulate_grad_batches
+        loader = self.trainer.train_dataloader
+        if loader is None or loader.batch_size is None:
+            return 1.0
+
+        batch = parts * loader.batch_size
+        before = index // parts * batch  # scans of the earlier steps
+        in_step = min(batch, len(loader.sampler) - before)
+        return count * parts / in_step
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.AdamW(
+            self.trained.parameters(), lr=self.config.lr, weight_decay=self.config.weight_decay
+        )
+        return self.one_cycle(optimizer)
+
+
+class RangeStage(NetworkStage):
+    """Stage `rv`: the loss is over pixels, each with the label of the point that represents it."""
+
+    name = "rv"
+    view: RangeView
+
+    def logits(
+        self, batch: PointBatch, labels: Tensor
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+        view = self.view.project(batch)
+        image = self.trained(view.image)  # (B, K, H, W)
+        pixels = image.permute(0, 2, 3, 1).flatten(0, 2)  # (B * H * W, K)
+
+        # Pixels without a point have no label.
+        occupied = view.nearest >= 0
+        sizes = occupied.view(batch.count, -1).sum(dim=1).tolist()
+        pixel_logits = pixels[occupied].split(sizes)
+        pixel_labels = labels[view.nearest[occupied]].split(sizes)
+        return list(pixel_logits), list(pixel_labels), pixels[view.pixel]
+
+    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
+        region = self.config.region
+        return range_view_loss(logits, labels, self.class_weights, region, self.region_loss)
+
+
+class PolarStage(NetworkStage):
+    """Stage `bev`: the loss is over points, each with the logits of its voxel, or over voxels."""
+
+    name = "bev"
+    view: PolarView
+
+    def logits(
+        self, batch: PointBatch, labels: Tensor
+    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+        view = self.view.project(batch)
+        scores = self.trained(view)  # (M, Z * K)
+        points = view.to_points(scores)  # (P, K)
+        if self.config.loss_over == "voxels":
+            voxel_logits, voxel_labels = _split_voxels(view, scores, labels)
+            return voxel_logits, voxel_labels, points
+
+        slices = batch.slices()
+        point_logits = [points[part] for part in slices]
+        point_labels = [labels[part] for part in slices]
+        return point_logits, point_labels, points
+
+    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
+        region = self.config.region
+        return polar_view_loss(logits, labels, self.class_weights, region, self.region_loss)
+
+
+def _split_voxels(
+    view: PolarGrid, scores: Tensor, labels: Tensor
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Return the logits and the majority labels of the voxels with points, scan by scan.
+
+    Args:
+        view: the grids of B scans.
+        scores: (M, Z * K) logits of the pillars with points.
+        labels: (P,) train ids.
+
+    Returns:
+        B tensors (V, K), and B tensors (V,).
+    """
+    scans, radial, angular, vertical = view.shape
+    logits = scores.unflatten(1, (vertical, -1)).flatten(0, 1)  # (M * Z, K)
+    voxels, (cells,) = occurring(len(logits), view.slot * vertical + view.voxel)
+    voxel_logits = logits.index_select(0, voxels)
+    voxel_labels = majority_labels(cells, labels, len(voxels), logits.shape[1])
+
+    scan = view.occupied[voxels // vertical] // (radial * angular)  # ascending
+    sizes = torch.bincount(scan, minlength=scans).tolist()
+    return list(voxel_logits.split(sizes)), list(voxel_labels.split(sizes))
+
+
+def train_network(plan: Plan, name: str, weights: Weights) -> None:
+    """Train a network, and write its weights after each epoch.
+
+    Args:
+        plan: of the run.
+        name: of the stage: rv or bev.
+        weights: to begin with.
+
+    Raises:
+        InputError: if the weights do not fit the recipe, or a scan is broken.
+    """
+    config = getattr(plan.recipe.training, name)
+    # Before the scans are read for the class weights.
+    if config.initial and PART_OF[name] not in weights.parts:
+        raise InputError(
+            f"training.{name}.initial: expected weights to begin with, found none; give "
+            "--init, or set it to 0"
+        )
+
+    model = build_model(plan, PART_OF[name], weights)
+    stage = make_stage(plan, name, model, class_weights_of(plan) if config.class_weights else None)
+    intensity = _intensity(plan, weights)
+    score = model.score_range_view if name == "rv" else model.score_polar_view
+    callbacks = [
+        keep_weights(plan, name, weights, intensity),
+        pictures(plan, intensity, score),
+    ]
+    fit(stage, plan, make_loaders(plan, config, intensity), callbacks)
+
+
+def try_network(plan: Plan, name: str, weights: Weights, steps: int) -> Speed:
+    """Take some steps of the training of a network; write nothing.
+
+    Args:
+        plan: of the run.
+        name: of the stage: rv or bev.
+        weights: to begin with.
+        steps: how many.
+
+    Returns:
+        How fast they were, and the memory that they took.
+    """
+    config = getattr(plan.recipe.training, name)
+    # To compute class weights would need every scan; their values do not change the speed.
+    uniform = class_weights(np.ones(weights.taxonomy.size)) if config.class_weights else None
+    stage = make_stage(plan, name, build_model(plan, PART_OF[name], weights), uniform)
+    return fit(stage, plan, make_loaders(plan, config, _intensity(plan, weights)), steps=steps)
+
+
+def make_stage(
+    plan: Plan, name: str, model: AMVNet, weights: np.ndarray | None
+) -> RangeStage | PolarStage:
+    """Return the stage rv or bev of a model, given the (K,) class weights of its loss."""
+    config = getattr(plan.recipe.training, name)
+    shared = (config, plan.scans.dataset.taxonomy, weights, plan.processes)
+    if name == "rv":
+        return RangeStage(model.range_view, model.range_net, *shared)
+    return PolarStage(model.polar_view, model.polar_net, *shared)
+
+
+def make_loaders(
+    plan: Plan, config: NetworkTraining, intensity: TrainedIntensity | None
+) -> Loaders:
+    """Return the batches of scans to learn from, and to validate with.
+
+    Args:
+        plan: of the run.
+        config: of the stage.
+        intensity: what the intensities of the scans are brought to.
+    """
+    training = plan.recipe.training
+    scans = plan.scans
+    shared: dict[str, Any] = {"workers": training.workers, "processes": plan.processes}
+
+    # Scans that one process takes at a time.
+    batch = config.batch // config.accumulate // plan.processes.size
+    train_set = ScanSet(scans.dataset, scans.train, training.augment, training.seed, intensity)
+    train = make_loader(train_set, batch, shuffle=True, **shared)
+    if not scans.val:
+        return train, None
+    val_set = ScanSet(scans.dataset, scans.val, intensity=intensity)
+    return train, make_loader(val_set, 1, shuffle=False, **shared)
+
+
+def _intensity(plan: Plan, weights: Weights) -> TrainedIntensity | None:
+    """Return what the intensities of each scan are brought to, as in a prediction."""
+    dataset = plan.scans.dataset
+    if isinstance(dataset, SimulatedStreets):
+        return simulated_intensity(dataset.sensor)
+    return trained_intensity(weights.training, weights.sensor)

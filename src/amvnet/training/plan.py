@@ -1,0 +1,207 @@
+"""The plan of a training run: what it trains, on which scans, and how it runs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from amvnet.config.schema import Recipe
+from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.joined import Part, split_share
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.select import TrainingScans, training_records
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, taxonomy_from_yaml
+from amvnet.distributed import ALONE, Processes
+from amvnet.errors import InputError
+from amvnet.inference.reading import open_for_weights
+from amvnet.inference.scores import ScorePair
+from amvnet.progress import Say, say_nothing
+from amvnet.training.callbacks import LoggerName, check_logger
+from amvnet.weights.file import Weights, load
+
+
+@dataclass(frozen=True)
+class Plan:
+    """One training run.
+
+    Attributes:
+        recipe: what to train.
+        scans: to train on and to validate with. Without validation scans, the last weights are
+            kept as the best.
+        out: the folder of the run.
+        resume: continue an earlier run in the same folder.
+        say: prints a line about what happens.
+        bars: show progress bars instead of a line for each epoch.
+        processes: those that share the run; all must see its folder.
+        logger: where the curves and pictures go.
+        scores: two other models' scores of the scans; the head is trained on them instead of on
+            those of the networks. None without other models.
+
+    Raises:
+        InputError: if the processes cannot share the scans or the batches, the recipe is for other
+            classes than the dataset's, or the logger lacks its library.
+    """
+
+    recipe: Recipe
+    scans: TrainingScans
+    out: Path
+    resume: bool = False
+    say: Say = say_nothing
+    bars: bool = False
+    processes: Processes = ALONE
+    logger: LoggerName = "tensorboard"
+    scores: ScorePair | None = None
+
+    def __post_init__(self) -> None:
+        check_logger(self.logger)
+
+        size = self.processes.size
+        val = self.scans.val
+        if 0 < len(val) < size:  # a process without a scan would keep the others waiting
+            raise InputError(
+                f"expected a validation scan for each of {size} processes, found {len(val)}; "
+                "name more validation sequences"
+            )
+        for name in ("rv", "bev"):
+            config = getattr(self.recipe.training, name)
+            if config.batch % (size * config.accumulate):
+                raise InputError(
+                    f"expected a batch for {size} processes, each in {config.accumulate} parts, "
+                    f"found {config.batch}; set --training.{name}.batch or "
+                    f"--training.{name}.accumulate"
+                )
+
+        taxonomy = self.scans.dataset.taxonomy.name
+        # A user's own classes fit any recipe.
+        if taxonomy in TAXONOMIES and taxonomy != self.recipe.taxonomy:
+            raise InputError(
+                f"expected a dataset with the classes of {self.recipe.taxonomy}, "
+                f"found {taxonomy}; use the recipe of that benchmark"
+            )
+
+
+def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
+    """Return a recipe with the classes, sensor and sizes of weights, if it asks for them.
+
+    Raises:
+        InputError: if it does, and there are no weights.
+    """
+    if not recipe.from_init:
+        return recipe
+    if init is None:
+        raise InputError("expected weights to begin with for this recipe, found none; add --init")
+
+    name = init.taxonomy.name
+    taxonomy = name if name in TAXONOMIES else recipe.taxonomy
+    return dataclasses.replace(
+        recipe,
+        model=init.model,
+        sensor=init.sensor,
+        taxonomy=taxonomy,  # type: ignore[arg-type]
+    )
+
+
+def without_mean(recipe: Recipe, init: Weights | None, classes: Taxonomy, say: Say) -> Recipe:
+    """Return a recipe that keeps no share of initial weights if these have other classes.
+
+    Their last layers are new then, and of no use in a mean.
+
+    Args:
+        recipe: of the training.
+        init: weights to begin with.
+        classes: of the data.
+        say: told what is left out.
+    """
+    if init is None or init.taxonomy.classes == classes.classes:
+        return recipe
+
+    networks = {}
+    for name in ("rv", "bev"):
+        config = getattr(recipe.training, name)
+        if config.initial:
+            say(f"{name}: no mean with the initial weights, which have other classes")
+            networks[name] = dataclasses.replace(config, initial=0.0)
+    return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
+
+
+def open_for_training(
+    data: str, taxonomy: Path | None, recipe: Recipe, out: Path, init: Weights | None = None
+) -> Dataset:
+    """Open the dataset of a training.
+
+    A user's own scans are normalised as by `predict`: to the initial weights, to what this run has trained before, or else to the sensor of the recipe.
+
+    Args:
+        data: as `open_dataset` takes it.
+        taxonomy: a YAML file of other classes.
+        recipe: of the training.
+        out: folder of the run.
+        init: weights to begin with.
+
+    Raises:
+        InputError: as `open_dataset`.
+    """
+    classes = None if taxonomy is None else taxonomy_from_yaml(taxonomy)
+    dataset = open_dataset(data, classes)
+    earlier = init or _earlier_weights(out)
+    return open_for_weights(data, _frame(recipe, dataset.taxonomy, earlier), dataset)
+
+
+def open_parts(
+    specs: Sequence[str], taxonomy: Path | None, recipe: Recipe, out: Path, init: Weights | None
+) -> tuple[Dataset, list[Part]]:
+    """Open the datasets of a training.
+
+    Args:
+        specs: each DATA, or, after the first, DATA@SHARE. The datasets that name no share have that
+            of the recipe, `training.others`; if it is 0, all of their scans are taken.
+        taxonomy: a YAML file of other classes.
+        recipe: of the training.
+        out: folder of the run.
+        init: weights to begin with.
+
+    Returns:
+        The first dataset, and those to mix in with their training scans.
+
+    Raises:
+        InputError: if a dataset cannot be opened, or the first has a share.
+    """
+    opened = []
+    for spec in specs:
+        data, share = split_share(spec)
+        opened.append((open_for_training(data, taxonomy, recipe, out, init), share))
+    (first, first_share), *rest = opened
+    if first_share is not None:
+        raise InputError(
+            f"{specs[0]}: expected the first --data without a share, found {first_share:g}; "
+            "give the others shares"
+        )
+
+    without_share = sum(share is None for _, share in rest)
+    others = recipe.training.others
+    parts = []
+    for dataset, share in rest:
+        if share is None and others > 0:
+            share = others / without_share
+        parts.append(Part(dataset, training_records(dataset), share))
+    return first, parts
+
+
+def _frame(recipe: Recipe, taxonomy: Taxonomy, earlier: Weights | None) -> Weights:
+    """Return weights without parameters that say what scans are to be normalised to."""
+    weights = Weights(recipe.model, taxonomy, recipe.sensor)
+    if earlier is None:
+        return weights
+    return dataclasses.replace(weights, training=earlier.training)
+
+
+def _earlier_weights(out: Path) -> Weights | None:
+    """Return weights that an earlier call has written into the folder of a run; None if none."""
+    paths = [out / "weights.safetensors"]
+    paths += [out / stage / "last.safetensors" for stage in ("rv", "bev")]
+    for path in paths:
+        if path.is_file():
+            return load(path)
+    return None

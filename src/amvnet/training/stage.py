@@ -1,0 +1,410 @@
+"""A stage of a training: what all stages share, and how Lightning fits one."""
+
+from __future__ import annotations
+
+import logging
+import math
+import pickle
+import signal
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import lightning as L
+import numpy as np
+import torch
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.strategies import DDPStrategy
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
+from amvnet.data.spacing import evenly_spaced
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.distributed import ALONE, Processes, device_of, environment
+from amvnet.errors import InputError
+from amvnet.evaluation.metrics import confusion, metrics
+from amvnet.memory import keep_freed_memory
+from amvnet.models.amvnet import AMVNet, build_amvnet
+from amvnet.models.sync_batch_norm import synchronise_batch_norms
+from amvnet.models.views.points import PointBatch
+from amvnet.sensors.intensity import TrainedIntensity, match_scan
+from amvnet.training.callbacks import (
+    WITH_PICTURES,
+    AverageWeights,
+    Bar,
+    Curves,
+    EpochLines,
+    KeepWeights,
+    Pictures,
+    SeedBatches,
+    Speed,
+    make_logger,
+)
+from amvnet.training.loaders import count_classes, sensor_record
+from amvnet.training.losses import class_weights
+from amvnet.training.plan import Plan
+from amvnet.training.record import LAST, PART_OF, description, stage_settings
+from amvnet.weights.file import Weights
+
+MOMENTUM_CYCLE = 0.1  # the one-cycle schedule lowers the momentum by this much
+LOGGED_EVERY = 10  # batches, of the loss
+PICTURED_SCANS = 2
+
+Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
+SINGLE: Final = "32-true"
+DOUBLE: Final = "64-true"
+MIXED: Final = "bf16-mixed"
+
+# The batches to learn from and to validate with; None if nothing is validated.
+Loaders = tuple[DataLoader[Any], DataLoader[Any] | None]
+
+
+class Stage(L.LightningModule):
+    """The base of all stages: class weights, metrics of the validation, the one-cycle schedule.
+
+    Args:
+        config: of this stage.
+        taxonomy: the K classes.
+        weights: (K,) class weights of the loss, or None for equal weights.
+        processes: those that share the training.
+    """
+
+    name: str  # the value of --stage
+    unit: str  # what a batch consists of
+    trained: nn.Module  # the part of the model that this stage trains
+    in_float32 = False  # whatever precision the recipe has
+
+    # What a stage may have besides; see `NetworkTraining`.
+    accumulate = 1
+    clip: float | None = None
+    ema = 0.0
+    initial = 0.0
+
+    def __init__(
+        self,
+        config: NetworkTraining | HeadTraining,
+        taxonomy: Taxonomy,
+        weights: np.ndarray | None,
+        processes: Processes = ALONE,
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.taxonomy = taxonomy
+        self.processes = processes
+
+        self.class_weights: Tensor | None
+        tensor = None if weights is None else torch.from_numpy(weights)
+        self.register_buffer("class_weights", tensor, persistent=False)
+
+        self.matrix = self.empty_matrix()
+
+    def size_of(self, batch: Any) -> int:
+        """Return how many units a batch has."""
+        raise NotImplementedError
+
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        """Convert floating-point values of a batch to the precision of the weights.
+
+        Raises:
+            InputError: if the batch is one, because a scan cannot be read.
+        """
+        if isinstance(batch, InputError):
+            raise batch
+        return tuple(self._in_precision(values) for values in batch)
+
+    def check_finite(self, loss: Tensor, where: str) -> None:
+        """Check a loss before it spoils the weights.
+
+        Raises:
+            InputError: if it is infinite or NaN.
+        """
+        if not torch.isfinite(loss):
+            option = f"--training.{self.name}.lr"
+            raise InputError(
+                f"expected a finite loss, found {loss:g} {where}; lower {option}, or leave them out"
+            )
+
+    def count(self, labels: Tensor, prediction: Tensor) -> None:
+        """Add points to the confusion matrix of the validation.
+
+        Args:
+            labels: (P,) train ids.
+            prediction: (P,) predicted train ids.
+        """
+        size = self.taxonomy.size
+        self.matrix += confusion(labels.cpu().numpy(), prediction.cpu().numpy(), size)
+
+    def whole_matrix(self) -> np.ndarray:
+        """Return the (K + 1, K + 1) confusion matrix of the validation, summed over processes."""
+        return np.sum(self.processes.gather(self.matrix), axis=0)
+
+    def on_validation_epoch_start(self) -> None:
+        self.matrix = self.empty_matrix()
+
+    def on_validation_epoch_end(self) -> None:
+        values = metrics(self.whole_matrix(), self.taxonomy)
+        self.log("val/miou", values["miou"] or 0.0, prog_bar=True)
+        self.log("val/miou_present", values["miou_present"] or 0.0)
+        self.log("val/acc", values["accuracy"] or 0.0)
+        for name, iou in values["iou"].items():
+            if iou is not None:
+                self.log(f"iou/{name}", iou)
+
+    def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
+        """Return an optimizer with the one-cycle schedule, as Lightning expects it.
+
+        The learning rate rises to its peak and falls again, while the momentum does the opposite.
+
+        Args:
+            momentum: highest momentum of SGD, or highest first beta of AdamW.
+        """
+        # The schedule needs two steps before its peak, more than a very short training has.
+        least = math.ceil(2 / self.config.warmup)
+        steps = max(int(self.trainer.estimated_stepping_batches), least)
+
+        schedule = torch.optim.lr_scheduler.OneCycleLR(
+            optimizer,
+            max_lr=self.config.lr,
+            total_steps=steps,
+            pct_start=self.config.warmup,
+            base_momentum=momentum - MOMENTUM_CYCLE,
+            max_momentum=momentum,
+        )
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def empty_matrix(self) -> np.ndarray:
+        """Return a (K + 1, K + 1) confusion matrix without counts."""
+        ids = self.taxonomy.size + 1
+        return np.zeros((ids, ids))
+
+    def _in_precision(self, values: PointBatch | Tensor) -> PointBatch | Tensor:
+        if isinstance(values, PointBatch) or values.is_floating_point():
+            return values.to(self.dtype)
+        return values
+
+
+class KeepSignals(Callback):
+    """Leaves SIGTERM to the process: Lightning would end the training as if it were done."""
+
+    def __init__(self) -> None:
+        self._handler = signal.getsignal(signal.SIGTERM)
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, self._handler)
+
+
+def build_model(plan: Plan, part: str, weights: Weights) -> AMVNet:
+    """Return a model whose part to train has the parameters of the weights, if these have any.
+
+    Raises:
+        InputError: if these parameters have other sizes.
+    """
+    model = build_amvnet(weights.model, weights.taxonomy.size)
+    if part in weights.parts:
+        try:
+            getattr(model, part).load_state_dict(weights.part(part))
+        except RuntimeError:
+            raise InputError(
+                f"expected weights whose {part} has the recipe's sizes, found others; "
+                "use the recipe of the weights"
+            ) from None
+
+    if plan.scans.dataset.is_normalised:
+        model.range_view = model.range_view.by_ring()
+    return model
+
+
+def class_weights_of(plan: Plan) -> np.ndarray:
+    """Return the (K,) weights of the classes in the loss (section 4.2 of the paper)."""
+    path = plan.out / "class_counts.npz"
+    scans = plan.scans
+    return class_weights(count_classes(scans.dataset, scans.train, path, plan.processes, plan.say))
+
+
+def keep_weights(
+    plan: Plan, name: str, weights: Weights, intensity: TrainedIntensity | None
+) -> KeepWeights:
+    """Return the callback that writes the trained part after each epoch.
+
+    Args:
+        plan: of the run.
+        name: of the stage.
+        weights: that the stage begins with.
+        intensity: what the intensities of the scans are brought to.
+    """
+    settings = stage_settings(plan, name, weights)
+    # Only the first process writes.
+    scans = plan.scans
+    is_first = plan.processes.first
+    sensor = sensor_record(scans.dataset, scans.train, intensity) if is_first else {}
+    return KeepWeights(
+        plan.out / name, PART_OF[name], weights, settings, description(plan, settings, sensor)
+    )
+
+
+def pictures(
+    plan: Plan, intensity: TrainedIntensity | None, score: Callable[[PointBatch], Tensor]
+) -> Pictures:
+    """Return the callback that draws validation scans.
+
+    Args:
+        plan: of the run.
+        intensity: what the intensities of the scans are brought to.
+        score: returns the (P, K) scores of a batch.
+    """
+    dataset = plan.scans.dataset
+    is_drawn = plan.processes.first and plan.logger in WITH_PICTURES
+    records = evenly_spaced(plan.scans.val, PICTURED_SCANS) if is_drawn else []
+    scans = [match_scan(dataset.read(record), intensity) for record in records]
+    return Pictures(scans, dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
+
+
+def fit(
+    stage: Stage,
+    plan: Plan,
+    loaders: Loaders,
+    callbacks: Sequence[Callback] = (),
+    steps: int | None = None,
+) -> Speed:
+    """Train a stage in its folder of the run.
+
+    Args:
+        callbacks: write at the end of each epoch, before the checkpoint, which therefore never
+            claims more than they have written.
+        steps: end after this many, for a trial; then nothing is validated or written.
+
+    Returns:
+        How fast it was.
+
+    Raises:
+        InputError: if a scan cannot be read, or the loss is not finite.
+    """
+    quiet_lightning()
+    train, val = loaders
+    device = device_of(plan.recipe.training.accelerator)
+    precision = SINGLE if stage.in_float32 else precision_of(plan.recipe.training)
+    if device == "cpu":
+        keep_freed_memory()
+    if plan.processes.size > 1:
+        synchronise_batch_norms(stage.trained, cuda=device == "cuda")
+    if precision == DOUBLE:
+        stage.double()
+    if plan.recipe.training.compile:
+        stage.trained.compile()
+
+    checkpoint = plan.out / stage.name / LAST
+    begun = checkpoint if plan.resume and checkpoint.is_file() else None
+    if begun is not None:
+        # Lightning sets the sampler's epoch only after the reading processes have begun to draw.
+        train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
+
+    speed = Speed()
+    trainer = L.Trainer(
+        # Lightning's own way to double precision does not convert our batches.
+        precision=SINGLE if precision == DOUBLE else precision,
+        max_epochs=stage.config.epochs,
+        max_steps=-1 if steps is None else steps,
+        limit_val_batches=0 if val is None else None,
+        accumulate_grad_batches=stage.accumulate,
+        gradient_clip_val=stage.clip,
+        callbacks=[speed, *callbacks, *_shared_callbacks(stage, plan, is_trial=steps is not None)],
+        log_every_n_steps=min(LOGGED_EVERY, len(train)),
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,
+        **_outputs(stage, plan, is_trial=steps is not None),
+        **_devices(plan),
+    )
+    trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
+    return speed
+
+
+def _shared_callbacks(stage: Stage, plan: Plan, is_trial: bool) -> list[Callback]:
+    """Return the callbacks that every stage has."""
+    folder = plan.out / stage.name
+    callbacks: list[Callback] = [
+        KeepSignals(),
+        SeedBatches(plan.recipe.training.seed, plan.processes.rank),
+    ]
+    if stage.ema or stage.initial:
+        callbacks.append(AverageWeights(stage.ema, stage.initial))
+    if not is_trial:
+        checkpoint = ModelCheckpoint(
+            folder, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
+        )
+        callbacks += [Curves(folder / "metrics.csv"), checkpoint, LearningRateMonitor()]
+    has_bar = plan.bars and plan.processes.first
+    callbacks.append(Bar() if has_bar else EpochLines(plan.say, stage.name))
+    return callbacks
+
+
+def _outputs(stage: Stage, plan: Plan, is_trial: bool) -> dict[str, Any]:
+    """Return the arguments of Lightning's trainer about what it writes and shows."""
+    folder = plan.out / stage.name
+    return {
+        "default_root_dir": folder,
+        "logger": False if is_trial else make_logger(plan.logger, folder),
+        "enable_checkpointing": not is_trial,
+        "enable_progress_bar": plan.bars and plan.processes.first,
+        "enable_model_summary": False,
+    }
+
+
+def _devices(plan: Plan) -> dict[str, Any]:
+    """Return the arguments of Lightning's trainer about devices and processes."""
+    # The statistics of synchronised batch norms are the same everywhere, and processes may validate
+    # unequal shares.
+    ddp = DDPStrategy(broadcast_buffers=False)
+    return {
+        "accelerator": plan.recipe.training.accelerator,
+        "devices": plan.processes.here,
+        "num_nodes": plan.processes.nodes,
+        "strategy": ddp if plan.processes.size > 1 else "auto",
+        "plugins": [environment()],
+    }
+
+
+def precision_of(training: TrainingConfig) -> Precision:
+    """Return the precision of a training, as Lightning names it.
+
+    `auto` is bf16-mixed on a device with bfloat16 arithmetic and 32-true on others, which only
+    emulate it, several times slower.
+
+    Raises:
+        InputError: if this machine does not have the training's accelerator.
+    """
+    if training.precision != "auto":
+        return training.precision
+    return MIXED if _multiplies_bfloat16(device_of(training.accelerator)) else SINGLE
+
+
+def _multiplies_bfloat16(device: str) -> bool:
+    if device == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if device == "cpu" and hasattr(torch.cpu, "get_capabilities"):  # newer than torch 2.6
+        capabilities = torch.cpu.get_capabilities()
+        return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+    return False
+
+
+def _epochs_done(checkpoint: Path) -> int:
+    """Return how many epochs a checkpoint has seen.
+
+    Raises:
+        InputError: if the file is broken.
+    """
+    try:
+        state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+        return state["epoch"] + 1
+    except (RuntimeError, OSError, EOFError, ValueError, KeyError, pickle.UnpicklingError):
+        raise InputError(
+            f"{checkpoint}: expected a checkpoint, found a broken file; delete it to train again"
+        ) from None
+
+
+def quiet_lightning() -> None:
+    """Suppress Lightning's notes; it sets its log levels when it is imported."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.ERROR)
