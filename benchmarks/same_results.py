@@ -141,7 +141,7 @@ submit city32 --sequences simulated-0000 --predictions labels/32/amvnet --use-ex
 
 # Training
 train kitti.yaml --data city64 --out runs/kitti --train-sequences 00,01 --val-sequences 02
-train nuscenes.yaml --data city32 --out runs/folds --training.head.folds 2 --training.workers 1
+train nuscenes.yaml --data city32 --out runs/nuscenes --training.workers 1
 train kitti.yaml --data city64 --out runs/tau --stage head --init runs/kitti \
     --train-sequences 00,01 --val-sequences 02 --training.head.class_weights true \
     --model.assertion.threshold 0.8

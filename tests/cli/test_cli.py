@@ -127,7 +127,6 @@ MISTAKES = {
     ),
     "training on validation data": TRAIN + " --train-sequences 00,08 --val-sequences 08",
     "head without networks": TRAIN_HEAD,
-    "more folds than sequences": TRAIN_HEAD + " --init {w}/w.safetensors --training.head.folds 3",
     "unknown recipe": "train best --data {w}/data --out {out}",
     "unknown key in a recipe": "train {w}/typo.yaml --data {w}/data --out {out}",
     "recipe that is no text": "train {w}/latin1.yaml --data {w}/data --out {out}",

@@ -272,7 +272,12 @@ def test_what_earlier_versions_wrote_is_read_if_it_asks_for_nothing_else() -> No
             },
             "point_head": {"pooling": "max", "heads": 1},
         },
-        "training": {"joint": {"batch": 2, "ema": 0.99}, "adapt": {"rounds": 1}},
+        "training": {
+            "head": {"folds": 1},
+            "joint": {"batch": 2, "ema": 0.99},
+            "adapt": {"rounds": 1},
+            "augment": {"far_drop": 0.0, "intensity_noise": 0.0},
+        },
     }
     assert from_dict(Recipe, earlier) == Recipe()
 

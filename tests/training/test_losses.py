@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -12,17 +11,36 @@ from torch import Tensor
 
 from amvnet.training.losses import (
     FREQUENCY_FLOOR,
+    RegionLoss,
+    Scored,
+    Targets,
     class_weights,
     dice,
     lovasz_softmax,
     majority_labels,
-    polar_view_loss,
-    range_view_loss,
+    network_loss,
 )
 
 K = 5
-LOSSES = pytest.mark.parametrize("loss", [range_view_loss, polar_view_loss])
-Loss = Callable[[Tensor, Tensor, Tensor | None, float], Tensor]
+LOSSES = pytest.mark.parametrize("region_loss", [dice, lovasz_softmax])
+
+
+def loss_of(
+    region_loss: RegionLoss,
+    logits: Tensor,
+    labels: Tensor,
+    weights: Tensor | None = None,
+    region: float = 1.0,
+) -> Tensor:
+    """Return the loss of a single scan."""
+    scored = Scored(logits, labels, torch.zeros(len(labels), dtype=torch.long), scans=1)
+    return network_loss(scored, weights, region, region_loss)
+
+
+def region_of(region_loss: RegionLoss, probabilities: Tensor, target: Tensor) -> Tensor:
+    """Return the region loss of a single scan."""
+    scan = torch.zeros_like(target)
+    return region_loss(probabilities, Targets.of(target, scan, (1, probabilities.shape[1])))
 
 
 def example(points: int = 60, seed: int = 0, classes: int = K) -> tuple[Tensor, Tensor]:
@@ -95,37 +113,47 @@ def lovasz_by_sets(probabilities: list[list[float]], target: list[int]) -> float
 @LOSSES
 @pytest.mark.parametrize("weights", [None, [1.0, 0.2, 3.0, 0.7, 2.0]])
 def test_without_the_region_loss_a_loss_is_weighted_cross_entropy(
-    loss: Loss, weights: list[float] | None
+    region_loss: RegionLoss, weights: list[float] | None
 ) -> None:
     logits, labels = example()
     tensor = None if weights is None else torch.tensor(weights)
     expected = cross_entropy_by_loop(logits, labels, weights or [1.0] * K)
-    assert loss(logits, labels, tensor, 0.0).item() == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("loss", "region_loss"), [(range_view_loss, dice), (polar_view_loss, lovasz_softmax)]
-)
-def test_a_loss_is_cross_entropy_plus_the_weighted_region_loss(
-    loss: Loss, region_loss: Callable[..., Tensor]
-) -> None:
-    logits, labels = example()
-    labelled = labels > 0
-    region = region_loss(logits[labelled].softmax(dim=1), labels[labelled] - 1)
-    expected = loss(logits, labels, None, 0.0) + 1.5 * region
-    torch.testing.assert_close(loss(logits, labels, None, 1.5), expected)
+    assert loss_of(region_loss, logits, labels, tensor, 0.0).item() == pytest.approx(
+        expected, rel=1e-5
+    )
 
 
 @LOSSES
-@pytest.mark.parametrize("region_loss", [dice, lovasz_softmax])
-def test_either_network_may_have_either_region_loss(
-    loss: Callable[..., Tensor], region_loss: Callable[..., Tensor]
-) -> None:
+def test_a_loss_is_cross_entropy_plus_the_weighted_region_loss(region_loss: RegionLoss) -> None:
     logits, labels = example()
     labelled = labels > 0
-    region = region_loss(logits[labelled].softmax(dim=1), labels[labelled] - 1)
-    expected = loss(logits, labels, None, 0.0) + region
-    torch.testing.assert_close(loss(logits, labels, None, 1.0, region_loss), expected)
+    region = region_of(region_loss, logits[labelled].softmax(dim=1), labels[labelled] - 1)
+    expected = loss_of(region_loss, logits, labels, None, 0.0) + 1.5 * region
+    torch.testing.assert_close(loss_of(region_loss, logits, labels, None, 1.5), expected)
+
+
+@LOSSES
+def test_the_loss_of_a_batch_is_the_mean_over_its_scans_and_so_is_its_gradient(
+    region_loss: RegionLoss,
+) -> None:
+    """One of the scans has no label, and the points of the scans are mixed."""
+    logits, labels = example(points=400, classes=9)
+    scan = torch.randint(0, 4, (400,), generator=torch.Generator().manual_seed(1))
+    labels[scan == 2] = 0
+    weights = torch.rand(9) + 0.1
+    logits.requires_grad_()
+
+    batch = network_loss(Scored(logits, labels, scan, scans=4), weights, 0.7, region_loss)
+    (gradient,) = torch.autograd.grad(batch, logits)
+    scans = []
+    for number in range(4):
+        of_scan = scan == number
+        scans.append(loss_of(region_loss, logits[of_scan], labels[of_scan], weights, 0.7))
+    mean = torch.stack(scans).mean()
+    (expected,) = torch.autograd.grad(mean, logits)
+    assert scans[2] == 0
+    torch.testing.assert_close(batch, mean)
+    torch.testing.assert_close(gradient, expected)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -149,7 +177,7 @@ def test_dice_equals_a_loop(seed: int) -> None:
     logits, target = example(seed=seed)
     probabilities = logits.softmax(dim=1)
     expected = dice_by_loop(probabilities.tolist(), target.tolist())
-    assert dice(probabilities, target).item() == pytest.approx(expected, abs=1e-5)
+    assert region_of(dice, probabilities, target).item() == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.parametrize("sharpness", [0.5, 2.0, 8.0])
@@ -158,7 +186,9 @@ def test_lovasz_softmax_equals_its_definition_by_sets(seed: int, sharpness: floa
     logits, target = example(seed=seed)
     probabilities = (logits * sharpness).softmax(dim=1)
     expected = lovasz_by_sets(probabilities.tolist(), target.tolist())
-    assert lovasz_softmax(probabilities, target).item() == pytest.approx(expected, abs=2e-3)
+    assert region_of(lovasz_softmax, probabilities, target).item() == pytest.approx(
+        expected, abs=2e-3
+    )
 
 
 def test_lovasz_softmax_sees_errors_of_a_few_percent() -> None:
@@ -166,28 +196,30 @@ def test_lovasz_softmax_sees_errors_of_a_few_percent() -> None:
     probabilities = (logits / 4 + 5 * torch.nn.functional.one_hot(target, K)).softmax(dim=1)
     expected = lovasz_by_sets(probabilities.tolist(), target.tolist())
     assert expected < 0.05
-    assert lovasz_softmax(probabilities, target).item() == pytest.approx(expected, abs=2e-3)
+    assert region_of(lovasz_softmax, probabilities, target).item() == pytest.approx(
+        expected, abs=2e-3
+    )
 
 
 def test_lovasz_softmax_of_hard_predictions_is_the_jaccard_loss() -> None:
     target = torch.tensor([0, 0, 0, 1, 1])
     hard = torch.nn.functional.one_hot(torch.tensor([0, 0, 1, 1, 0]), 3).float()
-    assert lovasz_softmax(hard, target).item() == pytest.approx(1 - (2 / 4 + 1 / 3) / 2)
+    assert region_of(lovasz_softmax, hard, target).item() == pytest.approx(1 - (2 / 4 + 1 / 3) / 2)
 
 
 @LOSSES
-def test_a_perfect_prediction_costs_nothing_and_a_wrong_one_does(loss: Loss) -> None:
+def test_a_perfect_prediction_costs_nothing_and_a_wrong_one_does(region_loss: RegionLoss) -> None:
     labels = torch.tensor([1, 2, 3, 3, 0])
     right = torch.nn.functional.one_hot((labels - 1).clamp_min(0), K) * 40.0
-    assert loss(right, labels, None, 1.0).item() == pytest.approx(0, abs=1e-5)
-    assert loss(right.roll(1, dims=1), labels, None, 1.0).item() > 1
+    assert loss_of(region_loss, right, labels, None, 1.0).item() == pytest.approx(0, abs=1e-5)
+    assert loss_of(region_loss, right.roll(1, dims=1), labels, None, 1.0).item() > 1
 
 
 @LOSSES
-def test_ignored_points_carry_no_gradient_and_the_others_do(loss: Loss) -> None:
+def test_ignored_points_carry_no_gradient_and_the_others_do(region_loss: RegionLoss) -> None:
     logits, labels = example()
     logits.requires_grad_()
-    loss(logits, labels, torch.rand(K), 1.0).backward()
+    loss_of(region_loss, logits, labels, torch.rand(K), 1.0).backward()
     assert (labels == 0).any()
     assert logits.grad is not None
     assert (logits.grad[labels == 0] == 0).all()
@@ -195,18 +227,23 @@ def test_ignored_points_carry_no_gradient_and_the_others_do(loss: Loss) -> None:
 
 
 @LOSSES
-def test_the_logits_of_ignored_points_do_not_change_the_loss(loss: Loss) -> None:
+def test_the_logits_of_ignored_points_do_not_change_the_loss(region_loss: RegionLoss) -> None:
     logits, labels = example()
     changed = torch.where((labels == 0)[:, None], torch.randn_like(logits) * 50, logits)
-    assert torch.equal(loss(logits, labels, None, 1.0), loss(changed, labels, None, 1.0))
+    assert torch.equal(
+        loss_of(region_loss, logits, labels, None, 1.0),
+        loss_of(region_loss, changed, labels, None, 1.0),
+    )
 
 
 @LOSSES
 @pytest.mark.parametrize("points", [0, 7])
-def test_if_every_point_is_ignored_loss_and_gradient_are_zero(loss: Loss, points: int) -> None:
+def test_if_every_point_is_ignored_loss_and_gradient_are_zero(
+    region_loss: RegionLoss, points: int
+) -> None:
     logits = torch.randn(points, K, requires_grad=True)
     labels = torch.zeros(points, dtype=torch.uint8)
-    value = loss(logits, labels, torch.ones(K), 1.0)
+    value = loss_of(region_loss, logits, labels, torch.ones(K), 1.0)
     value.backward()
     assert value.item() == 0
     assert logits.grad is not None
@@ -216,11 +253,11 @@ def test_if_every_point_is_ignored_loss_and_gradient_are_zero(loss: Loss, points
 @LOSSES
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_for_extreme_logits_the_loss_is_in_float32_and_its_gradient_finite(
-    loss: Loss, dtype: torch.dtype
+    region_loss: RegionLoss, dtype: torch.dtype
 ) -> None:
     logits, labels = example()
     logits = (logits * 1000).to(dtype).requires_grad_()
-    value = loss(logits, labels.to(torch.uint8), None, 1.0)
+    value = loss_of(region_loss, logits, labels.to(torch.uint8), None, 1.0)
     value.backward()
     assert value.dtype == torch.float32
     assert logits.grad is not None
@@ -228,13 +265,13 @@ def test_for_extreme_logits_the_loss_is_in_float32_and_its_gradient_finite(
 
 
 @LOSSES
-def test_a_step_down_the_gradient_lowers_the_loss(loss: Loss) -> None:
+def test_a_step_down_the_gradient_lowers_the_loss(region_loss: RegionLoss) -> None:
     logits, labels = example()
     logits.requires_grad_()
-    before = loss(logits, labels, None, 1.0)
+    before = loss_of(region_loss, logits, labels, None, 1.0)
     before.backward()
     assert logits.grad is not None
-    assert loss(logits - 0.5 * logits.grad, labels, None, 1.0) < before
+    assert loss_of(region_loss, logits - 0.5 * logits.grad, labels) < before
 
 
 def test_class_weights_are_proportional_to_the_square_root_of_the_inverse_frequency() -> None:

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Literal
 
+import numpy as np
 import pytest
 import torch
+from torch.nn import functional as F
 
 from amvnet.config.nested import from_dict
-from amvnet.config.schema import ModelConfig, NetworkTraining
+from amvnet.config.schema import ModelConfig, NetworkTraining, Recipe, TrainingConfig
+from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
-from amvnet.training.losses import dice, lovasz_softmax, polar_view_loss, range_view_loss
-from amvnet.training.networks import REGION_LOSSES, PolarStage, RangeStage
+from amvnet.training.losses import Targets, dice, lovasz_softmax
+from amvnet.training.networks import PolarStage, make_stage
+from amvnet.training.plan import Plan
 
 from fixtures.worlds import MODEL, street
 
@@ -24,9 +30,11 @@ OVER_VOXELS = replace(CONFIG, loss_over="voxels")
 MODEL_CONFIG = from_dict(ModelConfig, MODEL)
 
 
-def range_stage(config: NetworkTraining = CONFIG) -> RangeStage:
-    model = build_amvnet(MODEL_CONFIG, SEMANTICKITTI.size)
-    return RangeStage(model.range_view, model.range_net, config, SEMANTICKITTI, None)
+def plan_with(config: NetworkTraining) -> Plan:
+    """Return a plan without scans, in which both networks are trained alike."""
+    training = replace(TrainingConfig(), rv=config, bev=config)
+    dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
+    return Plan(Recipe(training=training), TrainingScans(dataset, [], []), Path("run"))
 
 
 def polar_stage(config: NetworkTraining = CONFIG) -> PolarStage:
@@ -46,8 +54,8 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
     batch, labels = batch_of_two()
     stage = polar_stage(OVER_VOXELS)
     with torch.no_grad():
-        logits, voxel_labels, point_logits = stage.logits(batch, labels)
-        _, _, expected_points = polar_stage().logits(batch, labels)
+        voxels, point_logits = stage.logits(batch, labels)
+        _, expected_points = polar_stage().logits(batch, labels)
     torch.testing.assert_close(point_logits, expected_points)
 
     # The voxels of each scan by their logits and labels, in any order.
@@ -64,8 +72,10 @@ def test_the_voxels_of_a_batch_equal_a_loop_over_its_points() -> None:
             majority = min(inside, key=lambda label: (-inside.count(label), label)) if inside else 0
             expected.append((point_logits[points[0]].tolist(), majority))
 
-        rows = logits[scan].tolist()
-        assert sorted(zip(rows, voxel_labels[scan].tolist(), strict=True)) == sorted(expected)
+        of_scan = voxels.scan == scan
+        rows = voxels.logits[of_scan].tolist()
+        voxel_labels = voxels.labels[of_scan].tolist()
+        assert sorted(zip(rows, voxel_labels, strict=True)) == sorted(expected)
 
 
 def test_the_loss_over_voxels_learns() -> None:
@@ -73,9 +83,9 @@ def test_the_loss_over_voxels_learns() -> None:
     stage = polar_stage(OVER_VOXELS)
     optimizer = torch.optim.Adam(stage.trained.parameters(), 0.02)
     losses = []
-    for _ in range(8):
-        logits, voxel_labels, _ = stage.logits(batch, labels)
-        loss = stage.loss(logits[0], voxel_labels[0])
+    for _ in range(16):
+        voxels, _ = stage.logits(batch, labels)
+        loss = stage.loss(voxels)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -84,15 +94,25 @@ def test_the_loss_over_voxels_learns() -> None:
 
 
 @pytest.mark.parametrize("name", ["default", "dice", "lovasz"])
-def test_a_stage_has_the_region_loss_of_its_recipe(
-    name: Literal["default", "dice", "lovasz"],
+@pytest.mark.parametrize("stage", ["rv", "bev"])
+def test_the_loss_of_a_stage_equals_its_formula_with_all_weights(
+    stage: str, name: Literal["default", "dice", "lovasz"]
 ) -> None:
-    logits = torch.randn(50, 19)
-    labels = torch.randint(0, 20, (50,))
-    region_loss = REGION_LOSSES[name]
-    config = replace(CONFIG, region_loss=name)
+    """Class weights, the weight of the region loss, and the recipe's region loss or the paper's."""
+    config = replace(CONFIG, region=0.3, region_loss=name)
+    of_paper = {"rv": dice, "bev": lovasz_softmax}[stage]
+    region_loss = {"default": of_paper, "dice": dice, "lovasz": lovasz_softmax}[name]
+    weights = np.linspace(0.2, 3, 19, dtype=np.float32)
+    made = make_stage(plan_with(config), stage, build_amvnet(MODEL_CONFIG, 19), weights)
 
-    expected = range_view_loss(logits, labels, None, 1.0, region_loss or dice)
-    assert range_stage(config).loss(logits, labels) == expected
-    expected = polar_view_loss(logits, labels, None, 1.0, region_loss or lovasz_softmax)
-    assert polar_stage(config).loss(logits, labels) == expected
+    batch, labels = batch_of_two()
+    with torch.no_grad():
+        scored, _ = made.eval().logits(batch, labels)
+        losses = []
+        for scan in range(2):
+            logits = scored.logits[(scored.scan == scan) & (scored.labels > 0)]
+            target = scored.labels[(scored.scan == scan) & (scored.labels > 0)] - 1
+            cross_entropy = F.cross_entropy(logits, target, torch.from_numpy(weights))
+            targets = Targets.of(target, torch.zeros_like(target), (1, 19))
+            losses.append(cross_entropy + 0.3 * region_loss(logits.softmax(1), targets))
+        torch.testing.assert_close(made.loss(scored), torch.stack(losses).mean())

@@ -6,6 +6,7 @@ import csv
 import json
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -22,12 +23,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
-from amvnet.errors import InputError
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
-from amvnet.training.head_points import PointGatherer
 from amvnet.training.loaders import count_classes
 from amvnet.training.networks import NetworkStage
 from amvnet.training.plan import Plan
@@ -148,7 +147,10 @@ def test_the_class_counts_of_a_run_are_those_of_its_training_scans(world: Path, 
         assert count == np.count_nonzero(raw_labels == raw_ids.get(index, -1))
 
 
-def test_counting_classes_reports_ten_times_and_only_once(tmp_path: Path) -> None:
+def test_counting_classes_reports_ten_times_and_only_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("amvnet.progress.QUIET_SECONDS", 0)
     dataset = open_dataset(str(make_streets(tmp_path, ("00",), 23)))
     records = dataset.records(["00"])
     lines: list[str] = []
@@ -471,49 +473,6 @@ def test_two_stages_trained_at_the_same_time_are_both_kept(
         assert weights.digest(PART_OF[stage]) == trained.digest(PART_OF[stage])
 
 
-def test_folds_score_no_sequence_that_they_learnt_from(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sources_of_calls = []
-    gather = PointGatherer.gather
-
-    def spy(self: PointGatherer, sources: Any, *arguments: Any, **options: Any) -> Any:
-        sources_of_calls.append(sources)
-        return gather(self, sources, *arguments, **options)
-
-    monkeypatch.setattr(PointGatherer, "gather", spy)
-    weights = train(world, tmp_path / "run", "--training.head.folds", 2, "--training.rv.epochs", 1)
-
-    scans = []
-    training_sources = sources_of_calls[0]
-    for source in training_sources:
-        scans += [record.name for record in source.records]
-        scored = {record.sequence for record in source.records}
-        for part in ("range_net", "polar_net"):
-            assert scored.isdisjoint(source.weights.training[part]["sequences"])
-
-    assert sorted(scans) == ["00/000000", "00/000001", "01/000000", "01/000001"]
-    assert weights.training["point_head"]["head"]["folds"] == 2
-    assert weights.training["range_net"]["sequences"] == ["00", "01"]
-
-
-def test_a_fold_does_not_choose_its_epoch_by_the_scans_that_it_scores(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plans = []
-
-    def stop(plan: Plan, name: str, weights: Weights) -> None:
-        plans.append(plan)
-        raise InputError("enough")
-
-    save(fresh_weights(), tmp_path / "w.safetensors")
-    monkeypatch.setattr(training_run, "train_network", stop)
-    options = ("--stage", "head", "--init", tmp_path / "w.safetensors", "--training.keep", "best")
-    fail(*train_arguments(world, tmp_path / "run"), *options, "--training.head.folds", 2)
-    assert plans[0].recipe.training.keep == "last"
-    assert plans[0].recipe.training.rv.epochs > 1
-
-
 def test_every_recipe_takes_the_last_epoch() -> None:
     assert {load_recipe(name).training.keep for name in recipe_names()} == {"last"}
 
@@ -618,7 +577,7 @@ def test_a_users_label_map_is_learnt(world: Path, tmp_path: Path) -> None:
 def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(
     world: Path, tmp_path: Path
 ) -> None:
-    weights = train(world, tmp_path / "run", "--model.assertion.threshold=-1")
+    weights = train(world, tmp_path / "run", "--model.assertion.threshold", 0)
     assert weights.parts == PARTS
     assert weights.usual_uncertain == 0
     assert max(column(tmp_path / "run", "head", "val/acc")) > 0.5
@@ -714,6 +673,44 @@ def test_a_killed_run_resumes_to_the_same_weights(
     assert resumed.returncode == 0, resumed.stderr
     weights = load(out / stage / "last.safetensors")
     assert not differing(weights, load(run / stage / "last.safetensors"))
+
+
+def test_sigterm_ends_a_training_with_143_and_one_line_and_resume_goes_on(
+    world: Path, run: Path, tmp_path: Path
+) -> None:
+    """Lightning has a handler of its own, under which the training would end as if it were done."""
+    command = command_of(world, tmp_path / "run", "rv")
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    while not (tmp_path / "run/rv/last.ckpt").exists() and process.poll() is None:
+        time.sleep(0.002)
+    process.terminate()
+    output, error = process.communicate()
+    assert process.returncode == 143, error
+    assert error == "amvnet: stopped; go on with --resume\n"
+    assert "weights in" not in output
+
+    assert subprocess.run([*command, "--resume"], capture_output=True, check=False).returncode == 0
+    resumed = load(tmp_path / "run/rv/last.safetensors")
+    assert not differing(resumed, load(run / "rv/last.safetensors"))
+
+
+def test_the_handler_of_sigterm_during_a_training_is_that_of_the_process(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    handlers: dict[str, Any] = {}
+    train_network = training_run.train_network
+
+    def note(plan: Plan, name: str, weights: Weights) -> None:
+        handlers["before"] = signal.getsignal(signal.SIGTERM)
+        train_network(plan, name, weights)
+
+    def note_within(self: NetworkStage, optimizer: Any) -> None:
+        handlers["within"] = signal.getsignal(signal.SIGTERM)
+
+    monkeypatch.setattr(training_run, "train_network", note)
+    monkeypatch.setattr(NetworkStage, "on_before_optimizer_step", note_within)
+    train(world, tmp_path / "run", "--stage", "rv", "--training.rv.epochs", 1)
+    assert handlers["within"] == handlers["before"] != signal.SIG_DFL
 
 
 @pytest.mark.parametrize("room", [pytest.param(1_000, marks=pytest.mark.slow), 40_000])

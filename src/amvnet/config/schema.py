@@ -163,7 +163,7 @@ class PolarNetConfig(Checked):
 class AssertionConfig(Checked):
     """The assertion that decides which points are uncertain (section 3.2 of the paper)."""
 
-    threshold: Annotated[float, Range(-1, 1)] = 0.85
+    threshold: Share = 0.85
     """tau: the largest cosine similarity of the two networks' scores of an uncertain point."""
 
     obsolete: ClassVar[Obsolete] = {
@@ -238,8 +238,6 @@ class AugmentConfig(Checked):
     """Shift of the intensity by up to +- this, the same in all of a scan (open)."""
     intensity_gamma: Annotated[float, Range(0, 3)] = 0.0
     """Intensity to the power of exp(+- up to this), one exponent per scan (open)."""
-    intensity_noise: Share = 0.0
-    """Standard deviation of the noise on the intensity of each point (open)."""
     laser_gain: Annotated[float, Range(0, 0.99)] = 0.0
     """Scaling of the intensity by 1 +- this, one factor per scan and laser (open)."""
     no_intensity: Share = 0.0
@@ -250,14 +248,14 @@ class AugmentConfig(Checked):
     """Probability of dropping every second laser of a scan, or up to half of them (open)."""
     block_drop: Share = 0.0
     """Probability of dropping a few rectangles of azimuth and elevation, as if hidden (open)."""
-    far_drop: Share = 0.0
-    """Probability of dropping all points beyond some range from 25 to 60 m (open)."""
     mix: Share = 0.0
     """Probability of replacing a sector by that of another training scan (PolarMix; open)."""
     laser_mix: Share = 0.0
     """Probability of taking every second band of elevation from another scan (LaserMix; open)."""
     paste: Share = 0.0
     """Probability of adding the rare objects of another scan, also turned (PolarMix; open)."""
+
+    obsolete: ClassVar[Obsolete] = {"intensity_noise": (0.0,), "far_drop": (0.0,)}
 
 
 @dataclass(frozen=True)
@@ -329,8 +327,8 @@ class HeadTraining(Checked):
     """Points of an epoch, other ones in each, drawn at random from those on disk; 0: all (open)."""
     balance: Share = 0.0
     """How far draws even out the classes: 0 draws points alike, 1 classes equally often (open)."""
-    folds: Count = 1
-    """Folds of cross-fitting: networks score sequences held out from their training; 1: none."""
+
+    obsolete: ClassVar[Obsolete] = {"folds": (1,)}
 
 
 @dataclass(frozen=True)

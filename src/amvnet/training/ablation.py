@@ -57,10 +57,7 @@ class HeadStudy:
 
     def _score(self, value: float, say: Say, device: str) -> Swept:
         networks = self._networks(value)
-        # Folds would train networks of their own.
-        head = dataclasses.replace(self.recipe.training.head, folds=1)
-        training = dataclasses.replace(self.recipe.training, head=head)
-        recipe = dataclasses.replace(self.recipe, model=networks.model, training=training)
+        recipe = dataclasses.replace(self.recipe, model=networks.model)
         out = self.out / self.name / str(value)
         plan = Plan(recipe, self.scans, out, resume=True, say=say)
 

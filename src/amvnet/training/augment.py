@@ -19,7 +19,6 @@ MOST_LASERS = 0.5  # largest share of the lasers that is dropped at random
 MOST_BLOCKS = 4  # dropped from one scan
 BLOCK_WIDTH = (5.0, 40.0)  # degrees of azimuth
 BLOCK_HEIGHT = (3.0, 12.0)  # degrees of elevation
-FAR = (25.0, 60.0)  # metres: the range of a dimmed or fogged sensor
 BANDS = (3, 6)  # bands of elevation of mixed scans, fewest and most; LaserMix's own numbers
 TURNS = (1, 2)  # turned copies of pasted objects, fewest and most
 
@@ -41,8 +40,6 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
         scan = _drop_lasers(scan, rng)
     if config.block_drop and rng.random() < config.block_drop:
         scan = _drop_blocks(scan, rng)
-    if config.far_drop and rng.random() < config.far_drop:
-        scan = _keep(scan, ~(_ranges(scan) > rng.uniform(*FAR)))
     if config.drop:
         scan = _drop_points(scan, config.drop, rng)
 
@@ -252,9 +249,6 @@ def _distort_intensity(
     if config.intensity_offset:
         offset = rng.uniform(-config.intensity_offset, config.intensity_offset)
         intensity = np.clip(intensity + offset, 0, 1)
-    if config.intensity_noise:
-        noise = rng.normal(scale=config.intensity_noise, size=len(scan))
-        intensity = np.clip(intensity + noise, 0, 1)
     return intensity
 
 
@@ -268,11 +262,6 @@ def _elevations(scan: Scan) -> np.ndarray:
     """Return (N,) angles above the horizon, radians."""
     x, y, z = scan.points[:, :3].T
     return np.arctan2(z, np.hypot(x, y))
-
-
-def _ranges(scan: Scan) -> np.ndarray:
-    """Return (N,) distances from the sensor, metres."""
-    return np.linalg.norm(scan.points[:, :3], axis=1)
 
 
 def _spread(values: np.ndarray) -> np.ndarray:

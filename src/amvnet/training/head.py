@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from amvnet.config.schema import HeadTraining
-from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.point_head import PointHead
@@ -24,7 +23,6 @@ from amvnet.training.head_points import (
     HeadPoints,
     PointDraw,
     PointGatherer,
-    ScoredScans,
     make_head_loader,
 )
 from amvnet.training.plan import Plan
@@ -123,13 +121,12 @@ class HeadStage(Stage):
         return self.class_weights[labels - 1].sum().float()
 
 
-def train_head(plan: Plan, weights: Weights, sources: Sequence[ScoredScans]) -> None:
+def train_head(plan: Plan, weights: Weights) -> None:
     """Train the point head on scores of frozen networks, and write its weights after each epoch.
 
     Args:
         plan: of the run.
-        weights: to begin with, of which the networks score the validation scans.
-        sources: what scores the training scans.
+        weights: to begin with, whose networks score the scans.
 
     Raises:
         InputError: if a network is missing, or the scans have too few points for the head.
@@ -140,13 +137,17 @@ def train_head(plan: Plan, weights: Weights, sources: Sequence[ScoredScans]) -> 
 
     # Gather the uncertain points of all scans, with their scores and neighbours. Other models'
     # scores are of the scans as they are.
-    val_source = scored_scans(plan, weights, plan.scans.val)
+    for part in BOTH_NETWORKS if plan.scores is None else ():
+        if part not in weights.parts:
+            raise InputError(
+                f"expected trained networks for the head, found no {part}; train it, or give --init"
+            )
     intensity = None
     if plan.scores is None:
         intensity = trained_intensity(weights.training, weights.sensor)
-    gatherer = PointGatherer(plan, weights.model, intensity)
-    train = gatherer.gather(sources, folder / "train", config.views, plan.say)
-    val = gatherer.gather([val_source], folder / "val") if plan.scans.val else None
+    gatherer = PointGatherer(plan, weights, intensity)
+    train = gatherer.gather(plan.scans.train, folder / "train", config.views, plan.say)
+    val = gatherer.gather(plan.scans.val, folder / "val") if plan.scans.val else None
 
     model = build_model(plan, "point_head", weights)
     assert model.point_head is not None
@@ -170,20 +171,6 @@ def train_head(plan: Plan, weights: Weights, sources: Sequence[ScoredScans]) -> 
     if plan.processes.first:
         for name in ("train", "val"):
             shutil.rmtree(folder / name, ignore_errors=True)
-
-
-def scored_scans(plan: Plan, weights: Weights, records: Sequence[ScanRecord]) -> ScoredScans:
-    """Return scans with the scores in files if the plan has any, else with those of networks.
-
-    Raises:
-        InputError: if the plan has none, and a network is missing.
-    """
-    for part in BOTH_NETWORKS if plan.scores is None else ():
-        if part not in weights.parts:
-            raise InputError(
-                f"expected trained networks for the head, found no {part}; train it, or give --init"
-            )
-    return ScoredScans(records, weights, plan.scores)
 
 
 def _make_loaders(plan: Plan, train: HeadPoints, val: HeadPoints | None) -> Loaders:

@@ -10,18 +10,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils import data
 
-from amvnet.config.schema import ModelConfig
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.distributed import ALONE, Processes, device_of
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
-from amvnet.inference.scores import SURE, ScorePair
+from amvnet.inference.scores import SURE
 from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
@@ -30,7 +30,7 @@ from amvnet.progress import Say, Tenths, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.augment import disturb
-from amvnet.training.loaders import ScanSet, collate
+from amvnet.training.loaders import Key, ScanSet, collate
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights
 
@@ -190,82 +190,23 @@ def make_head_loader(
 
 
 @dataclass(frozen=True)
-class ScoredScans:
-    """Scans, and what gives f and g of their points: frozen networks, or two other models' files.
-
-    Attributes:
-        records: the scans.
-        weights: the networks.
-        pair: two other models' scores in files, in place of the networks.
-    """
-
-    records: Sequence[ScanRecord]
-    weights: Weights
-    pair: ScorePair | None = None
-
-    def scorer(self, device: str, by_ring: bool) -> Scorer:
-        """Return what scores a scan on a device.
-
-        Args:
-            by_ring: whether `ring` of the scans is the row of each point in the range image.
-        """
-        if self.pair is not None:
-            return self._read
-        model = self.weights.build().to(device)
-        if by_ring:
-            model.range_view = model.range_view.by_ring()
-
-        def score(record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
-            return model.score(*model.project(batch))
-
-        return score
-
-    def _read(self, record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
-        assert self.pair is not None
-        f, g = self.pair.read(Path(record.prediction), scan, self.weights.taxonomy.size)
-        device = batch.points.device
-        f_valid = torch.from_numpy(f[scan.valid]).clamp_min(SURE).to(device)
-        return f_valid, torch.from_numpy(g[scan.valid]).clamp_min(SURE).to(device)
-
-
-@dataclass(frozen=True)
-class _Job:
-    """A scan to score, in one of its views.
-
-    Attributes:
-        source: scores the scan.
-        scans: reads the scans of the source, by view and index.
-        view: number of the augmented view; takes the place of the epoch.
-        index: of the scan in the source.
-    """
-
-    source: ScoredScans
-    scans: ScanSet
-    view: int
-    index: int
-
-
-@dataclass(frozen=True)
 class PointGatherer:
     """Scores scans by two networks, and keeps their uncertain points on disk for the head.
 
     Attributes:
-        plan: of the run; all of its processes must see the folder of the points.
-        model: says which points are uncertain, and how the head sees them.
+        plan: of the run; all of its processes must see the folder of the points. Two other models'
+            scores in it take the place of those of the networks.
+        weights: the networks.
         intensity: of the training of the networks, to which intensities are brought before the
             augmentation; None for other models' scores.
     """
 
     plan: Plan
-    model: ModelConfig
+    weights: Weights
     intensity: TrainedIntensity | None = None
 
     def gather(
-        self,
-        sources: Sequence[ScoredScans],
-        folder: Path,
-        views: int = 0,
-        say: Say = say_nothing,
+        self, records: Sequence[ScanRecord], folder: Path, views: int = 0, say: Say = say_nothing
     ) -> HeadPoints:
         """Gather the labelled uncertain points of some scans.
 
@@ -273,26 +214,29 @@ class PointGatherer:
         are drawn from all labelled points instead.
 
         Args:
-            sources: the scans, and what scores them.
+            records: the scans.
             folder: receives the points; its earlier content is removed.
             views: how often each scan is scored, each time augmented differently; 0 to score it
-                once, without augmentation. Taken as 0 if a source cannot score augmented scans.
+                once, without augmentation. Other models' scores are of the scans as they are.
             say: told the progress, line by line.
 
         Raises:
             InputError: if the scans have too few labelled points.
         """
-        if any(source.pair is not None for source in sources):
+        training = self.plan.recipe.training
+        if self.plan.scores is not None:
             views = 0
-
-        jobs = self._jobs(sources, views)
+        augment = training.augment if views > 0 else None
+        dataset = self.plan.scans.dataset
+        scans = ScanSet(dataset, records, augment, training.seed, self.intensity)
+        keys = [(view, index) for view in range(max(views, 1)) for index in range(len(scans))]
         least = max(2, self._processes.size)  # batch norm needs two, and each process one
 
-        assertion = Disagreement(self.model.assertion.threshold)
-        points = self._gather(jobs, folder, assertion, say)
+        assertion = Disagreement(self.weights.model.assertion.threshold)
+        points = self._gather(scans, keys, folder, assertion, say)
         if len(points) < least:
             say("head: the networks agree everywhere; it learns from points drawn from all")
-            everywhere = self._gather(jobs, folder, _everywhere, say)
+            everywhere = self._gather(scans, keys, folder, _everywhere, say)
             points = replace(everywhere, uncertain_share=points.uncertain_share)
 
         if len(points) < least:
@@ -302,30 +246,37 @@ class PointGatherer:
             )
         return points
 
-    def _jobs(self, sources: Sequence[ScoredScans], views: int) -> list[_Job]:
-        """List every view of every scan of every source."""
-        augment = self.plan.recipe.training.augment if views > 0 else None
+    def _scorer(self) -> Scorer:
+        """Return what scores a scan."""
+        if self.plan.scores is not None:
+            return self._read_scores
+        model = self.weights.build().to(self._device)
+        if self.plan.scans.dataset.is_normalised:
+            model.range_view = model.range_view.by_ring()
 
-        jobs = []
-        for source in sources:
-            seed = self.plan.recipe.training.seed
-            scans = ScanSet(self.plan.scans.dataset, source.records, augment, seed, self.intensity)
-            for view in range(max(views, 1)):
-                for index in range(len(scans)):
-                    jobs.append(_Job(source, scans, view, index))
-        return jobs
+        def score(record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
+            return model.score(*model.project(batch))
+
+        return score
+
+    def _read_scores(
+        self, record: ScanRecord, scan: Scan, batch: PointBatch
+    ) -> tuple[Tensor, Tensor]:
+        """Return two other models' scores of a scan."""
+        assert self.plan.scores is not None
+        classes = self.weights.taxonomy.size
+        f, g = self.plan.scores.read(Path(record.prediction), scan, classes)
+        f_valid = torch.from_numpy(f[scan.valid]).clamp_min(SURE)
+        g_valid = torch.from_numpy(g[scan.valid]).clamp_min(SURE)
+        return f_valid.to(self._device), g_valid.to(self._device)
 
     def _gather(
-        self,
-        jobs: Sequence[_Job],
-        folder: Path,
-        assertion: Assertion,
-        say: Say,
+        self, scans: ScanSet, keys: Sequence[Key], folder: Path, assertion: Assertion, say: Say
     ) -> HeadPoints:
-        """Gather the points that an assertion finds uncertain."""
+        """Gather the points that an assertion finds uncertain, of some views of scans."""
         _make_empty(folder, self._processes)
-        path = folder / str(self._processes.rank)
-        counts, matrices = self._score_share(jobs, path, assertion, say)
+        with (folder / str(self._processes.rank)).open("wb") as file:
+            counts, matrices = self._score_share(scans, keys, file, assertion, say)
 
         counts_by_rank = self._processes.gather(counts)
         certain, uncertain = np.sum(self._processes.gather(matrices), axis=0)
@@ -340,11 +291,7 @@ class PointGatherer:
         )
 
     def _score_share(
-        self,
-        jobs: Sequence[_Job],
-        path: Path,
-        assertion: Assertion,
-        say: Say,
+        self, scans: ScanSet, keys: Sequence[Key], file: IO[bytes], assertion: Assertion, say: Say
     ) -> tuple[list[int], np.ndarray]:
         """Score this process's share of the scans, and write their points to a file.
 
@@ -356,30 +303,25 @@ class PointGatherer:
         matrices = np.zeros((2, ids, ids), dtype=np.int64)
         counts = []
 
-        share = self._processes.share(jobs)
-        points = self.plan.recipe.training.head.points
-        most = -(-points // len(jobs))  # of a scan, rounded up
-        source = None
+        share = self._processes.share(keys)
+        limit = self.plan.recipe.training.head.points
+        most = -(-limit // len(keys))  # points of a scan, rounded up
+        scorer = self._scorer()
         tenths = Tenths()
-        with path.open("wb") as file:
-            for number, job in enumerate(share, start=1):
-                if job.source is not source:
-                    source = job.source
-                    scorer = source.scorer(self._device, self.plan.scans.dataset.is_normalised)
+        for number, key in enumerate(share, start=1):
+            points, scan_matrices = self._gather_scan(scans, key, scorer, assertion, most)
+            points.tofile(file)
+            counts.append(len(points))
+            matrices += scan_matrices
 
-                points, scan_matrices = self._gather_scan(job, scorer, assertion, most)
-                points.tofile(file)
-                counts.append(len(points))
-                matrices += scan_matrices
-
-                if tenths.ends(number, len(share)):
-                    say(f"head: scored {number * len(jobs) // len(share)} of {len(jobs)} scans")
+            if tenths.ends(number, len(share)):
+                say(f"head: scored {number * len(keys) // len(share)} of {len(keys)} scans")
 
         return counts, matrices
 
     @torch.inference_mode()
     def _gather_scan(
-        self, job: _Job, scorer: Scorer, assertion: Assertion, most: int
+        self, scans: ScanSet, key: Key, scorer: Scorer, assertion: Assertion, most: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Score one scan, and draw at most `most` of its uncertain points.
 
@@ -388,23 +330,24 @@ class PointGatherer:
             ensemble over the certain and over all uncertain points of the scan.
         """
         device = self._device
-        scan = job.scans[job.view, job.index]
+        seeds = [self.plan.recipe.training.seed, *key]
+        scan = scans[key]
         batch, labels = collate([scan])
         batch = batch.to(device)
         labels = labels.to(device)
 
-        f, g = scorer(job.source.records[job.index], scan, batch)
-        if job.scans.augment is not None:
-            f, g = self._disturbed(f, g, batch.points, job)
+        f, g = scorer(scans.records[key[1]], scan, batch)
+        if scans.augment is not None:
+            f, g = self._disturbed(f, g, batch.points, np.random.default_rng([*seeds, 1]))
         uncertain = assertion(f, g, batch.points) & (labels > 0)
         matrices = _ensemble_matrices(f, g, labels, uncertain)
 
         candidates = uncertain.nonzero()[:, 0]
-        rng = np.random.default_rng([self.plan.recipe.training.seed, job.view, job.index])
+        rng = np.random.default_rng(seeds)
         drawn = np.sort(rng.permutation(len(candidates))[:most])
         index = candidates[torch.from_numpy(drawn).to(device)]
 
-        config = self.model.point_head
+        config = self.weights.model.point_head
         near = nearest_neighbours(batch.points, index, config.neighbours)
         point, rows = head_features(config, point_table(batch.points, f, g), index, near)
 
@@ -415,10 +358,11 @@ class PointGatherer:
         points["stands_for"] = len(candidates) / max(len(index), 1)
         return points, matrices
 
-    def _disturbed(self, f: Tensor, g: Tensor, points: Tensor, job: _Job) -> tuple[Tensor, Tensor]:
+    def _disturbed(
+        self, f: Tensor, g: Tensor, points: Tensor, rng: np.random.Generator
+    ) -> tuple[Tensor, Tensor]:
         """Return the scores of both networks, each disturbed with the recipe's probability."""
         chance = self.plan.recipe.training.head.disturb
-        rng = np.random.default_rng([self.plan.recipe.training.seed, job.view, job.index, 1])
         disturbed_f = disturb(f, points, rng) if rng.random() < chance else f
         disturbed_g = disturb(g, points, rng) if rng.random() < chance else g
         return disturbed_f, disturbed_g
@@ -433,7 +377,8 @@ class PointGatherer:
 
     @property
     def _dtype(self) -> np.dtype:
-        return point_dtype(self.plan.scans.dataset.taxonomy.size, self.model.point_head.neighbours)
+        neighbours = self.weights.model.point_head.neighbours
+        return point_dtype(self.weights.taxonomy.size, neighbours)
 
 
 def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:

@@ -1,8 +1,13 @@
-"""The losses of the two networks (section 3.1 of the paper); train id 0 is ignored."""
+"""The losses of the two networks (section 3.1 of the paper); train id 0 is ignored.
+
+The loss of a batch is the mean over its scans. No loop runs over scans or classes: on a GPU its
+steps would cost more to launch than to compute.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,8 +17,6 @@ from torch.nn import functional as F
 # A rarer class gets the weight of one with this frequency, so that a few points cannot dominate a
 # step.
 FREQUENCY_FLOOR = 1e-4
-
-RegionLoss = Callable[[Tensor, Tensor], Tensor]  # of probabilities and target, as `dice`
 
 # Lovász-softmax leaves out smaller errors. Together they would add less than this to the loss of a
 # class.
@@ -37,40 +40,84 @@ def class_weights(counts: np.ndarray) -> np.ndarray:
     return (weights / weights.mean()).astype(np.float32)
 
 
-def range_view_loss(
-    logits: Tensor,
-    labels: Tensor,
-    weights: Tensor | None,
-    region: float,
-    region_loss: RegionLoss | None = None,
+@dataclass(frozen=True)
+class Scored:
+    """The points, pixels or voxels of a batch of scans that a loss is over.
+
+    Attributes:
+        logits: (P, K).
+        labels: (P,) train ids.
+        scan: (P,) number of the scan of each, 0..scans - 1.
+        scans: B.
+    """
+
+    logits: Tensor
+    labels: Tensor
+    scan: Tensor
+    scans: int
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What a region loss compares probabilities (P, K) with.
+
+    Attributes:
+        classes: (P,) index of the class of each point, 0..K - 1.
+        scan: (P,) number of its scan.
+        counts: (B, K) points of each class in each scan.
+    """
+
+    classes: Tensor
+    scan: Tensor
+    counts: Tensor
+
+    @classmethod
+    def of(cls, classes: Tensor, scan: Tensor, shape: tuple[int, int]) -> Targets:
+        """Return the targets of B scans and K classes, given `shape`: (B, K)."""
+        scans, kinds = shape
+        counts = classes.new_zeros(scans * kinds)
+        counts.scatter_add_(0, scan * kinds + classes, torch.ones_like(classes))
+        return cls(classes, scan, counts.view(shape))
+
+    def shares(self, dtype: torch.dtype) -> Tensor:
+        """Return the (B, K) shares of the classes in a mean over scans of means over classes.
+
+        A class that is absent from a scan has none. A scan without points counts as 0.
+        """
+        present = (self.counts > 0).to(dtype)
+        return present / (present.sum(dim=1, keepdim=True).clamp_min(1) * len(present))
+
+
+RegionLoss = Callable[[Tensor, Targets], Tensor]  # of (P, K) probabilities
+
+
+def network_loss(
+    scored: Scored, weights: Tensor | None, region: float, region_loss: RegionLoss
 ) -> Tensor:
-    """Return cross-entropy + a region loss: in the paper the Dice loss for the range view.
+    """Return the mean over scans of cross-entropy + a region loss.
 
     Args:
-        logits: (P, K).
-        labels: (P,) train ids; points with 0 are ignored.
+        scored: the points; those with label 0 are ignored.
         weights: (K,) class weights of the cross-entropy, or None for equal weights.
         region: weight of the region loss; that of the cross-entropy is 1.
-        region_loss: `dice` or `lovasz_softmax`; `dice` if None.
+        region_loss: `dice` or `lovasz_softmax`.
 
     Returns:
-        The loss, (), float32, or float64 if the logits are; 0 if all points are ignored.
+        The loss, (), float32, or float64 if the logits are. A scan without labels counts as 0.
     """
-    return _loss(logits, labels, weights, region, region_loss or dice)
+    labelled = (scored.labels > 0).nonzero()[:, 0]
+    logits = at_least_float32(scored.logits.index_select(0, labelled))
+    classes = scored.labels.index_select(0, labelled).long() - 1
+    scan = scored.scan.index_select(0, labelled)
+    targets = Targets.of(classes, scan, (scored.scans, logits.shape[1]))
 
-
-def polar_view_loss(
-    logits: Tensor,
-    labels: Tensor,
-    weights: Tensor | None,
-    region: float,
-    region_loss: RegionLoss | None = None,
-) -> Tensor:
-    """Return cross-entropy + a region loss: Lovász-softmax if None, as PolarNet.
-
-    The arguments and the result are as for `range_view_loss`.
-    """
-    return _loss(logits, labels, weights, region, region_loss or lovasz_softmax)
+    # Each point counts by the weight of its class, in proportion to all points of its scan.
+    by_class = targets.counts.to(logits) if weights is None else targets.counts * weights
+    per_class = logits.new_ones(logits.shape[1]) if weights is None else weights.to(logits)
+    totals = by_class.sum(dim=1).clamp_min(torch.finfo(logits.dtype).tiny)
+    shares = per_class[classes] / (totals[scan] * scored.scans)
+    cross_entropy = (F.cross_entropy(logits, classes, reduction="none") * shares).sum()
+    return cross_entropy + region * region_loss(logits.softmax(dim=1), targets)
 
 
 def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> Tensor:
@@ -97,25 +144,28 @@ def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> 
     return torch.where(points[:, 1:].any(dim=1), order.argmax(dim=1) + 1, 0)
 
 
-def dice(probabilities: Tensor, target: Tensor) -> Tensor:
-    """Return the soft Dice loss: 1 - the mean of 2 |p t| / (|p| + |t|) over the classes present.
+def dice(probabilities: Tensor, targets: Targets) -> Tensor:
+    """Return the soft Dice loss: 1 - 2 |p t| / (|p| + |t|), averaged over the classes present.
 
     Args:
         probabilities: (P, K), p.
-        target: (P,) class indices in 0..K - 1; t is their one-hot encoding.
+        targets: of P points; t is the one-hot encoding of their classes.
 
     Returns:
-        The loss, ().
+        The loss, (), the mean over the scans.
     """
-    truth = F.one_hot(target, probabilities.shape[1]).to(probabilities.dtype)
-    present = truth.sum(dim=0) > 0
+    truth = F.one_hot(targets.classes, probabilities.shape[1]).to(probabilities)
+    members = F.one_hot(targets.scan, len(targets.counts)).to(probabilities).T  # (B, P)
 
-    overlap = (probabilities * truth).sum(dim=0)
-    score = 2 * overlap / (probabilities.sum(dim=0) + truth.sum(dim=0)).clamp_min(1e-6)
-    return 1 - score[present].mean()
+    # Mixed precision would multiply these matrices in half precision.
+    with torch.autocast(probabilities.device.type, enabled=False):
+        overlap = members @ (probabilities * truth)  # (B, K)
+        size = members @ probabilities + targets.counts
+    losses = 1 - 2 * overlap / size.clamp_min(1e-6)
+    return (losses * targets.shares(losses.dtype)).sum()
 
 
-def lovasz_softmax(probabilities: Tensor, target: Tensor) -> Tensor:
+def lovasz_softmax(probabilities: Tensor, targets: Targets) -> Tensor:
     """Return the Lovász extension of the Jaccard loss, averaged over the classes present.
 
     For each class the errors |t - p| are sorted, largest first. Each is weighted by the increase of
@@ -124,56 +174,64 @@ def lovasz_softmax(probabilities: Tensor, target: Tensor) -> Tensor:
 
     Args:
         probabilities: (P, K), p.
-        target: (P,) class indices in 0..K - 1; t is 1 for the points of the class, else 0.
+        targets: of P points; t is 1 for the points of the class, else 0.
 
     Returns:
-        The loss, ().
+        The loss, (), the mean over the scans.
     """
-    losses = []
-    for index in target.unique():
-        truth = (target == index).to(probabilities.dtype)
-        errors = (truth - probabilities[:, index]).abs()
+    classes = probabilities.shape[1]
+    with torch.no_grad():  # the order and the increases have no gradient
+        truth = F.one_hot(targets.classes, classes).bool()
+        errors = torch.where(truth, 1 - probabilities, probabilities)
+        is_large = (errors > MIN_ERROR) & (targets.counts > 0)[targets.scan]
+        index = is_large.flatten().nonzero()[:, 0]  # of errors, point by point
 
-        large = (errors > MIN_ERROR).nonzero()[:, 0]
-        errors, order = errors[large].sort(descending=True)
-        increases = _jaccard_increases(truth[large][order], truth.sum())
-        losses.append(errors @ increases)
+        # A group is a class of a scan.
+        point = index // classes
+        group = targets.scan[point] * classes + index % classes
+        order = _order(group, errors.flatten()[index])
+        index = index[order]
+        group = group[order]
+        is_true = truth.flatten()[index]
 
-    return torch.stack(losses).mean()
+        increases = _jaccard_increases(is_true, group, targets.counts.flatten())
+        increases = increases * targets.shares(probabilities.dtype).flatten()[group]
+        sign = 1 - 2 * is_true.to(probabilities)
+
+    large = probabilities.flatten().index_select(0, index)
+    return ((is_true + sign * large) * increases).sum()
 
 
-def _jaccard_increases(truth: Tensor, total: Tensor) -> Tensor:
+def _order(group: Tensor, errors: Tensor) -> Tensor:
+    """Return the order that sorts errors (M,) by group (M,), and within it the largest first."""
+    # Numbers from 0 are ordered as their bits are: one sort of whole numbers does both.
+    bits = errors.to(torch.float32).view(torch.int32).long()
+    return (group * 2**32 - bits).argsort()
+
+
+def _jaccard_increases(is_true: Tensor, group: Tensor, counts: Tensor) -> Tensor:
     """Return how much the Jaccard loss increases as each point in turn becomes mispredicted.
 
     Args:
-        truth: (M,) 1 for points of the class, 0 for others; sorted by falling error.
-        total: () number of all points of the class, including those with a small error.
+        is_true: (M,) bool: whether a point is of the class of its group; the points are sorted by
+            group, and within it by falling error.
+        group: (M,) ascending.
+        counts: (G,) points of the class of each group, including those with a small error.
 
     Returns:
-        (M,).
+        (M,) float32.
     """
-    intersection = total - truth.cumsum(0)
-    union = total + (1 - truth).cumsum(0)
+    sizes = torch.zeros_like(counts).scatter_add_(0, group, torch.ones_like(group))
+    before = sizes.cumsum(0) - sizes  # points before each group
+    true = is_true.cumsum(0)  # whole numbers: exact, however many
+    true_before = F.pad(true, (1, 0))[before]
 
-    loss = 1 - intersection / union
-    return torch.cat([loss[:1], loss[1:] - loss[:-1]])
-
-
-def _loss(
-    logits: Tensor,
-    labels: Tensor,
-    weights: Tensor | None,
-    region: float,
-    region_loss: RegionLoss,
-) -> Tensor:
-    labelled = labels > 0
-    if not labelled.any():
-        return logits.sum() * 0  # so that backward() finds a graph, with gradients of 0
-
-    logits = at_least_float32(logits[labelled])
-    target = labels[labelled].long() - 1
-    cross_entropy = F.cross_entropy(logits, target, weights)
-    return cross_entropy + region * region_loss(logits.softmax(dim=1), target)
+    # Within the group, up to each point.
+    place = torch.arange(1, len(group) + 1, device=group.device) - before[group]
+    found = true - true_before[group]
+    total = counts[group]
+    loss = 1 - (total - found).float() / (total + place - found)
+    return loss - F.pad(loss, (1, 0))[:-1].where(place > 1, 0)
 
 
 def at_least_float32(x: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,12 +22,12 @@ from amvnet.training.callbacks import Speed
 from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
+    Scored,
     class_weights,
     dice,
     lovasz_softmax,
     majority_labels,
-    polar_view_loss,
-    range_view_loss,
+    network_loss,
 )
 from amvnet.training.plan import Plan
 from amvnet.training.record import PART_OF
@@ -44,11 +43,7 @@ from amvnet.training.stage import (
 from amvnet.weights.file import Weights
 
 Batch = tuple[PointBatch, Tensor]  # points, and their (P,) train ids
-REGION_LOSSES: dict[str, RegionLoss | None] = {
-    "default": None,
-    "dice": dice,
-    "lovasz": lovasz_softmax,
-}
+REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 
 
 class NetworkStage(Stage):
@@ -66,6 +61,7 @@ class NetworkStage(Stage):
     unit = "scans"
     config: NetworkTraining
     view: RangeView | PolarView
+    default_region_loss: RegionLoss  # the paper's
 
     def __init__(
         self,
@@ -87,41 +83,27 @@ class NetworkStage(Stage):
     def size_of(self, batch: Batch) -> int:
         return batch[0].count
 
-    def logits(
-        self, batch: PointBatch, labels: Tensor
-    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
         """Run the network on a batch of B scans.
 
         Args:
             labels: (P,) train ids.
 
         Returns:
-            The (M, K) logits of each scan that the loss is computed on, the (M,) train ids of each
-            scan that belong to them, and the (P, K) logits of all points.
+            What the loss is computed on, and the (P, K) logits of all points.
         """
         raise NotImplementedError
 
-    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
-        """Return the loss of one scan, given (M, K) logits and (M,) train ids."""
-        raise NotImplementedError
-
-    @property
-    def region_loss(self) -> RegionLoss | None:
-        """The region loss of the recipe; None for that of the paper."""
-        return REGION_LOSSES[self.config.region_loss]
-
-    def mean_loss(self, logits: Sequence[Tensor], labels: Sequence[Tensor]) -> Tensor:
-        """Return the mean loss of some scans, given (M, K) logits and (M,) train ids of each."""
+    def loss(self, scored: Scored) -> Tensor:
+        """Return the mean loss of some scans."""
         # The mean over scans stays the same if a batch is split, over processes or to save memory.
-        losses = []
-        for scan_logits, scan_labels in zip(logits, labels, strict=True):
-            losses.append(self.loss(scan_logits, scan_labels))
-        return torch.stack(losses).mean()
+        region_loss = REGION_LOSSES.get(self.config.region_loss, self.default_region_loss)
+        return network_loss(scored, self.class_weights, self.config.region, region_loss)
 
     def training_step(self, batch: Batch, index: int) -> Tensor:
         points, labels = batch
-        logits_by_scan, labels_by_scan, _ = self.logits(points, labels)
-        loss = self.mean_loss(logits_by_scan, labels_by_scan)
+        scored, _ = self.logits(points, labels)
+        loss = self.loss(scored)
 
         self.check_finite(loss, f"at the scans {', '.join(points.names)}")
         self.log("train/loss", loss, prog_bar=True, batch_size=points.count)
@@ -129,7 +111,7 @@ class NetworkStage(Stage):
 
     def validation_step(self, batch: Batch, index: int) -> None:
         points, labels = batch
-        _, _, logits = self.logits(points, labels)
+        _, logits = self.logits(points, labels)
         self.count(labels, logits.argmax(dim=1) + 1)
 
     def share_of_step(self, count: int, index: int) -> float:
@@ -153,8 +135,14 @@ class NetworkStage(Stage):
         return count * parts / in_step
 
     def configure_optimizers(self) -> Any:
+        # On a GPU one launch takes the whole step. Lightning cannot clip the scaled gradients of
+        # float16 then.
+        is_fused = self.device.type == "cuda" and self.trainer.precision != "16-mixed"
         optimizer = torch.optim.AdamW(
-            self.trained.parameters(), lr=self.config.lr, weight_decay=self.config.weight_decay
+            self.trained.parameters(),
+            lr=self.config.lr,
+            weight_decay=self.config.weight_decay,
+            fused=is_fused or None,
         )
         return self.one_cycle(optimizer)
 
@@ -164,24 +152,19 @@ class RangeStage(NetworkStage):
 
     name = "rv"
     view: RangeView
+    default_region_loss = staticmethod(dice)
 
-    def logits(
-        self, batch: PointBatch, labels: Tensor
-    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
         view = self.view.project(batch)
         image = self.trained(view.image)  # (B, K, H, W)
         pixels = image.permute(0, 2, 3, 1).flatten(0, 2)  # (B * H * W, K)
 
         # Pixels without a point have no label.
-        occupied = view.nearest >= 0
-        sizes = occupied.view(batch.count, -1).sum(dim=1).tolist()
-        pixel_logits = pixels[occupied].split(sizes)
-        pixel_labels = labels[view.nearest[occupied]].split(sizes)
-        return list(pixel_logits), list(pixel_labels), pixels[view.pixel]
-
-    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
-        region = self.config.region
-        return range_view_loss(logits, labels, self.class_weights, region, self.region_loss)
+        index = (view.nearest >= 0).nonzero()[:, 0]
+        scan = index // (len(pixels) // batch.count)
+        pixel_labels = labels[view.nearest[index]]
+        scored = Scored(pixels.index_select(0, index), pixel_labels, scan, batch.count)
+        return scored, pixels[view.pixel]
 
 
 class PolarStage(NetworkStage):
@@ -189,39 +172,24 @@ class PolarStage(NetworkStage):
 
     name = "bev"
     view: PolarView
+    default_region_loss = staticmethod(lovasz_softmax)
 
-    def logits(
-        self, batch: PointBatch, labels: Tensor
-    ) -> tuple[list[Tensor], list[Tensor], Tensor]:
+    def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
         view = self.view.project(batch)
         scores = self.trained(view)  # (M, Z * K)
         points = view.to_points(scores)  # (P, K)
         if self.config.loss_over == "voxels":
-            voxel_logits, voxel_labels = _split_voxels(view, scores, labels)
-            return voxel_logits, voxel_labels, points
-
-        slices = batch.slices()
-        point_logits = [points[part] for part in slices]
-        point_labels = [labels[part] for part in slices]
-        return point_logits, point_labels, points
-
-    def loss(self, logits: Tensor, labels: Tensor) -> Tensor:
-        region = self.config.region
-        return polar_view_loss(logits, labels, self.class_weights, region, self.region_loss)
+            return _score_voxels(view, scores, labels), points
+        return Scored(points, labels, batch.scan, batch.count), points
 
 
-def _split_voxels(
-    view: PolarGrid, scores: Tensor, labels: Tensor
-) -> tuple[list[Tensor], list[Tensor]]:
-    """Return the logits and the majority labels of the voxels with points, scan by scan.
+def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
+    """Return the voxels with points, each with the label of most of them.
 
     Args:
         view: the grids of B scans.
         scores: (M, Z * K) logits of the pillars with points.
         labels: (P,) train ids.
-
-    Returns:
-        B tensors (V, K), and B tensors (V,).
     """
     scans, radial, angular, vertical = view.shape
     logits = scores.unflatten(1, (vertical, -1)).flatten(0, 1)  # (M * Z, K)
@@ -229,9 +197,8 @@ def _split_voxels(
     voxel_logits = logits.index_select(0, voxels)
     voxel_labels = majority_labels(cells, labels, len(voxels), logits.shape[1])
 
-    scan = view.occupied[voxels // vertical] // (radial * angular)  # ascending
-    sizes = torch.bincount(scan, minlength=scans).tolist()
-    return list(voxel_logits.split(sizes)), list(voxel_labels.split(sizes))
+    scan = view.occupied[voxels // vertical] // (radial * angular)
+    return Scored(voxel_logits, voxel_labels, scan, scans)
 
 
 def train_network(plan: Plan, name: str, weights: Weights) -> None:

@@ -131,7 +131,8 @@ def open_for_training(
 ) -> Dataset:
     """Open the dataset of a training.
 
-    A user's own scans are normalised as by `predict`: to the initial weights, to what this run has trained before, or else to the sensor of the recipe.
+    A user's own scans are normalised as by `predict`: to the initial weights, to what this run has
+    trained before, or else to the sensor of the recipe.
 
     Args:
         data: as `open_dataset` takes it.

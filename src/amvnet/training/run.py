@@ -13,8 +13,7 @@ import torch
 
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
-from amvnet.training.head import scored_scans, train_head
-from amvnet.training.head_points import ScoredScans
+from amvnet.training.head import train_head
 from amvnet.training.networks import train_network, try_network
 from amvnet.training.plan import Plan
 from amvnet.training.record import (
@@ -22,11 +21,10 @@ from amvnet.training.record import (
     StageFolder,
     check_begun,
     initial_digests,
-    sequence_names,
     stage_settings,
     write_record,
 )
-from amvnet.weights.file import Weights, load, save
+from amvnet.weights.file import Weights, save
 
 TRIAL_STEPS = 2  # the second of them is timed
 
@@ -94,7 +92,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
     L.seed_everything(plan.recipe.training.seed, verbose=False)
     weights = weights.resized(PART_OF[name], plan.recipe.model)
     if name == "head":
-        train_head(plan, weights, _score_sources(plan, weights))
+        train_head(plan, weights)
     else:
         train_network(plan, name, weights)
 
@@ -185,65 +183,6 @@ def _check_init(plan: Plan, init: Weights, names: Sequence[str]) -> None:
                 f"{folder.path}: expected no earlier run of the stage {name} for other "
                 f"weights with {part}, found one; leave out --init, or give another folder"
             )
-
-
-def _score_sources(plan: Plan, weights: Weights) -> list[ScoredScans]:
-    """Return what scores the training scans for the head.
-
-    With folds, the scans of each are scored by networks that were trained without them.
-
-    Raises:
-        InputError: if a network is missing, or there are fewer sequences than folds.
-    """
-    scans = plan.scans.train
-    source = scored_scans(plan, weights, scans)
-    folds = plan.recipe.training.head.folds
-    if folds < 2 or plan.scores is not None:
-        return [source]
-
-    names = sequence_names(scans)
-    if len(names) < folds:
-        raise InputError(
-            f"expected at least {folds} training sequences for {folds} folds, "
-            f"found {len(names)}; name more, or set --training.head.folds"
-        )
-
-    sources = []
-    for index in range(folds):
-        fold = fold_plan(plan, index, left_out=set(names[index::folds]))
-        train(fold, "rv")
-        sources.append(ScoredScans(fold.scans.val, load(train(fold, "bev"))))
-    return sources
-
-
-def fold_plan(plan: Plan, index: int, left_out: set[str]) -> Plan:
-    """Return the plan of networks that are trained without some sequences and validated on these.
-
-    Args:
-        plan: of the whole run.
-        index: number of the fold.
-        left_out: names of the sequences.
-    """
-    scans = plan.scans
-    seen = [record for record in scans.train if record.sequence not in left_out]
-    unseen = [record for record in scans.train if record.sequence in left_out]
-
-    # The scans that a fold scores say nothing about which of its epochs to use. Its networks have
-    # no initial weights.
-    training = plan.recipe.training
-    training = dataclasses.replace(
-        training,
-        keep="last",
-        rv=dataclasses.replace(training.rv, initial=0.0),
-        bev=dataclasses.replace(training.bev, initial=0.0),
-    )
-    return dataclasses.replace(
-        plan,
-        recipe=dataclasses.replace(plan.recipe, training=training),
-        scans=dataclasses.replace(scans, train=seen, val=unseen),
-        out=plan.out / "folds" / str(index),
-        resume=True,
-    )
 
 
 def try_out(plan: Plan, stage: StageName | Literal["all"]) -> Iterator[str]:

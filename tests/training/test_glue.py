@@ -1,0 +1,171 @@
+"""What the recipe says reaches the stages: class weights, weights of the losses, the schedule."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+
+from amvnet.config.schema import NetworkTraining, PointHeadConfig
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.errors import InputError
+from amvnet.models.point_head import PointHead
+from amvnet.training import head, networks
+from amvnet.training.head import HeadStage
+from amvnet.training.losses import class_weights
+from amvnet.training.networks import NetworkStage
+from amvnet.training.stage import Stage
+from amvnet.weights.file import save
+
+from fixtures.worlds import NO_PICTURES, fresh_weights, make_streets, run_cli, write_recipe
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make five scans to train on, and a recipe."""
+    root = tmp_path_factory.mktemp("world")
+    make_streets(root / "data", ("00", "01", "02", "03", "04"), scans=1)
+    write_recipe(root / "recipe.yaml")
+    save(fresh_weights(), root / "start.safetensors")
+    return root
+
+
+def arguments(world: Path, out: Path, stage: str, *options: object) -> list[object]:
+    shared = ["--data", world / "data", "--out", out, "--stage", stage, *NO_PICTURES, "--with-val"]
+    shared += ["--train-sequences", "00,01,02,03,04", "--init", world / "start.safetensors"]
+    return ["train", world / "recipe.yaml", *shared, *options]
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("name", ["rv", "bev", "head"])
+def test_a_stage_has_the_class_weights_of_its_scans_if_the_recipe_says_so(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, weighted: bool
+) -> None:
+    stages: list[Stage] = []
+
+    def stop(stage: Stage, *_: object, **options: object) -> None:
+        stages.append(stage)
+        raise InputError("enough")
+
+    monkeypatch.setattr(head if name == "head" else networks, "fit", stop)
+    option = (f"--training.{name}.class_weights", str(weighted).lower())
+    assert run_cli(*arguments(world, tmp_path, name, *option))[0] == 2
+
+    (stage,) = stages
+    if not weighted:
+        assert stage.class_weights is None
+        return
+    counts = np.zeros(20, dtype=np.int64)
+    dataset = open_dataset(str(world / "data"))
+    for record in dataset.records(("00", "01", "02", "03", "04")):
+        labels = dataset.read(record).labels
+        assert labels is not None
+        counts += np.bincount(labels, minlength=20)
+    assert stage.class_weights is not None
+    np.testing.assert_array_equal(stage.class_weights, class_weights(counts[1:]))
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_loss_of_the_head_equals_its_formula_with_class_weights(weighted: bool) -> None:
+    weights = np.linspace(0.2, 3, 19, dtype=np.float32) if weighted else None
+    net = PointHead(PointHeadConfig(neighbours=4, hidden=(8, 8), fc=8), 19)
+    config = SimpleNamespace(epochs=1, lr=0.1)
+    stage = HeadStage(
+        net,
+        None,  # type: ignore[arg-type]  # no points: the batch is given
+        None,
+        config=config,
+        taxonomy=SEMANTICKITTI,
+        weights=weights,
+    )
+    trainer = L.Trainer(accelerator="cpu", logger=False, enable_checkpointing=False)
+    stage.trainer = trainer
+    stage.log = lambda *_, **options: None  # type: ignore[method-assign]
+
+    torch.manual_seed(0)
+    point, rows = torch.randn(30, 42), torch.randn(30, 4, 42)
+    labels = torch.randint(1, 20, (30,))
+    loss = stage.eval().training_step((point, rows, labels, torch.ones(30)), 0)
+
+    log_probabilities = net.eval()(point, rows).log_softmax(dim=1)
+    total = 0.0
+    total_weight = 0.0
+    for row, label in zip(log_probabilities.tolist(), labels.tolist(), strict=True):
+        weight = 1.0 if weights is None else float(weights[label - 1])
+        total -= weight * row[label - 1]
+        total_weight += weight
+    assert loss.item() == pytest.approx(total / total_weight, rel=1e-5)
+
+
+def one_cycle(step: int, steps: int, peak: float, warmup: float) -> float:
+    """Return the learning rate of a step: a cosine up to the peak, and one down to almost 0."""
+    top = warmup * steps - 1
+    first, last = peak / 25, peak / 25e4
+
+    def cosine(start: float, end: float, share: float) -> float:
+        return end + (start - end) / 2 * (1 + math.cos(math.pi * share))
+
+    if step <= top:
+        return cosine(first, peak, step / top)
+    return cosine(peak, last, (step - top) / (steps - 1 - top))
+
+
+@pytest.mark.parametrize("accumulate", [1, 2])
+@pytest.mark.parametrize("warmup", [0.2, 0.5])
+def test_the_learning_rate_of_a_whole_run_is_one_cycle(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, accumulate: int, warmup: float
+) -> None:
+    """Five scans in batches of two: the last step of each epoch is incomplete."""
+    rates: list[float] = []
+    momenta: list[float] = []
+
+    def note(self: NetworkStage, optimizer: torch.optim.Optimizer) -> None:
+        rates.append(optimizer.param_groups[0]["lr"])
+        momenta.append(optimizer.param_groups[0]["betas"][0])
+
+    monkeypatch.setattr(NetworkStage, "on_before_optimizer_step", note)
+    options = ["--training.bev.accumulate", accumulate, "--training.bev.warmup", warmup]
+    options += ["--training.bev.lr", 0.003, "--training.bev.epochs", 4]
+    assert run_cli(*arguments(world, tmp_path, "bev", *options)) == (0, "")
+
+    steps = 4 * 3
+    assert rates == pytest.approx([one_cycle(step, steps, 0.003, warmup) for step in range(steps)])
+    assert momenta[0] == max(momenta) == pytest.approx(0.95)
+    assert 0.85 <= min(momenta) < 0.87
+
+
+@pytest.mark.parametrize(("scans", "batch", "parts"), [(5, 2, 1), (5, 2, 2), (7, 2, 3), (8, 4, 2)])
+def test_every_scan_of_a_step_has_the_same_share_of_its_gradient(
+    scans: int, batch: int, parts: int
+) -> None:
+    """Also in the last step of an epoch, which may have fewer parts, and one with fewer scans."""
+    config = NetworkTraining(epochs=1, batch=batch * parts, lr=1e-3)
+    view: Any = None
+    stage = NetworkStage(view, torch.nn.Linear(1, 1), config, SEMANTICKITTI, None)
+    loader = SimpleNamespace(batch_size=batch, sampler=range(scans))
+    trainer: Any = SimpleNamespace(accumulate_grad_batches=parts, train_dataloader=loader)
+    stage._trainer = trainer
+
+    sizes = [min(batch, scans - first) for first in range(0, scans, batch)]
+    for step in range(0, len(sizes), parts):
+        in_step = sizes[step : step + parts]
+        for index, size in enumerate(in_step, start=step):
+            # Lightning divides by the number of parts, and the loss is a mean over the part.
+            share_of_scan = stage.share_of_step(size, index) / parts / size
+            assert share_of_scan == pytest.approx(1 / sum(in_step))
+
+
+def test_the_numbers_of_a_network_reach_its_stage() -> None:
+    config = NetworkTraining(epochs=1, batch=2, lr=1e-3)
+    config = replace(config, accumulate=2, clip=0.7, ema=0.9, initial=0.3)
+    view: Any = None
+    stage = NetworkStage(view, torch.nn.Linear(1, 1), config, SEMANTICKITTI, None)
+    assert (stage.accumulate, stage.clip, stage.ema, stage.initial) == (2, 0.7, 0.9, 0.3)
