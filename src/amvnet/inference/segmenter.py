@@ -25,7 +25,7 @@ from amvnet.inference.segmentation import (
     fetch,
     unpack,
 )
-from amvnet.inference.symmetries import SYMMETRIES, Score, average
+from amvnet.inference.symmetries import SYMMETRIES, Score, average, check_tta
 from amvnet.memory import available_memory, keep_freed_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.assertion import Disagreement
@@ -38,9 +38,10 @@ from amvnet.models.methods import (
     MethodName,
     Precision,
     TtaName,
+    check_method,
 )
 from amvnet.models.polar_net import PolarNet
-from amvnet.models.precision import InPrecision, choose_device, choose_precision
+from amvnet.models.precision import InPrecision, check_device, choose_device, choose_precision
 from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import Voting
@@ -104,33 +105,34 @@ class Segmenter:
         graphs: bool = True,
     ) -> None:
         self.weights = weights if isinstance(weights, Weights) else load(weights)
-        self.method = _check_method(method, self.weights)
-        self.tta = _check_tta(tta)
+        self.method = check_method(method, self.weights.parts)
+        self.tta = check_tta(tta)
         self.tau = tau
-        # Weights that were trained with other intensities take them, too.
-        trained = trained_intensity(self.weights.training, self.weights.sensor)
-        self._are_fractions = trained is None or trained.quantiles[-1] <= 1
-        self.intensity = trained
+        self.device = check_device(choose_device(device))
+        self.precision = choose_precision(precision, self.device)
         self.engine = "torch"
         self._at_once: int | None = None
-        self.device = device = _check_device(choose_device(device))
-        self.precision = precision = choose_precision(precision, device)
-        self._keeps_memory = keep_memory and device == "cpu"
+
+        # Weights that were trained with other intensities take them, too.
+        self.intensity = trained_intensity(self.weights.training, self.weights.sensor)
+        self._are_fractions = self.intensity is None or self.intensity.quantiles[-1] <= 1
+
+        self._keeps_memory = keep_memory and self.device == "cpu"
         if self._keeps_memory:
             keep_freed_memory()
         survive_forks()
         self._machine = BusyMachine()
 
-        self.model: AMVNet = self.weights.build().to(device)
+        self.model: AMVNet = self.weights.build().to(self.device)
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         freeze(self.model)
-        _set_up_networks(self.model, device, precision, graphs)
+        _set_up_networks(self.model, self.device, self.precision, graphs)
 
         if tau is not None:
             self.model.assertion = Disagreement(tau)
-        method_used = METHODS[method]
-        if method_used.ensemble is not None:
-            self.model.ensemble = method_used.ensemble
+        ensemble = METHODS[method].ensemble
+        if ensemble is not None:
+            self.model.ensemble = ensemble
             self.model.point_head = None
 
     @property
@@ -373,40 +375,6 @@ def check_scan(points: np.ndarray | Scan, trained: TrainedIntensity | None = Non
         )
 
     return scan
-
-
-def _check_method(method: MethodName, weights: Weights) -> MethodName:
-    if method not in METHODS:
-        raise InputError(
-            f"expected a method of {', '.join(METHODS)}, found {method!r}; use one of them"
-        )
-    needed = METHODS[method].parts
-    missing = [part for part in needed if part not in weights.parts]
-    if missing:
-        raise InputError(
-            f"expected weights with {', '.join(needed)} for the method {method}, "
-            f"found no {missing[0]}; train that part, or choose a method without it"
-        )
-
-    return method
-
-
-def _check_tta(tta: TtaName | None) -> TtaName | None:
-    if tta is not None and tta not in SYMMETRIES:
-        raise InputError(
-            f"expected a test-time augmentation of {', '.join(SYMMETRIES)}, found {tta!r}; "
-            "use one of them, or None"
-        )
-    return tta
-
-
-def _check_device(name: str) -> str:
-    """Return the name, if it is that of a device of this machine; else raise InputError."""
-    try:
-        torch.zeros(1, device=name).item()
-    except (RuntimeError, AssertionError, NotImplementedError):
-        raise InputError(f"expected a device of this machine, found {name!r}; use cpu") from None
-    return name
 
 
 def _is_gpu(device: str) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from amvnet.errors import InputError
 from amvnet.models.methods import TtaName
 from amvnet.models.views.points import PointBatch
 
@@ -71,3 +72,17 @@ def average(score: Score, batch: PointBatch, symmetries: Sequence[Symmetry]) -> 
         sums = tuple(map(torch.add, sums, score(symmetry(batch))))
 
     return tuple(total / len(symmetries) for total in sums)
+
+
+def check_tta(tta: TtaName | None) -> TtaName | None:
+    """Return the name of an augmentation, or None.
+
+    Raises:
+        InputError: if there is no such augmentation.
+    """
+    if tta is not None and tta not in SYMMETRIES:
+        raise InputError(
+            f"expected a test-time augmentation of {', '.join(SYMMETRIES)}, found {tta!r}; "
+            "use one of them, or None"
+        )
+    return tta

@@ -9,6 +9,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
+from amvnet.errors import InputError
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -92,3 +94,24 @@ def widest_method(parts: Collection[str]) -> MethodName:
     """
     names = [name for name in PAPER_METHODS if set(METHODS[name].parts) <= set(parts)]
     return names[-1] if names else "amvnet"
+
+
+def check_method(method: MethodName, parts: Collection[str]) -> MethodName:
+    """Return the method.
+
+    Raises:
+        InputError: if there is no such method, or one of the parts that it needs is missing.
+    """
+    if method not in METHODS:
+        raise InputError(
+            f"expected a method of {', '.join(METHODS)}, found {method!r}; use one of them"
+        )
+    needed = METHODS[method].parts
+    missing = [part for part in needed if part not in parts]
+    if missing:
+        raise InputError(
+            f"expected weights with {', '.join(needed)} for the method {method}, "
+            f"found no {missing[0]}; train that part, or choose a method without it"
+        )
+
+    return method

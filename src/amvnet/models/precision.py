@@ -47,6 +47,15 @@ def choose_device(name: str, engine: str = "torch") -> str:
     return "cuda" if torch.cuda.is_available() and engine not in ONNX_ENGINES else "cpu"
 
 
+def check_device(name: str) -> str:
+    """Return the name, if it is that of a device of this machine; else raise InputError."""
+    try:
+        torch.zeros(1, device=name).item()
+    except (RuntimeError, AssertionError, NotImplementedError):
+        raise InputError(f"expected a device of this machine, found {name!r}; use cpu") from None
+    return name
+
+
 def choose_precision(precision: Precision, device: str) -> Precision:
     """Return the precision; for "auto", bfloat16 on a GPU that has it, else float32.
 
