@@ -11,13 +11,13 @@ import json
 import math
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from signal import SIGXCPU
 from tempfile import mkdtemp
 from threading import Lock
 from typing import Any, BinaryIO, cast
@@ -145,7 +145,8 @@ class _Process:
         cast(BinaryIO, self._popen.stdout).close()
         self._replies.close()
         shutil.rmtree(self._folder, ignore_errors=True)
-        return "takes too long" if code == -SIGXCPU else "stops its reader"
+        is_slow = hasattr(signal, "SIGXCPU") and code == -signal.SIGXCPU
+        return "takes too long" if is_slow else "stops its reader"
 
 
 _process: _Process | None = None
