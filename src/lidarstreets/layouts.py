@@ -196,8 +196,8 @@ def _add_shared_rows(tables: Tables) -> None:
     )
 
     log = _token("log")
-    names = dict.fromkeys(("logfile", "vehicle"), "simulated")
-    _add(tables, "log", log, **names, date_captured="2020-09-13", location="simulated")
+    name = "simulated"
+    _add(tables, "log", log, logfile=name, vehicle=name, date_captured="2020-09-13", location=name)
     picture = {"category": "semantic_prior", "filename": "maps/simulated.png"}
     _add(tables, "map", _token("map"), log_tokens=[log], **picture)
 

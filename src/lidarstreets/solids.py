@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 Vector = tuple[float, float, float]
 
-# Corners of the unit box, whose lower face is centred on the origin: z, y, x change ever faster.
+# Corners of the unit box, whose lower face is centred on the origin; x changes fastest.
 _BOX_CORNERS = np.array(list(product((0.0, 1.0), (-0.5, 0.5), (-0.5, 0.5))))[:, ::-1]
 # Two triangles for each face, counter-clockwise seen from outside.
 _BOX_FACES = np.array([

@@ -43,7 +43,7 @@ def take_one_thread() -> None:
     """Let this process cast rays with one thread, if it has not cast any yet.
 
     Embree counts the processors that it may use when it is first used; there is no other way to
-    tell it. Does nothing but on Linux.
+    tell it. Does nothing on systems other than Linux.
     """
     if hasattr(os, "sched_setaffinity"):
         processors = os.sched_getaffinity(0)

@@ -53,8 +53,8 @@ def line_up(
 ) -> None:
     """Put the segments of a boundary in a straight line.
 
-    `start` and `end` are x along the street and the distance from its middle line, `gap` is from
-    and to, the x of a drive that no segment closes off.
+    `start` and `end` are x along the street and the distance from its middle line. `gap` is the
+    two x between which a drive is, which no segment closes off.
     """
     rng = plot.rng
     line = np.array(end) - np.array(start)

@@ -19,7 +19,6 @@ VANS = 0.09
 CONVERTIBLES = 0.09
 OPEN_TYPES = ("coupe", "city car", "saloon")
 
-
 CAR_TYPES = read_table(Path(__file__).with_suffix(".toml"))
 SHARES = {name: limits["share"] for name, limits in CAR_TYPES.items()}
 
