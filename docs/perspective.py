@@ -24,7 +24,8 @@ from amvnet.data import palette
 PANEL = (1000, 560)  # pixels, width and height
 GAP = 8  # pixels between panels
 OVERSAMPLE = 2
-LEGEND = 56  # pixels, height
+LEGEND = 56  # pixels, height of a row
+MOST_COLUMNS = 10  # of the legend
 LEAST = 40  # points of a class in the legend
 
 BACKGROUND = np.array([13, 16, 22], np.float32)
@@ -209,28 +210,34 @@ def draw(
     ]
 
     width, height = PANEL
-    sheet = Image.new(
-        "RGB", (2 * width + GAP, 2 * height + GAP + LEGEND), tuple(int(c) for c in BACKGROUND * 2)
-    )
+    present = np.flatnonzero(np.bincount(truth, minlength=taxonomy.size + 1) >= LEAST)
+    size = (2 * width + GAP, 2 * height + GAP + LEGEND * legend_rows(present))
+    sheet = Image.new("RGB", size, tuple(int(c) for c in BACKGROUND * 2))
     pen = ImageDraw.Draw(sheet)
     for place, (title, picture) in enumerate(panels):
         x, y = (place % 2) * (width + GAP), (place // 2) * (height + GAP)
         sheet.paste(picture, (x, y))
         pen.text((x + 22, y + 16), title, fill=INK, font=font(28))
-    counts = np.bincount(truth, minlength=taxonomy.size + 1)
-    draw_legend(pen, taxonomy, np.flatnonzero(counts >= LEAST), 2 * height + GAP)
+    draw_legend(pen, taxonomy, present, 2 * height + GAP)
     return sheet
 
 
 def draw_legend(pen: ImageDraw.ImageDraw, taxonomy: Any, present: np.ndarray, top: int) -> None:
-    """Write the classes in a row below the panels."""
+    """Write the classes in rows below the panels."""
     ids = [int(class_id) for class_id in present if class_id > 0]
-    step = (2 * PANEL[0] + GAP - 30) / len(ids)
+    columns = -(-len(ids) // legend_rows(present))
+    step = (2 * PANEL[0] + GAP - 30) / columns
     for place, class_id in enumerate(ids):
-        x = 22 + place * step
+        x = 22 + place % columns * step
+        y = top + place // columns * LEGEND
         color = class_colors(taxonomy, np.array([class_id]))[0]
-        pen.rounded_rectangle((x, top + 17, x + 22, top + 39), 5, fill=tuple(int(c) for c in color))
-        pen.text((x + 32, top + 13), taxonomy.classes[class_id - 1], fill=INK, font=font(22))
+        pen.rounded_rectangle((x, y + 17, x + 22, y + 39), 5, fill=tuple(int(c) for c in color))
+        pen.text((x + 32, y + 13), taxonomy.classes[class_id - 1], fill=INK, font=font(22))
+
+
+def legend_rows(present: np.ndarray) -> int:
+    """Return the number of rows of the legend, in which the names do not overlap."""
+    return -(-np.count_nonzero(present) // MOST_COLUMNS)
 
 
 def reduced(sheet: Image.Image, taxonomy: Any) -> Image.Image:

@@ -249,6 +249,12 @@ def test_a_linked_folder_of_the_output_is_refused(verb: str, weights: Path) -> N
         assert "found a link" in line
 
 
+@pytest.mark.parametrize("link", ["sequences", "sequences/00", "sequences/00/velodyne"])
+def test_simulated_scans_are_not_written_through_a_link(link: str) -> None:
+    with surroundings(link) as base:
+        assert "found a link" in refusal(f"simulate {base}/out --scans 1")
+
+
 # ---- one file
 
 

@@ -110,12 +110,27 @@ def inside(folder: Path | str, name: Path | str) -> Path:
         )
 
     for parent in list(name.parents)[:-1]:
-        if (folder / parent).is_symlink():
-            raise InputError(
-                f"{folder / parent}: expected a folder for output files, found a link; remove it "
-                "or change --out"
-            )
+        _refuse_link(folder / parent)
     return folder / name
+
+
+def check_no_links(folder: Path, levels: int = 3) -> None:
+    """Check that the first levels of an output folder, which another library fills, have no links.
+
+    Raises:
+        InputError: if one of its folders is a link.
+    """
+    for level in range(levels):
+        for path in folder.glob("/".join(["*"] * (level + 1))):
+            if path.is_dir():
+                _refuse_link(path)
+
+
+def _refuse_link(path: Path) -> None:
+    if path.is_symlink():
+        raise InputError(
+            f"{path}: expected a folder for output files, found a link; remove it or change --out"
+        )
 
 
 def _fault_of(name: Path) -> str | None:

@@ -30,7 +30,9 @@ def simulate(
         processes: sequences that are simulated at the same time; default: one per processor.
     """
     from amvnet.data.datasets.simulated import simulate as simulate_streets
+    from amvnet.files import check_no_links
 
+    check_no_links(out)
     with progress("simulating") as step:
         simulate_streets(
             out,
