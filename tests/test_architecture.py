@@ -21,7 +21,7 @@ UPWARD = {
     ("amvnet.inference.segmentation", "amvnet.viewing.frames"),
     ("amvnet.inference.segmentation", "amvnet.viewing.page"),
 }
-SAME_NAMES = {"amvnet": {"precision"}}  # of files, likewise
+SAME_NAMES = {"amvnet": {"record"}}  # of files, likewise
 
 Graph = Mapping[str, set[str]]
 
