@@ -33,15 +33,16 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
     if not is_multiple:
         return convolution(torch.cat([upsample(coarse, fine), fine], dim=1))
 
+    coarse_weight = convolution.weight[:, : coarse.shape[1]]
     fine_weight = convolution.weight[:, coarse.shape[1] :]
     wrapped = wrap_width(fine, 1, 1)
     result = convolve(wrapped, fine_weight, convolution.bias, stride=(1, 1), padding=(1, 0))
-    kernels = _kernels(convolution, coarse.shape[1], scale)
+    kernels = _kernels(convolution, coarse_weight, scale)
     return result.add_(_convolve_upsampled(coarse, kernels, scale))
 
 
-def _kernels(convolution: RingConv2d, channels: int, scale: tuple[int, int]) -> Tensor:
-    """Return the kernels (s * s * C', C, taps, taps) for upsampled maps of C `channels`.
+def _kernels(convolution: RingConv2d, weight: Tensor, scale: tuple[int, int]) -> Tensor:
+    """Return the kernels (s * s * C', C, taps, taps) for upsampled maps, of a weight (C', C, 3, 3).
 
     Those of a frozen convolution are kept. An exporter has to see how they are made.
     """
@@ -51,7 +52,6 @@ def _kernels(convolution: RingConv2d, channels: int, scale: tuple[int, int]) -> 
         return kept[scale]
 
     # The sums of weights are exact enough only in the weights' own type.
-    weight = convolution.weight[:, :channels]
     with torch.autocast(weight.device.type, enabled=False):
         row_taps, column_taps = (_taps(size, weight) for size in scale)
         kernels = torch.einsum("pak,qbl,oikl->pqoiab", row_taps, column_taps, weight).flatten(0, 2)
