@@ -246,3 +246,29 @@ def test_a_synced_batch_norm_evaluates_like_the_one_it_replaces() -> None:
     assert isinstance(synced[1], SyncedBatchNorm)
     assert torch.equal(synced.eval()(x), expected)
     assert {"1.weight", "1.running_mean"} <= set(synced.state_dict())
+
+
+DIES = """
+from amvnet.distributed import Processes, dist
+
+def fail(*_: object, **__: object) -> None:
+    raise RuntimeError("Connection closed by peer")
+
+dist.all_gather_object = fail
+try:
+    Processes(rank=0, size=2).wait()
+except OSError as error:
+    print(error.filename, error.strerror)
+"""
+
+
+def test_the_death_of_another_process_is_one_line() -> None:
+    """It is an error of the system, which the command line prints without a traceback."""
+    done = subprocess.run(
+        [sys.executable, "-c", DIES],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "another process ended" in done.stdout
+    assert done.stdout.count("\n") == 1

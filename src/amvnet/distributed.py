@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import functools
 import os
 from collections.abc import Sequence
@@ -57,12 +58,20 @@ class Processes:
         return items[self.rank :: self.size]
 
     def gather(self, value: T) -> list[T]:
-        """Return the values of all processes, by rank. Every process must call this."""
+        """Return the values of all processes, by rank. Every process must call this.
+
+        Raises:
+            ConnectionError: if another process has ended.
+        """
         if self.size == 1:
             return [value]
 
         values: list[Any] = [None] * self.size
-        dist.all_gather_object(values, value, group=self.group)
+        try:
+            dist.all_gather_object(values, value, group=self.group)
+        except RuntimeError as error:
+            reason = "another process ended before its work was done, for the reason that it gave"
+            raise ConnectionResetError(errno.ECONNRESET, reason, "torch.distributed") from error
         return values
 
     def wait(self) -> None:
