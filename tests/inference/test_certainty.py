@@ -63,6 +63,18 @@ def test_the_verdict_is_a_line_with_both_shares() -> None:
     assert "\n" not in line
 
 
+def test_labels_of_another_tau_are_not_judged_by_the_share_usual_for_the_weights() -> None:
+    weights = with_usual(0.001)
+    tau = weights.model.assertion.threshold
+    assert Segmenter(weights, tau=tau)(POINTS).verdict == Segmenter(weights)(POINTS).verdict
+
+    verdict = Segmenter(weights, tau=1.0)(POINTS).verdict
+    assert verdict is not None
+    assert verdict.share == 1
+    assert not verdict.is_doubtful
+    assert str(verdict) == "100.0% of the points are uncertain"
+
+
 def test_a_result_has_the_share_of_its_valid_points() -> None:
     points = np.concatenate([POINTS, np.full((100, 4), np.nan, np.float32)])
     result = Segmenter(with_usual(0.1))(points)

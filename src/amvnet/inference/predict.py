@@ -96,7 +96,7 @@ def predict(
     if writes_bags and execution.processes.first:
         _write_bags(scans, output)
     if method.has_two_networks:
-        report(entries, segmenter.weights.usual_uncertain, say)
+        report(entries, segmenter.usual_uncertain, say)
     check_faults(faults, len(scans))
     return len(scans)
 
@@ -168,7 +168,7 @@ def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment
     return segment
 
 
-def report(entries: Sequence[Entry], usual: float, say: Say) -> None:
+def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
     """Say how sure the labels are, which recordings have doubtful ones, and what to try."""
     points: Counter[str] = Counter()
     uncertain: Counter[str] = Counter()

@@ -33,21 +33,28 @@ class Verdict:
 
     Attributes:
         share: the share of the points that are uncertain, in [0, 1].
-        usual: this share in the scans that the weights were validated on.
+        usual: this share in the scans that the weights were validated on; None if it is not known,
+            as for another tau.
     """
 
     share: float
-    usual: float
+    usual: float | None
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether so many points are uncertain that the weights do not know such scans."""
+        """Whether so many points are uncertain that the weights do not know such scans.
+
+        False if the usual share is not known.
+        """
+        if self.usual is None:
+            return False
         return self.share * (1 - self.usual) > UNUSUAL_ODDS * self.usual * (1 - self.share)
 
     @property
     def shares(self) -> str:
         """Both shares, as text."""
-        return f"{self.share:.1%} of the points are uncertain (usual: {self.usual:.1%})"
+        text = f"{self.share:.1%} of the points are uncertain"
+        return text if self.usual is None else f"{text} (usual: {self.usual:.1%})"
 
     def __str__(self) -> str:
         return f"do not rely on these labels: {self.shares}" if self.is_doubtful else self.shares
@@ -61,7 +68,8 @@ class Origin:
         scan: as the networks saw it.
         taxonomy: the classes.
         method: the method of the labels.
-        usual_uncertain: the share of uncertain points that the weights had in their validation.
+        usual_uncertain: the share of uncertain points that the weights had in their validation, or
+            None if it is not known for this tau.
         path: the file of the scan, or None if it was in memory.
         file_xyz: (N, 3) the coordinates as they are in the file, or None if it was in memory.
         assumed: what was assumed of the scan's sensor; empty if the scan was in memory.
@@ -70,7 +78,7 @@ class Origin:
     scan: Scan
     taxonomy: Taxonomy
     method: str
-    usual_uncertain: float
+    usual_uncertain: float | None
     path: Path | None = None
     file_xyz: np.ndarray | None = None
     assumed: str = ""

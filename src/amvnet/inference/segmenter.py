@@ -166,6 +166,13 @@ class Segmenter:
             return self.device
         return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
 
+    @property
+    def usual_uncertain(self) -> float | None:
+        """The share of uncertain points in the scans of the validation; None for another tau."""
+        if self.tau not in (None, self.weights.model.assertion.threshold):
+            return None
+        return self.weights.usual_uncertain
+
     def __repr__(self) -> str:
         return f"<Segmenter {self.method} on {self.device}, {self.precision}: {self.weights!r}>"
 
@@ -215,7 +222,7 @@ class Segmenter:
         results = []
         for scan, points in zip(checked, batch.slices(), strict=True):
             result = unpack(scan.valid, labels, scores, points)
-            origin = Origin(scan, self.taxonomy, self.method, self.weights.usual_uncertain)
+            origin = Origin(scan, self.taxonomy, self.method, self.usual_uncertain)
             results.append(replace(result, origin=origin))
         return results
 
