@@ -350,7 +350,7 @@ def check_faults(faults: Sequence[str], total: int) -> None:
         raise InputError(faults[0] + more)
     if faults:
         raise SomeBroken(
-            f"{total - len(faults)} of {total} scans are segmented, {len(faults)} are broken",
+            f"{total - len(faults)} of {total} scans segmented, {len(faults)} broken",
             list(faults),
         )
 
