@@ -188,6 +188,21 @@ def zstd_files(path: Path) -> None:
     file.write_bytes(file.read_bytes() + zstd_of_zeros(40))
 
 
+def many_zstd_files(path: Path) -> None:
+    """Write a bag of 40 files, each of which is small enough when it is unpacked."""
+    write_bag2(path, {"/lidar": [some_points()]}, StoragePlugin.MCAP, CompressionMode.FILE)
+    (file,) = path.glob("*.zstd")
+    packed = file.read_bytes() + zstd.compress(bytes(50 << 20))
+    others = [f"part{index}.mcap.zstd" for index in range(40)]
+    for name in others:
+        (path / name).write_bytes(packed)
+
+    metadata = path / "metadata.yaml"
+    text = metadata.read_text()
+    assert f"- {file.name}\n" in text
+    metadata.write_text(text.replace(f"- {file.name}\n", "".join(f"- {n}\n  " for n in others)))
+
+
 def zstd_messages(path: Path) -> None:
     """Write a message of four gigabytes into a database."""
     write_bag2(path, {"/lidar": [some_points()]}, StoragePlugin.SQLITE3, CompressionMode.MESSAGE)
@@ -301,6 +316,7 @@ BOMBS: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "lz4.mcap": ("scan", mcap_lz4, "lz4.mcap"),
     "bz2.bag": ("scan", ros1_bz2, "bz2.bag"),
     "zstd_files": ("scan", zstd_files, "zstd_files"),
+    "many_zstd_files": ("scan", many_zstd_files, "unpacked"),
     "zstd_messages": ("scan", zstd_messages, "zstd_messages"),
     "metadata": ("scan", metadata_of_merges, "metadata"),
     "schema.db3": ("scan", endless_schema, "takes too long"),

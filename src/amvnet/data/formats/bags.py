@@ -15,7 +15,7 @@ from amvnet.data.formats.detect import FOLDER
 from amvnet.data.formats.livox import TYPES as LIVOX
 from amvnet.data.formats.livox import read_custom_message, read_header
 from amvnet.data.formats.pointcloud2 import Origin, read_message
-from amvnet.data.formats.reader_process import size_of
+from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
 from amvnet.data.formats.recording import Decode, Recording
 from amvnet.errors import InputError
 
@@ -38,6 +38,7 @@ PACKETS = {
 }
 LISTED = 10  # topics in a message
 
+CHUNK = 1 << 20  # bytes that are unpacked at a time
 MIN_MESSAGE = 16  # bytes of a bag for each message, compressed ones too
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
@@ -96,9 +97,30 @@ def _open_reader(path: Path, ending: str) -> Any:
     }
     reader = readers[ending](path)
     if ending == FOLDER:
+        _check_unpacked(path)
         reader.STORAGE_PLUGINS = {"mcap": McapReader, "sqlite3": open_database}
     reader.open()
     return reader
+
+
+def _check_unpacked(folder: Path) -> None:
+    """Raise InputError if the compressed files of a bag would fill the disk.
+
+    rosbags unpacks all of them when it opens the bag; the process limits each file only.
+    """
+    from rosbags.rosbag2.reader import zstd
+
+    most = DISK + DISK_PER_BYTE * size_of(folder)
+    unpacked = 0
+    for path in sorted(folder.glob("*.zstd")):
+        with zstd.open(path, "rb") as file:
+            while chunk := file.read(CHUNK):
+                unpacked += len(chunk)
+                if unpacked > most:
+                    raise InputError(
+                        f"{folder}: expected at most {most >> 20} MB of unpacked files, found "
+                        f"more; {ADVICE}"
+                    )
 
 
 def _deserialiser(is_ros1: bool) -> Callable[[bytes, str], Any]:
