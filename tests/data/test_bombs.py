@@ -19,6 +19,7 @@ from pathlib import Path
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
+import yaml
 from backports import zstd
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
@@ -198,9 +199,9 @@ def many_zstd_files(path: Path) -> None:
         (path / name).write_bytes(packed)
 
     metadata = path / "metadata.yaml"
-    text = metadata.read_text()
-    assert f"- {file.name}\n" in text
-    metadata.write_text(text.replace(f"- {file.name}\n", "".join(f"- {n}\n  " for n in others)))
+    content = yaml.safe_load(metadata.read_text())
+    content["rosbag2_bagfile_information"]["relative_file_paths"] = others
+    metadata.write_text(yaml.safe_dump(content))
 
 
 def zstd_messages(path: Path) -> None:
