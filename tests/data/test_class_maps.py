@@ -12,8 +12,11 @@ import pytest
 import yaml
 
 from amvnet.data.class_maps import class_map
+from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
+from amvnet.evaluation.scoring import _check_left_out
 from amvnet.weights.file import save
 
 from fixtures.worlds import (
@@ -217,6 +220,22 @@ def test_a_map_that_leaves_out_most_of_the_points_is_refused(tmp_path: Path) -> 
     assert error.count("\n") == 1
     assert all(name in error for name in ("road", "building", "--classes"))
     assert not figures.exists()
+
+
+@pytest.mark.parametrize(("left_out", "is_refused"), [(5, False), (6, True)])
+def test_a_map_may_leave_out_half_of_the_points_and_no_more(
+    tmp_path: Path, left_out: int, is_refused: bool
+) -> None:
+    dataset = open_dataset(str(make_streets(tmp_path / "data")))
+    scored = np.ones(10 - left_out, dtype=int)
+    evaluation = Evaluation(SEMANTICKITTI)
+    evaluation.add(np.ones((len(scored), 3)), scored, {"a": scored})
+    evaluation.leave_out("building", np.ones(left_out, dtype=bool))
+    if not is_refused:
+        _check_left_out(evaluation, dataset)
+        return
+    with pytest.raises(InputError, match="building"):
+        _check_left_out(evaluation, dataset)
 
 
 def test_parts_of_an_evaluation_add_up_to_the_classes_left_out_of_the_whole() -> None:

@@ -535,6 +535,11 @@ def test_bags_of_any_name_are_read(folder: Path, tmp_path: Path, name: str) -> N
     np.testing.assert_array_equal(read_scan(path).points, some_points())
 
 
+def test_a_topic_without_messages_is_refused(tmp_path: Path) -> None:
+    path = write_bag2(tmp_path / "empty", {"/lidar": []}, StoragePlugin.MCAP)
+    fails(lambda: list(list_scans(path)), "/lidar", "0 messages")
+
+
 def test_the_topic_is_found_or_asked_for(tmp_path: Path) -> None:
     front = [some_points(60, 1)]
     rear = [some_points(60, 2), some_points(60, 3)]

@@ -18,11 +18,13 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.models.point_head import PointHead
+from amvnet.models.views.range_view import RangeView
 from amvnet.training import head, networks
-from amvnet.training.head import HeadStage
+from amvnet.training.head import HeadStage, _score_with
+from amvnet.training.head_points import PointGatherer
 from amvnet.training.losses import class_weights
 from amvnet.training.networks import NetworkStage
-from amvnet.training.stage import Stage
+from amvnet.training.stage import Stage, build_model
 from amvnet.weights.file import save
 
 from fixtures.worlds import NO_PICTURES, fresh_weights, make_streets, run_cli, write_recipe
@@ -169,3 +171,27 @@ def test_the_numbers_of_a_network_reach_its_stage() -> None:
     view: Any = None
     stage = NetworkStage(view, torch.nn.Linear(1, 1), config, SEMANTICKITTI, None)
     assert (stage.accumulate, stage.clip, stage.ema, stage.initial) == (2, 0.7, 0.9, 0.3)
+
+
+@pytest.mark.parametrize("is_normalised", [False, True])
+def test_every_part_of_a_training_takes_normalised_scans_by_their_rings(
+    monkeypatch: pytest.MonkeyPatch, is_normalised: bool
+) -> None:
+    views: list[RangeView] = []
+
+    def by_ring(view: RangeView) -> RangeView:
+        views.append(view)
+        return view
+
+    monkeypatch.setattr(RangeView, "by_ring", by_ring)
+    weights = fresh_weights()
+    dataset = SimpleNamespace(is_normalised=is_normalised)
+    plan: Any = SimpleNamespace(scans=SimpleNamespace(dataset=dataset), scores=None)
+    gatherer: Any = SimpleNamespace(plan=plan, weights=weights, _device="cpu")
+    point_head = weights.build().point_head
+    assert point_head is not None
+
+    build_model(plan, "range_net", weights)  # of the networks
+    _score_with(point_head, plan, weights)  # of the pictures of the head
+    PointGatherer._scorer(gatherer)  # of the points of the head
+    assert len(views) == 3 * is_normalised
