@@ -55,6 +55,9 @@ def open_bag(path: Path, ending: str, topic: str | None = None) -> Recording:
     Raises:
         InputError: if the bag cannot be read, or has no such topic, or more than one.
     """
+    if ending == FOLDER:
+        with reading(path, EXPECTED, ADVICE):
+            _check_unpacked(path)
     with reading(path, EXPECTED, ADVICE), closing(_open_reader(path, ending)) as reader:
         counts = _count_messages(reader)
         topic = _choose_topic(counts, topic, path, _describe_others(reader))
@@ -97,7 +100,6 @@ def _open_reader(path: Path, ending: str) -> Any:
     }
     reader = readers[ending](path)
     if ending == FOLDER:
-        _check_unpacked(path)
         reader.STORAGE_PLUGINS = {"mcap": McapReader, "sqlite3": open_database}
     reader.open()
     return reader
