@@ -67,7 +67,7 @@ USAGE = f"""usage: amvnet VERB ...
   train      train the networks and the point head
   predict    segment scans
   evaluate   score weights or predictions by the official formulas
-  submit     pack or check predictions for a benchmark's server
+  submit     check and pack predictions for a benchmark's server
   fuse       fuse the scores of any two models
   rank       which scans to look at next: those whose labels look wrong
   analyze    the paper's figures, sweeps and tables

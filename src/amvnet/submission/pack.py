@@ -1,18 +1,23 @@
-"""Pack predictions for a benchmark's server, or check a packed archive, by the same rules."""
+"""Check predictions by the rules of a benchmark's server, and pack them into an archive."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+import stat
+import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
 from amvnet.errors import InputError
+from amvnet.files import atomic_write
 from amvnet.progress import Progress, no_progress
 from amvnet.submission.rules import Rules, Sources
-from amvnet.submission.zips import Archive, open_archive, write_archive
 
 ENDING = ".zip"
-SHOWN = 5  # names listed in a message
+LEVEL = 6  # of deflate: 9 takes five to eight times as long and saves a sixth
+# Time of every entry, the earliest of the format: the same content gives the same bytes.
+LONG_AGO = (1980, 1, 1, 0, 0, 0)
+UNIX = 3  # code of the system that wrote an entry
+FOLDER_BIT = 0x10  # of an entry's MS-DOS attributes
 
 
 @dataclass(frozen=True)
@@ -72,144 +77,61 @@ def write(
         A summary of the archive.
 
     Raises:
-        InputError: if a prediction is missing or breaks the rules.
+        InputError: if a prediction is missing or breaks the rules, or the archive cannot be
+            written.
     """
-    _check_ending(out)
+    if out.suffix != ENDING:
+        raise InputError(
+            f"{out}: expected a name that ends in {ENDING}, "
+            f"found {out.suffix or 'no ending'}; rename it"
+        )
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 
-    possible_names = (*rules.texts, *sorted(rules.points))
-    names = [name for name in possible_names if (folder / name).is_file()]
-    _check_missing(rules.required, set(names), str(folder))
+    names = [name for name in sorted(rules.points) if (folder / name).is_file()]
+    _check_missing(rules, names, folder)
     for name in names:
-        path = folder / name
-        rules.check_size(name, path.stat().st_size, str(path))
+        rules.check_size(name, (folder / name).stat().st_size, folder / name)
 
-    with write_archive(out) as archive:
+    with atomic_write(out) as part, zipfile.ZipFile(part, "w") as archive:
         for name in rules.folders:
-            archive.add(name, b"")
+            _add(archive, name, b"")
         if rules.meta is not None:
-            archive.add(rules.meta, (sources or Sources()).to_json())
+            _add(archive, rules.meta, (sources or Sources()).to_json())
+        for name in rules.texts:
+            if (folder / name).is_file():
+                _add(archive, name, (folder / name).read_bytes())
 
         for done, name in enumerate(names):
             progress(done, len(names))
-            path = folder / name
-            data = path.read_bytes()
-            rules.check_content(name, data, str(path))
-            archive.add(name, data)
+            data = (folder / name).read_bytes()
+            rules.check_ids(data, folder / name)
+            _add(archive, name, data)
 
     progress(len(names), len(names))
-    return _submission(rules, names)
+    counts = [rules.points[name] for name in names]
+    return Submission(len(names), unmatched=counts.count(None), official=rules.official)
 
 
-def check(rules: Rules, path: Path, progress: Progress = no_progress) -> Submission:
-    """Check an archive that any tool has packed.
-
-    All names and sizes are checked first, then the files one by one; one is in memory at a time.
-
-    Raises:
-        InputError: at the first rule that the archive breaks.
-    """
-    _check_ending(path)
-    with open_archive(path) as archive:
-        _check_names(rules, archive)
-        for name, size in archive.sizes.items():
-            rules.check_size(name, size, f"{path}: {name}")
-
-        # Texts before predictions: they are short.
-        names = sorted(archive.sizes, key=lambda name: name in rules.points)
-        for done, name in enumerate(names):
-            progress(done, len(names))
-            rules.check_content(name, archive.read(name), f"{path}: {name}")
-
-        progress(len(names), len(names))
-        return _submission(rules, names)
-
-
-def _submission(rules: Rules, names: Iterable[str]) -> Submission:
-    """Return the summary of an archive that holds the files of these names."""
-    point_counts = [rules.points[name] for name in names if name in rules.points]
-    return Submission(
-        len(point_counts), unmatched=point_counts.count(None), official=rules.official
-    )
-
-
-def _check_ending(path: Path) -> None:
-    if path.suffix != ENDING:
-        raise InputError(
-            f"{path}: expected a name that ends in {ENDING}, "
-            f"found {path.suffix or 'no ending'}; rename it"
-        )
-
-
-def _check_names(rules: Rules, archive: Archive) -> None:
-    """Check which files and folders an archive has."""
-    path = archive.path
-    names = set(archive.sizes)
-    top_names = _names_at_depth(names | archive.folders, 0)
-    _check_not_nested(rules, names, top_names, path)
-
-    missing_folders = [name for name in rules.folders if name not in archive.folders]
-    if rules.needs_folders and missing_folders:
-        raise InputError(
-            f"{path}: expected an entry for every folder, found none for "
-            f"{_first_of(missing_folders)}; pack folders as entries of their own, as zip -r does"
-        )
-
-    if rules.meta is not None and rules.meta not in names:
-        listed = ", ".join(map(repr, sorted(top_names)[:SHOWN])) or "nothing"
-        raise InputError(
-            f"{path}: expected {rules.meta}, found only {listed}; "
-            "add this file, or name the archive's split with --split"
-        )
-
-    _check_missing(rules.required, names, str(path))
-    unexpected = sorted(names - {*rules.points, *rules.others})
-    if unexpected:
-        raise InputError(
-            f"{path}: expected only predictions, found {_first_of(unexpected)}; leave these out"
-        )
-
-
-def _check_not_nested(rules: Rules, names: set[str], top_names: set[str], path: Path) -> None:
-    """Check that the folders of the benchmark are not packed inside another folder."""
-    expected = _names_at_depth(rules.folders, 0)
-    if len(top_names) != 1 or top_names & expected:
-        return
-
-    (outer_folder,) = top_names
-    if _names_at_depth(names, 1) & expected:
-        raise InputError(
-            f"{path}: expected {' and '.join(sorted(expected))} at the top, "
-            f"found all below {outer_folder!r}; pack the content of that folder, not the folder"
-        )
-
-
-def _check_missing(required: Collection[str], names: set[str], source: str) -> None:
-    """Check that no required prediction is missing; `source` begins the message."""
-    missing = sorted(set(required) - names)
+def _check_missing(rules: Rules, names: list[str], folder: Path) -> None:
+    """Check that no required prediction is missing, given the names of those that are there."""
+    missing = sorted(set(rules.required) - set(names))
     if missing:
+        others = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise InputError(
-            f"{source}: expected a prediction for each of {len(required)} scans, "
-            f"found no {_first_of(missing)}; predict these scans too, "
+            f"{folder}: expected a prediction for each of {len(rules.required)} scans, "
+            f"found no {missing[0]}{others}; predict these scans too, "
             "or select predicted ones with --sequences or --split"
         )
 
 
-def _names_at_depth(paths: Iterable[str], depth: int) -> set[str]:
-    """Return the names of files and folders at one depth of some paths; 0 is the top."""
-    names = set()
-    for path in paths:
-        path_names = path.split("/")
-        if depth < len(path_names):
-            names.add(path_names[depth])
-
-    return names
-
-
-def _first_of(names: list[str]) -> str:
-    """Return the first name and the number of further names, as text."""
-    first = names[0] if names[0].isprintable() else repr(names[0])
-    if len(names) == 1:
-        return first
-    return f"{first} and {len(names) - 1} more"
+def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    """Add a file, or a folder (NAME/), by an entry that is the same everywhere and at any time."""
+    entry = zipfile.ZipInfo(name, LONG_AGO)
+    entry.create_system = UNIX
+    if name.endswith("/"):
+        entry.external_attr = (stat.S_IFDIR | 0o755) << 16 | FOLDER_BIT
+    else:
+        entry.external_attr = (stat.S_IFREG | 0o644) << 16
+        entry.compress_type = zipfile.ZIP_DEFLATED
+    archive.writestr(entry, data, compresslevel=LEVEL)

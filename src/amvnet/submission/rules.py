@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -37,7 +38,6 @@ TEST_SCANS = {
 }
 # Most points accepted of a scan that is not on disk. A full turn of the sensor has 130,000.
 MOST_POINTS = 1_000_000
-MOST_TEXT = 1_000_000  # most bytes of description.txt or submission.json
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,7 @@ class Rules:
         required: names of the predictions that it must contain.
         dtype: number type of the ids.
         unlabelled: whether points may have no class (train id 0).
-        folders: names of the folders, outer ones first, each with a trailing slash.
-        needs_folders: whether the folders need entries of their own.
+        folders: names of the folders' entries, outer ones first, each with a trailing slash.
         meta: name of submission.json, the file of `Sources`; None if there is none.
         texts: names of text files that the archive may contain.
         official: how many predictions the server expects, or None if it has no fixed number.
@@ -81,69 +80,47 @@ class Rules:
     dtype: type[np.unsignedinteger]
     unlabelled: bool
     folders: tuple[str, ...]
-    needs_folders: bool
     meta: str | None = None
     texts: tuple[str, ...] = ()
     official: int | None = None
 
-    @property
-    def others(self) -> tuple[str, ...]:
-        """The names of the files that are not predictions."""
-        return self.texts if self.meta is None else (*self.texts, self.meta)
-
-    def check_size(self, name: str, size: int, label: str) -> None:
-        """Check the size of a file before it is read.
+    def check_size(self, name: str, size: int, path: Path) -> None:
+        """Check the size of a prediction before it is read.
 
         Args:
-            name: name of the file in the archive.
-            size: bytes that the file has, or that its entry declares.
-            label: the beginning of error messages.
+            name: its name in the archive.
+            size: its bytes.
+            path: the file, for messages.
 
         Raises:
-            InputError: if a prediction does not have one id per point, or another file is too
-                large.
+            InputError: if it does not have one id per point.
         """
-        if name in self.others:
-            if size > MOST_TEXT:
-                raise InputError(
-                    f"{label}: expected at most {MOST_TEXT} bytes of text, found {size}; shorten it"
-                )
-            return
-
         count = self.points[name]
         if count is not None:
-            check_size(label, size, count, self.dtype)
+            check_size(path, size, count, self.dtype)
             return
 
         width = np.dtype(self.dtype).itemsize
         if not 0 < size <= MOST_POINTS * width or size % width:
             raise InputError(
-                f"{label}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; "
+                f"{path}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; "
                 "write one id per point"
             )
 
-    def check_content(self, name: str, data: bytes, label: str) -> None:
-        """Check the content of a file whose size has been checked.
+    def check_ids(self, data: bytes, path: Path) -> None:
+        """Check the ids of a prediction whose size has been checked.
 
         Args:
-            name: name of the file in the archive.
-            data: all of its bytes.
-            label: the beginning of error messages.
+            data: its bytes.
+            path: the file, for messages.
 
         Raises:
-            InputError: if an id is not one of the benchmark, if a point needs a class and has
-                none, or if submission.json is not valid (see `check_sources`).
+            InputError: if an id is not one of the benchmark, or a point needs a class and has none.
         """
-        if name == self.meta:
-            check_sources(data, label)
-            return
-        if name not in self.points:
-            return
-
-        ids = train_ids(label, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
+        ids = train_ids(path, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
         if not self.unlabelled and not ids.all():
             raise InputError(
-                f"{label}: expected a class 1..{self.taxonomy.size} for every point, "
+                f"{path}: expected a class 1..{self.taxonomy.size} for every point, "
                 f"found 0 for {np.count_nonzero(ids == 0)} of {len(ids)}; "
                 "give these points a class"
             )
@@ -175,11 +152,10 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
     The archive holds sequences/11 to 21, each with predictions/NNNNNN.label, raw ids as uint32.
 
     The official validator requires a name that ends in .zip, an entry for every folder, a file
-    for every scan in the `velodyne` folders, and 4 bytes per point. It checks neither the ids nor
-    other files. The server's evaluation counts all label files, reads unknown ids as
-    "unlabeled" and stops at ids above 358; here, further label files and unknown ids are errors.
-    A point may be unlabelled (it counts as missed) and the upper 16 bits are free. The file
-    description.txt is optional.
+    for every scan in the `velodyne` folders, and 4 bytes per point, but does not check the ids. The
+    server's evaluation reads unknown ids as "unlabeled" and stops at ids above 358; here, unknown
+    ids are errors. A point may be unlabelled (it counts as missed) and the upper 16 bits are free.
+    The file description.txt is optional.
     """
     present = dataset.sequences("all")
     absent: list[str] = []  # test sequences that are not on disk
@@ -215,7 +191,6 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
         dtype=np.uint32,
         unlabelled=True,
         folders=tuple(folders),
-        needs_folders=True,
         texts=("description.txt", "sequences/description.txt"),
         official=sum(TEST_SCANS.values()) if is_whole_test else None,
     )
@@ -229,7 +204,7 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
 
     The official validator requires a file for every key frame that the tables list for the split,
     one byte per point with a value of 1..16, and in submission.json a "meta" with exactly the five
-    keys of `Sources`, all true or false. It does not check other files; here they are errors.
+    keys of `Sources`, all true or false.
 
     Raises:
         InputError: if there are no such scenes, or they belong to several splits.
@@ -263,47 +238,11 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
         dtype=np.uint8,
         unlabelled=False,
         folders=("lidarseg/", f"lidarseg/{only_split}/", f"{only_split}/"),
-        needs_folders=False,
         meta=f"{only_split}/submission.json",
     )
 
 
 RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuScenes: _nuscenes}
-
-
-def check_sources(data: bytes, label: str) -> None:
-    """Check the content of a submission.json.
-
-    Args:
-        data: all of its bytes.
-        label: the beginning of error messages.
-
-    Raises:
-        InputError: if it is not JSON, or its "meta" does not have exactly the five flags.
-    """
-    try:
-        content = json.loads(data.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{label}: expected JSON, found {reason}; write it again") from None
-
-    flags = content.get("meta") if isinstance(content, dict) else None
-    keys = list(asdict(Sources()))
-    if not isinstance(flags, dict) or set(flags) != set(keys):
-        flags_text = "no such object"
-        if isinstance(flags, dict):
-            flags_text = ", ".join(map(repr, flags)) or "nothing"
-        raise InputError(
-            f'{label}: expected {", ".join(keys)} in the object "meta", '
-            f"found {flags_text[:200]}; write these five"
-        )
-
-    for key in keys:
-        if not isinstance(flags[key], bool):
-            raise InputError(
-                f"{label}: expected true or false for {key}, "
-                f"found a value of type {type(flags[key]).__name__}; write true or false"
-            )
 
 
 def _count_points(dataset: Dataset, record: ScanRecord) -> int | None:

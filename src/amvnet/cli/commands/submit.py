@@ -13,9 +13,8 @@ from amvnet.progress import counted
 
 def submit(
     data: str,
-    predictions: Path | None = None,
-    out: Path | None = None,
-    check: Path | None = None,
+    predictions: Path,
+    out: Path,
     split: Literal["train", "val", "test"] = "test",
     sequences: str | None = None,
     use_camera: bool = False,
@@ -25,13 +24,12 @@ def submit(
     use_external: bool = False,
     overwrite: bool = False,
 ) -> None:
-    """Check and pack predictions for the benchmark's server, or check an archive of any tool.
+    """Check predictions by the rules of the benchmark's server, and pack them for it.
 
     Args:
         data: the dataset, whose scans are the reference.
         predictions: a folder of predictions in the benchmark's layout.
         out: the archive to write, NAME.zip.
-        check: an archive to check instead.
         split: the official split; the servers score test, the others are for trials.
         sequences: sequences or scenes instead, separated by commas, for trials.
         use_camera: nuScenes: the method was given images.
@@ -47,27 +45,15 @@ def submit(
 
     sources = Sources(use_camera, use_lidar, use_radar, use_map, use_external)
     rules = rules_for(open_data(data), split, parse_names(sequences))
-    if sources != Sources() and (check is not None or rules.meta is None):
+    if sources != Sources() and rules.meta is None:
         raise InputError(
             "expected no --use-... but to write an archive for nuScenes, found one; leave it out"
         )
 
-    if check is not None and predictions is None and out is None:
-        with progress("checking") as step:
-            submission = pack.check(rules, check, step)
-    elif predictions is not None and out is not None and check is None:
-        with protecting([out], overwrite), progress("packing") as step:
-            submission = pack.write(rules, predictions, out, sources, step)
-    else:
-        raise InputError(
-            "expected either --predictions and --out, or --check, found others; "
-            "give one or the other"
-        )
+    with protecting([out], overwrite), progress("packing") as step:
+        submission = pack.write(rules, predictions, out, sources, step)
     packed = counted(submission.predictions, "prediction")
     fit = "keeps" if submission.predictions == 1 else "keep"
-    say(
-        f"{check or out}: {packed} of {rules.description} {fit} to the rules of "
-        f"{rules.taxonomy.name}"
-    )
+    say(f"{out}: {packed} of {rules.description} {fit} to the rules of {rules.taxonomy.name}")
     for note in submission.notes:
         say(f"note: {note}")
