@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, TRAIN_DETECT, VAL, NuScenes
+from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, VAL, NuScenes
 from amvnet.data.datasets.open import is_dataset, open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 
@@ -246,11 +246,6 @@ def test_nuscenes_own_names_of_splits_are_taken(tmp_path: Path) -> None:
     assert isinstance(dataset, NuScenes)
     assert dataset.scenes("mini_val") == dataset.scenes("val") == ("scene-0103",)
     assert dataset.scenes("mini_train") == dataset.scenes("train")
-
-    halves = (*dataset.scenes("train_detect"), *dataset.scenes("train_track"))
-    assert sorted(halves) == list(dataset.scenes("train"))
-    assert not TRAIN_DETECT & {"scene-0004", "scene-0328", "scene-0992", "scene-1106"}
-    assert {"scene-0001", "scene-0382", "scene-0991", "scene-1105"} <= TRAIN_DETECT
 
 
 def test_an_empty_split_names_the_one_of_all_scans(layout: Layout) -> None:

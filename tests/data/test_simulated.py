@@ -53,7 +53,7 @@ def test_a_scan_equals_that_of_the_files_of_a_simulation(
     options: dict[str, Any] = {"sensor": sensor, "scans": 2, "seed": simulated.SEED}
     written = open_dataset(str(simulate(tmp_path / "files", first_sequence=12, **options)))
 
-    dataset = SimulatedStreets(tmp_path / "cache", sensor)
+    dataset = pickle.loads(pickle.dumps(SimulatedStreets(tmp_path / "cache", sensor)))
     expected = written.records(written.sequences("all"))
     records = dataset.records(["12"])
     for record, written_record in zip(records, expected, strict=True):
@@ -78,7 +78,7 @@ def test_streets_are_opened_by_the_name_of_their_sensor(sensor: str, tmp_path: P
     assert isinstance(dataset, Dataset)
     assert dataset.taxonomy is BENCHMARKS[sensor]
     assert dataset.spec == spec
-    assert pickle.loads(pickle.dumps(dataset)) == dataset
+    assert vars(pickle.loads(pickle.dumps(dataset))) == vars(dataset)
 
 
 def test_other_classes_are_refused(tmp_path: Path) -> None:

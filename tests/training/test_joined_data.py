@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +105,8 @@ def test_scans_that_are_normalised_are_not_mixed_with_others(tmp_path: Path) -> 
     classes = {name: number for number, name in enumerate(SEMANTICKITTI.classes, start=1)}
     description = {"classes": classes, "scans": "*.npy"}
     (tmp_path / "own.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
-    own = replace(open_own(tmp_path / "own.yaml"), is_normalised=True)
+    own = open_own(tmp_path / "own.yaml")
+    own.is_normalised = True
     with pytest.raises(InputError, match="found both"):
         join(scans, [Part(own, own.records(own.sequences("all")))])
 

@@ -30,10 +30,7 @@ if TYPE_CHECKING:
     from amvnet.sensors.lidars import Sensor
     from amvnet.weights.file import Weights
 
-# Those from the fifth on are nuScenes' own.
-Split = Literal[
-    "train", "val", "test", "all", "mini_train", "mini_val", "train_detect", "train_track"
-]
+Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]  # the last two: nuScenes
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 SHOWN = 20  # names of sequences in a line

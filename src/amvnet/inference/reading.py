@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -195,7 +194,7 @@ def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
         for scan in scans:
             normaliser.expect(source, scan.read)
     is_normalised = normaliser.expected is not None
-    return dataclasses.replace(dataset, normalise=normaliser, is_normalised=is_normalised)
+    return OwnScans(dataset.description, normaliser, is_normalised)
 
 
 def _described_sensor(dataset: OwnScans) -> Sensor:

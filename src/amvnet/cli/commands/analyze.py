@@ -52,7 +52,7 @@ def analyze(
     """
     from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.select import TrainingScans, labelled_records
+    from amvnet.data.datasets.select import TrainingScans
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
@@ -69,14 +69,14 @@ def analyze(
     dataset = open_for_weights(data, loaded)
     segmenter = make_segmenter(loaded, device, engine, precision, at_once, method="amvnet")
     records = choose_records(dataset, parse_names(sequences), split)
-    records = labelled_records(dataset, records)
+    records = dataset.labelled(records)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
     studies: list[tuple[HeadStudy, Sequence[float]]] = []
     if recipe is not None:
         loaded_recipe = load_recipe(recipe)
         names = parse_names(train_sequences) or dataset.sequences("train")
-        scans = TrainingScans(dataset, labelled_records(dataset, dataset.records(names)), records)
+        scans = TrainingScans(dataset, dataset.labelled(dataset.records(names)), records)
         if taus is not None:
             study = HeadStudy("taus", loaded_recipe, loaded, scans, out)
             studies.append((study, parse_taus(taus)))

@@ -74,7 +74,6 @@ def evaluate(
             core, if the memory suffices.
     """
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.select import labelled_records
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
@@ -93,7 +92,7 @@ def evaluate(
         has_own = taxonomy is not None or class_map is not None
         opened = open_data(data, taxonomy) if has_own else None
         dataset = open_for_weights(data, loaded, opened)
-        records = labelled_records(dataset, choose_records(dataset, names, split))
+        records = dataset.labelled(choose_records(dataset, names, split))
         method_names = parse_methods(methods)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in method_names]
@@ -116,7 +115,7 @@ def evaluate(
                     f"--{option}: expected --weights, found --predictions; leave --{option} out"
                 )
         dataset = open_data(data, taxonomy)
-        records = labelled_records(dataset, choose_records(dataset, names, split))
+        records = dataset.labelled(choose_records(dataset, names, split))
         labeller = label_from_files(dataset, predictions, class_map, mapped)
     else:
         raise InputError(

@@ -42,7 +42,6 @@ def rank(
         overwrite: replace files that amvnet did not write, too.
     """
     from amvnet.data.datasets.base import choose_records
-    from amvnet.data.datasets.select import labelled_records
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.ranking.label_errors import rank as rank_records
@@ -62,7 +61,7 @@ def rank(
         loaded = load(weights)
         dataset = open_for_weights(data, loaded)
         chosen = choose_records(dataset, parse_names(sequences), split)
-        records = labelled_records(dataset, chosen)
+        records = dataset.labelled(chosen)
         segmenter = make_segmenter(loaded, device, engine, precision, at_once, method="ensemble")
 
         with progress("scoring") as step:

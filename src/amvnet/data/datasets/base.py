@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from amvnet.data.labels.ids import check_count, read_ids, train_ids, write_ids
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import InputError
 from amvnet.files import inside
 from amvnet.scan import Scan
 
@@ -34,26 +35,25 @@ class ScanRecord:
     prediction: str
 
 
-@runtime_checkable
-class Dataset(Protocol):
-    """One dataset on disk; instances can be pickled, so that worker processes can read."""
+class Dataset(ABC):
+    """One dataset on disk; instances can be pickled, so that worker processes can read.
 
-    @property
-    def taxonomy(self) -> Taxonomy:
-        """The classes of the labels."""
+    Attributes:
+        root: the folder that was opened.
+        taxonomy: the classes of the labels.
+        spec: what `open_dataset` opens the same dataset with; by default the folder.
+        is_normalised: whether `ring` of each scan is the row of each point in the range image, 0
+            the lowest.
+    """
 
-    @property
-    def root(self) -> Path:
-        """The folder that was opened."""
+    is_normalised = False
 
-    @property
-    def spec(self) -> str:
-        """What `open_dataset` opens the same dataset with."""
+    def __init__(self, root: Path | str, taxonomy: Taxonomy, spec: str | None = None) -> None:
+        self.root = Path(root)
+        self.taxonomy = taxonomy
+        self.spec = spec or str(root)
 
-    @property
-    def is_normalised(self) -> bool:
-        """Whether `ring` of each scan is the row of each point in the range image, 0 the lowest."""
-
+    @abstractmethod
     def sequences(self, split: str) -> tuple[str, ...]:
         """Return the sequences of a split that are on disk.
 
@@ -64,6 +64,7 @@ class Dataset(Protocol):
             InputError: if the split is unknown or none of its sequences is on disk.
         """
 
+    @abstractmethod
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these sequences, sorted by sequence and then by time.
 
@@ -71,9 +72,7 @@ class Dataset(Protocol):
             InputError: if a sequence does not exist; the message lists those that do.
         """
 
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the scan to train on in place of a scan in an epoch: most datasets, the scan."""
-
+    @abstractmethod
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan.
 
@@ -85,12 +84,25 @@ class Dataset(Protocol):
             InputError: if a file is missing, truncated, empty or does not fit its scan.
         """
 
+    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
+        """Return the scan to train on in place of a scan in an epoch: most datasets, the scan."""
+        return record
+
+    def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+        """Return the scans to train on or to score.
+
+        Raises:
+            InputError: if all of them may be left out for lack of labels, and are.
+        """
+        return list(records)
+
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan.
 
         Raises:
             InputError: as `read`.
         """
+        return len(self.read(record, labels=False))
 
     def read_prediction(
         self, record: ScanRecord, folder: Path, taxonomy: Taxonomy | None = None
@@ -105,6 +117,9 @@ class Dataset(Protocol):
         Raises:
             InputError: if the file is missing, has another number of points or an unknown id.
         """
+        path = Path(folder) / record.prediction
+        raw = read_ids(path, _id_type(path), self.count_points(record))
+        return train_ids(path, raw, taxonomy or self.taxonomy)
 
     def write_prediction(
         self,
@@ -124,38 +139,17 @@ class Dataset(Protocol):
         Raises:
             InputError: if there is not one id per point, or an id is outside 0..K.
         """
-
-
-class OnDisk:
-    """What the datasets have in common. `Dataset` documents the methods and their errors."""
-
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the scan itself."""
-        return record
-
-    def count_points(self: Dataset, record: ScanRecord) -> int:
-        """Read the scan and return the number of its points."""
-        return len(self.read(record, labels=False))
-
-    def read_prediction(
-        self: Dataset, record: ScanRecord, folder: Path, taxonomy: Taxonomy | None = None
-    ) -> np.ndarray:
-        """Read a file of nothing but ids."""
-        path = Path(folder) / record.prediction
-        raw = read_ids(path, _id_type(path), self.count_points(record))
-        return train_ids(path, raw, taxonomy or self.taxonomy)
-
-    def write_prediction(
-        self: Dataset,
-        record: ScanRecord,
-        folder: Path,
-        ids: np.ndarray,
-        taxonomy: Taxonomy | None = None,
-    ) -> Path:
-        """Write a file of nothing but ids."""
         ids = check_count(ids, record.points_path, self.count_points(record))
         path = inside(folder, record.prediction)
         return write_ids(path, (taxonomy or self.taxonomy).to_raw(ids), _id_type(path))
+
+
+def check_split(source: Path | str, split: str, splits: Collection[str]) -> None:
+    """Raise an InputError if a dataset does not know a split."""
+    if split not in splits:
+        raise InputError(
+            f"{source}: expected a split of {', '.join(splits)}, found {split!r}; give one of them"
+        )
 
 
 def _id_type(path: Path) -> type[np.unsignedinteger]:

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.datasets.base import Dataset, OnDisk, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import check_classes
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.simulated import SCANS
-from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -54,39 +53,25 @@ class Part:
     share: float | None = None
 
 
-@dataclass(frozen=True)
-class Joined(OnDisk):
+class Joined(Dataset):
     """Several datasets with the same classes. `Dataset` documents the methods and their errors.
 
     Scans of the first dataset keep their records. Scans of the others have a `MixedRecord`, and
     sequences named by the number of the dataset: "2/000012". A dataset with fewer places than scans
     shows others of its scans in each epoch, all of them equally often.
 
-    Attributes:
+    Args:
         dataset: the first of them; names the split, is validated, and takes predictions.
         parts: the others.
-        places: of each of them, the scans of an epoch.
+        places: of each of the parts, how many scans an epoch has.
     """
 
-    dataset: Dataset
-    parts: tuple[Part, ...]
-    places: tuple[int, ...]
-
-    @property
-    def taxonomy(self) -> Taxonomy:
-        return self.dataset.taxonomy
-
-    @property
-    def root(self) -> Path:
-        return self.dataset.root
-
-    @property
-    def spec(self) -> str:
-        return self.dataset.spec
-
-    @property
-    def is_normalised(self) -> bool:
-        return self.dataset.is_normalised
+    def __init__(self, dataset: Dataset, parts: Sequence[Part], places: Sequence[int]) -> None:
+        super().__init__(dataset.root, dataset.taxonomy, dataset.spec)
+        self.is_normalised = dataset.is_normalised
+        self.dataset = dataset
+        self.parts = parts
+        self.places = places
 
     @property
     def specs(self) -> list[str]:
@@ -166,7 +151,7 @@ def join(scans: TrainingScans, parts: Sequence[Part]) -> TrainingScans:
                 "in every --data, found both; train on one after the other, with --init"
             )
 
-    joined = Joined(scans.dataset, tuple(parts), _places(len(scans.train), parts))
+    joined = Joined(scans.dataset, parts, _places(len(scans.train), parts))
     return TrainingScans(joined, [*scans.train, *joined.mixed_records()], scans.val)
 
 
@@ -178,7 +163,7 @@ def _order(member: int, count: int) -> np.ndarray:
     return indices[indices < count]
 
 
-def _places(first: int, parts: Sequence[Part]) -> tuple[int, ...]:
+def _places(first: int, parts: Sequence[Part]) -> list[int]:
     """Return how many scans of an epoch each of the parts has, at least one.
 
     Args:
@@ -197,7 +182,7 @@ def _places(first: int, parts: Sequence[Part]) -> tuple[int, ...]:
     for part in parts:
         count = len(part.records) if part.share is None else round(part.share * epoch)
         places.append(max(count, 1))
-    return tuple(places)
+    return places
 
 
 def split_share(spec: str) -> tuple[str, float | None]:

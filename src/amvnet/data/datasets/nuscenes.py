@@ -6,11 +6,11 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from amvnet.data.datasets.base import OnDisk, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.raw import (
     FULL_INTENSITY,
     NUSCENES_COLUMNS,
@@ -44,7 +44,7 @@ def _scene_names(numbers: str) -> frozenset[str]:
     return frozenset(names)
 
 
-SPLITS = ("train", "val", "test", "all", "mini_train", "mini_val", "train_detect", "train_track")
+SPLITS = ("train", "val", "test", "all", "mini_train", "mini_val")
 # The official splits. A scene in none of these belongs to "train".
 MINI_TRAIN = _scene_names("61 553 655 757 796 1077 1094 1100")
 MINI_VAL = _scene_names("103 916")
@@ -53,20 +53,14 @@ VAL = _scene_names(
     "632-638 770-771 775 777-778 780-784 794-800 802 904-917 919-931 962-963 966-969 971-972 "
     "1059-1073"
 )
-# "train" in two halves, for networks that learn from the output of others: "train_detect" has
-# those of its scenes that are listed here, "train_track" the others.
-TRAIN_DETECT = _scene_names(
-    "1-2 41-76 161-176 190-214 254-324 347-375 382 420-439 457-480 566-583 665-689 739-769 868-991 "
-    "1011-1025 1074-1105"
-)
 
 
-class NuScenes(OnDisk):
+class NuScenes(Dataset):
     """The LIDAR_TOP key frames of one version of nuScenes.
 
     `Dataset` documents the arguments and errors of the methods.
 
-    Attributes:
+    Args:
         root: the folder that holds `samples/` and `v1.0-*/`.
         version: "v1.0-mini", "v1.0-trainval" or "v1.0-test".
         taxonomy: the classes.
@@ -76,15 +70,11 @@ class NuScenes(OnDisk):
             missing.
     """
 
-    is_normalised: ClassVar[bool] = False
-
     def __init__(
         self, root: Path | str, version: str | None = None, taxonomy: Taxonomy = NUSCENES
     ) -> None:
-        self.root = Path(root)
+        super().__init__(root, taxonomy)
         self.version = self._find_version(version)
-        self.taxonomy = taxonomy
-
         try:
             label_rows = self._table("lidarseg", required=False)
             self._label_files = _lookup(label_rows, "sample_data_token", "filename")
@@ -95,11 +85,6 @@ class NuScenes(OnDisk):
                 f"{self.root / self.version}: expected the tables of nuScenes, "
                 f"found no entry {error}; unpack them"
             ) from None
-
-    @property
-    def spec(self) -> str:
-        """The folder."""
-        return str(self.root)
 
     @staticmethod
     def matches(root: Path) -> bool:
@@ -139,17 +124,8 @@ class NuScenes(OnDisk):
         Raises:
             InputError: if the split is unknown.
         """
-        if split not in SPLITS:
-            raise InputError(
-                f"{self.root}: expected a split of {', '.join(SPLITS)}, "
-                f"found {split!r}; give one of them"
-            )
-
-        scenes = []
-        for scene in sorted(self._records_by_scene):
-            if self._is_in(scene, split):
-                scenes.append(scene)
-        return tuple(scenes)
+        check_split(self.root, split, SPLITS)
+        return tuple(scene for scene in sorted(self._records_by_scene) if self._is_in(scene, split))
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these scenes, in order."""
@@ -189,11 +165,8 @@ class NuScenes(OnDisk):
 
     def _find_version(self, version: str | None) -> str:
         """Return the version to read: the one asked for, or the only one in the folder."""
-        present = []
-        for path in sorted(self.root.glob("v1.0-*")):
-            if path.is_dir():
-                present.append(path.name)
-
+        folders = filter(Path.is_dir, self.root.glob("v1.0-*"))
+        present = sorted(folder.name for folder in folders)
         if version is None and len(present) == 1:
             return present[0]
         if version is not None and version in present:
@@ -281,11 +254,7 @@ class NuScenes(OnDisk):
         for row in self._table("sample"):
             scene_of_sample[row["token"]] = scene_names[row["scene_token"]]
 
-        is_lidar = self._lidar_sensors()
-        rows = []
-        for row in self._table("sample_data"):
-            if self._is_scan(row, is_lidar):
-                rows.append(row)
+        rows = list(filter(_is_scan, self._table("sample_data")))
         rows.sort(key=lambda row: (row["timestamp"], row["token"]))
 
         records: dict[str, list[ScanRecord]] = {}
@@ -293,25 +262,6 @@ class NuScenes(OnDisk):
             scene = scene_of_sample[row["sample_token"]]
             records.setdefault(scene, []).append(self._record(row, scene))
         return records
-
-    def _lidar_sensors(self) -> dict[str, bool]:
-        """Return whether a calibrated sensor is the LiDAR, by its token.
-
-        The dictionary is empty if the tables of the sensors are missing.
-        """
-        channels = _lookup(self._table("sensor", required=False), "token", "channel")
-        is_lidar = {}
-        for row in self._table("calibrated_sensor", required=False):
-            is_lidar[row["token"]] = channels.get(row["sensor_token"], CHANNEL) == CHANNEL
-        return is_lidar
-
-    @staticmethod
-    def _is_scan(row: Row, is_lidar: dict[str, bool]) -> bool:
-        """Return whether a row of sample_data is a key frame of the LiDAR."""
-        in_folder = str(row["filename"]).startswith(f"samples/{CHANNEL}/")
-        if not row["is_key_frame"] or not in_folder:
-            return False
-        return is_lidar.get(row["calibrated_sensor_token"], True)
 
     def _record(self, row: Row, scene: str) -> ScanRecord:
         """Return the scan of a row of sample_data."""
@@ -335,12 +285,7 @@ class NuScenes(OnDisk):
         if split == "mini_train":
             return scene in MINI_TRAIN
 
-        scene_split = self._split(scene).removeprefix("mini_")
-        if split == "train_detect":
-            return scene_split == "train" and scene in TRAIN_DETECT
-        if split == "train_track":
-            return scene_split == "train" and scene not in TRAIN_DETECT
-        return split in ("all", scene_split)
+        return split in ("all", self._split(scene).removeprefix("mini_"))
 
     def _split(self, scene: str) -> str:
         """Return the official split of a scene in this version: "train", "mini_val", ..."""
@@ -353,6 +298,11 @@ class NuScenes(OnDisk):
                 return "mini_train"
 
         return "val" if scene in VAL else "train"
+
+
+def _is_scan(row: Row) -> bool:
+    """Return whether a row of sample_data is a key frame of the LiDAR."""
+    return bool(row["is_key_frame"]) and str(row["filename"]).startswith(f"samples/{CHANNEL}/")
 
 
 def _lookup(rows: list[Row], key: str, value: str) -> dict[str, Any]:

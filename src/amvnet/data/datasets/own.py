@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.datasets.base import OnDisk, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
@@ -27,7 +28,6 @@ ENDINGS = (".yaml", ".yml")
 KEYS = ("name", "root", "classes", "ignored", "scans", "labels", "split", "sensor")
 ROW_KEYS = ("columns", "dtype")
 SPLITS = ("train", "val", "test")
-LARGEST_LIST = 50_000_000  # bytes of a file with names of scans
 
 # Turns what a file holds into a scan, given the recording that it is from.
 Normalise = Callable[[Cloud, str], Scan]
@@ -45,6 +45,10 @@ class LabelPlace:
 
     file: str | None = None
     field: str | None = None
+
+    def path_of(self, scan: Path, name: str) -> Path:
+        """Return the file of the labels of a scan, given its file and its name."""
+        return scan if self.file is None else scan.parent / self.file.replace("{name}", name)
 
 
 @dataclass(frozen=True)
@@ -72,45 +76,34 @@ class Description:
     layout: RowLayout = UNKNOWN
 
 
-@dataclass(frozen=True)
-class OwnScans(OnDisk):
+class OwnScans(Dataset):
     """A user's labelled scans. `Dataset` documents the arguments and errors of its methods.
 
     A scan's sequence is the first folder below the part of the pattern that has no wildcards. If
     the split cuts through a folder, its parts are sequences: `site-train`, `site-val`.
 
-    Attributes:
+    Args:
         description: what the YAML file says.
         normalise: brings the scans to the frame, height, intensities and rows that some weights
             expect; None reads them as they are.
         is_normalised: whether it does, so that `ring` is the row of each point.
     """
 
-    description: Description
-    normalise: Normalise | None = None
-    is_normalised: bool = False
-
-    @property
-    def taxonomy(self) -> Taxonomy:
-        return self.description.taxonomy
-
-    @property
-    def root(self) -> Path:
-        return self.description.root
-
-    @property
-    def spec(self) -> str:
-        """The YAML file."""
-        return str(self.description.path)
+    def __init__(
+        self,
+        description: Description,
+        normalise: Normalise | None = None,
+        is_normalised: bool = False,
+    ) -> None:
+        super().__init__(description.root, description.taxonomy, str(description.path))
+        self.description = description
+        self.normalise = normalise
+        self.is_normalised = is_normalised
+        self._counts: dict[str, int] = {}  # points of the scans that have been read, by name
 
     def sequences(self, split: str) -> tuple[str, ...]:
         """Return the sequences of "train", "val", "test" or "all" that have scans."""
-        if split != "all" and split not in SPLITS:
-            raise InputError(
-                f"{self.spec}: expected a split of {', '.join((*SPLITS, 'all'))}, found {split!r}; "
-                "give one of them"
-            )
-
+        check_split(self.spec, split, (*SPLITS, "all"))
         names = set()
         for record, split_of_scan in self._listing:
             if split in ("all", split_of_scan):
@@ -134,6 +127,23 @@ class OwnScans(OnDisk):
 
         chosen = [record for record, _ in self._listing if record.sequence in sequences]
         return sorted(chosen, key=lambda record: (record.sequence, record.name))
+
+    def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+        """Return the scans that have labels."""
+        labelled = [record for record in records if record.labels_path is not None]
+        if records and not labelled:
+            place = self.description.labels
+            found = "no labels in the description"
+            if place is not None:
+                scan = self._scans[records[0].name]
+                found = f"no {os.path.normpath(place.path_of(scan.path, scan.name))}"
+            if len(records) > 1:
+                found += f" and none for the other scans ({len(records) - 1})"
+            raise InputError(
+                f"{self.spec}: expected labelled scans, found {found}; "
+                "correct labels in the file, or name other sequences"
+            )
+        return labelled
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan."""
@@ -161,12 +171,7 @@ class OwnScans(OnDisk):
     def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
         """Return the scans for predictions of other classes, without their labels."""
         description = dataclasses.replace(self.description, taxonomy=taxonomy, labels=None)
-        return dataclasses.replace(self, description=description)
-
-    @cached_property
-    def _counts(self) -> dict[str, int]:
-        """Numbers of points of the scans that have been read, by name."""
-        return {}
+        return OwnScans(description, self.normalise, self.is_normalised)
 
     @cached_property
     def _scans(self) -> dict[str, NamedScan]:
@@ -179,10 +184,13 @@ class OwnScans(OnDisk):
         paths = [path for path in matches if path.is_file() and not path.name.startswith(".")]
 
         # Files of labels may match the pattern of the scans, too.
-        label_paths = {self._place_of_labels(path, scan_stem(path)) for path in paths}
+        place = self.description.labels
+        label_paths = set()
+        if place is not None and place.file is not None:
+            label_paths = {place.path_of(path, scan_stem(path)) for path in paths}
         scans: dict[str, NamedScan] = {}
         for path in paths:
-            if path not in label_paths or self._has_fields:
+            if path not in label_paths:
                 for scan in list_scans(path, layout=self.description.layout):
                     self._add(scans, scan)
         if not scans:
@@ -213,11 +221,13 @@ class OwnScans(OnDisk):
             sequence = self._folder_of(name)
             if len(splits_of_folder[sequence]) > 1:
                 sequence = f"{sequence}-{splits[name] or 'rest'}"
+            place = self.description.labels
+            labels_path = None if place is None else place.path_of(scan.path, scan.name)
             record = ScanRecord(
                 name=name,
                 sequence=sequence,
                 points_path=scan.path,
-                labels_path=self._labels_path(scan),
+                labels_path=labels_path if labels_path and labels_path.is_file() else None,
                 prediction=f"{name}.label",
             )
             listing.append((record, splits[name]))
@@ -265,28 +275,6 @@ class OwnScans(OnDisk):
             names[split] = frozenset(texts)
         return names
 
-    @property
-    def _has_fields(self) -> bool:
-        """Whether the labels are in the files of the scans."""
-        return self.description.labels is not None and self.description.labels.file is None
-
-    def place_of_labels(self, record: ScanRecord) -> Path | None:
-        """Return where the labels of a scan would be; None if the description names no labels."""
-        scan = self._scans[record.name]
-        return self._place_of_labels(scan.path, scan.name)
-
-    def _labels_path(self, scan: NamedScan) -> Path | None:
-        """Return the file of a scan's labels; None if it has none."""
-        path = self._place_of_labels(scan.path, scan.name)
-        return path if path is not None and path.is_file() else None
-
-    def _place_of_labels(self, path: Path, name: str) -> Path | None:
-        """Return where the labels of a scan would be; None if there are none."""
-        place = self.description.labels
-        if place is None:
-            return None
-        return path if place.file is None else path.parent / place.file.replace("{name}", name)
-
     def _read_labels(self, record: ScanRecord, count: int) -> np.ndarray | None:
         place = self.description.labels
         path = record.labels_path
@@ -314,8 +302,6 @@ def _fixed_part(pattern: str) -> Path:
 
 def _read_list(path: Path) -> list[str]:
     """Return the lines of a list of scans or folders; names may have the ending of the scans."""
-    if path.stat().st_size > LARGEST_LIST:
-        raise InputError(f"{path}: expected a list of scans, found a larger file; give another")
     lines = map(str.strip, path.read_text(encoding="utf-8", errors="replace").splitlines())
     return [line for line in lines if line and not line.startswith("#")]
 

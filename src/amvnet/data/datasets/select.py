@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.own import OwnScans
 from amvnet.errors import InputError
 
 
@@ -36,27 +34,6 @@ class TrainingScans:
                 "expected different scans to train on and to validate with, "
                 f"found {min(common)} in both; name other sequences"
             )
-
-
-def labelled_records(dataset: Dataset, records: Sequence[ScanRecord]) -> list[ScanRecord]:
-    """Return the scans to train on or to score: of a user's own scans, those with labels.
-
-    Raises:
-        InputError: if a user's own scans are all without labels.
-    """
-    if not isinstance(dataset, OwnScans) or not records:
-        return list(records)
-    labelled = [record for record in records if record.labels_path is not None]
-    if not labelled:
-        place = dataset.place_of_labels(records[0])
-        found = "no labels in the description" if place is None else f"no {os.path.normpath(place)}"
-        if len(records) > 1:
-            found += f" and none for the other scans ({len(records) - 1})"
-        raise InputError(
-            f"{dataset.spec}: expected labelled scans, found {found}; "
-            "correct labels in the file, or name other sequences"
-        )
-    return labelled
 
 
 def split_records(
@@ -93,9 +70,7 @@ def split_records(
 
     if with_val:
         added = [name for name in val if name not in train]
-        return TrainingScans(
-            dataset, labelled_records(dataset, dataset.records([*train, *added])), []
-        )
+        return TrainingScans(dataset, dataset.labelled(dataset.records([*train, *added])), [])
 
     if not train or not val:
         raise InputError(
@@ -104,8 +79,8 @@ def split_records(
         )
     return TrainingScans(
         dataset,
-        labelled_records(dataset, dataset.records(train)),
-        labelled_records(dataset, dataset.records(val)),
+        dataset.labelled(dataset.records(train)),
+        dataset.labelled(dataset.records(val)),
     )
 
 

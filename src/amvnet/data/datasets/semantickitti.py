@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
-from amvnet.data.datasets.base import OnDisk, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.raw import KITTI_COLUMNS, check_points, count_rows, read_table
 from amvnet.data.labels.ids import read_ids, train_ids
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
@@ -17,11 +15,10 @@ from amvnet.errors import InputError
 from amvnet.scan import Scan
 
 
-@dataclass(frozen=True)
-class SemanticKitti(OnDisk):
+class SemanticKitti(Dataset):
     """A SemanticKITTI dataset. `Dataset` documents the arguments and errors of its methods.
 
-    Attributes:
+    Args:
         root: the folder that holds `sequences/`, or `sequences` itself.
         taxonomy: the classes that the labels were written with.
 
@@ -29,22 +26,13 @@ class SemanticKitti(OnDisk):
         InputError: if `root` does not have this layout.
     """
 
-    root: Path
-    taxonomy: Taxonomy = SEMANTICKITTI
-    is_normalised: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "root", Path(self.root))
+    def __init__(self, root: Path | str, taxonomy: Taxonomy = SEMANTICKITTI) -> None:
+        super().__init__(root, taxonomy)
         if not self._sequences_on_disk():
             raise InputError(
                 f"{self.root}: expected sequences/XX/velodyne/*.bin, found no folder XX/velodyne; "
                 "give the folder that holds `sequences`"
             )
-
-    @property
-    def spec(self) -> str:
-        """The folder."""
-        return str(self.root)
 
     @staticmethod
     def matches(root: Path) -> bool:
@@ -55,12 +43,7 @@ class SemanticKitti(OnDisk):
         """Return the sequences of "train", "val", "test" or "all" that are on disk."""
         present = self._sequences_on_disk()
         splits = {**self.taxonomy.splits, "all": present}
-        if split not in splits:
-            raise InputError(
-                f"{self.root}: expected a split of {', '.join(splits)}, "
-                f"found {split!r}; give one of them"
-            )
-
+        check_split(self.root, split, splits)
         sequences = tuple(sequence for sequence in splits[split] if sequence in present)
         if not sequences:
             raise InputError(
@@ -101,10 +84,7 @@ class SemanticKitti(OnDisk):
 
     def _sequences_on_disk(self) -> tuple[str, ...]:
         """Return the names of the sequences on disk, sorted."""
-        names = []
-        for path in self._folder.glob("*/velodyne"):
-            names.append(path.parent.name)
-        return tuple(sorted(names))
+        return tuple(sorted(path.parent.name for path in self._folder.glob("*/velodyne")))
 
     def _records(self, sequence: str) -> list[ScanRecord]:
         """Return the scans of one sequence, in order.

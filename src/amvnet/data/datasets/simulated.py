@@ -11,16 +11,15 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache, wraps
 from pathlib import Path
-from typing import ClassVar, ParamSpec
+from typing import ParamSpec
 
 import numpy as np
 
-from amvnet.data.datasets.base import OnDisk, ScanRecord
+from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.raw import FULL_INTENSITY
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError, one_line_errors, shown
 from amvnet.files import make_folder
 from amvnet.scan import Scan
@@ -61,8 +60,7 @@ def _with_input_errors(simulate: Callable[P, Path]) -> Callable[P, Path]:
 simulate = _with_input_errors(simulate_streets)
 
 
-@dataclass(frozen=True)
-class SimulatedStreets(OnDisk):
+class SimulatedStreets(Dataset):
     """Streets of a simulated sensor. `Dataset` documents the arguments and errors of its methods.
 
     A sequence is a street, named by its number: "000012". Streets with any number exist. A street
@@ -70,38 +68,21 @@ class SimulatedStreets(OnDisk):
     processes may share the folder of the cache. If it exceeds `CACHE_BYTES`, the streets that have
     not been read for the longest time are removed.
 
-    Attributes:
+    Args:
         root: the folder of the cache; made if there is none.
-        sensor: the name of a sensor in `SENSORS`.
+        sensor: the name of a sensor in `SENSORS`, whose benchmark has the classes.
     """
 
-    root: Path
-    sensor: str = "hdl64e"
-    is_normalised: ClassVar[bool] = False
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "root", Path(self.root))
-
-    @property
-    def taxonomy(self) -> Taxonomy:
-        """The classes of the benchmark that uses the sensor."""
-        return SENSORS[self.sensor]
-
-    @property
-    def spec(self) -> str:
-        """What `open_dataset` opens this dataset with."""
-        return f"simulated-{self.sensor}:{self.root}"
+    def __init__(self, root: Path | str, sensor: str = "hdl64e") -> None:
+        super().__init__(root, SENSORS[sensor], f"simulated-{sensor}:{root}")
+        self.sensor = sensor
 
     def sequences(self, split: str) -> tuple[str, ...]:
         """Return the streets of "train", "val" or "all"."""
         train = range(TRAIN_STREETS[self.sensor])
         val = range(FIRST_VAL_STREET, FIRST_VAL_STREET + VAL_STREETS)
         splits = {"train": [*train], "val": [*val], "all": [*train, *val]}
-        if split not in splits:
-            raise InputError(
-                f"{self.spec}: expected a split of {', '.join(splits)}, "
-                f"found {split!r}; give one of them"
-            )
+        check_split(self.spec, split, splits)
         return tuple(map(_name, splits[split]))
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
@@ -144,7 +125,7 @@ class SimulatedStreets(OnDisk):
 
     @property
     def _is_nuscenes(self) -> bool:
-        return self.taxonomy is NUSCENES
+        return SENSORS[self.sensor] is NUSCENES
 
     def _number(self, sequence: str) -> int:
         if not re.fullmatch("[0-9]{1,9}", sequence) or int(sequence) > LAST_STREET:
