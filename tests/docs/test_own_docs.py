@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from amvnet.cli.main import main
-from amvnet.data.formats.detect import formats_table
+from amvnet.data.formats.detect import ENDINGS, UNREADABLE
+from amvnet.data.formats.registry import PACKAGES
 from amvnet.sensors.lidars import SENSORS
 
 from fixtures.scan_writers import write_bag1, write_pcd
@@ -117,9 +118,19 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
     assert re.sub(heights, "", printed) == re.sub(heights, "", " ".join(documented))
 
 
-def test_the_table_of_formats_is_that_of_the_code() -> None:
-    table = formats_table()
-    assert table in read_page("own_scans.md"), f"replace the table by this one:\n{table}"
+def test_the_tables_of_formats_are_those_of_the_code() -> None:
+    page = read_page("own_scans.md").partition("## Formats")[2]
+    read, unread = re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE)[:2]
+    extras = {}
+    for endings, _, needs in (row.strip("|").split(" | ") for row in read.splitlines()[2:]):
+        for ending in re.findall(r"`([.\w]+)`", endings):
+            extras[ending] = needs.strip("`[] ")
+    packages = {ending: extra for ending, (extra, *_) in PACKAGES.items() if ending}
+    assert list(extras) == list(ENDINGS)
+    assert extras == dict.fromkeys(ENDINGS, "") | packages | {".pcap": "packets"}
+
+    rows = [f"| `{ending}`, {found} | {advice} |" for ending, (found, advice) in UNREADABLE.items()]
+    assert unread.splitlines()[2:] == rows
 
 
 def test_the_names_of_sensors_are_those_that_are_known() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.registry import SCANS
+from amvnet.data.formats.registry import COLUMN_READERS
 from amvnet.data.labels.label_bags import KINDS as BAG_KINDS
 from amvnet.data.labels.writers import check_kind, write_uncertain
 from amvnet.data.taxonomy import Taxonomy
@@ -369,7 +369,7 @@ def _check_names(scans: Sequence[InputScan]) -> None:
 
 def _check_folder(scan: InputScan, output: OutputOptions) -> None:
     """Raise InputError if output files would lie among the scans and could be taken for scans."""
-    labels_look_like_scans = f".{output.kind}" in SCANS
+    labels_look_like_scans = f".{output.kind}" in COLUMN_READERS
     scores_look_like_scans = output.scores and scan.path.suffix.lower() == ".npz"
     folder = (output.folder / scan.scores_path).parent
     is_own_folder = folder.resolve() == scan.path.parent.resolve()

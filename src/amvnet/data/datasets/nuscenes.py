@@ -11,14 +11,8 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
-from amvnet.data.formats.raw import (
-    FULL_INTENSITY,
-    NUSCENES_COLUMNS,
-    check_points,
-    count_rows,
-    read_table,
-    ring_column,
-)
+from amvnet.data.formats.cloud import check_usable, ring_indices
+from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError
@@ -149,15 +143,20 @@ class NuScenes(Dataset):
         """Read one scan, with the ring of every point."""
         path = record.points_path
         table = read_table(path, np.float32, NUSCENES_COLUMNS)
-        points = check_points(table[:, :4], path)
+        points = np.ascontiguousarray(table[:, :4])
         points[:, 3] /= FULL_INTENSITY
-        ring = ring_column(table[:, 4], path)
+        ring = ring_indices(table[:, 4])
+        if ring is None and len(points):
+            raise InputError(
+                f"{path}: expected ring indices 0, 1, ... in column 5, found other values; "
+                "correct the column"
+            )
 
         ids = None
         if labels and record.labels_path is not None:
             indices = read_ids(record.labels_path, np.uint8, len(points))
             ids = self._categories_to_train(indices, record.labels_path)
-        return Scan(points, labels=ids, ring=ring, name=record.name)
+        return check_usable(Scan(points, labels=ids, ring=ring, name=record.name), path)
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""

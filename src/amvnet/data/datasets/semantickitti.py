@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
-from amvnet.data.formats.raw import KITTI_COLUMNS, check_points, count_rows, read_table
+from amvnet.data.formats.cloud import check_usable
+from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids, train_ids
 from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
@@ -64,13 +65,13 @@ class SemanticKitti(Dataset):
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan."""
         path = record.points_path
-        points = check_points(read_table(path, np.float32, KITTI_COLUMNS), path)
+        points = read_table(path, np.float32, KITTI_COLUMNS)
         ids = None
         if labels and record.labels_path is not None:
             raw = read_ids(record.labels_path, np.uint32, len(points))
             ids = train_ids(record.labels_path, raw, self.taxonomy)
 
-        return Scan(points, labels=ids, name=record.name)
+        return check_usable(Scan(points, labels=ids, name=record.name), path)
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""

@@ -128,10 +128,7 @@ class Cloud:
         at_origin = (x == 0) & (y == 0) & (z == 0)
         points[at_origin, :3] = np.nan
 
-        scan = Scan(points, ring=self.ring, name=self.name)
-        if not scan.valid.any():
-            raise InputError(f"{self.name}: {_why_unusable(points[:, :3])}")
-        return scan
+        return check_usable(Scan(points, ring=self.ring, name=self.name), self.name)
 
 
 def usual_scale(largest: float, is_integer: bool) -> float:
@@ -141,6 +138,17 @@ def usual_scale(largest: float, is_integer: bool) -> float:
         if largest <= limit:
             return limit
     return largest
+
+
+def check_usable(scan: Scan, source: Path | str) -> Scan:
+    """Return a scan of a file.
+
+    Raises:
+        InputError: if it has no valid point.
+    """
+    if not scan.valid.any():
+        raise InputError(f"{source}: {_why_unusable(scan.points[:, :3])}")
+    return scan
 
 
 def _why_unusable(xyz: np.ndarray) -> str:

@@ -4,85 +4,29 @@ from __future__ import annotations
 
 import re
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 
 from amvnet.data.formats.packets import PCAPNG
 from amvnet.data.formats.raw import NUSCENES_ENDING, columns_of
 from amvnet.data.formats.rows import guess_rows
 from amvnet.data.formats.text import ADVICE as TEXT_ADVICE
-from amvnet.data.formats.text import find_table, is_text
+from amvnet.data.formats.text import find_table, is_text, read_head
 from amvnet.errors import InputError
-
-
-@dataclass(frozen=True)
-class Format:
-    """A kind of scan files.
-
-    Attributes:
-        endings: of the files' names.
-        content: what is read of them, for people.
-        extra: the extra of this package that is needed; empty if none is.
-    """
-
-    endings: tuple[str, ...]
-    content: str
-    extra: str = ""
-
 
 TEXT = (".xyz", ".txt", ".csv", ".asc", ".pts")
 PACKED = (".gz", ".zip")
 BAGS = (".bag", ".mcap", ".db3")
 FOLDER = ""  # instead of an ending: the folder of a ROS 2 bag
 METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
-FORMATS = (
-    Format(
-        (NUSCENES_ENDING, ".bin"),
-        "rows of 3 to 6 float32 or float64: x, y, z, intensity (KITTI), ring (nuScenes); others "
-        "with `--columns` and `--dtype`",
-    ),
-    Format(
-        (".pcd",),
-        "ascii, binary or binary_compressed; organised or not; columns of any type and order, "
-        "padding",
-    ),
-    Format((".ply",), "the vertices; ascii, or binary of either byte order"),
-    Format(
-        (".npy",),
-        "numbers of shape (N, 3 or more) or (H, W, 3 or more), or an array with named columns",
-    ),
-    Format(
-        (".npz",),
-        "the same, next to an array `intensity` and `ring` or without; or the columns `x`, `y`, "
-        "`z`, ... as arrays",
-    ),
-    Format(
-        TEXT,
-        "a line per point, separated by spaces, commas or semicolons; with the names of the "
-        "columns or without; UTF-8 or UTF-16",
-    ),
-    Format(PACKED, "one scan of the formats above, such as `scan.bin.gz`"),
-    Format((".las", ".laz"), "coordinates and intensity", "formats"),
-    Format(
-        BAGS,
-        "ROS 1 and ROS 2: the PointCloud2 or Livox CustomMsg messages of one topic; also the "
-        "folder of a ROS 2 bag",
-        "formats",
-    ),
-    Format(
-        (".feather",),
-        "a table with named columns; of Argoverse 2, moved to the LiDARs by the log's calibration",
-        "datasets",
-    ),
-    Format((".e57",), "every scan, in the frame of the instrument", "e57"),
-    Format(
-        (".pcap",),
-        "the packets of a Velodyne, a scan per turn; of other sensors, an error with the command "
-        "that converts it",
-        "packets",
-    ),
+# Of files that are read; docs/own_scans.md says what is read of each kind.
+ENDINGS = (
+    *(NUSCENES_ENDING, ".bin", ".pcd", ".ply", ".npy", ".npz"),
+    *TEXT,
+    *PACKED,
+    *(".las", ".laz"),
+    *BAGS,
+    *(".feather", ".e57", ".pcap"),
 )
-ENDINGS = tuple(ending for kind in FORMATS for ending in kind.endings)
 
 # Kinds of files that are known, but not read: what they are, and what to do.
 UNREADABLE = {
@@ -133,25 +77,8 @@ BEGINNINGS = {
     b"\xa1\xb2\x3c\x4d": ".pcap",
     PCAPNG: ".pcap",
 }
-HEAD = 4096  # bytes in which the beginning must be found
+BEGINNING = 4096  # bytes in which they must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
-
-
-def formats_table() -> str:
-    """Return the table of docs/own_scans.md, in Markdown: kinds of files, and what happens."""
-    lines = ["| Files | What is read | Needs |", "|---|---|---|"]
-    for kind in FORMATS:
-        extra = f"`[{kind.extra}]`" if kind.extra else ""
-        lines.append(f"| {_listing(kind.endings)} | {kind.content} | {extra} |")
-
-    lines += ["", "| Files that are not read | What to do |", "|---|---|"]
-    for ending, (content, advice) in UNREADABLE.items():
-        lines.append(f"| `{ending}`, {content} | {advice} |")
-    return "\n".join(lines) + "\n"
-
-
-def _listing(endings: tuple[str, ...]) -> str:
-    return ", ".join(f"`{ending}`" for ending in endings)
 
 
 def ending_of(path: Path) -> str:
@@ -167,19 +94,20 @@ def ending_of(path: Path) -> str:
         raise InputError(f"{path}: expected a scan file, found {content}; check the path")
 
     try:
-        ending = _begins_as(path)
+        head = read_head(path)
     except OSError as error:
         raise InputError(
             f"{path}: expected a file that can be read, found {error.strerror}; check it"
         ) from None
+    ending = _begins_as(head[:BEGINNING])
     if ending is not None:
-        return ending
+        return ".npz" if ending == ".zip" and _has_arrays(path) else ending
 
     named = named_ending(path)
-    if find_table(path) is not None:
+    if find_table(head) is not None:
         return named if named in TEXT else TEXT[0]
     if named in (NUSCENES_ENDING, ".bin"):
-        if is_text(path):
+        if is_text(head):
             raise InputError(f"{path}: expected rows of numbers, found other text; {TEXT_ADVICE}")
         return named
     if columns_of(path) is not None:
@@ -187,15 +115,13 @@ def ending_of(path: Path) -> str:
     return named or _guess_ending(path)
 
 
-def _begins_as(path: Path) -> str | None:
+def _begins_as(beginning: bytes) -> str | None:
     """Return the ending that the first bytes of a file tell; None if they do not."""
-    with path.open("rb") as file:
-        beginning = file.read(HEAD)
     without_comments = COMMENT_LINES.sub(b"", beginning, 1)
     for text in (beginning, without_comments):
         for known, ending in BEGINNINGS.items():
             if text.startswith(known):
-                return ".npz" if ending == ".zip" and _has_arrays(path) else ending
+                return ending
     return None
 
 

@@ -21,7 +21,7 @@ from amvnet.data.formats.detect import (
 )
 from amvnet.data.formats.registry import RECORDINGS, RecordedScans, read_file
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.formats.text import find_table
+from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
 
 POSE_COLUMNS = 12  # of poses, as of KITTI: a 3 x 4 matrix in each line of a text file
@@ -218,7 +218,7 @@ def _is_text_scan(path: Path) -> bool:
     is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
     if not is_text or not path.is_file():
         return False
-    table = find_table(path)
+    table = find_table(read_head(path))
     return table is not None and (bool(table.names) or table.count != POSE_COLUMNS)
 
 

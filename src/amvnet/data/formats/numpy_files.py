@@ -24,12 +24,14 @@ from amvnet.data.formats.cloud import (
     require_columns,
     ring_indices,
 )
+from amvnet.data.formats.fields import Arrays, Choose
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
 KEYS = ("points", "xyz", "scan", "arr_0")  # names of the array to read, if there are several
 FEW = 10  # an array with as few rows and more columns is transposed
 BLOCK = 1 << 20  # bytes read at once
+MOST_COLUMNS = 200  # of an array without names, of which one can be chosen
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # in which NumPy packs archives
 ADVICE = "save it again with np.save"
 ARCHIVE_ADVICE = "save it again with np.savez"
@@ -80,6 +82,20 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         intensity = extra.get("intensity") if cloud.intensity is None else cloud.intensity
         ring = ring_indices(extra.get("ring")) if cloud.ring is None else cloud.ring
         return replace(cloud, intensity=intensity, ring=ring)
+
+
+def read_columns(path: Path, choose: Choose) -> Arrays:
+    """Read some columns of an array of points; those without names are called "0", "1", ...
+
+    Raises:
+        InputError: as `read_npy`.
+    """
+    array = read_array(path)
+    if array.dtype.names is not None:
+        names = array.dtype.names
+        return {key: array[names[index]] for key, index in choose(names).items()}
+    numbers = range(min(array.shape[-1], MOST_COLUMNS))
+    return {key: array[..., index] for key, index in choose(tuple(map(str, numbers))).items()}
 
 
 def member_names(path: Path) -> list[str]:

@@ -7,27 +7,17 @@ single spaces separate the numbers.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
-from amvnet.data.formats.cloud import (
-    MAX_BYTES,
-    Cloud,
-    check_point_count,
-    make_cloud,
-    reading,
-    require_columns,
-)
-from amvnet.data.formats.fields import Arrays, Fields, read_header_line
+from amvnet.data.formats.cloud import MAX_BYTES, check_point_count, reading
+from amvnet.data.formats.fields import Arrays, Choose, Fields, read_header_line
 from amvnet.errors import InputError
 
 KIND = "a PCD file"
 ADVICE = "write the file again"
-ENCODINGS = ("ascii", "binary", "binary_compressed")
 
 # NumPy types by the letter of TYPE and the bytes of SIZE.
 TYPES = {
@@ -42,26 +32,16 @@ LONGEST_REPETITION = 264  # bytes
 REPETITION_CODE = 3  # bytes
 
 
-def read_pcd(path: Path) -> Cloud:
-    """Read one cloud; an organised one (a grid of points) row by row.
-
-    Raises:
-        InputError: if the file is not PCD, is truncated, or has no x, y, z.
-    """
-    return make_cloud(read_fields(path, partial(require_columns, path=path)), str(path))
-
-
-def read_fields(path: Path, choose: Callable[[Sequence[str]], dict[str, int]]) -> Arrays:
+def read_columns(path: Path, choose: Choose) -> Arrays:
     """Read some fields of the points; of a field of several values the first.
 
-    Args:
-        choose: returns the index of each field to read, given the names of all.
+    The points of an organised cloud (a grid) come row by row.
 
-    Returns:
-        The (N,) values of each field, by the keys of `choose`.
+    Args:
+        choose: returns the fields to read, given the names of all.
 
     Raises:
-        InputError: as `read_pcd`.
+        InputError: if the file is not PCD or is truncated.
     """
     with reading(path, KIND, ADVICE), path.open("rb") as file:
         entries = _read_header(file, path)
@@ -80,7 +60,8 @@ def read_fields(path: Path, choose: Callable[[Sequence[str]], dict[str, int]]) -
         if encoding == "binary_compressed":
             return _read_compressed(file, fields, points, chosen, path)
         raise InputError(
-            f"{path}: expected DATA {', '.join(ENCODINGS)}, found {encoding[:20]!a}; {ADVICE}"
+            f"{path}: expected DATA ascii, binary, binary_compressed, "
+            f"found {encoding[:20]!a}; {ADVICE}"
         )
 
 

@@ -5,20 +5,12 @@ We do not use plyfile: it allocates whatever a header claims, and is under the G
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
-from amvnet.data.formats.cloud import (
-    Cloud,
-    check_point_count,
-    make_cloud,
-    reading,
-    require_columns,
-)
-from amvnet.data.formats.fields import Arrays, Fields, read_header_line
+from amvnet.data.formats.cloud import check_point_count, reading
+from amvnet.data.formats.fields import Arrays, Choose, Fields, read_header_line
 from amvnet.errors import InputError
 
 TYPES = {
@@ -66,26 +58,14 @@ class Element:
         return Fields(self.properties, dtypes, [1] * len(dtypes))
 
 
-def read_ply(path: Path) -> Cloud:
-    """Read the vertices.
-
-    Raises:
-        InputError: if the file is not PLY, is truncated, or has no vertices with x, y, z.
-    """
-    return make_cloud(read_vertices(path, partial(require_columns, path=path)), str(path))
-
-
-def read_vertices(path: Path, choose: Callable[[Sequence[str]], dict[str, int]]) -> Arrays:
+def read_columns(path: Path, choose: Choose) -> Arrays:
     """Read some properties of the vertices.
 
     Args:
-        choose: returns the index of each property to read, given the names of all.
-
-    Returns:
-        The (N,) values of each property, by the keys of `choose`.
+        choose: returns the properties to read, given the names of all.
 
     Raises:
-        InputError: as `read_ply`.
+        InputError: if the file is not PLY, is truncated, or has no vertices.
     """
     with reading(path, KIND, ADVICE), path.open("rb") as file:
         encoding, elements = _read_header(file, path)

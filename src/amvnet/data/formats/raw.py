@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from amvnet.data.formats.rows import (
     COUNTS,
     DTYPES,
     ENOUGH,
+    NAMES,
     UNKNOWN,
     RowLayout,
     are_rings,
@@ -42,30 +44,23 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         layout: what the user says.
 
     Raises:
-        InputError: if the file is not a whole number of rows, the values fit no layout, or the
-            fifth of nuScenes' columns is not a ring.
+        InputError: if the file is not a whole number of rows, or the values fit no layout.
     """
     if layout != UNKNOWN:
         return _read_rows(path, _complete(path, layout))
 
-    columns = columns_of(path)
-    if columns is None:
-        guess = guess_rows(path)
-        if guess is not None:
-            return _read_rows(path, guess)
-        columns = _usual_columns(path)
+    count = columns_of(path)
+    guess = guess_rows(path) if count is None else None
+    if guess is not None:
+        return _read_rows(path, guess)
 
-    check_point_count(count_rows(path, np.float32, columns, ADVICE), path)
-    table = read_table(path, np.float32, columns)
-    if columns == KITTI_COLUMNS:
-        return Cloud(table[:, :3], table[:, 3], name=str(path))
-
-    ring = ring_column(table[:, 4], path)
-    full = FULL_INTENSITY if _has_nuscenes_name(path) else None
-    return Cloud(table[:, :3], table[:, 3], ring, str(path), full)
+    usual = RowLayout(NAMES[: count or _usual_count(path)], DTYPES[:1])
+    is_nuscenes = _has_nuscenes_name(path) and len(usual.columns) == NUSCENES_COLUMNS
+    full = FULL_INTENSITY if is_nuscenes else None
+    return replace(_read_rows(path, usual), full=full, note="")
 
 
-def _usual_columns(path: Path) -> int:
+def _usual_count(path: Path) -> int:
     """Return the number of columns of a file whose values do not tell.
 
     Raises:
@@ -109,24 +104,6 @@ def _read_rows(path: Path, layout: RowLayout) -> Cloud:
     return named_cloud(columns, layout.columns, str(path), layout.describe())
 
 
-def check_points(points: np.ndarray, path: Path) -> np.ndarray:
-    """Check that a scan has usable points, and return them as contiguous (N, 4) float32.
-
-    Raises:
-        InputError: if there is no point, or none with finite coordinates.
-    """
-    if not len(points):
-        raise InputError(f"{path}: expected a scan with points, found 0 points; leave the file out")
-
-    is_finite = np.isfinite(points[:, :3]).all(axis=1)
-    if not is_finite.any():
-        raise InputError(
-            f"{path}: expected finite coordinates, found NaN or infinity in every point; "
-            "leave the file out"
-        )
-    return np.ascontiguousarray(points, dtype=np.float32)
-
-
 def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
     """Read a file of rows of `columns` values each, with nothing else in it.
 
@@ -140,11 +117,8 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
     return np.fromfile(path, dtype=dtype, count=count * columns).reshape(count, columns)
 
 
-def count_rows(path: Path, dtype: DTypeLike, columns: int, advice: str = "copy it again") -> int:
+def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
     """Return the number of rows of such a file from its size alone.
-
-    Args:
-        advice: what to do if it is not a whole number of rows.
 
     Raises:
         InputError: as `read_table`.
@@ -159,7 +133,7 @@ def count_rows(path: Path, dtype: DTypeLike, columns: int, advice: str = "copy i
     if size % row_size:
         raise InputError(
             f"{path}: expected a whole number of rows of {row_size} bytes, found {size} bytes; "
-            f"the file is truncated or has another format; {advice}"
+            "the file is truncated or has another format; copy it again"
         )
     return size // row_size
 
@@ -219,20 +193,3 @@ def _is_kitti(table: np.ndarray) -> bool:
     is_position = (np.abs(xyz) < NEAR).all() and (xyz < 0).any()
     is_intensity = (intensity >= 0).all() and (intensity <= MAX_INTENSITY).all()
     return bool(is_position and is_intensity)
-
-
-@np.errstate(invalid="ignore")
-def ring_column(values: np.ndarray, path: Path) -> np.ndarray:
-    """Return the ring indices in a fifth column, (N,) int64.
-
-    Raises:
-        InputError: if a value is not a whole number from 0 on.
-    """
-    is_whole = np.isfinite(values).all() and np.array_equal(values, np.round(values))
-    if not is_whole or (values < 0).any():
-        raise InputError(
-            f"{path}: expected ring indices 0, 1, ... in column 5, found other values; "
-            "correct the column"
-        )
-
-    return values.astype(np.int64)

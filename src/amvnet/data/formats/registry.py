@@ -2,55 +2,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+import numpy as np
+
+from amvnet.data.formats import las, numpy_files, pcd, ply, text
 from amvnet.data.formats.arrow import read_feather
 from amvnet.data.formats.bags import open_bag
-from amvnet.data.formats.cloud import Cloud, Message, require
+from amvnet.data.formats.cloud import Cloud, Message, make_cloud, require, require_columns
 from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, PACKED, TEXT, ending_of
 from amvnet.data.formats.e57 import open_e57
-from amvnet.data.formats.las import read_las
-from amvnet.data.formats.numpy_files import read_npy, read_npz
+from amvnet.data.formats.fields import Arrays, Choose
 from amvnet.data.formats.packed import unpacked
 from amvnet.data.formats.packets import open_capture
-from amvnet.data.formats.pcd import read_pcd
-from amvnet.data.formats.ply import read_ply
 from amvnet.data.formats.raw import read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.recording import Recording
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.formats.text import read_text_cloud
 from amvnet.errors import InputError
 
 OPEN_FILES = 4  # that the process with limits keeps open
 
 
-# Readers of one scan, by the endings of files. Those of rows need to know what the rows hold.
+# Readers by the endings of files: of rows, which need to know what the rows hold; of named columns;
+# and of files of several scans.
 ROW_READERS: dict[str, Callable[[Path, RowLayout], Cloud]] = {
     NUSCENES_ENDING: read_raw,
     ".bin": read_raw,
-    ".npy": read_npy,
-    ".npz": read_npz,
-    **dict.fromkeys(TEXT, read_text_cloud),
+    ".npy": numpy_files.read_npy,
+    ".npz": numpy_files.read_npz,
+    **dict.fromkeys(TEXT, text.read_text_cloud),
 }
-CLOUD_READERS: dict[str, Callable[[Path], Cloud]] = {
-    ".pcd": read_pcd,
-    ".ply": read_ply,
-    ".las": read_las,
-    ".laz": read_las,
-    ".feather": read_feather,
+COLUMN_READERS: dict[str, Callable[[Path, Choose], Arrays]] = {
+    ".npy": numpy_files.read_columns,
+    ".npz": numpy_files.read_columns,
+    ".pcd": pcd.read_columns,
+    ".ply": ply.read_columns,
+    ".las": las.read_columns,
+    ".laz": las.read_columns,
+    **dict.fromkeys(TEXT, text.read_columns),
 }
 RECORDINGS: dict[str, Callable[[Path, str, str | None], Recording]] = {
     **dict.fromkeys((FOLDER, *BAGS), open_bag),
     ".e57": lambda path, *_: open_e57(path),
     ".pcap": lambda path, *_: open_capture(path),
 }
-SCANS = (*ROW_READERS, *CLOUD_READERS)  # endings of files of one scan
 
 # The extra of this package that reads a file, and the packages that it installs.
 PACKAGES = {
@@ -96,10 +97,47 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     """
     if ending not in WITH_LIMITS:
         return _read(path, ending, layout)
-    if ending in PACKAGES:
-        require(path, *PACKAGES[ending])
-    what = (ending, layout.columns, layout.dtypes)
-    return _to_cloud(call(f"{__name__}:read_with_limits", path, *what))
+    what = (layout.columns, layout.dtypes)
+    return _to_cloud(_with_limits("read_with_limits", path, ending, *what))
+
+
+def read_column(path: Path, ending: str, names: Sequence[str]) -> np.ndarray:
+    """Read one column of a file of points, such as their labels.
+
+    Args:
+        ending: one of `COLUMN_READERS`.
+        names: of the column; the first that the file has counts.
+
+    Returns:
+        A number for each point, in any shape.
+
+    Raises:
+        InputError: if the file is broken or has no such column.
+    """
+    if ending not in WITH_LIMITS:
+        return _read_column(path, ending, names)
+    values: np.ndarray = _with_limits("column_with_limits", path, ending, names)["values"]
+    return values
+
+
+def first_of(names: Sequence[str], wanted: Sequence[str], path: Path) -> str:
+    """Return the first of the wanted names of a column or array that a file has.
+
+    Args:
+        names: those of the file.
+        wanted: the possible names.
+
+    Raises:
+        InputError: if it has none of them.
+    """
+    for name in wanted:
+        if name in names:
+            return name
+    listing = ", ".join(names)[:200] or "none"
+    raise InputError(
+        f"{path}: expected a column of labels ({', '.join(wanted)}), found {listing!a}; "
+        "correct the field"
+    )
 
 
 class RecordedScans:
@@ -115,11 +153,9 @@ class RecordedScans:
     """
 
     def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
-        if ending in PACKAGES:
-            require(path, *PACKAGES[ending])
         self.path = path
         self._what = (ending, topic, uuid4().hex)
-        self._count: int = call(f"{__name__}:count_with_limits", path, *self._what)["count"]
+        self._count: int = _with_limits("count_with_limits", path, *self._what)["count"]
 
     def __len__(self) -> int:
         return self._count
@@ -130,8 +166,14 @@ class RecordedScans:
         Raises:
             InputError: if it is broken.
         """
-        what = (*self._what, index)
-        return _to_cloud(call(f"{__name__}:read_recorded_with_limits", self.path, *what))
+        return _to_cloud(_with_limits("recorded_with_limits", self.path, *self._what, index))
+
+
+def _with_limits(function: str, path: Path, ending: str, *arguments: Any) -> dict[str, Any]:
+    """Call a function of this module in the process with limits, if the packages are there."""
+    if ending in PACKAGES:
+        require(path, *PACKAGES[ending])
+    return call(f"{__name__}:{function}", path, ending, *arguments)
 
 
 def _read(path: Path, ending: str, layout: RowLayout) -> Cloud:
@@ -142,7 +184,19 @@ def _read(path: Path, ending: str, layout: RowLayout) -> Cloud:
             return replace(cloud, name=str(path))
     if ending in ROW_READERS:
         return ROW_READERS[ending](path, layout)
-    return CLOUD_READERS[ending](path)
+    if ending == ".feather":
+        return read_feather(path)
+    columns = COLUMN_READERS[ending](path, partial(require_columns, path=path))
+    return make_cloud(columns, str(path))
+
+
+def _read_column(path: Path, ending: str, names: Sequence[str]) -> np.ndarray:
+    """Read one column of a file in this process."""
+
+    def choose(all_names: Sequence[str]) -> dict[str, int]:
+        return {"values": list(all_names).index(first_of(all_names, names, path))}
+
+    return COLUMN_READERS[ending](path, choose)["values"]
 
 
 def _ending_of_one(path: Path) -> str:
@@ -171,12 +225,17 @@ def read_with_limits(
     return vars(_read(Path(path), ending, RowLayout(tuple(columns), tuple(dtypes))))
 
 
+def column_with_limits(path: str, ending: str, names: list[str]) -> Arrays:
+    """Return one column of a file, for `read_column`."""
+    return {"values": _read_column(Path(path), ending, names)}
+
+
 def count_with_limits(path: str, *what: str) -> dict[str, int]:
     """Return the number of scans in a file."""
     return {"count": len(_open(path, *what))}
 
 
-def read_recorded_with_limits(path: str, *what: Any) -> dict[str, Any]:
+def recorded_with_limits(path: str, *what: Any) -> dict[str, Any]:
     """Return the attributes of a cloud in a file of several, and of its message."""
     *which, index = what
     cloud = _open(path, *which).read(index)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from codecs import BOM_UTF16_BE, BOM_UTF16_LE
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from io import StringIO
 from itertools import islice
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.data.formats.cloud import MAX_POINTS, Cloud, check_point_count, find_columns, reading
+from amvnet.data.formats.fields import Arrays, Choose
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
@@ -38,6 +39,7 @@ SEPARATORS: tuple[tuple[str | None, str], ...] = (
 POINTS = re.compile(r"points?(?:_m_xyz)?[:_](\d)")
 FIRST_RETURN = re.compile(r"([xyz])1")  # "X1 (m)" by ouster-cli
 UNITS = re.compile(r"\s*[\[(].*$")  # as in "x [m]"
+EXPECTED = "lines of numbers"
 ADVICE = "write a line x y z intensity per point"
 
 
@@ -75,13 +77,8 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     Raises:
         InputError: if there are no lines of three numbers or more, or a later line is another.
     """
-    with reading(path, "lines of numbers", ADVICE):
-        table = find_table(path)
-        if table is None:
-            raise InputError(
-                f"{path}: expected lines of numbers x y z ..., found other text; {ADVICE}"
-            )
-
+    with reading(path, EXPECTED, ADVICE):
+        table = _require_table(path)
         names = layout.columns or table.names
         if names:
             indices = sorted(find_columns(names).values())
@@ -100,27 +97,39 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         return named_cloud(list(values.T), names, str(path), note)
 
 
-def read_column(path: Path, choose: Callable[[Sequence[str]], str]) -> np.ndarray:
-    """Read one column of all points, (N,) float64.
+def read_columns(path: Path, choose: Choose) -> Arrays:
+    """Read some columns of all points as float64.
 
     Args:
-        choose: returns the name of the column, given the names of all: those of the file, in lower
+        choose: returns the columns to read, given the names of all: those of the file, in lower
             case, or else "0", "1", ...
 
     Raises:
         InputError: as `read_text_cloud`.
     """
-    with reading(path, "lines of numbers", ADVICE):
-        table = find_table(path)
-        if table is None:
-            raise InputError(f"{path}: expected lines of numbers, found other text; {ADVICE}")
-        names = table.names or tuple(map(str, range(table.count)))
-        return _read_values(path, table, [names.index(choose(names))])[:, 0]
+    with reading(path, EXPECTED, ADVICE):
+        table = _require_table(path)
+        chosen = choose(table.names or tuple(map(str, range(table.count))))
+        values = _read_values(path, table, list(chosen.values()))
+        return dict(zip(chosen, values.T, strict=True))
 
 
-def find_table(path: Path) -> TextTable | None:
-    """Return how the lines of a text file are to be read; None if it is no text with points."""
-    text, encoding = _read_head(path)
+def _require_table(path: Path) -> TextTable:
+    table = find_table(read_head(path))
+    if table is None:
+        raise InputError(f"{path}: expected lines of numbers x y z ..., found other text; {ADVICE}")
+    return table
+
+
+def read_head(path: Path) -> bytes:
+    """Return the beginning of a file, in which the columns of a text must be found."""
+    with path.open("rb") as file:
+        return file.read(HEAD)
+
+
+def find_table(head: bytes) -> TextTable | None:
+    """Return how the lines of a text are to be read, given its head; None if it has no points."""
+    text, encoding = _decode(head)
     lines = StringIO(text, newline=None).readlines()
 
     for separator, decimal in SEPARATORS:
@@ -130,16 +139,14 @@ def find_table(path: Path) -> TextTable | None:
     return None
 
 
-def is_text(path: Path) -> bool:
-    """Return whether a file begins as text does, and not as numbers in binary."""
-    text, _ = _read_head(path)
+def is_text(head: bytes) -> bool:
+    """Return whether a file with this head is text, and not numbers in binary."""
+    text, _ = _decode(head)
     return bool(text.split()) and UNDECODED not in text
 
 
-def _read_head(path: Path) -> tuple[str, str]:
-    """Return the whole lines at the beginning of a file, and its encoding; no lines if binary."""
-    with path.open("rb") as file:
-        head = file.read(HEAD)
+def _decode(head: bytes) -> tuple[str, str]:
+    """Return the whole lines of the head of a file, and their encoding; no lines if binary."""
     encoding = "utf-16" if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else ENCODING
     text = head.decode(encoding, errors="replace")
     if len(head) == HEAD:

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from amvnet.data.formats.cloud import MAX_POINTS, reading
 from amvnet.data.formats.detect import TEXT, ending_of
-from amvnet.data.formats.las import read_dimension
 from amvnet.data.formats.numpy_files import member_names, read_array
-from amvnet.data.formats.pcd import read_fields
-from amvnet.data.formats.ply import read_vertices
 from amvnet.data.formats.raw import count_rows
+from amvnet.data.formats.registry import COLUMN_READERS, first_of, read_column
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.formats.text import read_column
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -25,7 +20,6 @@ from amvnet.errors import InputError
 INTEGERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.int64}
 COLUMNS = ("class", "label", "scalar_class", "scalar_label")  # the latter by CloudCompare
 ARRAYS = ("labels", "label", "class", "arr_0")  # of an archive
-MOST_COLUMNS = 200  # of an array without names
 LARGEST = np.iinfo(np.uint32).max
 ADVICE = "write the labels again, one whole number per point"
 
@@ -65,9 +59,11 @@ def read_labels(path: Path, count: int, field: str | None = None) -> np.ndarray:
     with reading(path, "labels", ADVICE):
         if ending in TEXT and field is None:
             labels = _read_numbers(path)
-        elif ending in (".npy", ".npz") and field is None:
-            labels = read_array(path, _usual_member(path) if ending == ".npz" else None)
-        elif ending in FIELD_READERS:
+        elif ending == ".npy" and field is None:
+            labels = read_array(path)
+        elif ending == ".npz" and field is None:
+            labels = _usual_array(path)
+        elif ending in COLUMN_READERS:
             labels = _read_field(path, ending, field)
         else:
             labels = _read_integers(path, count)
@@ -94,11 +90,11 @@ def read_label_field(path: Path, count: int, field: str, layout: RowLayout = UNK
     with reading(path, f"the field {field} with labels", ADVICE):
         if ending.endswith(".bin"):
             labels = _read_raw_column(path, layout, field)
-        elif ending in FIELD_READERS:
+        elif ending in COLUMN_READERS:
             labels = _read_field(path, ending, field)
         else:
             raise InputError(
-                f"{path}: expected a file with fields of labels ({', '.join(FIELD_READERS)}), "
+                f"{path}: expected a file with fields of labels ({', '.join(COLUMN_READERS)}), "
                 f"found {ending or 'a bag'}; write the labels into files next to the scans"
             )
     return _check(labels, path, count)
@@ -143,43 +139,17 @@ def _read_numbers(path: Path) -> np.ndarray:
         return np.loadtxt(file, delimiter=",", max_rows=MAX_POINTS + 1, ndmin=1)
 
 
-def _usual_member(path: Path) -> str:
-    """Return the name of the array of labels in an archive."""
+def _usual_array(path: Path) -> np.ndarray:
+    """Read the array of labels in an archive."""
     names = member_names(path)
-    return names[0] if len(names) == 1 else _choose(None, path, names, ARRAYS)
+    return read_array(path, names[0] if len(names) == 1 else first_of(names, ARRAYS, path))
 
 
 def _read_field(path: Path, ending: str, field: str | None) -> np.ndarray:
     """Read a column of a file, or an array of an archive."""
     if ending == ".npz" and field in member_names(path):
         return read_array(path, field)
-    return FIELD_READERS[ending](path, partial(_choose, field, path))
-
-
-def _choose(
-    field: str | None, path: Path, names: Sequence[str], usual: Sequence[str] = COLUMNS
-) -> str:
-    """Return the column that a user names, or the first one with a usual name."""
-    for name in usual if field is None else [field]:
-        if name in names:
-            return name
-    listing = ", ".join(names)[:200] or "none"
-    raise InputError(
-        f"{path}: expected a column of labels ({field or ', '.join(usual)}), found {listing!a}; "
-        "correct the field"
-    )
-
-
-Choose = Callable[[Sequence[str]], str]  # returns the column to read, given the names of all
-
-
-def _read_array_column(path: Path, choose: Choose) -> np.ndarray:
-    """Read a column of an array of points; columns without names are called "0", "1", ..."""
-    array = read_array(path)
-    if array.dtype.names is not None:
-        return array[choose(array.dtype.names)]
-    numbers = range(min(array.shape[-1], MOST_COLUMNS))
-    return array[..., int(choose(tuple(map(str, numbers))))]
+    return read_column(path, ending, COLUMNS if field is None else (field,))
 
 
 def _read_raw_column(path: Path, layout: RowLayout, field: str) -> np.ndarray:
@@ -189,31 +159,7 @@ def _read_raw_column(path: Path, layout: RowLayout, field: str) -> np.ndarray:
             f"{path}: expected columns and dtype of rows with labels, found none; "
             "add columns: [x, y, z, intensity, label] and dtype: float32"
         )
-    column = _choose(field, path, layout.columns)
+    column = first_of(layout.columns, (field,), path)
     count = count_rows(path, layout.record, 1)
     records = np.fromfile(path, dtype=layout.record, count=min(count, MAX_POINTS))
     return records[str(layout.columns.index(column))]
-
-
-def _index(choose: Choose, names: Sequence[str]) -> dict[str, int]:
-    """Return the index of the column with the labels, as the readers of formats want it."""
-    return {"labels": list(names).index(choose(names))}
-
-
-def _read_pcd(path: Path, choose: Choose) -> np.ndarray:
-    return read_fields(path, partial(_index, choose))["labels"]
-
-
-def _read_ply(path: Path, choose: Choose) -> np.ndarray:
-    return read_vertices(path, partial(_index, choose))["labels"]
-
-
-FIELD_READERS: dict[str, Callable[[Path, Choose], np.ndarray]] = {
-    ".npy": _read_array_column,
-    ".npz": _read_array_column,
-    ".pcd": _read_pcd,
-    ".ply": _read_ply,
-    ".las": read_dimension,
-    ".laz": read_dimension,
-    **dict.fromkeys(TEXT, read_column),
-}
