@@ -122,7 +122,7 @@ def write(base: Path, scans: Sequence[InputScan], kind: str = "label") -> None:
 
 def some_cloud() -> Cloud:
     xyz = np.arange(3.0 * COUNT).reshape(COUNT, 3)
-    return Cloud(xyz, np.zeros(COUNT), message=Message("/lidar", 0, 0, "lidar"))
+    return Cloud(xyz, np.zeros(COUNT), message=Message(0, "lidar", topic="/lidar"))
 
 
 def named(name: str) -> InputScan:

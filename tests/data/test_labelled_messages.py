@@ -14,33 +14,35 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from amvnet.data.formats.cloud import Message
-from amvnet.data.formats.pointcloud2 import (
-    CLOUD_TYPE,
-    Origin,
-    PlainCloud,
-    encode_labels,
-    pack_rgb,
-    read_message,
-)
+from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.labels import label_bags
+from amvnet.data.labels.messages import encode_labels
 from amvnet.data.labels.writers import LabelledPoints
 
 from fixtures.scan_writers import cloud_message, some_points
-from fixtures.worlds import fails
 
 NUMBER_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-ORIGIN = Origin(stamp=1_700_000_000_123_456_789, frame_id="lidar")
+ORIGIN = Message(stamp=1_700_000_000_123_456_789, frame_id="lidar")
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 
 
-def through_ros2(cloud: PlainCloud) -> Any:
-    message = cloud.to_message(ROS2.types)
+def labelled(
+    labels: np.ndarray, xyz: np.ndarray | None = None, uncertain: np.ndarray | None = None
+) -> LabelledPoints:
+    """Return points with these labels, in black."""
+    count = len(labels)
+    xyz = np.zeros((count, 3)) if xyz is None else xyz
+    return LabelledPoints(xyz, labels, np.zeros((count, 3), np.uint8), uncertain)
+
+
+def through_ros2(origin: Message, points: LabelledPoints, has_points: bool = True) -> Any:
+    message = encode_labels(ROS2.types, origin, points, has_points)
     return ROS2.deserialize_cdr(ROS2.serialize_cdr(message, CLOUD_TYPE), CLOUD_TYPE)
 
 
-def through_ros1(cloud: PlainCloud) -> Any:
-    message = cloud.to_message(ROS1.types)
+def through_ros1(origin: Message, points: LabelledPoints) -> Any:
+    message = encode_labels(ROS1.types, origin, points)
     return ROS1.deserialize_ros1(ROS1.serialize_ros1(message, CLOUD_TYPE), CLOUD_TYPE)
 
 
@@ -57,15 +59,15 @@ def column(message: Any, name: str) -> np.ndarray:
 
 @pytest.mark.parametrize("through", [through_ros1, through_ros2])
 @pytest.mark.parametrize("height", [1, 4])
-def test_every_value_arrives(through: Callable[[PlainCloud], Any], height: int) -> None:
+def test_every_value_arrives(through: Callable[..., Any], height: int) -> None:
     rng = np.random.default_rng(0)
     points = some_points(60)
     labels = rng.integers(0, 260, 60)
     uncertain = rng.random(60) < 0.5
     colors = rng.integers(0, 256, (60, 3)).astype(np.uint8)
-    origin = Origin(ORIGIN.stamp, "lidar", height)
+    origin = Message(ORIGIN.stamp, "lidar", height)
 
-    message = through(encode_labels(origin, labels, uncertain, points[:, :3], colors))
+    message = through(origin, LabelledPoints(points[:, :3], labels, colors, uncertain))
     assert [field.name for field in message.fields] == ["x", "y", "z", "rgb", "label", "uncertain"]
     assert (message.height, message.width) == (height, 60 // height)
     assert message.header.frame_id == "lidar"
@@ -94,21 +96,22 @@ def test_the_origin_of_a_message_is_kept_to_the_nanosecond(
     seconds: int, nanoseconds: int, count: int
 ) -> None:
     stamp = seconds * 10**9 + nanoseconds
-    message = through_ros2(encode_labels(Origin(stamp, "os_lidar"), np.zeros(count, np.uint8)))
+    message = through_ros2(Message(stamp, "os_lidar"), labelled(np.zeros(count, np.uint8)))
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (seconds, nanoseconds)
-    assert Origin.of(message) == Origin(stamp, "os_lidar")
+    assert Message.of(message) == Message(stamp, "os_lidar")
     assert message.width == count
 
 
 def test_the_reader_of_scans_reads_what_was_encoded() -> None:
     points = some_points(30)
-    cloud = encode_labels(ORIGIN, np.arange(30), xyz=points[:, :3])
-    np.testing.assert_array_equal(read_message(cloud, "here").xyz, points[:, :3])
+    message = through_ros2(ORIGIN, labelled(np.arange(30), points[:, :3]))
+    np.testing.assert_array_equal(read_message(message, "here").xyz, points[:, :3])
 
 
 def test_labels_alone_take_the_place_of_each_point_of_the_scan() -> None:
     scan = cloud_message(ROS2, some_points(60), padded=True)
-    message = through_ros2(encode_labels(Origin.of(scan), np.arange(60), np.ones(60, bool)))
+    points = labelled(np.arange(60), uncertain=np.ones(60, bool))
+    message = through_ros2(Message.of(scan), points, has_points=False)
     assert [field.name for field in message.fields] == ["label", "uncertain"]
     assert (message.height, message.width) == (scan.height, scan.width)
     assert message.header == scan.header
@@ -117,7 +120,7 @@ def test_labels_alone_take_the_place_of_each_point_of_the_scan() -> None:
 def test_lost_points_stay_and_the_message_says_that_there_are_some() -> None:
     xyz = some_points(5)[:, :3].astype(np.float64)
     xyz[2] = np.nan
-    message = through_ros2(encode_labels(ORIGIN, np.arange(5), xyz=xyz))
+    message = through_ros2(ORIGIN, labelled(np.arange(5), xyz))
     assert not message.is_dense
     assert np.isnan(column(message, "x")).tolist() == [False, False, True, False, False]
 
@@ -127,9 +130,10 @@ def test_a_run_that_is_killed_while_it_joins_leaves_nothing_to_the_next(
     tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = ["drive/000000", "drive/000001"]
-    points = LabelledPoints(np.zeros((5, 3)), np.arange(5), np.zeros((5, 3), np.uint8), None)
+    points = labelled(np.arange(5))
     for time, name in enumerate(names):
-        label_bags.write_part(tmp_path, name, kind, Message("/lidar", time, time, "lidar"), points)
+        message = Message(time, "lidar", topic="/lidar", time=time)
+        label_bags.write_part(tmp_path, name, kind, message, points)
 
     with monkeypatch.context() as patch:
         patch.setattr(label_bags, "publish", lambda part, path: os._exit(7))
@@ -141,16 +145,3 @@ def test_a_run_that_is_killed_while_it_joins_leaves_nothing_to_the_next(
 
     label_bags.join_parts(tmp_path, names, kind)
     assert [path.name for path in tmp_path.rglob("*")] == [f"drive.{kind}"]
-
-
-def test_colors_are_packed_as_in_pcl() -> None:
-    bits = pack_rgb(np.array([[1, 2, 3], [255, 255, 255]], np.uint8)).view(np.uint32)
-    assert bits.tolist() == [0x010203, 0xFFFFFF]
-
-
-def test_lengths_that_do_not_fit_are_refused() -> None:
-    labels = np.arange(6)
-    fails(lambda: encode_labels(ORIGIN, labels, np.ones(5, bool)), "6", "5")
-    fails(lambda: encode_labels(ORIGIN, labels, xyz=np.zeros((7, 3))), "6", "7")
-    fails(lambda: encode_labels(Origin(0, "lidar", 4), labels), "6 points", "4 rows")
-    fails(lambda: encode_labels(Origin(0, "lidar", 0), labels), "0 rows")

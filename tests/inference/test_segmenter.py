@@ -315,7 +315,7 @@ def test_normalised_scans_are_segmented_by_their_rings_and_others_by_elevation()
     segmenter = Segmenter(WEIGHTS)
     for is_normalised, rows in ((True, "ring"), (False, "elevation")):
         dataset = SimpleNamespace(is_normalised=is_normalised)
-        chosen = segmenter.for_dataset(dataset)
+        chosen = segmenter.for_dataset(dataset)  # type: ignore[arg-type]
         assert chosen.model.range_view.config.rows == rows
     assert segmenter.model.range_view.config.rows == "elevation"
 

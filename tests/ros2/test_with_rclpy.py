@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from array import array
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amvnet.data.formats.pointcloud2 import Origin, PlainCloud, PointField, read_message
+from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.weights.file import save
 
 from fixtures.worlds import fresh_weights, street
@@ -30,13 +31,26 @@ def context(tmp_path: Path) -> Iterator[None]:
     rclpy.try_shutdown()
 
 
-def plain_scan(points: np.ndarray) -> PlainCloud:
-    """Return the message of (N, 4) points."""
+def scan_message(points: np.ndarray) -> Any:
+    """Return the message of (N, 4) float32 points."""
+    from builtin_interfaces.msg import Time
+    from sensor_msgs.msg import PointCloud2, PointField
+    from std_msgs.msg import Header
+
     fields = []
     for column, name in enumerate(("x", "y", "z", "intensity")):
-        fields.append(PointField(name, 4 * column, 7))
-    data = np.frombuffer(points.tobytes(), np.uint8)
-    return PlainCloud(Origin(1_000_000_002, "lidar"), len(points), tuple(fields), 16, data, True)
+        fields.append(PointField(name=name, offset=4 * column, datatype=7, count=1))
+    return PointCloud2(
+        header=Header(stamp=Time(sec=1, nanosec=2), frame_id="lidar"),
+        height=1,
+        width=len(points),
+        fields=fields,
+        is_bigendian=False,
+        point_step=16,
+        row_step=16 * len(points),
+        data=array("B", points.tobytes()),
+        is_dense=True,
+    )
 
 
 def test_a_cloud_in_and_a_cloud_out(context: None) -> None:
@@ -45,11 +59,11 @@ def test_a_cloud_in_and_a_cloud_out(context: None) -> None:
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import PointCloud2
 
-    from amvnet_ros.node import SegmentNode, to_ros
+    from amvnet_ros.node import SegmentNode
 
     points, _ = street(0)
     points[:, 3] = np.clip(points[:, 3], 0, 1)
-    message = to_ros(plain_scan(points))
+    message = scan_message(points)
 
     node = SegmentNode()
     driver = rclpy.create_node("driver")

@@ -22,19 +22,14 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header, String
 
-from amvnet.data.formats.pointcloud2 import (
-    CLOUD_TYPE,
-    FIELD_TYPE,
-    HEADER_TYPE,
-    NANOSECONDS,
-    TIME_TYPE,
-    PlainCloud,
-)
+from amvnet.data.formats.cloud import NANOSECONDS
+from amvnet.data.formats.pointcloud2 import CLOUD_TYPE
+from amvnet.data.labels.messages import FIELD_TYPE, HEADER_TYPE, TIME_TYPE, encode_labels
 from amvnet.errors import InputError
 from amvnet.threads import wait_passively
 from amvnet_ros.health import Health, Labelled
 from amvnet_ros.newest import NewestOnly
-from amvnet_ros.segmentation import CloudSegmenter, Settings
+from amvnet_ros.segmentation import CloudSegmenter, LabelledCloud, Settings
 
 # Exit codes, as those of the command line.
 DONE = 0
@@ -123,16 +118,16 @@ class SegmentNode(Node):
 
         # Encoding takes time, too.
         if self._labels.get_subscription_count():
-            self._labels.publish(to_ros(labelled.labels_message()))
+            self._labels.publish(to_ros(labelled, has_points=False))
         if self._cloud.get_subscription_count():
-            self._cloud.publish(to_ros(labelled.cloud_message()))
+            self._cloud.publish(to_ros(labelled, has_points=True))
 
         age = self.get_clock().now().nanoseconds - labelled.origin.stamp
         self._health.label(
             Labelled(
                 seconds=time.monotonic() - arrival.time,
                 age=age / NANOSECONDS,
-                points=len(labelled.raw),
+                points=len(labelled.points.raw),
                 uncertain=labelled.uncertain_share,
             )
         )
@@ -187,9 +182,15 @@ def latched_profile() -> QoSProfile:
     )
 
 
-def to_ros(cloud: PlainCloud) -> Any:
-    """Return the PointCloud2 of rclpy."""
-    return cloud.to_message(TYPES, lambda data: array("B", data.tobytes()))
+def to_ros(labelled: LabelledCloud, has_points: bool) -> PointCloud2:
+    """Return the message with label and uncertain, and with x, y, z, rgb if it has points."""
+    return encode_labels(
+        TYPES,
+        labelled.origin,
+        labelled.points,
+        has_points,
+        to_bytes=lambda data: array("B", data.tobytes()),
+    )
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import reading
-from amvnet.data.formats.pointcloud2 import Origin, PlainCloud, encode_labels, read_message
+from amvnet.data.formats.cloud import Message, reading
+from amvnet.data.formats.pointcloud2 import read_message
+from amvnet.data.labels.writers import LabelledPoints
 
 
 def _parameter(default: Any, description: str) -> Any:
@@ -53,31 +54,17 @@ class Settings:
 
 @dataclass(frozen=True)
 class LabelledCloud:
-    """The N points of a message with their labels, in their order.
+    """The points of a message with their labels, in their order.
 
     Attributes:
         origin: of the message.
-        xyz: (N, 3) coordinates as in the message, metres.
-        raw: (N,) raw ids; 0 for lost points.
-        colors: (N, 3) uint8 RGB of the classes.
-        uncertain: (N,) bool; None for a single network.
+        points: with the raw ids, 0 for lost points, and the colours of the classes.
         uncertain_share: of the points that are not lost; None for a single network.
     """
 
-    origin: Origin
-    xyz: np.ndarray
-    raw: np.ndarray
-    colors: np.ndarray
-    uncertain: np.ndarray | None
+    origin: Message
+    points: LabelledPoints
     uncertain_share: float | None
-
-    def labels_message(self) -> PlainCloud:
-        """Return a message with label and uncertain only, point by point as in the scan's."""
-        return encode_labels(self.origin, self.raw, self.uncertain)
-
-    def cloud_message(self) -> PlainCloud:
-        """Return a message with x, y, z, rgb, label and uncertain."""
-        return encode_labels(self.origin, self.raw, self.uncertain, self.xyz, self.colors)
 
 
 class CloudSegmenter:
@@ -136,19 +123,18 @@ class CloudSegmenter:
         """
         with reading(self._topic, "a PointCloud2 message", "check the driver"):
             cloud = read_message(message, self._topic)
-            origin = Origin.of(message)
+            origin = Message.of(message)
 
         scan = self._normalise(cloud, self._topic)
         result = self._segment(scan)
         verdict = result.verdict  # None for a single network
-        return LabelledCloud(
-            origin=origin,
-            xyz=cloud.xyz,
+        points = LabelledPoints(
+            cloud.xyz,
             raw=self.taxonomy.to_raw(result.labels),
             colors=self._colors[result.labels],
             uncertain=None if verdict is None else result.uncertain,
-            uncertain_share=None if verdict is None else verdict.share,
         )
+        return LabelledCloud(origin, points, None if verdict is None else verdict.share)
 
     def classes(self) -> str:
         """Return the classes as JSON: id as in the field label, name, color (RGB)."""

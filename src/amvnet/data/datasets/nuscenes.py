@@ -143,10 +143,10 @@ class NuScenes(Dataset):
         """Read one scan, with the ring of every point."""
         path = record.points_path
         table = read_table(path, np.float32, NUSCENES_COLUMNS)
-        points = np.ascontiguousarray(table[:, :4])
+        points = check_usable(np.ascontiguousarray(table[:, :4]), path)
         points[:, 3] /= FULL_INTENSITY
         ring = ring_indices(table[:, 4])
-        if ring is None and len(points):
+        if ring is None:
             raise InputError(
                 f"{path}: expected ring indices 0, 1, ... in column 5, found other values; "
                 "correct the column"
@@ -156,7 +156,7 @@ class NuScenes(Dataset):
         if labels and record.labels_path is not None:
             indices = read_ids(record.labels_path, np.uint8, len(points))
             ids = self._categories_to_train(indices, record.labels_path)
-        return check_usable(Scan(points, labels=ids, ring=ring, name=record.name), path)
+        return Scan(points, labels=ids, ring=ring, name=record.name)
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""

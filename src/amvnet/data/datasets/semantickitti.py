@@ -65,13 +65,13 @@ class SemanticKitti(Dataset):
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan."""
         path = record.points_path
-        points = read_table(path, np.float32, KITTI_COLUMNS)
+        points = check_usable(read_table(path, np.float32, KITTI_COLUMNS), path)
         ids = None
         if labels and record.labels_path is not None:
             raw = read_ids(record.labels_path, np.uint32, len(points))
             ids = train_ids(record.labels_path, raw, self.taxonomy)
 
-        return check_usable(Scan(points, labels=ids, name=record.name), path)
+        return Scan(points, labels=ids, name=record.name)
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""

@@ -14,13 +14,12 @@ from amvnet.data.formats.cloud import Cloud, Message, reading
 from amvnet.data.formats.detect import FOLDER
 from amvnet.data.formats.livox import TYPES as LIVOX
 from amvnet.data.formats.livox import read_custom_message, read_header
-from amvnet.data.formats.pointcloud2 import Origin, read_message
+from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
 from amvnet.data.formats.recording import Decode, Recording
 from amvnet.errors import InputError
 
-CLOUD = "sensor_msgs/msg/PointCloud2"
-TYPES = (CLOUD, *LIVOX)
+TYPES = (CLOUD_TYPE, *LIVOX)
 KINDS = "PointCloud2 or Livox CustomMsg"
 
 # Messages with the packets of a sensor, by the beginning of their type, and what turns them into
@@ -74,7 +73,7 @@ def _read_messages(path: Path, ending: str, topic: str) -> Iterator[Decode]:
         is_ros1 = ending == ".bag"
         deserialise = _deserialiser(is_ros1)
         for connection, time, data in reader.messages(connections=_connections(reader, topic)):
-            if connection.msgtype == CLOUD:
+            if connection.msgtype == CLOUD_TYPE:
                 read = partial(_read_pointcloud2, deserialise)
             else:
                 read = partial(_read_livox, is_ros1)
@@ -137,16 +136,15 @@ def _deserialiser(is_ros1: bool) -> Callable[[bytes, str], Any]:
 def _read_pointcloud2(
     deserialise: Callable[[bytes, str], Any], data: bytes, topic: str, time: int, name: str
 ) -> Cloud:
-    values = deserialise(data, CLOUD)
-    origin = Origin.of(values)
-    message = Message(topic, time, origin.stamp, origin.frame_id, origin.height)
+    values = deserialise(data, CLOUD_TYPE)
+    message = replace(Message.of(values), topic=topic, time=time)
     return replace(read_message(values, name), message=message)
 
 
 def _read_livox(is_ros1: bool, data: bytes, topic: str, time: int, name: str) -> Cloud:
     stamp, frame = read_header(data, is_ros1)
     cloud = read_custom_message(data, is_ros1, name)
-    return replace(cloud, message=Message(topic, time, stamp, frame))
+    return replace(cloud, message=Message(stamp, frame, topic=topic, time=time))
 
 
 def _connections(reader: Any, topic: str) -> list[Any]:

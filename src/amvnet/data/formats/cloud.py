@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from amvnet.scan import FARTHEST, Scan
 # broken.
 MAX_POINTS = 10_000_000
 MAX_BYTES = 32 * MAX_POINTS  # of the points of a packed file
+NANOSECONDS = 1_000_000_000  # of a second
 MOST_RINGS = 256  # a column with larger values does not hold ring indices
 
 # The largest intensities that sensors write: fractions, 8 bits, 16 bits.
@@ -47,18 +49,25 @@ class Message:
     """The ROS message that a cloud is from.
 
     Attributes:
-        topic: its topic.
-        time: when it was recorded, nanoseconds.
-        stamp: when the points were measured, nanoseconds.
+        stamp: when the points were measured, nanoseconds since the epoch.
         frame_id: name of the frame of the coordinates.
         height: number of rows of an organised cloud, else 1.
+        topic: its topic in a bag.
+        time: when it was recorded, nanoseconds.
     """
 
-    topic: str
-    time: int
     stamp: int
     frame_id: str
     height: int = 1
+    topic: str = ""
+    time: int = 0
+
+    @classmethod
+    def of(cls, message: Any) -> Message:
+        """Return what the header of a deserialised PointCloud2 says."""
+        stamp = message.header.stamp
+        nanoseconds = stamp.sec * NANOSECONDS + stamp.nanosec
+        return cls(nanoseconds, message.header.frame_id, message.height)
 
 
 @dataclass(frozen=True)
@@ -128,7 +137,7 @@ class Cloud:
         at_origin = (x == 0) & (y == 0) & (z == 0)
         points[at_origin, :3] = np.nan
 
-        return check_usable(Scan(points, ring=self.ring, name=self.name), self.name)
+        return Scan(check_usable(points, self.name), ring=self.ring, name=self.name)
 
 
 def usual_scale(largest: float, is_integer: bool) -> float:
@@ -140,15 +149,15 @@ def usual_scale(largest: float, is_integer: bool) -> float:
     return largest
 
 
-def check_usable(scan: Scan, source: Path | str) -> Scan:
-    """Return a scan of a file.
+def check_usable(points: np.ndarray, source: Path | str) -> np.ndarray:
+    """Return the (N, 4) points of a scan.
 
     Raises:
-        InputError: if it has no valid point.
+        InputError: if none of them is valid.
     """
-    if not scan.valid.any():
-        raise InputError(f"{source}: {_why_unusable(scan.points[:, :3])}")
-    return scan
+    if not Scan(points).valid.any():
+        raise InputError(f"{source}: {_why_unusable(points[:, :3])}")
+    return points
 
 
 def _why_unusable(xyz: np.ndarray) -> str:

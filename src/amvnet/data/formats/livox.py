@@ -6,8 +6,13 @@ import struct
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, split_records
-from amvnet.data.formats.pointcloud2 import NANOSECONDS
+from amvnet.data.formats.cloud import (
+    NANOSECONDS,
+    Cloud,
+    check_point_count,
+    make_cloud,
+    split_records,
+)
 from amvnet.errors import InputError
 
 TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")

@@ -14,7 +14,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from amvnet.data.formats.cloud import Message
-from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, Origin, encode_labels
+from amvnet.data.formats.pointcloud2 import CLOUD_TYPE
+from amvnet.data.labels.messages import encode_labels
 from amvnet.data.labels.writers import LabelledPoints
 from amvnet.errors import InputError
 from amvnet.files import atomic_write, inside, make_folder, publish
@@ -63,10 +64,8 @@ def write_part(
         message: the scan's own message.
         points: the points and their labels.
     """
-    origin = Origin(message.stamp, message.frame_id, message.height)
-    cloud = encode_labels(origin, points.raw, points.uncertain, points.xyz, points.colors)
     store = _types(kind)
-    values = cloud.to_message(store.types)
+    values = encode_labels(store.types, message, points)
     serialise = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
     data = np.frombuffer(serialise(values, CLOUD_TYPE), np.uint8)
 

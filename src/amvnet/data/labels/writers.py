@@ -10,7 +10,6 @@ from typing import Literal, get_args
 import numpy as np
 
 from amvnet.data.formats.cloud import split_records
-from amvnet.data.formats.pointcloud2 import pack_rgb
 from amvnet.data.labels.ids import check_count, write_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -57,6 +56,11 @@ class LabelledPoints:
     raw: np.ndarray
     colors: np.ndarray
     uncertain: np.ndarray | None
+
+    def packed_colors(self) -> np.ndarray:
+        """Return (N,) little-endian float32 whose bits are the colours as PCL packs them."""
+        red, green, blue = self.colors.astype(np.uint32).T
+        return (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
 
 
 def check_kind(kind: str) -> None:
@@ -171,7 +175,7 @@ def _write_ply(path: Path, points: LabelledPoints) -> None:
 def _write_pcd(path: Path, points: LabelledPoints) -> None:
     columns = _coordinates(points.xyz)
 
-    columns["rgb"] = pack_rgb(points.colors)
+    columns["rgb"] = points.packed_colors()
     columns["label"] = points.raw
     table = _to_records(columns | _uncertain_column(points.uncertain))
 

@@ -1,0 +1,84 @@
+"""Labels as ROS messages of the type sensor_msgs/PointCloud2, in the classes of any ROS library."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.formats.cloud import NANOSECONDS, Message, record_dtype
+from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, TYPES
+from amvnet.data.labels.writers import LabelledPoints
+
+FIELD_TYPE = "sensor_msgs/msg/PointField"
+HEADER_TYPE = "std_msgs/msg/Header"
+TIME_TYPE = "builtin_interfaces/msg/Time"
+ALIGNMENT = 4  # bytes: every field of an encoded point starts at a multiple, as in PCL
+
+
+def encode_labels(
+    types: Mapping[str, Callable[..., Any]],
+    origin: Message,
+    points: LabelledPoints,
+    has_points: bool = True,
+    to_bytes: Callable[[np.ndarray], Any] = np.asarray,
+) -> Any:
+    """Return the message of N labelled points, in their order.
+
+    Its fields are x, y, z (float32), rgb (float32, packed as in PCL), label (uint32, raw ids) and
+    uncertain (uint8), if it is known. PCL and RViz read no other type of coordinates.
+
+    Args:
+        types: the classes of PointCloud2, PointField, Header and Time by name, such as `types` of a
+            type store of rosbags.
+        origin: the message with the scan, whose header and rows are taken.
+        points: the points; NaN stays NaN.
+        has_points: whether the message has x, y, z and rgb.
+        to_bytes: turns (B,) uint8 into what the library takes as bytes.
+    """
+    columns: dict[str, np.ndarray] = {}
+    if has_points:
+        with np.errstate(over="ignore", invalid="ignore"):
+            columns["x"], columns["y"], columns["z"] = points.xyz.T.astype("<f4")
+        columns["rgb"] = points.packed_colors()
+    columns["label"] = points.raw.astype("<u4")
+    if points.uncertain is not None:
+        columns["uncertain"] = points.uncertain.astype("u1")
+
+    numbers = {kind: number for number, kind in TYPES.items()}
+    fields: list[Any] = []
+    layout = {}
+    for name, values in columns.items():
+        kind = values.dtype.str
+        offset = ALIGNMENT * len(fields)  # no column is wider
+        number = numbers[kind[1:]]
+        fields.append(types[FIELD_TYPE](name=name, offset=offset, datatype=number, count=1))
+        layout[name] = (kind, offset)
+
+    records = np.zeros(len(points.raw), record_dtype(layout, ALIGNMENT * len(fields)))
+    for name, values in columns.items():
+        records[name] = values
+
+    width = len(records) // origin.height
+    return types[CLOUD_TYPE](
+        header=_header(types, origin),
+        height=origin.height,
+        width=width,
+        fields=fields,
+        is_bigendian=False,
+        point_step=records.itemsize,
+        row_step=width * records.itemsize,
+        data=to_bytes(records.view(np.uint8)),
+        is_dense=not has_points or bool(np.isfinite(points.xyz).all()),
+    )
+
+
+def _header(types: Mapping[str, Callable[..., Any]], origin: Message) -> Any:
+    seconds, nanoseconds = divmod(origin.stamp, NANOSECONDS)
+    stamp = types[TIME_TYPE](sec=seconds, nanosec=nanoseconds)
+    header_type = types[HEADER_TYPE]
+    # In ROS 1, headers have a sequence number.
+    is_ros1 = "seq" in getattr(header_type, "__annotations__", {})
+    sequence = {"seq": 0} if is_ros1 else {}
+    return header_type(stamp=stamp, frame_id=origin.frame_id, **sequence)
