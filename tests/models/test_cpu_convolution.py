@@ -1,4 +1,4 @@
-"""The gradients of the CPU's convolution are those of torch's."""
+"""The CPU's convolutions and their gradients are those of torch."""
 
 from __future__ import annotations
 
@@ -61,3 +61,26 @@ def test_a_layer_learns_the_same_on_processors_of_both_kinds(
 
     for by_products, by_torch in zip(*gradients, strict=True):
         torch.testing.assert_close(by_products, by_torch)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize("step", [1, 2])
+def test_kernels_of_one_cell_give_the_same_without_gradients(
+    threads: int, memory_format: torch.memory_format, step: int
+) -> None:
+    torch.manual_seed(0)
+    x = torch.randn(2, 5, 9, 12).contiguous(memory_format=memory_format)[..., ::step, ::step]
+    weight = torch.randn(7, 5, 1, 1)
+    bias = torch.randn(7)
+    expected = torch.einsum("bihw,oi->bohw", x.double(), weight[..., 0, 0].double())
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        with torch.inference_mode():
+            outputs = cpu_convolution.convolve(x, weight, bias, (1, 1), (0, 0))
+    finally:
+        torch.set_num_threads(before)
+    expected = expected + bias.double()[:, None, None]
+    torch.testing.assert_close(outputs.double(), expected, rtol=1e-5, atol=1e-5)

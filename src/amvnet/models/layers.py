@@ -101,7 +101,8 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
     # (1, C, N, 1), with the channels last in memory
     image = x.reshape(1, len(x), 1, x.shape[1]).permute(0, 3, 1, 2)
-    return F.conv2d(image, weight[:, :, None, None], bias).permute(0, 2, 3, 1).flatten(0, 2)
+    outputs = convolve(image, weight[:, :, None, None], bias, stride=(1, 1), padding=(0, 0))
+    return outputs.permute(0, 2, 3, 1).flatten(0, 2)
 
 
 class ConvBlock(nn.Sequential):

@@ -17,7 +17,7 @@ from amvnet.threads import run_parts
 
 POINT_VALUES = 4  # x, y, z, intensity
 LEAST = 1e-24  # product of two probabilities whose logarithm is still taken
-PART = 1024  # uncertain points scored at a time, so that they fit into a CPU's cache
+PART = 2048  # uncertain points scored at a time, so that they fit into a CPU's cache
 PART_ON_GPU = 2**16  # the same for a GPU: enough to keep it busy
 AT_ONCE = 2**17  # uncertain points whose table is in memory: a scan may have millions of them
 

@@ -15,7 +15,7 @@ from amvnet.models.upsampled_conv import joined
 from amvnet.models.views.polar_view import FEATURES, PolarGrid
 
 # Points that are encoded at a time.
-PART = 2048  # fits a processor's cache
+PART = 8192  # fits a processor's cache
 PART_ON_GPU = 2**18  # keeps a GPU busy
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import RangeNetConfig
+from amvnet.models.cpu_convolution import convolve
 from amvnet.models.layers import AzimuthGRU, ConvBlock, ResidualBlock, upsample
 from amvnet.models.upsampled_conv import joined
 from amvnet.models.views.range_view import CHANNELS
@@ -43,7 +44,8 @@ class RangeNet(nn.Module):
 
         maps = self.encode(full)
         decoded = self.decode(maps[FIRST_DECODED:])  # (B, decoder, H, W / 4)
-        return self.scores(joined(self.last, decoded, full))
+        x = joined(self.last, decoded, full)
+        return convolve(x, self.scores.weight, self.scores.bias, stride=(1, 1), padding=(0, 0))
 
     def encode(self, x: Tensor) -> list[Tensor]:
         """Return the maps of width strides 2, 4, 8, ...; the last two after their GRUs."""
