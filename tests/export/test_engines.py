@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +36,9 @@ from lidarstreets import simulate
 
 from fixtures.worlds import fails, files, fresh_weights
 
+TENSORRT = "TensorrtExecutionProvider"
+CUDA = "CUDAExecutionProvider"
+CPU = "CPUExecutionProvider"
 PART = 2000  # uncertain points that the plain model settles at a time
 
 
@@ -90,6 +95,43 @@ def test_onnx_says_what_torch_says_and_exports_once(cache: Path) -> None:
 
     use_engine(Segmenter(fresh_weights()), "onnx")
     assert modification_times(folder) == times
+
+
+@pytest.mark.parametrize(
+    ("installed", "expected"),
+    [
+        ([CPU, "AzureExecutionProvider"], [CPU]),
+        ([CPU, CUDA], [CUDA, CPU]),
+        ([CUDA, CPU, TENSORRT], [TENSORRT, CUDA, CPU]),
+    ],
+)
+def test_onnx_takes_the_fastest_provider_that_is_installed_and_int8_the_cpu(
+    installed: list[str], expected: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime")
+    opened: list[list[str]] = []
+
+    class Session:
+        def __init__(self, path: str, options: Any, providers: list[tuple[str, Any]]) -> None:
+            opened.append([name for name, _ in providers])
+            for name, values in providers:
+                is_kept = values.get("trt_engine_cache_path") == str(tmp_path)
+                assert is_kept == (name == TENSORRT)
+
+        def get_inputs(self) -> list[SimpleNamespace]:
+            return [SimpleNamespace(name="x")]
+
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: installed)
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
+    monkeypatch.setattr(engines, "exported", lambda *args: tmp_path)
+
+    said: list[str] = []
+    use_engine(Segmenter(fresh_weights()), "onnx", said.append)
+    assert opened == [expected, expected]
+    assert [expected[0] in line for line in said] == [True] * (len(expected) > 1)
+
+    use_engine(Segmenter(fresh_weights()), "int8", said.append)
+    assert opened[2:] == [[CPU], [CPU]]
 
 
 def test_other_weights_have_another_export(monkeypatch: pytest.MonkeyPatch) -> None:

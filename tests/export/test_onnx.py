@@ -47,6 +47,11 @@ from fixtures.worlds import (
 
 PROJECT = Path(__file__).parents[2]
 POINTS = 6000
+# The operators of the graphs that TensorRT has, by the table of its ONNX parser
+OF_TENSORRT = (
+    "Add BatchNormalization Clip Concat Conv Div GRU Gemm LeakyRelu Log MaxPool Mul ReduceMax Relu "
+    "Reshape Resize Slice Split Transpose"
+)
 TAXONOMIES = {"elevation": SEMANTICKITTI, "ring": NUSCENES}  # by the rows of `fresh_weights`
 
 
@@ -217,6 +222,24 @@ def test_the_description_is_that_of_the_graphs(exported: Exports) -> None:
         assert opsets[""] == description["opset"], name
         check_values(graph["inputs"], model.graph.input)
         check_values(graph["outputs"], model.graph.output)
+
+
+def test_tensorrt_takes_the_graphs(exported: Exports) -> None:
+    import onnx
+
+    for name, graph in read_description(exported["ring"].folder)["graphs"].items():
+        model = onnx.load(exported["ring"].folder / graph["file"])
+        onnx.checker.check_model(model, full_check=True)
+        weights = {tensor.name for tensor in model.graph.initializer}
+        for node in model.graph.node:
+            assert not node.domain
+            assert node.op_type in OF_TENSORRT.split(), name
+            # Kernels have to be constants, and positions of maxima are not returned.
+            assert node.op_type != "Conv" or set(node.input[1:]) <= weights
+            assert node.op_type != "MaxPool" or len(node.output) == 1
+        if name in ("range_net", "polar_map"):
+            sizes = model.graph.input[0].type.tensor_type.shape.dim
+            assert all(size.HasField("dim_value") for size in sizes), name
 
 
 def check_values(described: list[dict[str, Any]], values: Any) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
@@ -28,6 +28,8 @@ from amvnet.progress import Say, say_nothing
 
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 FASTEST = "torch"  # what "auto" means: the others start slowly, see docs/performance.md
+# ONNX Runtime's execution providers, the fastest first
+PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
 CACHE = "AMVNET_CACHE"  # the environment variable with the folder of exported networks
 
 Runner = Callable[[Tensor], Tensor]
@@ -38,7 +40,8 @@ def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> str
 
     Everything around the networks stays with torch. `compile` takes a minute before the first scan.
     `onnx` exports the networks once, in half a minute, and keeps them in `cache_folder`; it takes
-    scans one by one. So does `int8`, which also converts the convolutions to 8-bit integers; it
+    scans one by one, and computes on a GPU if the installed ONNX Runtime can. So does `int8`, which
+    stays on the CPU and also converts the convolutions to 8-bit integers; it
     calibrates them once, in a few minutes, on simulated scans of the weights' sensor.
 
     Args:
@@ -97,10 +100,22 @@ def _use_onnx(segmenter: Segmenter, engine: str, say: Say) -> None:
 
     parts = METHODS[segmenter.method].parts
     folder = exported(segmenter, SIMULATED if engine == "int8" else None, say)
+    # A GPU does not take the unsigned activations of the int8 graphs.
+    providers = PROVIDERS[-1:] if engine == "int8" else installed_providers()
+    if len(providers) > 1:
+        say(f"the networks compute with the {providers[0]} of ONNX Runtime")
     if "range_net" in parts:
-        _set_range_net(segmenter, OnnxGraph(folder / "range_net.onnx"))
+        _set_range_net(segmenter, OnnxGraph(folder / "range_net.onnx", providers))
     if "polar_net" in parts:
-        _polar_net(segmenter).run_unet = OnnxGraph(folder / "polar_map.onnx")
+        _polar_net(segmenter).run_unet = OnnxGraph(folder / "polar_map.onnx", providers)
+
+
+def installed_providers() -> Sequence[str]:
+    """Return those of `PROVIDERS` that the installed ONNX Runtime has."""
+    import onnxruntime
+
+    installed = onnxruntime.get_available_providers()
+    return [name for name in PROVIDERS if name in installed]
 
 
 def _compiled(function: Runner, shape: tuple[int, ...], device: str) -> Any:
@@ -179,11 +194,16 @@ class OnnxGraph(nn.Module):
     """An exported graph with one input (1, C, H, W) and one output; float32, without gradients.
 
     It computes with as many threads as torch does in the thread that calls it.
+
+    Args:
+        path: of the graph's file.
+        providers: ONNX Runtime's execution providers, the preferred one first.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, providers: Sequence[str] = PROVIDERS[-1:]) -> None:
         super().__init__()
         self.path = path
+        self.providers = providers
         self.sessions: dict[int, Any] = {}  # by number of threads
         self.lock = Lock()
         self.process = os.getpid()
@@ -194,7 +214,7 @@ class OnnxGraph(nn.Module):
         threads = torch.get_num_threads()
         with self.lock:
             if threads not in self.sessions:
-                self.sessions[threads] = _open_session(self.path, threads)
+                self.sessions[threads] = _open_session(self.path, self.providers, threads)
         return self.sessions[threads]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -212,11 +232,14 @@ class OnnxGraph(nn.Module):
         return torch.from_numpy(self.session().run(None, inputs)[0])
 
 
-def _open_session(path: Path, threads: int) -> Any:
+def _open_session(path: Path, providers: Sequence[str], threads: int) -> Any:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     # Threads that wait for the next graph would take the processor from torch's.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    # TensorRT builds its engine in minutes, once.
+    cached = {"trt_engine_cache_enable": True, "trt_engine_cache_path": str(path.parent)}
+    chosen = [(name, cached if name == PROVIDERS[0] else {}) for name in providers]
+    return onnxruntime.InferenceSession(str(path), options, providers=chosen)
