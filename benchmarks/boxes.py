@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from amvnet.data.datasets.open import open_dataset
+from amvnet.evaluation.scoring import labels_by_method
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import PAPER_METHODS
 
@@ -42,7 +43,7 @@ def main() -> None:
     points = 0
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record, labels=False)
-        labels, uncertain = segmenter.labels_by_method(scan, PAPER_METHODS)
+        labels, uncertain = labels_by_method(segmenter, scan, PAPER_METHODS)
         assert uncertain is not None
         uncertain_points += int(uncertain.sum())
         points += len(scan)

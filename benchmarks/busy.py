@@ -60,7 +60,7 @@ import amvnet
 from amvnet import read as read_scan
 
 scan, weights, count = sys.argv[1:]
-segmenter = amvnet.load(weights, keep_memory=True)
+segmenter = amvnet.load(weights)
 points = read_scan(scan)
 seconds = []
 for _ in range(int(count)):

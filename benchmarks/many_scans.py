@@ -91,7 +91,7 @@ def networks_rate(folder: Path, engine: str, at_once: int) -> float:
 @torch.inference_mode()
 def time_networks(paths: list[Path], engine: str, at_once: int) -> float:
     """Return how many scans per second the two networks score, once these are projected."""
-    segmenter = Segmenter(WEIGHTS, keep_memory=True)
+    segmenter = Segmenter(WEIGHTS)
     use_engine(segmenter, engine)
     model = segmenter.model
     views = [model.project(segmenter.batch([read_scan(path)])) for path in paths]

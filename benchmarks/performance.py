@@ -35,7 +35,7 @@ from amvnet.config.recipes import load_recipe
 from amvnet.data.labels.ids import write_ids
 from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
 from amvnet.inference.segmenter import Segmenter
-from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, product_limits, run_once, untrained
+from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, run_once, untrained
 from amvnet.models.amvnet import AMVNet, step
 from amvnet.models.layers import upsample
 from amvnet.models.methods import ONNX_ENGINES
@@ -47,10 +47,6 @@ from lidarstreets import simulate
 HEIGHT = 64  # of the range image that SalsaNext is timed on
 WIDTH = 2048
 WARM_UP = 2
-
-
-def without_memory() -> None:
-    amvnet.inference.segmenter.keep_freed_memory = lambda: False
 
 
 def without_folding() -> None:
@@ -112,7 +108,6 @@ def without_sharing() -> None:
 UNCHANGED = "as it is"
 ALL = "all of these"
 REMOVALS: dict[str, Callable[[], None]] = {
-    "freed memory goes back to the system": without_memory,
     "batch norms not folded": without_folding,
     "linear layers by matrix products": without_convolved_rows,
     "every voxel scored, occupied or not": without_occupied_pillars,
@@ -148,7 +143,6 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
             segmenter,
             read=lambda: read_scan(options.scan),
             write=lambda ids: write_ids(target, ids),
-            name=options.engines,
             share=options.uncertain,
         )
         for _ in range(WARM_UP + options.runs):
@@ -163,9 +157,7 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
             figures["uncertain"] = run.uncertain / run.points
             times.append(figures)
 
-    medians = {key: median_of(times[WARM_UP:], key) for key in times[0]}
-    medians["limit"] = product_limits("cpu")["float32"]
-    return medians
+    return {key: median_of(times[WARM_UP:], key) for key in times[0]}
 
 
 def median_of(rows: Sequence[dict[str, float]], key: str) -> float:

@@ -1,11 +1,11 @@
 """Score weights place by place, as one easy place may carry the mean over all of them.
 
-    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--methods M,...] [--tta flips]
+    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--methods M,...]
         [--every N]
 
 DATA is a dataset such as semantickitti:PATH; each of its sequences is a place. Print mIoU over all
 classes and accuracy of each method, and the share of uncertain points, for each place and for all.
-With --no-intensity, the intensities of all scans are set to 0. --methods and --tta are those of
+With --no-intensity, the intensities of all scans are set to 0. --methods are those of
 `amvnet evaluate`. With --every N, only every Nth scan is scored.
 """
 
@@ -22,6 +22,7 @@ from rich.table import Table
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
+from amvnet.evaluation.scoring import labels_by_method
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import PAPER_METHODS
 from amvnet.scan import Scan
@@ -39,7 +40,7 @@ def score(
     for record in records:
         scan = dataset.read(record)
         shown = scan if intensity else without_intensity(scan)
-        ids, uncertain = segmenter.labels_by_method(shown, methods)
+        ids, uncertain = labels_by_method(segmenter, shown, methods)
         assert scan.labels is not None
         evaluation.add(scan.points, scan.labels, ids, uncertain)
     return evaluation
@@ -70,12 +71,11 @@ def main() -> None:
     parser.add_argument("weights")
     parser.add_argument("--no-intensity", action="store_true")
     parser.add_argument("--methods", default=",".join(PAPER_METHODS))
-    parser.add_argument("--tta")
     parser.add_argument("--every", type=int, default=1)
     options = parser.parse_args()
 
     dataset = open_dataset(options.data)
-    segmenter = Segmenter(options.weights, tta=options.tta)
+    segmenter = Segmenter(options.weights)
     methods = options.methods.split(",")
     chosen = dataset.records(dataset.sequences("all"))[:: options.every]
     table = Table("place", *methods, "uncertain, %")
@@ -86,7 +86,7 @@ def main() -> None:
             continue
         evaluation = score(dataset, records, segmenter, methods, not options.no_intensity)
         add_row(table, place, evaluation, dataset.taxonomy.size)
-        total.merge(evaluation)
+        total += evaluation
     add_row(table, "all", total, dataset.taxonomy.size)
     Console().print(table)
 

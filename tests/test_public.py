@@ -184,7 +184,7 @@ def test_show_writes_a_page_and_opens_it(
     points[7] = np.nan
     result = segmenter(Scan(points, SEMANTICKITTI.to_train(raw), name="my <scan>"))
 
-    path = result.show(tmp_path / "p.html")
+    path = amvnet.show(result, tmp_path / "p.html")
     assert opened == [path.as_uri()]
     page = read_page(path)
     _, planes = page.scan(0)
@@ -198,7 +198,7 @@ def test_show_writes_a_page_and_opens_it(
 
 
 def test_show_needs_no_path_and_no_browser(segmenter: Segmenter) -> None:
-    path = Segmenter(WEIGHTS, method="bev")(POINTS).show(open_browser=False)
+    path = amvnet.show(Segmenter(WEIGHTS, method="bev")(POINTS), open_browser=False)
     _, planes = read_page(path).scan(0)
     assert "bev" in planes
     assert "uncertain" not in planes
@@ -253,7 +253,7 @@ def segment(path: Path) -> float:
         print(len(other))
     first, second = segmenter.many([scan, np.zeros((3, 4), np.float32)])
     saved: Path = segmenter(path).save("a.ply")
-    page: Path = first.show(saved)
+    page: Path = amvnet.show(first, saved)
     names: list[str] = [second.class_names[index] for index in result.labels]
     rgb = result.colors[result.labels]
     print(page, names, rgb.shape, result.raw_ids.tolist(), amvnet.__version__)

@@ -21,8 +21,9 @@ if TYPE_CHECKING:
     from amvnet.inference.listing import read, read_all
     from amvnet.inference.segmentation import Segmentation
     from amvnet.inference.segmenter import Segmenter
-    from amvnet.models.methods import MethodName, Precision, TtaName
+    from amvnet.models.methods import MethodName, Precision
     from amvnet.scan import Scan
+    from amvnet.viewing.page import show
     from amvnet.weights.file import Weights
     from amvnet.weights.push import push
 
@@ -37,6 +38,7 @@ __all__ = [
     "push",
     "read",
     "read_all",
+    "show",
     "simulate",
 ]
 __version__ = version("amvnet")
@@ -51,6 +53,7 @@ _MODULES = {
     "push": "amvnet.weights.push",
     "read": "amvnet.inference.listing",
     "read_all": "amvnet.inference.listing",
+    "show": "amvnet.viewing.page",
     "simulate": "amvnet.data.datasets.simulated",
 }
 _SUBMODULES = ("onnx_runner", "weights")
@@ -62,10 +65,7 @@ def load(
     method: MethodName = "amvnet",
     precision: Precision = "auto",
     engine: str = "torch",
-    keep_memory: bool = False,
-    tta: TtaName | None = None,
     tau: float | None = None,
-    graphs: bool = True,
 ) -> Segmenter:
     """Return a segmenter with trained weights.
 
@@ -80,11 +80,8 @@ def load(
             bfloat16 on a GPU that has it, else float32.
         engine: what runs the networks: "torch", "compile", "onnx", "int8", or "auto", the fastest
             that gives the same labels here.
-        keep_memory: let the whole process keep freed memory, see `Segmenter`.
-        tta: test-time augmentation: "flips", "yaw" or "both", see `Segmenter`.
         tau: the cosine similarity up to which points are uncertain, in [0, 1]; None means as the
             weights say.
-        graphs: on a GPU, capture the networks as CUDA graphs, see `Segmenter`.
 
     Raises:
         InputError: if there are no such weights, they lack a part that the method needs, or the
@@ -92,16 +89,8 @@ def load(
     """
     segmenter_class = import_module("amvnet.inference.segmenter").Segmenter
     choose_device = import_module("amvnet.models.precision").choose_device
-    segmenter: Segmenter = segmenter_class(
-        weights,
-        choose_device(device, engine),
-        method,
-        precision,
-        keep_memory=keep_memory,
-        tta=tta,
-        tau=tau,
-        graphs=graphs,
-    )
+    device = choose_device(device, engine)
+    segmenter: Segmenter = segmenter_class(weights, device, method, precision, tau)
     if engine != "torch":
         import_module("amvnet.export.engines").use_engine(segmenter, engine)
     return segmenter

@@ -32,8 +32,6 @@ def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") ->
     """Return the end of an error message: the most similar name, or else what to do.
 
     Args:
-        word: what the user wrote.
-        known: the names that are possible.
         advice: what to do if none is similar.
     """
     names = {name.lower(): name for name in known}

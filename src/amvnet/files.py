@@ -77,8 +77,6 @@ def publish(part: Path, path: Path) -> None:
     with part.open("rb+") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
-    if not hasattr(os, "O_DIRECTORY"):  # Windows
-        return
     folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     try:
         with suppress(OSError):  # some network file systems refuse it
@@ -162,11 +160,7 @@ def checked_token(text: Any) -> str:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder and its parents.
-
-    Raises:
-        InputError: if it cannot be made.
-    """
+    """Make a folder and its parents; raise InputError if it cannot be made."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -179,7 +173,6 @@ def read_yaml(path: Path, content: str) -> Any:
     """Return what a YAML file holds: dictionaries, lists, texts, numbers. Nothing is executed.
 
     Args:
-        path: the file.
         content: what the file should hold, for messages, such as "a label map".
 
     Raises:
@@ -201,7 +194,6 @@ def parse_yaml(text: str, expected: str) -> Any:
     """Return the value of a YAML text. Nothing is executed.
 
     Args:
-        text: the text.
         expected: the beginning of error messages.
 
     Raises:

@@ -20,6 +20,9 @@ MEMINFO = Path("/proc/meminfo")
 CONTROL_GROUP = Path("/sys/fs/cgroup")  # of this process, in a container
 
 
+_is_kept = False  # by `keep_freed_memory`
+
+
 def keep_freed_memory() -> bool:
     """Let this process keep the memory that it frees, instead of returning it to the system.
 
@@ -33,17 +36,22 @@ def keep_freed_memory() -> bool:
     Returns:
         Whether the C library supports it: glibc on Linux does.
     """
+    global _is_kept
     # No block has a mapping of its own, no memory is returned (-1), and there is one heap.
-    return _set_options({M_MMAP_MAX: 0, M_TRIM_THRESHOLD: -1, M_ARENA_MAX: 1})
+    _is_kept = _set_options({M_MMAP_MAX: 0, M_TRIM_THRESHOLD: -1, M_ARENA_MAX: 1})
+    return _is_kept
 
 
 @contextmanager
 def return_freed_memory() -> Iterator[None]:
-    """Return freed memory to the system within the block, after `keep_freed_memory`.
+    """Return freed memory to the system within the block, also after `keep_freed_memory`.
 
     Blocks of a very large scan, freed and requested in turn, leave gaps in the heap that no other
     block fits into.
     """
+    if not _is_kept:
+        yield
+        return
     _set_options(DEFAULTS)
     try:
         yield

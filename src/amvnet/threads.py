@@ -110,8 +110,7 @@ def survive_forks() -> None:
 
     The threads of the team are not part of the forked process, which would wait for them forever.
     """
-    if hasattr(os, "register_at_fork"):  # not on Windows, which cannot fork
-        os.register_at_fork(after_in_child=_use_one_thread)
+    os.register_at_fork(after_in_child=_use_one_thread)
 
 
 def _use_one_thread() -> None:
@@ -141,10 +140,6 @@ class BusyMachine:
         """Take note of a call, and warn if it and the one before waited for a processor.
 
         The first call, which also waits for memory and files, does not count.
-
-        Args:
-            seconds: how long it took.
-            thread_seconds: how long the calling thread ran.
         """
         self._calls += 1
         is_slow = seconds > SHORTEST and seconds > BUSY * thread_seconds

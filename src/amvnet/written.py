@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,11 +14,6 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 
 RECORD = ".amvnet-written.json"
-
-try:
-    import fcntl
-except ImportError:  # Windows: files are not locked
-    fcntl = None  # type: ignore[assignment]
 
 Stamp = tuple[int, int]  # a file's size in bytes, and when it changed last, in nanoseconds
 
@@ -106,10 +102,7 @@ class WrittenFiles:
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Keep other processes out of this block for the same folder, where the system can."""
-    if fcntl is None:
-        yield
-        return
+    """Keep other processes out of this block for the same folder."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         with suppress(OSError):  # some network file systems have no locks
@@ -120,20 +113,18 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 
 def hold(file: IO[str]) -> None:
-    """Lock a file until it is closed or its process ends, where the system can."""
-    if fcntl is not None:
-        with suppress(OSError):
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    """Lock a file until it is closed or its process ends."""
+    with suppress(OSError):  # some network file systems have no locks
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_held(path: Path) -> bool:
     """Return whether a process holds a file by `hold`."""
-    if fcntl is not None:
-        with suppress(OSError), path.open() as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
+    with suppress(OSError), path.open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
     return False
 
 

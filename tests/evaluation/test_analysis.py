@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ import pytest
 import torch
 from matplotlib.image import imread
 
-from amvnet.config.schema import AssertionConfig
+from amvnet.config.schema import AssertionConfig, Recipe
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.distributed import Processes
 from amvnet.evaluation import analysis
 from amvnet.evaluation.analysis import BINS, SWEPT, Analysis, analyze
 from amvnet.evaluation.metrics import confusion, metrics
@@ -22,7 +25,9 @@ from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import Job, run_once
 from amvnet.models.methods import arithmetic_mean, maximum
+from amvnet.progress import Say, say_nothing
 from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES
+from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.worlds import (
@@ -304,6 +309,33 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
 
 
 # ---- the verb `ablate`
+
+
+@dataclass(frozen=True)
+class PlanOfTwo:
+    """The plan of the second of two processes, as far as `ablate` asks for it."""
+
+    recipe: Recipe
+    out: Path
+    scans: Any
+    processes: Processes
+    say: Say = say_nothing
+
+
+def test_ablate_scores_on_the_gpu_of_its_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    devices = []
+    evaluation = SimpleNamespace(matrices={"rv": np.ones((1, 20, 20))})
+    monkeypatch.setattr(ablation, "choose_device", lambda name: "cuda")
+    monkeypatch.setattr(ablation, "train", lambda plan, stage: plan.out)
+    monkeypatch.setattr(ablation, "Segmenter", lambda path, device, *_: devices.append(device))
+    monkeypatch.setattr(ablation, "label_by_weights", lambda *_: None)
+    monkeypatch.setattr(ablation, "evaluate", lambda *_, **options: evaluation)
+
+    scans = SimpleNamespace(dataset=SimpleNamespace(taxonomy=SEMANTICKITTI), val=[])
+    second = Processes(rank=1, size=2, local_rank=1)
+    plan: Any = PlanOfTwo(Recipe(), Path("out"), scans, second)
+    assert len(list(ablation.ablate(plan, "auto"))) == 4
+    assert devices == ["cuda:1"] * 4
 
 
 def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -> None:

@@ -186,9 +186,6 @@ def test_halves_add_up() -> None:
     assert (first + second).report("x") == whole.report("x")
     assert first.scans == 1  # the sum left its parts alone
 
-    first.merge(second)
-    assert first.report("x") == whole.report("x")
-
 
 def test_order_of_the_points_changes_nothing() -> None:
     example = random_example(4)
@@ -236,5 +233,3 @@ def test_what_does_not_fit_is_refused() -> None:
         confusion(np.zeros(3, int), np.zeros(4, int), 16)
     with pytest.raises(InputError, match=r"0\.\.16"):
         confusion(np.zeros(1, int), np.full(1, 17), 16)
-    with pytest.raises(InputError, match="merge"):
-        Evaluation(NUSCENES).merge(Evaluation(SEMANTICKITTI))

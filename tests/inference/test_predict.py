@@ -230,7 +230,6 @@ def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_p
     other = save(fresh_weights(seed=1), tmp_path / "other.safetensors")
     for options, key in (
         ("--method rv", "method"),
-        ("--tta flips", "tta"),
         ("--tau 0.1", "tau"),
         ("--height 2", "sensor"),
         ("--scores", "scores"),

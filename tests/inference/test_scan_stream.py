@@ -104,13 +104,10 @@ GIBIBYTE = 2**30
 def test_a_scan_for_each_core_is_computed_if_the_memory_suffices(
     threads: int, gibibytes: float, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    segmenter = Segmenter(fresh_weights())
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     available = int(gibibytes * GIBIBYTE)
     monkeypatch.setattr("amvnet.inference.segmenter.available_memory", lambda: available)
-    assert segmenter.at_once == expected
-    segmenter.at_once = 3
-    assert segmenter.at_once == 3
+    assert Segmenter(fresh_weights()).at_once == expected
 
 
 def test_the_available_memory_is_that_of_the_machine_or_of_the_control_group(

@@ -15,6 +15,7 @@ import torch
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
 from amvnet.data.taxonomy import NUSCENES
+from amvnet.evaluation.scoring import labels_by_method
 from amvnet.models.methods import METHODS, MethodName
 from amvnet.weights.file import save
 
@@ -198,7 +199,7 @@ def test_each_method_has_its_own_scores(result: Segmentation) -> None:
 
 
 def test_by_method_is_what_each_method_gives_alone(segmenter: Segmenter) -> None:
-    labels, uncertain = segmenter.labels_by_method(Scan(POINTS))
+    labels, uncertain = labels_by_method(segmenter, Scan(POINTS))
     assert set(labels) == {"rv", "bev", "ensemble", "amvnet"}
     for method in METHOD_NAMES:
         if method in labels:
@@ -209,7 +210,7 @@ def test_by_method_is_what_each_method_gives_alone(segmenter: Segmenter) -> None
 
 def test_by_method_equals_each_method(segmenter: Segmenter) -> None:
     points, _ = with_lost_returns(POINTS)
-    labels, uncertain = segmenter.labels_by_method(Scan(points), METHOD_NAMES)
+    labels, uncertain = labels_by_method(segmenter, Scan(points), METHOD_NAMES)
     assert tuple(METHODS) == METHOD_NAMES
     assert tuple(labels) == METHOD_NAMES
     for method in METHOD_NAMES:
@@ -226,7 +227,7 @@ def test_a_method_includes_those_that_need_no_more_than_its_networks() -> None:
     }
     for method, names in expected.items():
         segmenter = Segmenter(WEIGHTS, method=method)  # type: ignore[arg-type]
-        labels, _ = segmenter.labels_by_method(Scan(POINTS), METHOD_NAMES)
+        labels, _ = labels_by_method(segmenter, Scan(POINTS), METHOD_NAMES)
         assert list(labels) == names
         for name in names:
             assert np.array_equal(labels[name], labels_by(name))  # type: ignore[arg-type]
@@ -242,7 +243,7 @@ def test_prediction_runs_the_model_as_it_is(segmenter: Segmenter, result: Segmen
 @pytest.mark.parametrize(("method", "other"), [("rv", "polar_net"), ("bev", "range_net")])
 def test_by_method_of_one_network_is_that_network(method: MethodName, other: str) -> None:
     one_network = without(WEIGHTS, "point_head", other)
-    labels, uncertain = Segmenter(one_network, method=method).labels_by_method(Scan(POINTS))
+    labels, uncertain = labels_by_method(Segmenter(one_network, method=method), Scan(POINTS))
     assert list(labels) == [method]
     assert uncertain is None
     assert np.array_equal(labels[method], labels_by(method))
@@ -437,9 +438,11 @@ def test_every_exported_name_is_there() -> None:
 PEAK = """
 import sys, numpy as np
 from amvnet import Segmenter
+from amvnet.memory import keep_freed_memory
+keep_freed_memory()
 points = np.random.default_rng(0).normal(size=(int(sys.argv[2]), 4)).astype(np.float32) * 10
 points[:, 3] = 0.5
-Segmenter(sys.argv[1], keep_memory=True)(points)
+Segmenter(sys.argv[1])(points)
 with open("/proc/self/status") as file:
     status = dict(line.split(":", 1) for line in file)
 print(1024 * int(status["VmHWM"].split()[0]))

@@ -9,14 +9,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from amvnet.evaluation.top_view import TopView
-from amvnet.training import callbacks
-from amvnet.training.callbacks import (
-    LIBRARIES,
-    LoggerName,
-    check_logger,
-    log_figure,
-    make_logger,
-)
+from amvnet.training import callbacks, plan
+from amvnet.training.callbacks import log_figure, make_logger
+from amvnet.training.plan import LIBRARIES, LoggerName, check_logger
 
 from fixtures.worlds import fails, make_streets, refusal, succeed, write_recipe
 
@@ -38,7 +33,7 @@ def test_a_logger_writes_into_the_folder_of_its_stage(name: LoggerName, tmp_path
 def test_a_missing_library_is_named_before_anything_is_trained(
     name: LoggerName, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(callbacks, "find_spec", lambda library: None)
+    monkeypatch.setattr(plan, "find_spec", lambda library: None)
     fails(lambda: check_logger(name), f"pip install 'amvnet[{name}]'")
 
     data = make_streets(tmp_path / "data")

@@ -21,6 +21,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.palette import WRONG, class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
+from amvnet.evaluation.scoring import labels_by_method
 from amvnet.inference.segmenter import Segmenter
 from amvnet.viewing import page as pages
 from amvnet.viewing import rerun_log
@@ -107,7 +108,7 @@ def test_the_page_has_the_labels_of_every_method(world: Path, dataset: SemanticK
     segmenter = Segmenter(world / "w.safetensors")
     for index, record in enumerate(dataset.records(dataset.sequences("all"))):
         _, planes = page.scan(index)
-        labels, uncertain = segmenter.labels_by_method(dataset.read(record))
+        labels, uncertain = labels_by_method(segmenter, dataset.read(record))
         assert list(labels) == ["rv", "bev", "ensemble", "amvnet"]
         for method, ids in labels.items():
             np.testing.assert_array_equal(planes[method], ids)
@@ -552,7 +553,7 @@ def test_a_recording_reads_back(world: Path, tmp_path: Path, dataset: SemanticKi
         assert scan.labels is not None
         assert recording.values("/truth", step, "class_ids") == scan.labels.tolist()
 
-        labels, uncertain = segmenter.labels_by_method(scan)
+        labels, uncertain = labels_by_method(segmenter, scan)
         assert uncertain is not None
         for method, ids in labels.items():
             assert recording.values(f"/labels/{method}", step, "class_ids") == ids.tolist()

@@ -93,6 +93,7 @@ class CloudSegmenter:
 
         import amvnet
         from amvnet.inference.reading import normaliser_for
+        from amvnet.memory import keep_freed_memory
         from amvnet.sensors.lidars import make_sensor
 
         sensor = make_sensor(**settings.sensor_options())
@@ -105,8 +106,9 @@ class CloudSegmenter:
             method=settings.method,  # type: ignore[arg-type]  # checked there
             precision=settings.precision,  # type: ignore[arg-type]
             engine=settings.engine,
-            keep_memory=True,
         )
+        if segmenter.device == "cpu":
+            keep_freed_memory()
         self.taxonomy = segmenter.taxonomy
         self.hardware = segmenter.hardware
         self.usual_uncertain = segmenter.weights.usual_uncertain

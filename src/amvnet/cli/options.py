@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from amvnet.cli.console import say, silence
+from amvnet.config.bounds import Range
 from amvnet.errors import InputError, shown
-from amvnet.models.methods import (
-    METHODS,
-    EngineName,
-    MethodName,
-    Precision,
-    TtaName,
-    widest_method,
-)
+from amvnet.models.methods import METHODS, EngineName, MethodName, Precision
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
@@ -25,7 +18,7 @@ if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.distributed import Processes
     from amvnet.inference.listing import ScanOptions
-    from amvnet.inference.scores import ScorePair, Which
+    from amvnet.inference.scores import ScorePair
     from amvnet.inference.segmenter import Segmenter
     from amvnet.sensors.lidars import Sensor
     from amvnet.weights.file import Weights
@@ -34,6 +27,9 @@ Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]  # the 
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 SHOWN = 20  # names of sequences in a line
+NEIGHBOURS = Range(1, 1000)
+
+Number = TypeVar("Number", int, float)
 
 
 @dataclass(frozen=True)
@@ -100,6 +96,93 @@ class SensorChoice:
         return make_sensor(**asdict(self))
 
 
+@dataclass(frozen=True)
+class ComputeChoice:
+    """The options that say where and how the networks are computed."""
+
+    device: str = "auto"
+    """cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU."""
+    engine: EngineName = "auto"
+    """what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8 (the same
+    in 8-bit integers, calibrated once; a few labels change), or auto, the fastest here that changes
+    none."""
+    precision: Precision = "auto"
+    """of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32."""
+    at_once: int | None = None
+    """scans that are segmented at the same time on a CPU; default: one per core, if the memory
+    suffices."""
+
+    def segmenter(
+        self,
+        weights: Weights,
+        method: MethodName,
+        tau: float | None = None,
+        processes: Processes | None = None,
+    ) -> Segmenter:
+        """Return the segmenter of a verb.
+
+        Args:
+            tau: as for --tau.
+            processes: those that share the scans, each on a GPU of its own if there are several.
+
+        Raises:
+            InputError: if one of the options does not fit the weights or this machine.
+        """
+        from amvnet.export.engines import use_engine
+        from amvnet.inference.segmenter import Segmenter
+        from amvnet.memory import keep_freed_memory
+        from amvnet.models.precision import choose_device
+
+        if self.at_once is not None and self.at_once < 1:
+            raise InputError(
+                f"expected one scan or more at a time, found {self.at_once}; set --at-once"
+            )
+        device = choose_device(self.device, self.engine)
+        if processes is not None:
+            device = processes.device(device)
+        if device == "cpu":
+            keep_freed_memory()
+        segmenter = Segmenter(weights, device, method, self.precision, tau)
+        say(f"computing on {segmenter.hardware} in {segmenter.precision}")
+        use_engine(segmenter, self.engine, say)
+        if self.at_once is not None:
+            segmenter.at_once = self.at_once
+        return segmenter
+
+
+@dataclass(frozen=True)
+class ScoresChoice:
+    """The options that name two models' scores of scans."""
+
+    scores_a: Path | None = None
+    """folder of one model's class probabilities, an .npz or .npy of shape (N, K) for each scan,
+    where predict --scores writes its own."""
+    scores_b: Path | None = None
+    """folder of the other model's."""
+    key_a: str | None = None
+    """which array of each .npz in --scores-a; not needed if there is one."""
+    key_b: str | None = None
+    """which array of each .npz in --scores-b."""
+    logits: Literal["a", "b", "both"] | None = None
+    """which of the two are scores before softmax."""
+
+    def parse(self) -> ScorePair | None:
+        """Return the scores of two models; None if no option names any.
+
+        Raises:
+            InputError: if a folder is missing.
+        """
+        from amvnet.inference.scores import ScorePair
+
+        if self == ScoresChoice():
+            return None
+        if self.scores_a is None or self.scores_b is None:
+            raise InputError(
+                "expected --scores-a and --scores-b, found not both; give two models' scores"
+            )
+        return ScorePair.of(self.scores_a, self.scores_b, self.key_a, self.key_b, self.logits)
+
+
 def join_processes(cuda: bool = False) -> Processes:
     """Join the processes of this job, if torchrun or SLURM started several; only one prints."""
     from amvnet.distributed import join
@@ -129,49 +212,6 @@ def parse_classes(name: str | None) -> ClassMap | None:
     return None if name is None else class_map(name)
 
 
-def make_segmenter(
-    weights: Weights,
-    device: str,
-    engine: EngineName,
-    precision: Precision,
-    at_once: int | None,
-    method: MethodName | None = None,
-    tta: TtaName | None = None,
-    tau: float | None = None,
-    processes: Processes | None = None,
-) -> Segmenter:
-    """Return the segmenter of a verb.
-
-    Args:
-        weights: trained weights.
-        device: as for --device.
-        engine: as for --engine.
-        precision: as for --precision.
-        at_once: as for --at-once; None means the best number.
-        method: by which it labels scans; by default the widest that the weights have parts for.
-        tta: as for --tta.
-        tau: as for --tau.
-        processes: those that share the scans, each on a GPU of its own if there are several.
-
-    Raises:
-        InputError: if one of the options does not fit the weights or this machine.
-    """
-    from amvnet.export.engines import use_engine
-    from amvnet.inference.segmenter import Segmenter
-    from amvnet.models.precision import choose_device
-
-    chosen = method or widest_method(weights.parts)
-    device = choose_device(device, engine)
-    if processes is not None:
-        device = processes.device(device)
-    segmenter = Segmenter(weights, device, chosen, precision, keep_memory=True, tta=tta, tau=tau)
-    say(f"computing on {segmenter.hardware} in {segmenter.precision}")
-    if at_once is not None:
-        segmenter.at_once = at_once
-    use_engine(segmenter, engine, say)
-    return segmenter
-
-
 def describe_records(records: Sequence[ScanRecord]) -> str:
     """Return how many scans there are, and of which sequences."""
     if not records:
@@ -182,6 +222,13 @@ def describe_records(records: Sequence[ScanRecord]) -> str:
         text += f" and {len(names) - SHOWN} more"
 
     return f"{counted(len(records), 'scan')} of {text}"
+
+
+def labelled_scans(dataset: Dataset, sequences: str | None, split: Split) -> Sequence[ScanRecord]:
+    """Return the scans with labels of a split, or of sequences that are named instead."""
+    from amvnet.data.datasets.base import choose_records
+
+    return dataset.labelled(choose_records(dataset, parse_names(sequences), split))
 
 
 def parse_names(text: str | None) -> list[str] | None:
@@ -204,11 +251,7 @@ def parse_names(text: str | None) -> list[str] | None:
 
 
 def parse_methods(text: str) -> list[str]:
-    """Parse methods separated by commas.
-
-    Raises:
-        InputError: if a name is no method.
-    """
+    """Parse methods separated by commas; raise InputError if a name is no method."""
     names = parse_names(text) or []
     for name in names:
         if name not in METHODS:
@@ -219,52 +262,27 @@ def parse_methods(text: str) -> list[str]:
     return names
 
 
-def parse_numbers(text: str) -> list[int]:
-    """Parse numbers from 1 separated by commas; return them sorted, each once.
+def parse_numbers(
+    text: str, kind: Callable[[str], Number], allowed: Range, example: str
+) -> list[Number]:
+    """Parse numbers separated by commas; return them sorted, each once.
+
+    Args:
+        kind: int or float.
+        example: for the message.
 
     Raises:
-        InputError: if one is no such number.
-    """
-    names = parse_names(text) or []
-    if not all(re.fullmatch("0*[1-9][0-9]{0,5}", name) for name in names):
-        raise InputError(
-            f"expected numbers of neighbours with commas, found {shown(text)}; say 5,10,15"
-        )
-    return sorted({int(name) for name in names})
-
-
-def parse_taus(text: str) -> list[float]:
-    """Parse values of tau in [0, 1] separated by commas; return them sorted, each once.
-
-    Raises:
-        InputError: if one is no such number.
+        InputError: if one is no number in the range.
     """
     values = set()
-    for name in parse_names(text) or [""]:
+    for name in parse_names(text) or []:
         try:
-            value = float(name)
+            value = kind(name)
         except ValueError:
-            value = -1.0
-        if not 0 <= value <= 1:  # nor NaN
+            value = kind("-1")
+        if value not in allowed:  # nor NaN
             raise InputError(
-                f"expected values of tau from 0 to 1 with commas, found {text!r}; say 0.7,0.85,1"
+                f"expected numbers {allowed} with commas, found {shown(text)}; say {example}"
             )
         values.add(value)
     return sorted(values)
-
-
-def parse_scores(
-    a: Path | None, b: Path | None, key_a: str | None, key_b: str | None, logits: Which | None
-) -> ScorePair | None:
-    """Return the scores of two models; None if no option names any.
-
-    Raises:
-        InputError: if a folder is missing.
-    """
-    from amvnet.inference.scores import ScorePair
-
-    if a is not None and b is not None:
-        return ScorePair.of(a, b, key_a, key_b, logits)
-    if (a, b, key_a, key_b, logits) == (None,) * 5:
-        return None
-    raise InputError("expected --scores-a and --scores-b, found not both; give two models' scores")

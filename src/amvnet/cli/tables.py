@@ -46,8 +46,6 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
     methods = report["methods"]
     figures = list(methods.values())
     title = f"{report['dataset']}: {counted(report['scans'], 'scan')}, {report['points']:,} points"
-    if "tta" in report:
-        title += f", test-time augmentation: {report['tta']}"
     if "tau" in report:
         title += f", tau: {report['tau']}"
     table = Table(title=title, show_edge=False)
@@ -74,50 +72,37 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 
 
 def timing_table(report: Mapping[str, Any]) -> Table:
-    """Return the table of a report of `time_jobs`: the time of each stage, the networks' speed."""
+    """Return the table of a report of `time_job`: the time of each stage."""
     points = report["points"]
     table = Table(
-        title=f"{report['engine']} on {report['device']}, {report['threads']} threads: "
+        title=f"{report['engine']} on {report['device']} in {report['precision']}, "
+        f"{report['threads']} threads: "
         f"{points:,} points, {report['uncertain'] / points:.1%} of them uncertain",
         show_edge=False,
     )
-    for name in ("stage", "ms", "half of the runs", "share", "GFLOP", "of the limit"):
+    for name in ("stage", "ms", "half of the runs", "share"):
         table.add_column(name, justify="left" if name == "stage" else "right")
 
     stages = report["stages_ms"]
     total = report["all_ms"]
     for stage in STAGES:
         share = f"{stages[stage]['median'] / total['median']:.1%}"
-        speed = _speed(report["networks"].get(stage))
-        table.add_row(stage, *_times(stages[stage]), share, *speed)
+        table.add_row(stage, *_times(stages[stage]), share)
     table.add_section()
 
     fusion = report["fusion_share"]
     quartiles = f"{fusion['low']:.1%} to {fusion['high']:.1%}"
-    table.add_row("all", *_times(total), f"{report['all_over_networks']['median']:.2f} x networks")
+    table.add_row("all", *_times(total))
     table.add_row("fusion", "", quartiles, f"{fusion['median']:.1%}")
     table.add_row("ensemble instead of it", *_times(stages[MEAN]))
 
-    limits = []
-    for kind, speed in report["limit_gflop_per_s"].items():
-        limits.append(f"{speed:,.0f} GFLOP/s in {kind}")
-    table.caption = (
-        f"limit, a large matrix product: {', '.join(limits)}; "
-        f"peak memory {report['peak_memory_mib']:,.0f} MiB"
-    )
+    table.caption = f"peak memory {report['peak_memory_mib']:,.0f} MiB"
     return table
 
 
 def _times(spread: Mapping[str, float]) -> tuple[str, str]:
     """Return the median and the range between the quartiles, in milliseconds."""
     return f"{spread['median']:.1f}", f"{spread['low']:.1f} to {spread['high']:.1f}"
-
-
-def _speed(network: Mapping[str, float] | None) -> tuple[str, ...]:
-    """Return the GFLOP of a network and its share of the limit; no cells for other stages."""
-    if network is None:
-        return ()
-    return f"{network['gflop']:.1f}", f"{network['share_of_limit']:.0%}"
 
 
 def installation_table() -> Table:

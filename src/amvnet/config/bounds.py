@@ -83,11 +83,6 @@ class Checked:
     def check(self, holds: bool, expected: str, found: str) -> None:
         """Check a condition that involves several numbers.
 
-        Args:
-            holds: the condition.
-            expected: what the message says was expected.
-            found: what the message says was found.
-
         Raises:
             InputError: if the condition does not hold.
         """
@@ -107,11 +102,7 @@ def _check_range(name: str, value: Any, kind: Any) -> None:
 
 
 def check_text(name: str, value: Any) -> None:
-    """Check that a value of a file is a short text of one line.
-
-    Raises:
-        InputError: if it is not.
-    """
+    """Check that a value of a file is a short text of one line; raise InputError if it is not."""
     if not isinstance(value, str) or not value.isprintable() or len(value) > LONGEST_TEXT:
         raise InputError(
             f"{name}: expected a text of at most {LONGEST_TEXT} printable characters, "

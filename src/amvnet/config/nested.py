@@ -44,15 +44,7 @@ def from_dict(cls: type[T], tree: Any, where: str = "configuration") -> T:
         raise InputError(
             f"{where}: expected keys and values, found {shown(tree)}; correct the value"
         )
-    return _replace(cls(), tree, where)
-
-
-def replace_values(config: T, tree: Mapping[str, Any], where: str) -> T:
-    """Return a copy of a dataclass with the values of nested dictionaries in place of its own.
-
-    The arguments and exceptions are those of `from_dict`.
-    """
-    return _replace(config, tree, where)
+    return replace_values(cls(), tree, where)
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -69,8 +61,8 @@ def to_dict(config: Any) -> dict[str, Any]:
     return tree
 
 
-def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
-    """Return a copy of a dataclass with the values of a tree in the fields that it names."""
+def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
+    """Return a copy of a dataclass with the values of a tree; raise the errors of `from_dict`."""
     field_types = get_type_hints(type(default))
     field_types.pop("obsolete", None)  # of the class, no field
     obsolete = getattr(default, "obsolete", {})
@@ -102,19 +94,13 @@ def _replace(default: T, tree: Mapping[str, Any], where: str) -> T:
 def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
     """Convert a value to the type of a field.
 
-    Args:
-        default: the field's default value.
-        value: the value in YAML's or JSON's types.
-        kind: the field's type.
-        where: the beginning of error messages.
-
     Raises:
         InputError: if the value does not fit the type.
     """
     if dataclasses.is_dataclass(default):
         if not isinstance(value, Mapping):
             raise _wrong_type(default, value, where)
-        return _replace(default, value, where)
+        return replace_values(default, value, where)
 
     if isinstance(default, tuple):
         if not isinstance(value, list | tuple):

@@ -40,7 +40,6 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
     """Read a recipe, merged with its bases.
 
     Args:
-        name_or_path: the recipe.
         dependents: the recipes that build on this one, to detect a circle of bases.
     """
     if name_or_path in dependents:

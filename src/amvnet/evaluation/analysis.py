@@ -15,8 +15,9 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.evaluation.scoring import stream_labelled
+from amvnet.inference.reading import check_scan
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
-from amvnet.inference.segmenter import Segmenter, check_scan
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.models.methods import ENSEMBLES
 from amvnet.progress import Progress, no_progress

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 from amvnet.evaluation.analysis import BINS, Analysis, Swept
 from amvnet.evaluation.metrics import metrics
 from amvnet.files import atomic_write
+from amvnet.models.methods import title_of
 
 SIZE = (6.0, 3.6)  # inches
 DOTS_PER_INCH = 160
@@ -21,33 +21,20 @@ MOST_MARKED = 20  # longer sweeps are drawn without markers, which would overlap
 Cell = str | float | int | None  # None: no such number, written as a dash
 
 
-@dataclass(frozen=True)
-class Style:
-    """The title of a method, and the marker and line style of its curve in Matplotlib."""
-
-    title: str
-    marker: str
-    line: str
-
-
+# Of the curves of the methods, in Matplotlib.
 STYLES = {
-    "rv": Style("RV", marker="o", line=":"),
-    "bev": Style("BEV", marker="s", line="--"),
-    "ensemble": Style("ensemble", marker="^", line="-."),
-    "amvnet": Style("AMVNet", marker="D", line="-"),
+    "rv": {"marker": "o", "linestyle": ":"},
+    "bev": {"marker": "s", "linestyle": "--"},
+    "ensemble": {"marker": "^", "linestyle": "-."},
+    "amvnet": {"marker": "D", "linestyle": "-"},
 }
 
 
 def write_all(analysis: Analysis, dataset: str, out: Path) -> list[Path]:
-    """Write Figures 5, 6 and 8a and Tables 3 and 4 of the paper for one analysis.
+    """Write Figures 5, 6 and 8a and Tables 3 and 4 of the paper; return the files.
 
     Args:
-        analysis: what to draw and write.
         dataset: the dataset as the user named it, for the titles.
-        out: folder for the files.
-
-    Returns:
-        The files that were written.
     """
     return [
         *_write_similarity(analysis, dataset, out / "similarity"),
@@ -63,15 +50,11 @@ def write_sweep(
 ) -> list[Path]:
     """Write Figure 8 of the paper: mIoU and share of uncertain points for values of a parameter.
 
-    Args:
-        swept: the results for each value of the parameter.
-        name: the parameter's name.
-        used: the parameter's value in the weights.
-        dataset: the dataset as the user named it, for the title.
-        path: the files to write, without an ending.
+    Return the files.
 
-    Returns:
-        The files that were written.
+    Args:
+        used: the parameter's value in the weights.
+        path: the files to write, without an ending.
     """
     values = []
     mious = []
@@ -102,15 +85,12 @@ def write_sweep(
 
 
 def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path) -> list[Path]:
-    """Write Table 5 of the paper, the ablation of the range-view network.
+    """Write Table 5 of the paper, the ablation of the range-view network; return the files.
 
     Args:
         rows: for each network, whether it has the GRU, whether it was trained with class weights,
             and its metrics.
         path: the files to write, without an ending.
-
-    Returns:
-        The files that were written.
     """
     table: list[Sequence[Cell]] = []
     for gru, weighted, network_metrics in rows:
@@ -153,22 +133,15 @@ def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
     columns = ["from m", "to m"]
     figure, axes = _figure(f"mIoU by distance on {dataset}")
     for method, style in STYLES.items():
-        columns.append(f"{style.title} %")
+        title = title_of(method)
+        columns.append(f"{title} %")
         mious = []
         for row, extent in zip(table, methods[method]["by_distance"], strict=True):
             miou = _percent(extent["miou_present"])
             row.append(miou)
             mious.append(np.nan if miou is None else miou)
 
-        axes.plot(
-            middles,
-            mious,
-            label=style.title,
-            marker=style.marker,
-            linestyle=style.line,
-            color="black",
-            markersize=4,
-        )
+        axes.plot(middles, mious, label=title, color="black", markersize=4, **style)
 
     axes.set(xlabel="distance from the sensor (m)", ylabel="mIoU, classes present (%)")
     axes.legend(frameon=False)
@@ -179,8 +152,8 @@ def _write_classes(analysis: Analysis, path: Path) -> list[Path]:
     """Write Table 3 of the paper: IoU by class."""
     rows: list[list[Cell]] = [[name] for name in (*analysis.taxonomy.classes, "mIoU", "fwIoU")]
     columns = ["IoU %"]
-    for method, style in STYLES.items():
-        columns.append(style.title)
+    for method in STYLES:
+        columns.append(title_of(method))
         figures = metrics(analysis.evaluation.matrices[method][0], analysis.taxonomy)
         values = (*figures["iou"].values(), figures["miou"], figures["fwiou"])
         for row, value in zip(rows, values, strict=True):
@@ -191,14 +164,10 @@ def _write_classes(analysis: Analysis, path: Path) -> list[Path]:
 
 def _write_methods(analysis: Analysis, path: Path) -> list[Path]:
     """Write Table 4 of the paper: the networks, the ensembles and AMVNet."""
-    titles = {method: style.title for method, style in STYLES.items()}
-    titles["arithmetic"] = "arithmetic mean"
-    titles["ensemble"] = "geometric mean"
-
     rows: list[Sequence[Cell]] = []
     for method, matrices in analysis.evaluation.matrices.items():
         figures = metrics(matrices[0], analysis.taxonomy)
-        row: list[Cell] = [titles.get(method, method)]
+        row: list[Cell] = ["geometric mean" if method == "ensemble" else title_of(method)]
         for key in ("miou", "miou_present", "accuracy", "fwiou"):
             row.append(_percent(figures[key]))
         rows.append(row)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -103,27 +104,26 @@ class Evaluation:
 
     Attributes:
         taxonomy: the classes.
-        edges: distances from the sensor in metres. Each two neighbouring edges bound a bin;
-            points exactly on an edge are in no bin, as in SemanticKITTI's tool.
         matrices: method -> (bins + 1, K + 1, K + 1) counts; the first matrix is over all
-            distances.
+            distances, the others are of the bins between `EDGES`. Points exactly on an edge are in
+            no bin, as in SemanticKITTI's tool.
         scans: number of scans that were added.
         points: number of points in these scans, labelled or not.
         uncertain: number of uncertain points.
         asked: number of points of which it is known whether they are uncertain.
         labelled: number of points with a class here.
-        left_out: by name, the points of classes of the data that have none here.
+        left_out: by name, the points of classes of the data that have none here; `truth` of `add`
+            has them as 0.
     """
 
     taxonomy: Taxonomy
-    edges: Sequence[float] = EDGES
     matrices: dict[str, np.ndarray] = field(default_factory=dict)
     scans: int = 0
     points: int = 0
     uncertain: int = 0
     asked: int = 0
     labelled: int = 0
-    left_out: dict[str, int] = field(default_factory=dict)
+    left_out: Counter[str] = field(default_factory=Counter)
 
     def add(
         self,
@@ -158,50 +158,22 @@ class Evaluation:
             self.uncertain += int(np.count_nonzero(uncertain))
             self.asked += len(uncertain)
 
-    def leave_out(self, name: str, is_left_out: np.ndarray) -> None:
-        """Count the points of a scan that are of a class without a name here; `add` has them as 0.
-
-        Args:
-            name: of the class.
-            is_left_out: (N,) bool.
-        """
-        self._add_left_out(name, int(np.count_nonzero(is_left_out)))
-
     def left_out_shares(self) -> dict[str, float]:
         """Return the shares of the labelled points that are in classes left out, by name."""
-        total = self.labelled + sum(self.left_out.values())
+        total = self.labelled + self.left_out.total()
         return {name: points / total for name, points in self.left_out.items()}
 
-    def merge(self, other: Evaluation) -> None:
-        """Add the counts of another evaluation, which scored other scans.
-
-        Raises:
-            InputError: if its classes or its bins differ.
-        """
-        same_classes = self.taxonomy.classes == other.taxonomy.classes
-        same_edges = tuple(self.edges) == tuple(other.edges)
-        if not (same_classes and same_edges):
-            raise InputError(
-                f"expected an evaluation of {self.taxonomy.name} with edges {tuple(self.edges)}, "
-                f"found one of {other.taxonomy.name} with edges {tuple(other.edges)}; "
-                "merge evaluations of the same classes and edges"
-            )
-
-        self._add_counts(other.matrices)
-        self.scans += other.scans
-        self.points += other.points
-        self.uncertain += other.uncertain
-        self.asked += other.asked
-        self.labelled += other.labelled
-        for name, points in other.left_out.items():
-            self._add_left_out(name, points)
-
     def __add__(self, other: Evaluation) -> Evaluation:
-        """Return a new evaluation with the counts of both; raises the same errors as `merge`."""
-        total = Evaluation(self.taxonomy, self.edges)
-        total.merge(self)
-        total.merge(other)
-
+        """Return an evaluation of the scans of both, which have the same classes."""
+        total = Evaluation(self.taxonomy)
+        for part in (self, other):
+            total._add_counts(part.matrices)
+            total.scans += part.scans
+            total.points += part.points
+            total.uncertain += part.uncertain
+            total.asked += part.asked
+            total.labelled += part.labelled
+            total.left_out += part.left_out
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
@@ -227,7 +199,7 @@ class Evaluation:
 
     def _method_report(self, matrices: np.ndarray) -> dict[str, Any]:
         bins = []
-        for (near, far), matrix in zip(pairwise(self.edges), matrices[1:], strict=True):
+        for (near, far), matrix in zip(pairwise(EDGES), matrices[1:], strict=True):
             extent = {"from_m": float(near), "to_m": float(far), "points": int(matrix.sum())}
             bins.append({**extent, **metrics(matrix, self.taxonomy)})
 
@@ -236,7 +208,7 @@ class Evaluation:
     def _masks(self, points: np.ndarray) -> list[np.ndarray]:
         """Return one (N,) bool mask per bin: the points that are in it."""
         distances = np.linalg.norm(points[:, :3], axis=1)
-        return [(near < distances) & (distances < far) for near, far in pairwise(self.edges)]
+        return [(near < distances) & (distances < far) for near, far in pairwise(EDGES)]
 
     def _confusions(
         self, truth: np.ndarray, ids: np.ndarray, masks: Sequence[np.ndarray]
@@ -252,7 +224,3 @@ class Evaluation:
     def _add_counts(self, counts: Mapping[str, np.ndarray]) -> None:
         for method, matrices in counts.items():
             self.matrices[method] = self.matrices.get(method, 0) + matrices
-
-    def _add_left_out(self, name: str, points: int) -> None:
-        if points:
-            self.left_out[name] = self.left_out.get(name, 0) + points

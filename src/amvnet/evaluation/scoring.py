@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
@@ -20,30 +23,22 @@ from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import TopView, draw_scan
 from amvnet.files import inside
+from amvnet.inference.reading import check_scan
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmenter import Segmenter, check_scan
-from amvnet.models.methods import PAPER_METHODS
+from amvnet.inference.segmentation import expand_labels, expand_to_scan
+from amvnet.inference.segmenter import Segmenter
+from amvnet.models.amvnet import Scores
+from amvnet.models.methods import METHODS, PAPER_METHODS
+from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 
 Result = TypeVar("Result")
+# (N,) train ids by method, and (N,) bool: the uncertain points; None without two networks.
+MethodLabels = tuple[dict[str, np.ndarray], np.ndarray | None]
 
 PICTURES = 4  # scans that are drawn, evenly spaced
 MOST_LEFT_OUT = 0.5  # of the labelled points, in classes that a map of classes leaves out
-
-
-@dataclass(frozen=True)
-class MethodLabels:
-    """The labels of a scan with N points.
-
-    Attributes:
-        ids: (N,) train ids by method.
-        uncertain: (N,) bool, true for uncertain points; None if the labels are not those of two
-            networks.
-    """
-
-    ids: dict[str, np.ndarray]
-    uncertain: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -71,8 +66,6 @@ def evaluate(
     """Score the labels of some scans.
 
     Args:
-        dataset: the dataset that has the scans.
-        records: the scans.
         labeller: labels the scans, in the classes of the map if there is one.
         pictures: folder for pictures of a few of the scans from above; None draws none.
         classes: maps the classes of the dataset to those that are scored; None scores these.
@@ -97,17 +90,14 @@ def evaluate(
     for record, scan, labels in labelled:
         assert scan.labels is not None
         truth = table[scan.labels]
-        evaluation.add(scan.points, truth, labels.ids, labels.uncertain)
+        ids, uncertain = labels
+        evaluation.add(scan.points, truth, ids, uncertain)
         for train_id in np.flatnonzero(table[1:] == 0) + 1:
-            evaluation.leave_out(own.names[train_id], scan.labels == train_id)
+            count = int(np.count_nonzero(scan.labels == train_id))
+            evaluation.left_out += Counter({own.names[train_id]: count})
         if pictures is not None and record.name in pictured:
             view = TopView(
-                scan.points,
-                taxonomy,
-                labels.ids,
-                truth,
-                uncertain=labels.uncertain,
-                title=record.name,
+                scan.points, taxonomy, ids, truth, uncertain=uncertain, title=record.name
             )
             draw_scan(inside(pictures, f"{record.name.replace('/', '_')}.png"), view)
 
@@ -168,9 +158,6 @@ def label_by_weights(
     """Return what labels scans by several methods.
 
     Args:
-        dataset: the dataset that has the scans.
-        segmenter: the networks, with the parts that the methods need.
-        methods: names of the methods.
         classes: maps the classes of the weights to those that are scored; None if they are the
             same.
 
@@ -185,10 +172,50 @@ def label_by_weights(
     segmenter = segmenter.for_dataset(dataset)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
-        labels, uncertain = segmenter.labels_by_method(check_scan(scan), methods)
-        return MethodLabels({name: table[ids] for name, ids in labels.items()}, uncertain)
+        labels, uncertain = labels_by_method(segmenter, check_scan(scan), methods)
+        return {name: table[ids] for name, ids in labels.items()}, uncertain
 
     return Labeller(label, segmenter.at_once)
+
+
+def labels_by_method(
+    segmenter: Segmenter, scan: Scan, methods: Sequence[str] = PAPER_METHODS
+) -> MethodLabels:
+    """Label the N points of a scan by a segmenter's method and by those that it includes.
+
+    AMVNet includes the ensembles and each network alone; an ensemble includes the other ensembles
+    and each network alone; others of `methods` are left out. The networks run once.
+    """
+    batch = segmenter.batch([scan])
+    scores = segmenter.run(batch)
+    labels = {}
+    for name in methods:
+        values = scores.merged
+        if name != segmenter.method:
+            values = _scores_by(name, segmenter, scores, batch)
+        if values is not None:
+            labels[name] = expand_labels(values, scan.valid)
+
+    if not METHODS[segmenter.method].has_two_networks:
+        return labels, None
+    return labels, expand_to_scan(scores.uncertain, scan.valid)
+
+
+@torch.inference_mode()
+def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatch) -> Tensor | None:
+    """Return the scores (P, K) by another method than the segmenter's; None if it lacks one."""
+    f = scores.rv
+    g = scores.bev
+    ensemble = METHODS[name].ensemble
+    if name == "rv":
+        return f
+    if name == "bev":
+        return g
+    if name == "rv-knn" and f is not None:
+        return segmenter.vote(f, batch)
+    if ensemble is not None and f is not None and g is not None:
+        return ensemble(f, g)
+    return None
 
 
 def label_from_files(
@@ -197,8 +224,6 @@ def label_from_files(
     """Return what reads the labels of scans from a folder of predictions.
 
     Args:
-        dataset: the dataset that has the scans.
-        folder: the predictions.
         classes: maps the classes of the dataset to those that are scored; None scores these.
         is_mapped: whether the predictions have the ids of the map; else those of the dataset.
 
@@ -226,7 +251,7 @@ def label_from_files(
         return classes.table(dataset.taxonomy)[ids]
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
-        return MethodLabels({"predictions": read(record)})
+        return {"predictions": read(record)}, None
 
     return Labeller(label)
 

@@ -45,7 +45,6 @@ def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> str
     calibrates them once, in a few minutes, on simulated scans of the weights' sensor.
 
     Args:
-        segmenter: the segmenter.
         engine: one of `ENGINES`.
         say: told what takes long.
 
@@ -74,6 +73,7 @@ def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> str
 
 def _use_compile(segmenter: Segmenter) -> None:
     # A network is compiled for a number of threads; another one would compile it again.
+    segmenter.at_once = 1
     if segmenter.model.arrange is side_by_side:
         segmenter.model.arrange = one_after_the_other
     parts = METHODS[segmenter.method].parts
@@ -170,9 +170,7 @@ def exported(segmenter: Segmenter, int8: str | None = None, say: Say = say_nothi
     """Return the folder of a segmenter's exported networks, which are exported if necessary.
 
     Args:
-        segmenter: the segmenter.
         int8: as for `export`.
-        say: told what takes long.
     """
     check_libraries()
     weights = segmenter.weights

@@ -100,7 +100,6 @@ def export(
 
     Args:
         weights: trained weights, or the name or path of a weights file.
-        out: the folder.
         int8: convert the convolutions to int8, calibrated with these scans: as `predict` takes
             them, or `simulated`.
 
@@ -369,11 +368,7 @@ def _fold_weights(model: Any) -> None:
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:
-    """Run a file on the example inputs.
-
-    Returns:
-        Descriptions of the file's inputs and of its outputs, and the result.
-    """
+    """Run a file on the examples; return descriptions of inputs and outputs, and the result."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])

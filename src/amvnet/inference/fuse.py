@@ -13,11 +13,10 @@ from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_faults
-from amvnet.inference.reading import normaliser_for
+from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults
+from amvnet.inference.reading import check_scan, normaliser_for
 from amvnet.inference.scores import SURE, ScorePair, check_probabilities
 from amvnet.inference.segmentation import Segmentation, to_segmentation
-from amvnet.inference.segmenter import check_scan
 from amvnet.models.amvnet import LateFusion, Scores
 from amvnet.models.assertion import Disagreement
 from amvnet.models.point_head import PointHead
@@ -47,11 +46,18 @@ class Fusion:
     def __init__(self, head: Head = None, tau: float | None = None) -> None:
         if isinstance(head, str | Path):
             head = load(head)
-        self.model = _build_fusion(head, tau)
-        # The head sees the intensities, too.
+        assertion = Disagreement()
         self._intensity = None
         if isinstance(head, Weights):
+            assertion = Disagreement(head.model.assertion.threshold)
+            # The head sees the intensities, too.
             self._intensity = trained_intensity(head.training, head.sensor)
+            head = head.build_head()
+        if tau is not None:
+            assertion = Disagreement(tau)
+
+        point_head = None if head is None else copy.deepcopy(head).cpu().eval()
+        self.model = LateFusion(assertion, point_head)
 
     def __call__(self, points: np.ndarray | Scan, f: np.ndarray, g: np.ndarray) -> Segmentation:
         """Fuse (N, K) class probabilities of one scan's N points.
@@ -116,19 +122,6 @@ def fuse(
     return Fusion(head, tau)(points, f, g).labels
 
 
-def _build_fusion(head: PointHead | Weights | None, tau: float | None) -> LateFusion:
-    """Return the head with the assertion that chooses its points."""
-    assertion = Disagreement()
-    if isinstance(head, Weights):
-        assertion = Disagreement(head.model.assertion.threshold)
-        head = head.build_head()
-    if tau is not None:
-        assertion = Disagreement(tau)
-
-    point_head = None if head is None else copy.deepcopy(head).cpu().eval()
-    return LateFusion(assertion, point_head)
-
-
 def fuse_files(
     inputs: Sequence[str],
     pair: ScorePair,
@@ -143,10 +136,6 @@ def fuse_files(
     """Fuse two models' scores of scans, and write the labels as `predict` does.
 
     Args:
-        inputs: as for `predict`.
-        pair: the two models' scores.
-        output: where the labels are written.
-        options: which scans of the inputs to fuse.
         head: weights with a point head; None gives the ensemble.
         tau: threshold of the cosine similarity; None means the head's, or else the paper's.
         taxonomy: the classes if there is no head; None means those of the inputs.
@@ -170,31 +159,19 @@ def fuse_files(
         pair.a.find(scan.scores_path)
         pair.b.find(scan.scores_path)
 
-    segment = _segment_by(Fusion(head, tau), pair, taxonomy.size)
-    entries, faults = Pipeline(scans, segment, output, taxonomy).run(
-        {"fused": pair.to_dict()}, progress
-    )
+    fusion = Fusion(head, tau)
+
+    def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
+        results = []
+        for scan_input, scan in zip(inputs, loaded, strict=True):
+            checked = check_scan(scan)
+            f, g = pair.read(scan_input.scores_path, checked, taxonomy.size)
+            results.append(fusion(checked, f, g))
+        return results
+
+    pipeline = Pipeline(scans, segment, output, taxonomy)
+    entries, faults = pipeline.run({"fused": pair.to_dict()}, progress)
     check_faults(faults, len(scans))
     points = sum(entry.points for entry in entries)
     uncertain = sum(entry.uncertain for entry in entries)
     return len(scans), uncertain / max(points, 1)
-
-
-def _segment_by(fusion: Fusion, pair: ScorePair, classes: int) -> Segment:
-    """Return what fuses the scores that two models wrote for scans.
-
-    Args:
-        fusion: fuses the scores of one scan.
-        pair: the folders of scores.
-        classes: K.
-    """
-
-    def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
-        results = []
-        for scan_input, scan in zip(inputs, scans, strict=True):
-            checked = check_scan(scan)
-            f, g = pair.read(scan_input.scores_path, checked, classes)
-            results.append(fusion(checked, f, g))
-        return results
-
-    return segment

@@ -43,10 +43,8 @@ class Journal:
     journal has is on the disk, because `atomic_write` puts it there before.
 
     Args:
-        folder: of the output.
         settings: what the output depends on, as JSON types.
         done: entries of an earlier run that stay valid, from `read_journals`.
-        processes: those that share the run.
 
     Raises:
         InputError: if another run is writing into the folder.
@@ -127,10 +125,11 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
         if not path.is_file():
             continue
         earlier_settings, entries = _read(path)
-        if earlier_settings != settings:
-            changed = ", ".join(_changed_keys(earlier_settings, dict(settings)))
+        changed = [key for key in settings if settings[key] != earlier_settings.get(key)]
+        if changed:
+            names = ", ".join(changed)
             raise InputError(
-                f"{folder}: expected the settings of the earlier run, found another {changed}; "
+                f"{folder}: expected the settings of the earlier run, found another {names}; "
                 "resume it with the same, or leave --resume out to start over"
             )
         done.update({entry.scan: entry for entry in entries})
@@ -157,10 +156,12 @@ def _to_line(value: Any) -> str:
     return f"{json.dumps(value)}\n"
 
 
-def _read(path: Path) -> tuple[Any, list[Entry]]:
-    """Return the settings and the entries in a journal; None for settings that cannot be read."""
+def _read(path: Path) -> tuple[dict[str, Any], list[Entry]]:
+    """Return the settings, empty if they cannot be read, and the entries in a journal."""
     lines = path.read_text(errors="replace").splitlines(keepends=True)
     settings = _from_line(lines[0]) if lines else None
+    if not isinstance(settings, dict):
+        settings = {}
 
     entries = []
     for line in lines[1:]:
@@ -178,11 +179,3 @@ def _from_line(line: str) -> Any:
         return json.loads(line)
     except (ValueError, RecursionError):
         return None
-
-
-def _changed_keys(earlier: Any, settings: dict[str, Any]) -> list[str]:
-    """Return the keys of the settings whose values differ from those of an earlier run."""
-    if not isinstance(earlier, dict):
-        return list(settings)
-    keys = {**earlier, **settings}  # an option that was left out may have no key
-    return [key for key in keys if earlier.get(key) != settings.get(key)]

@@ -48,31 +48,24 @@ class ScanOptions:
 
 
 class InputScan(Protocol):
-    """One scan of the inputs, not read yet."""
+    """One scan of the inputs, not read yet.
 
-    @property
-    def name(self) -> str:
-        """The name for messages, unique among the scans of one input."""
+    Attributes:
+        name: for messages, unique among the scans of one input.
+        title: a short name for people who look at the scan.
+        source: the recording that it is from: a bag, a folder, a sequence.
+        path: the file that the scan is read from.
+        scores_path: of the `.npz` of its scores, relative to a folder of predictions.
+        is_normalised: whether `ring` is the row of each point in the range image, for
+            `Segmenter.by_ring`.
+    """
 
-    @property
-    def title(self) -> str:
-        """A short name for people who look at the scan."""
-
-    @property
-    def source(self) -> str:
-        """The recording that it is from: a bag, a folder, a sequence."""
-
-    @property
-    def path(self) -> Path:
-        """The file that the scan is read from."""
-
-    @property
-    def scores_path(self) -> Path:
-        """The path of the `.npz` of its scores, relative to a folder of predictions."""
-
-    @property
-    def is_normalised(self) -> bool:
-        """Whether `ring` is the row of each point in the range image, for `Segmenter.by_ring`."""
+    name: str
+    title: str
+    source: str
+    path: Path
+    scores_path: Path
+    is_normalised: bool
 
     def labels_path(self, kind: str) -> Path:
         """Return the path of the file of its labels, relative to a folder of predictions.
@@ -83,10 +76,7 @@ class InputScan(Protocol):
         """
 
     def load(self, labels: bool = False) -> LoadedScan:
-        """Read the scan.
-
-        Args:
-            labels: whether to read the ground truth too, if there is any.
+        """Read the scan, with the ground truth if `labels` and there is any.
 
         Raises:
             InputError: if it cannot be read.
@@ -114,62 +104,36 @@ class InputScan(Protocol):
         taxonomy: Taxonomy,
         uncertain: np.ndarray | None = None,
     ) -> Path:
-        """Write labels into a folder of predictions.
+        """Write labels into a folder of predictions; return the path of the file.
 
         Args:
-            folder: the folder.
             loaded: what `load` returned.
             ids: (N,) train ids.
             kind: the format for scan files; datasets have their own.
             taxonomy: turns the train ids of scan files into raw ids; datasets have their own.
             uncertain: (N,) bool, the uncertain points; None if unknown.
-
-        Returns:
-            The path of the file.
         """
 
 
-@dataclass(frozen=True)
 class DatasetScan:
     """A scan of a dataset.
 
-    Attributes:
-        dataset: has the scan.
-        record: its files.
+    Args:
         written: the classes of the labels that are written; None means those of the dataset.
     """
 
-    dataset: Dataset
-    record: ScanRecord
-    written: Taxonomy | None = None
-
-    @property
-    def name(self) -> str:
-        return self.record.name
-
-    @property
-    def title(self) -> str:
-        if "/" in self.record.name:
-            return self.record.name
-        # The name is a token of nuScenes. The file's name is easier to read: it ends in the time.
-        time = scan_stem(self.record.points_path).split("__")[-1]
-        return f"{self.record.sequence}/{time}"
-
-    @property
-    def source(self) -> str:
-        return self.record.sequence
-
-    @property
-    def path(self) -> Path:
-        return self.record.points_path
-
-    @property
-    def scores_path(self) -> Path:
-        return Path(self.record.prediction).with_suffix(".npz")
-
-    @property
-    def is_normalised(self) -> bool:
-        return self.dataset.is_normalised
+    def __init__(
+        self, dataset: Dataset, record: ScanRecord, written: Taxonomy | None = None
+    ) -> None:
+        self.dataset = dataset
+        self.record = record
+        self.written = written
+        self.name = record.name
+        self.title = _title_of(record)
+        self.source = record.sequence
+        self.path = record.points_path
+        self.scores_path = Path(record.prediction).with_suffix(".npz")
+        self.is_normalised = dataset.is_normalised
 
     def labels_path(self, kind: str) -> Path:
         return Path(self.record.prediction)
@@ -193,48 +157,38 @@ class DatasetScan:
         return self.dataset.write_prediction(self.record, folder, ids, self.written)
 
 
-@dataclass(frozen=True)
+def _title_of(record: ScanRecord) -> str:
+    if "/" in record.name:
+        return record.name
+    # The name is a token of nuScenes. The file's name is easier to read: it ends in the time.
+    time = scan_stem(record.points_path).split("__")[-1]
+    return f"{record.sequence}/{time}"
+
+
 class FileScan:
     """A scan in a file or a bag."""
 
-    scan: NamedScan
-    reader: FileReader
-
-    @property
-    def name(self) -> str:
-        return self.scan.name
-
-    @property
-    def title(self) -> str:
-        return self.scan.name
-
-    @property
-    def source(self) -> str:
-        return self.scan.source
-
-    @property
-    def path(self) -> Path:
-        return self.scan.path
-
-    @property
-    def scores_path(self) -> Path:
-        return Path(f"{self.scan.name}.npz")
-
-    @property
-    def is_normalised(self) -> bool:
-        return self.reader.is_normalising
+    def __init__(self, scan: NamedScan, reader: FileReader) -> None:
+        self.scan = scan
+        self.reader = reader
+        self.name = scan.name
+        self.title = scan.name
+        self.source = scan.source
+        self.path = scan.path
+        self.scores_path = Path(f"{scan.name}.npz")
+        self.is_normalised = reader.is_normalising
 
     def labels_path(self, kind: str) -> Path:
         if kind in label_bags.KINDS:
-            return label_bags.part_path(self.scan.name, kind)
-        return Path(f"{self.scan.name}.{kind}")
+            return label_bags.part_path(self.name, kind)
+        return Path(f"{self.name}.{kind}")
 
     def load(self, labels: bool = False) -> LoadedScan:
         return self.reader.read(self.scan)
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
         if path.is_dir():
-            stem = path / self.scan.name
+            stem = path / self.name
             paths = [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]
             path = next(filter(Path.is_file, paths), paths[0])
         return read_scan_labels(path, count, taxonomy)
@@ -249,19 +203,14 @@ class FileScan:
         taxonomy: Taxonomy,
         uncertain: np.ndarray | None = None,
     ) -> Path:
-        assert loaded.file_xyz is not None
+        xyz = loaded.file_xyz
+        assert xyz is not None
         if kind in label_bags.KINDS:
             assert loaded.message is not None  # predict checks that the scan is from a bag
-            points = label_points(loaded.file_xyz, ids, taxonomy, uncertain)
-            return label_bags.write_part(folder, self.scan.name, kind, loaded.message, points)
-        return write_scan_labels(
-            inside(folder, self.scan.name),
-            kind,
-            loaded.file_xyz,
-            ids,
-            taxonomy,
-            uncertain=uncertain,
-        )
+            points = label_points(xyz, ids, taxonomy, uncertain)
+            return label_bags.write_part(folder, self.name, kind, loaded.message, points)
+        path = inside(folder, self.name)
+        return write_scan_labels(path, kind, xyz, ids, taxonomy, uncertain=uncertain)
 
 
 def list_inputs(
@@ -276,7 +225,6 @@ def list_inputs(
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, a folder of these, or
             a pattern as `find_scans` takes it.
-        options: which scans of the inputs to use.
         taxonomy: the classes, of weights or as the user names them. If None, they are those of the
             datasets; scan files have nuScenes' if they end in `.pcd.bin`, else SemanticKITTI's.
         normaliser: normalises scan files to weights; None reads them as they are.

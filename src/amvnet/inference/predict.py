@@ -10,7 +10,6 @@ from typing import Any
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.detect import BAGS, FOLDER
-from amvnet.data.formats.rows import UNKNOWN
 from amvnet.data.labels import label_bags
 from amvnet.errors import InputError
 from amvnet.inference.journal import Entry
@@ -54,10 +53,6 @@ def predict(
 
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
-        segmenter: labels the scans.
-        output: what is written, and where.
-        options: which scans of the inputs to segment.
-        execution: how many scans at a time, and by which processes.
         sensor: what is known of the sensor of scan files; the rest is measured.
         classes: maps the classes of the weights to those that are written; None writes these.
         say: is told what was assumed of the sensor, and at the end how sure the labels are, if
@@ -87,7 +82,9 @@ def predict(
 
     settings = _settings(segmenter, output, normaliser.sensor, options, classes)
     if classes is not None:
-        scans = [_with_classes(scan, classes) for scan in scans]
+        for scan in scans:
+            if isinstance(scan, DatasetScan):
+                scan.written = classes.target
         taxonomy = classes.target
     execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
     segment = segment_by(segmenter, classes)
@@ -99,13 +96,6 @@ def predict(
         report(entries, segmenter.usual_uncertain, say)
     check_faults(faults, len(scans))
     return len(scans)
-
-
-def _with_classes(scan: InputScan, classes: ClassMap) -> InputScan:
-    """Return a scan whose labels are written as those of mapped classes."""
-    if isinstance(scan, DatasetScan):
-        return replace(scan, written=classes.target)
-    return scan
 
 
 def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
@@ -149,7 +139,6 @@ def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment
     """Return what segments scans of the inputs; those that are normalised, by their rings.
 
     Args:
-        segmenter: labels the scans.
         classes: maps the labels to other classes; None leaves them.
     """
     by_ring = segmenter.by_ring()
@@ -201,27 +190,17 @@ def _settings(
 ) -> dict[str, Any]:
     """Return what the written files depend on, as JSON types."""
     weights = segmenter.weights
-    settings: dict[str, Any] = {
+    return {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": segmenter.method,
+        "precision": segmenter.precision,
+        "engine": "int8" if segmenter.engine == "int8" else None,  # no other one changes labels
+        "tau": segmenter.tau,
         "sensor": repr(sensor),
+        "topic": options.topic,
+        "layout": repr(options.layout),
+        "classes": None if classes is None else repr(classes),
         "scores": output.scores,
         "uncertain": output.uncertain,
         "format": output.kind,
     }
-
-    if segmenter.precision != "float32":
-        settings["precision"] = segmenter.precision
-    if segmenter.engine == "int8":  # no other engine changes labels
-        settings["engine"] = segmenter.engine
-    if segmenter.tta is not None:
-        settings["tta"] = segmenter.tta
-    if segmenter.tau is not None:
-        settings["tau"] = segmenter.tau
-    if options.topic is not None:
-        settings["topic"] = options.topic
-    if options.layout != UNKNOWN:
-        settings["layout"] = repr(options.layout)
-    if classes is not None:
-        settings["classes"] = repr(classes)
-    return settings

@@ -31,11 +31,9 @@ def stream_groups(
     """Read scans and compute on groups of them, of which only a few are in memory at a time.
 
     Args:
-        records: say what to read.
         load: reads a scan; called in one other thread, in the order of the records.
         compute: takes a group of records, each with its scan as it is being read; called in
             `at_once` other threads, or if that is 1, in this one.
-        batch: scans of a group.
         at_once: groups that are computed at the same time, each with a share of torch's threads.
 
     Yields:

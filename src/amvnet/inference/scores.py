@@ -218,11 +218,7 @@ def check_probabilities(values: np.ndarray, name: str, advice: str) -> None:
 
 
 def check_finite(values: np.ndarray, name: str) -> None:
-    """Check that all scores are finite.
-
-    Raises:
-        InputError: if one is NaN or infinite.
-    """
+    """Check that all scores are finite; raise InputError if one is NaN or infinite."""
     if not np.isfinite(values).all():
         raise InputError(
             f"{name}: expected finite scores, found NaN or infinity among them; give probabilities"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
-import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -133,17 +131,17 @@ class Segmentation:
     @property
     def class_names(self) -> tuple[str, ...]:
         """K + 1 names of the classes, by id; the name of id 0 is "unlabelled"."""
-        return self._origin().taxonomy.names
+        return self.require_origin().taxonomy.names
 
     @property
     def colors(self) -> NDArray[np.uint8]:
         """(K + 1, 3) RGB colours of the classes in 0..255, by id: `colors[labels]` is (N, 3)."""
-        return np.asarray(self._origin().taxonomy.colors, dtype=np.uint8)
+        return np.asarray(self.require_origin().taxonomy.colors, dtype=np.uint8)
 
     @property
     def raw_ids(self) -> NDArray[np.uint32]:
         """(N,) the labels as the benchmark's files number them (10 is a car of SemanticKITTI)."""
-        raw: NDArray[np.uint32] = self._origin().taxonomy.to_raw(self.labels)
+        raw: NDArray[np.uint32] = self.require_origin().taxonomy.to_raw(self.labels)
         return raw
 
     @property
@@ -175,7 +173,7 @@ class Segmentation:
             InputError: if the ending is another one, the path is that of the scan itself, a library
                 for the format is missing, or the file cannot be written.
         """
-        origin = self._origin()
+        origin = self.require_origin()
         path = Path(path)
         kind = path.suffix.removeprefix(".")
         if kind not in KINDS:
@@ -197,42 +195,8 @@ class Segmentation:
             uncertain=self.uncertain if has_two_networks else None,
         )
 
-    def show(self, path: Path | str | None = None, open_browser: bool = True) -> Path:
-        """Write a self-contained HTML page that shows the scan in 3D, and open it.
-
-        It shows the labels, those of each network, uncertain points, and errors if the scan has
-        labels.
-
-        Args:
-            path: the file, NAME.html; by default in a temporary folder.
-            open_browser: whether to open the page in a browser.
-
-        Returns:
-            The path of the page.
-
-        Raises:
-            InputError: if the file cannot be written.
-        """
-        # Viewing is built on inference. Imported here, it closes no circle.
-        from amvnet.viewing.frames import frame_of
-        from amvnet.viewing.page import write_page
-
-        origin = self._origin()
-        title = origin.scan.name or "scan"
-        if path is None:
-            path = Path(tempfile.mkdtemp(prefix="amvnet-")) / "scan.html"
-
-        page = write_page(path, [frame_of(self, origin)], origin.taxonomy, Path(title).name)
-        if open_browser:
-            webbrowser.open(page.resolve().as_uri())
-        return page
-
-    def _origin(self) -> Origin:
-        """Return the origin.
-
-        Raises:
-            InputError: if there is none.
-        """
+    def require_origin(self) -> Origin:
+        """Return the origin; raise InputError if there is none."""
         if self.origin is None:
             raise InputError(
                 "expected the result of a Segmenter, which knows its classes and points, "

@@ -16,17 +16,14 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import array_scan, normaliser_for
+from amvnet.inference.reading import array_scan, check_scan, normaliser_for
 from amvnet.inference.segmentation import (
     Origin,
     Segmentation,
-    expand_labels,
-    expand_to_scan,
     fetch,
     unpack,
 )
-from amvnet.inference.symmetries import SYMMETRIES, Score, average, check_tta
-from amvnet.memory import available_memory, keep_freed_memory, return_freed_memory
+from amvnet.memory import available_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.assertion import Disagreement
 from amvnet.models.graphs import Captured
@@ -34,10 +31,8 @@ from amvnet.models.layers import freeze
 from amvnet.models.methods import (
     METHODS,
     ONNX_ENGINES,
-    PAPER_METHODS,
     MethodName,
     Precision,
-    TtaName,
     check_method,
 )
 from amvnet.models.polar_net import PolarNet
@@ -46,12 +41,7 @@ from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import Voting
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import (
-    TrainedIntensity,
-    check_intensity,
-    match_scan,
-    trained_intensity,
-)
+from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
 from amvnet.threads import BusyMachine, survive_forks
 from amvnet.weights.file import Weights, load
 
@@ -71,26 +61,23 @@ class Segmenter:
         precision: of the two networks: "float32", "bfloat16", on a GPU "float16", or "auto":
             bfloat16 on a GPU that has it, else float32. Everything else is computed in float32, the
             projections in float64.
-        keep_memory: on a CPU, let the whole process keep freed memory (`keep_freed_memory`), which
-            saves time for each scan. This changes the allocator of your program.
-        tta: test-time augmentation: the networks' class probabilities are means over "flips" of the
-            scan in x and y, "yaw" turns by quarters (4 passes of the networks each), or "both" (8).
         tau: points whose class probabilities by the two networks have a cosine similarity of at
             most this are uncertain, in [0, 1]; None means as the weights say.
         graphs: on a GPU, capture the networks as CUDA graphs (`models.graphs`), once for each
             number of scans in a batch.
 
     Attributes:
-        weights, device, precision, tta, tau: as given, the weights as `Weights`; device and
+        weights, device, method, precision, tau: as given, the weights as `Weights`; device and
             precision are never "auto", but what it stands for.
-        method: the name of the method.
+        at_once: scans to segment at the same time, each with its share of torch's threads: by
+            default on a CPU, one for each thread, if the memory suffices.
         intensity: the intensities of the training, to which those of a scan may be brought
             (`sensors.intensity.match_scan`); None if unknown.
         model: the networks and the head, on the device.
 
     Raises:
         InputError: if the weights lack a part that the method needs, or there is no such method,
-            device, precision or augmentation, or tau is out of range.
+            device or precision, or tau is out of range.
     """
 
     def __init__(
@@ -99,27 +86,23 @@ class Segmenter:
         device: str = "auto",
         method: MethodName = "amvnet",
         precision: Precision = "auto",
-        keep_memory: bool = False,
-        tta: TtaName | None = None,
         tau: float | None = None,
         graphs: bool = True,
     ) -> None:
         self.weights = weights if isinstance(weights, Weights) else load(weights)
         self.method = check_method(method, self.weights.parts)
-        self.tta = check_tta(tta)
         self.tau = tau
         self.device = check_device(choose_device(device))
         self.precision = choose_precision(precision, self.device)
         self.engine = "torch"
-        self._at_once: int | None = None
+        self.at_once = 1
+        if self.device == "cpu":
+            self.at_once = max(min(torch.get_num_threads(), available_memory() // EACH), 1)
 
         # Weights that were trained with other intensities take them, too.
         self.intensity = trained_intensity(self.weights.training, self.weights.sensor)
         self._are_fractions = self.intensity is None or self.intensity.quantiles[-1] <= 1
 
-        self._keeps_memory = keep_memory and self.device == "cpu"
-        if self._keeps_memory:
-            keep_freed_memory()
         survive_forks()
         self._machine = BusyMachine()
 
@@ -134,25 +117,6 @@ class Segmenter:
         if ensemble is not None:
             self.model.ensemble = ensemble
             self.model.point_head = None
-
-    @property
-    def at_once(self) -> int:
-        """Scans to segment at the same time, each with its share of torch's threads.
-
-        If it was not set, it is the best number for the device and the engine: on a CPU, one for
-        each thread, if the memory suffices.
-        """
-        if self._at_once is not None:
-            return self._at_once
-        if self.device != "cpu" or self.engine == "compile":
-            return 1
-        return max(min(torch.get_num_threads(), available_memory() // EACH), 1)
-
-    @at_once.setter
-    def at_once(self, count: int) -> None:
-        if count < 1:
-            raise InputError(f"expected one scan or more at a time, found {count}; set --at-once")
-        self._at_once = count
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -214,10 +178,10 @@ class Segmenter:
         checked = [check_scan(points, self.intensity) for points in scans]
         uses_team = self.device == "cpu" and self.engine not in ONNX_ENGINES
         is_large = sum(map(len, checked)) >= LARGE
-        memory = return_freed_memory() if self._keeps_memory and is_large else nullcontext()
+        memory = return_freed_memory() if is_large else nullcontext()
         with self._machine.watch(uses_team), memory:
             batch = self.batch(checked)
-            labels, scores = fetch(self._run(batch))
+            labels, scores = fetch(self.run(batch))
 
         results = []
         for scan, points in zip(checked, batch.slices(), strict=True):
@@ -282,70 +246,20 @@ class Segmenter:
         """Return the segmenter for the scans of a dataset: `by_ring` if these are normalised."""
         return self.by_ring() if dataset.is_normalised else self
 
-    def labels_by_method(
-        self, scan: Scan, methods: Sequence[str] = PAPER_METHODS
-    ) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
-        """Label the N points of a scan by this segmenter's method and by those that it includes.
-
-        AMVNet includes the ensembles and each network alone; an ensemble includes the other
-        ensembles and each network alone. The networks run once.
-
-        Returns:
-            (N,) train ids by method, of those among `methods` that are included; and (N,) bool,
-            the uncertain points, or None without two networks.
-        """
-        batch = self.batch([scan])
-        scores = self._run(batch)
-        labels = {}
-        for name in methods:
-            values = self._scores_of(name, scores, batch)
-            if values is not None:
-                labels[name] = expand_labels(values, scan.valid)
-
-        if not METHODS[self.method].has_two_networks:
-            return labels, None
-        return labels, expand_to_scan(scores.uncertain, scan.valid)
-
     @torch.inference_mode()
-    def _run(self, batch: PointBatch) -> Scores:
+    def run(self, batch: PointBatch) -> Scores:
         """Score the points of a batch by the method of this segmenter."""
         model = self.model
-        if self.method == "bev":
-            (g,) = self._average(lambda turned: (model.score_polar_view(turned),), batch)
-            return Scores(g, _nowhere(g), rv=None, bev=g)
-        if not METHODS[self.method].has_two_networks:
-            (f,) = self._average(lambda turned: (model.score_range_view(turned),), batch)
-            y = self._vote(f, batch) if self.method == "rv-knn" else f
-            return Scores(y, _nowhere(y), rv=f, bev=None)
-
-        if self.tta is None:
+        if METHODS[self.method].has_two_networks:
             return model(batch)
-        f, g = self._average(lambda turned: model.score(*model.project(turned)), batch)
-        return model.fuse(batch, f, g)
+        if self.method == "bev":
+            g = model.score_polar_view(batch)
+            return Scores(g, _nowhere(g), rv=None, bev=g)
+        f = model.score_range_view(batch)
+        y = self.vote(f, batch) if self.method == "rv-knn" else f
+        return Scores(y, _nowhere(y), rv=f, bev=None)
 
-    def _average(self, score: Score, batch: PointBatch) -> tuple[Tensor, ...]:
-        """Return class probabilities, with test-time augmentation as means over symmetries."""
-        return score(batch) if self.tta is None else average(score, batch, SYMMETRIES[self.tta])
-
-    @torch.inference_mode()
-    def _scores_of(self, name: str, scores: Scores, batch: PointBatch) -> Tensor | None:
-        """Return the scores (P, K) by a method; None if this segmenter's does not include it."""
-        f = scores.rv
-        g = scores.bev
-        ensemble = METHODS[name].ensemble
-        if name == self.method:
-            return scores.merged
-        if name == "rv":
-            return f
-        if name == "bev":
-            return g
-        if name == "rv-knn" and f is not None:
-            return self._vote(f, batch)
-        if ensemble is not None and f is not None and g is not None:
-            return ensemble(f, g)
-        return None
-
-    def _vote(self, f: Tensor, batch: PointBatch) -> Tensor:
+    def vote(self, f: Tensor, batch: PointBatch) -> Tensor:
         """Return the shares of votes (P, K) of neighbours in the range image."""
         return Voting()(f, batch, self.model.range_view.project(batch))
 
@@ -361,27 +275,6 @@ class Segmenter:
             scans = [check_intensity(scan) for scan in scans]
         scans = [match_scan(scan, self.intensity) for scan in scans]
         return PointBatch.of(scans, self.device)
-
-
-def check_scan(points: np.ndarray | Scan, trained: TrainedIntensity | None = None) -> Scan:
-    """Make a `Scan` of an array of points, and check that at least one point is valid.
-
-    Args:
-        points: a scan, or an array as `array_scan` takes it.
-        trained: the intensities of the training, for an array that has none.
-
-    Raises:
-        InputError: if there is no point, or none is valid.
-    """
-    scan = points if isinstance(points, Scan) else array_scan(points, trained=trained)
-    if not scan.valid.any():
-        problem = "none finite" if len(scan) else "none"
-        raise InputError(
-            f"{scan.name or 'scan'}: expected points to segment, found {problem}; "
-            "leave the scan out"
-        )
-
-    return scan
 
 
 def _is_gpu(device: str) -> bool:

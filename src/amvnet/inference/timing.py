@@ -1,7 +1,4 @@
-"""Time per stage from a scan's file to its written labels, and the networks' share of the limit.
-
-The limit is the speed of a large matrix product on the same machine.
-"""
+"""Time per stage from a scan's file to its written labels."""
 
 from __future__ import annotations
 
@@ -16,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.schema import Recipe
 from amvnet.data.taxonomy import TAXONOMIES
@@ -26,7 +22,6 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.memory import peak_memory
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertion import cosine_similarity
-from amvnet.models.layers import linear
 from amvnet.models.methods import geometric_mean
 from amvnet.models.streams import one_after_the_other
 from amvnet.progress import Progress, no_progress
@@ -34,12 +29,9 @@ from amvnet.scan import Scan
 from amvnet.weights.file import PARTS, Weights, part_state
 
 STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")
-NETWORKS = ("RV", "BEV")
 FUSION = ("compare", "neighbours", "head", "merge")
 MEAN = "mean"  # what the ensemble does instead of the fusion
 WARM_UP = 2  # runs that do not count
-PRODUCT = (4096, 1024, 1024)  # rows, inner size and columns of the matrix product
-PRODUCT_RUNS = 3  # before each round
 UNCERTAIN = 0.1  # of the points, for random weights, which cannot tell
 MEBIBYTE = 2**20
 
@@ -52,7 +44,6 @@ class Job:
         segmenter: with all of AMVNet.
         read: reads the scan.
         write: writes its (P,) train ids.
-        name: of the engine, or whatever distinguishes it from other jobs.
         share: of the points that count as uncertain: those on which the networks agree least; None
             means as tau says.
     """
@@ -60,7 +51,6 @@ class Job:
     segmenter: Segmenter
     read: Callable[[], Scan]
     write: Callable[[np.ndarray], object]
-    name: str = "torch"
     share: float | None = None
 
 
@@ -76,6 +66,10 @@ class Timing:
     def all(self) -> float:
         """Seconds from the file to the written labels."""
         return sum(self.seconds[stage] for stage in STAGES)
+
+    def share_of(self, stages: Sequence[str]) -> float:
+        """Return the share of some stages in this time."""
+        return sum(self.seconds[stage] for stage in stages) / self.all
 
 
 @dataclass(frozen=True)
@@ -93,48 +87,29 @@ class LeastAgreeing:
         return uncertain
 
 
-def time_jobs(
-    jobs: Sequence[Job], runs: int, progress: Progress = no_progress
-) -> list[dict[str, Any]]:
-    """Time some jobs in turn, so that a disturbance hits all of them.
-
-    Returns:
-        A report of each job, for JSON.
+def time_job(job: Job, runs: int, progress: Progress = no_progress) -> dict[str, Any]:
+    """Time a job some times, and return a report for JSON.
 
     Raises:
-        InputError: if there is no run to time, or the weights have no point head.
+        InputError: if there is no run to time, the segmenter is not of AMVNet, or the share of
+            uncertain points is out of range.
     """
     if runs < 1:
         raise InputError(f"expected one run or more, found {runs}; give a number from 1")
-    for job in jobs:
-        _check_job(job)
-
-    timings: list[list[Timing]] = [[] for _ in jobs]
-    limits: dict[str, float] = {}
-    for run in range(runs + WARM_UP):
-        for kind, speed in product_limits(jobs[0].segmenter.device).items():
-            limits[kind] = max(speed, limits.get(kind, 0))
-        for job, timings_of_job in zip(jobs, timings, strict=True):
-            timings_of_job.append(run_once(job))
-
-        progress(run + 1, runs + WARM_UP)
-
-    reports = []
-    for job, timings_of_job in zip(jobs, timings, strict=True):
-        reports.append(_report(job, timings_of_job[WARM_UP:], limits))
-    return reports
-
-
-def _check_job(job: Job) -> None:
-    method = job.segmenter.method
-
-    if method != "amvnet":
-        raise InputError(f"expected AMVNet to time, found the method {method}; use amvnet")
-
+    if job.segmenter.method != "amvnet":
+        raise InputError(
+            f"expected AMVNet to time, found the method {job.segmenter.method}; use amvnet"
+        )
     if job.share is not None and not 0 <= job.share <= 1:
         raise InputError(
             f"expected a share of uncertain points from 0 to 1, found {job.share}; give another"
         )
+
+    timings = []
+    for run in range(runs + WARM_UP):
+        timings.append(run_once(job))
+        progress(run + 1, runs + WARM_UP)
+    return _report(job, timings[WARM_UP:])
 
 
 @torch.inference_mode()
@@ -172,7 +147,7 @@ class _Clock:
 
     def __init__(self, device: str) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
-        self._gpu = device.startswith("cuda")
+        self._gpu = _is_cuda(device)
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -185,106 +160,36 @@ class _Clock:
         self.seconds[stage] += time.perf_counter() - start
 
 
-def _report(job: Job, timings: Sequence[Timing], limits: dict[str, float]) -> dict[str, Any]:
+def _report(job: Job, timings: Sequence[Timing]) -> dict[str, Any]:
     stages = {}
     for stage in (*STAGES, MEAN):
-        stages[stage] = _spread([timing.seconds[stage] for timing in timings], unit=1e3)
+        stages[stage] = _spread([1e3 * timing.seconds[stage] for timing in timings])
 
-    flops = _flops(job)
-    networks = {}
-    for name in NETWORKS:
-        speed = flops[name] / stages[name]["median"] / 1e6  # GFLOP/s
-        networks[name] = {
-            "gflop": flops[name] / 1e9,
-            "gflop_per_s": speed,
-            "share_of_limit": speed / limits["float32"],
-        }
-
-    fusion_shares = [_sum(timing, FUSION) / timing.all for timing in timings]
-    over_networks = [timing.all / _sum(timing, NETWORKS) for timing in timings]
-
+    device = job.segmenter.device
+    memory = torch.cuda.max_memory_allocated(device) if _is_cuda(device) else peak_memory()
     return {
-        "engine": job.name,
-        "device": job.segmenter.device,
+        "engine": job.segmenter.engine,
+        "precision": job.segmenter.precision,
+        "device": device,
         "threads": torch.get_num_threads(),
         "runs": len(timings),
         "points": timings[0].points,
         "uncertain": timings[0].uncertain,
         "stages_ms": stages,
-        "all_ms": _spread([timing.all for timing in timings], unit=1e3),
-        "fusion_share": _spread(fusion_shares, unit=1),
-        "all_over_networks": _spread(over_networks, unit=1),
-        "networks": networks,
-        "limit_gflop_per_s": limits,
-        "peak_memory_mib": _peak_memory(job.segmenter.device) / MEBIBYTE,
+        "all_ms": _spread([1e3 * timing.all for timing in timings]),
+        "fusion_share": _spread([timing.share_of(FUSION) for timing in timings]),
+        "peak_memory_mib": memory / MEBIBYTE,
     }
 
 
-def _sum(timing: Timing, stages: Sequence[str]) -> float:
-    return sum(timing.seconds[stage] for stage in stages)
-
-
-def _spread(values: Sequence[float], unit: float) -> dict[str, float]:
+def _spread(values: Sequence[float]) -> dict[str, float]:
     """Return the median and the quartiles."""
-    low, median, high = np.quantile(np.asarray(values) * unit, (0.25, 0.5, 0.75)).tolist()
+    low, median, high = np.quantile(values, (0.25, 0.5, 0.75)).tolist()
     return {"median": median, "low": low, "high": high}
 
 
-def _flops(job: Job) -> dict[str, float]:
-    """Return each network's floating-point operations; a multiply-add counts as two."""
-    device = job.segmenter.device
-    # A counter sees one thread only, and `run_parts` uses several unless gradients are enabled.
-    model = job.segmenter.weights.build().requires_grad_(False).to(device)
-    batch = job.segmenter.batch([job.read()])
-
-    counts = {}
-    for name, score in (("RV", model.score_range_view), ("BEV", model.score_polar_view)):
-        with FlopCounterMode(display=False) as counter:
-            score(batch)
-        counts[name] = float(counter.get_total_flops())
-
-    return counts
-
-
-def product_limits(device: str) -> dict[str, float]:
-    """Return the GFLOP/s of a large matrix product, the fastest way that torch has, by type.
-
-    The types are float32, and on a GPU bfloat16.
-    """
-    types = [torch.float32, torch.bfloat16] if device.startswith("cuda") else [torch.float32]
-    rows, inner, columns = PRODUCT
-
-    limits = {}
-    for kind in types:
-        x = torch.randn(rows, inner, dtype=kind, device=device)
-        weight = torch.randn(columns, inner, dtype=kind, device=device)
-
-        seconds = min(_fastest(_matmul, x, weight), _fastest(linear, x, weight))
-        limits[str(kind).removeprefix("torch.")] = 2 * rows * inner * columns / seconds / 1e9
-    return limits
-
-
-def _matmul(x: Tensor, weight: Tensor, bias: None) -> Tensor:
-    return x @ weight.T
-
-
-@torch.inference_mode()
-def _fastest(product: Callable[[Tensor, Tensor, None], Tensor], x: Tensor, weight: Tensor) -> float:
-    """Return the seconds of the fastest of a few runs."""
-    seconds = []
-    for _ in range(PRODUCT_RUNS):
-        clock = _Clock(str(x.device))
-        with clock("product"):
-            product(x, weight, None)
-
-        seconds.append(clock.seconds["product"])
-
-    return min(seconds)
-
-
-def _peak_memory(device: str) -> int:
-    """Return the peak memory in bytes: of the GPU, or of the process."""
-    return torch.cuda.max_memory_allocated(device) if device.startswith("cuda") else peak_memory()
+def _is_cuda(device: str) -> bool:
+    return device.startswith("cuda")
 
 
 def untrained(recipe: Recipe) -> Weights:

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 MethodName = Literal["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
-TtaName = Literal["flips", "yaw", "both"]  # of a scan, over which probabilities are averaged
 Precision = Literal["auto", "float32", "bfloat16", "float16"]  # of the two networks
 EngineName = Literal["auto", "torch", "compile", "onnx", "int8"]  # what runs the two networks
 Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]  # f, g: (P, K) -> (P, K)

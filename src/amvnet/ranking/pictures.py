@@ -8,7 +8,8 @@ import numpy as np
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.evaluation.top_view import TopView, draw_scan
-from amvnet.inference.segmenter import Segmenter, check_scan
+from amvnet.inference.reading import check_scan
+from amvnet.inference.segmenter import Segmenter
 from amvnet.ranking.label_errors import Ranking, find_clusters, find_doubts
 from amvnet.scan import Scan
 

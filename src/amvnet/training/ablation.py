@@ -14,6 +14,7 @@ from amvnet.evaluation.analysis import Swept
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.precision import choose_device
 from amvnet.progress import Say, say_nothing
 from amvnet.training.plan import Plan
 from amvnet.training.run import train
@@ -101,7 +102,7 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
         recipe = _ablated(plan.recipe, gru, weighted)
         path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name), "rv")
 
-        segmenter = Segmenter(path, plan.processes.device(device), "rv")
+        segmenter = Segmenter(path, plan.processes.device(choose_device(device)), "rv")
         scans = plan.scans
         evaluation = evaluate(
             scans.dataset,

@@ -104,11 +104,6 @@ def paste(scan: Scan, other: Scan, classes: Sequence[int], rng: np.random.Genera
 
     They are added at their place, and once or twice more, rotated by a random yaw. What they hide
     stays in the scan.
-
-    Args:
-        scan: the scan to add to.
-        other: a scan with labels.
-        classes: the train ids to add.
     """
     assert other.labels is not None
     objects = _select(other, np.isin(other.labels, classes) & other.valid)
@@ -132,12 +127,8 @@ def disturb(scores: Tensor, points: Tensor, rng: np.random.Generator) -> Tensor:
     like those of the network's training.
 
     Args:
-        scores: (P, K) probabilities.
+        scores: (P, K) probabilities, as is the result.
         points: (P, 4) x, y, z, intensity.
-        rng: draws the changes.
-
-    Returns:
-        (P, K) probabilities.
     """
     temperature = float(np.exp(rng.uniform(0, np.log(HOTTEST))))
     softened = scores.clamp_min(1e-7).log().div(temperature).softmax(dim=1)

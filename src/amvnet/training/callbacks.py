@@ -5,12 +5,11 @@ from __future__ import annotations
 import csv
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning as L
 import numpy as np
@@ -21,22 +20,23 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError
+from amvnet.data.spacing import evenly_spaced
 from amvnet.evaluation.top_view import TopView, scan_figure
 from amvnet.files import atomic_write
 from amvnet.memory import peak_memory
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
+from amvnet.sensors.intensity import TrainedIntensity, match_scan
+from amvnet.training.loaders import sensor_record
+from amvnet.training.plan import LoggerName, Plan, check_logger
+from amvnet.training.run_folder import PART_OF, SETTINGS, description, stage_settings
 from amvnet.weights.file import Weights, part_state, save
 
+PICTURED_SCANS = 2
 PICTURE_ROUNDS = 10  # about how many times in a training pictures are drawn
 PICTURE_DPI = 60
-SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
 
-LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
 PROJECT = "amvnet"  # the project of Weights & Biases, and the experiment of MLflow
-LIBRARIES = ("wandb", "mlflow")  # loggers that need a library of the same name
 WITH_PICTURES = ("tensorboard", "wandb", "mlflow")
 
 
@@ -69,8 +69,8 @@ class AverageWeights(Callback):
         self.average = state_dict["average"]
         self.steps = state_dict["steps"]
 
-    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        weights = _trained_part(pl_module).state_dict()
+    def on_fit_start(self, trainer: L.Trainer, pl_module: Any) -> None:
+        weights = pl_module.trained.state_dict()
         if not self.average:
             self.average = _copies(weights)
             self.initial = _copies(weights) if self.initial_share else {}
@@ -88,7 +88,7 @@ class AverageWeights(Callback):
             return
 
         decay = min(self.decay, (1 + self.steps) / (10 + self.steps))
-        weights = _trained_part(pl_module).state_dict()
+        weights = pl_module.trained.state_dict()
         floats = [name for name, value in weights.items() if value.is_floating_point()]
         torch._foreach_lerp_(
             [self.average[name] for name in floats], [weights[name] for name in floats], 1 - decay
@@ -97,11 +97,11 @@ class AverageWeights(Callback):
             self.average[name].copy_(weights[name])
         self.steps = trainer.global_step
 
-    def on_validation_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._insert(_trained_part(pl_module))
+    def on_validation_start(self, trainer: L.Trainer, pl_module: Any) -> None:
+        self._insert(pl_module.trained)
 
-    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._remove(_trained_part(pl_module))
+    def on_validation_end(self, trainer: L.Trainer, pl_module: Any) -> None:
+        self._remove(pl_module.trained)
 
     @contextmanager
     def inserted(self, part: nn.Module) -> Iterator[None]:
@@ -134,27 +134,20 @@ class KeepWeights(Callback):
 
     Without validation the last weights are kept as the best.
 
-    Args:
-        folder: of the stage; receives last.safetensors, best.safetensors and `SETTINGS`.
-        part: name of the trained part.
-        weights: that the stage begins with.
-        settings: of the stage.
-        description: of the training, for the weights files.
+    The folder of the stage receives last.safetensors, best.safetensors and `SETTINGS`.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        part: str,
-        weights: Weights,
-        settings: dict[str, Any],
-        description: dict[str, Any],
+        self, plan: Plan, name: str, weights: Weights, intensity: TrainedIntensity | None
     ) -> None:
-        self.folder = folder
-        self.part = part
+        self.folder = plan.out / name
+        self.part = PART_OF[name]
         self.weights = weights
-        self.settings = settings
-        self.description = description
+        self.settings = stage_settings(plan, name, weights)
+        self.description: dict[str, Any] = {}
+        if plan.processes.first:  # the others do not write
+            sensor = sensor_record(plan.scans.dataset, plan.scans.train, intensity)
+            self.description = description(plan, self.settings, sensor)
         self.started = time.time()
         self.highest = -1.0  # mIoU of the best weights so far
 
@@ -164,7 +157,7 @@ class KeepWeights(Callback):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.highest = state_dict["highest"]
 
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         metrics = {}
         for name, value in _metrics(trainer).items():
             if name.startswith("val/"):
@@ -177,7 +170,7 @@ class KeepWeights(Callback):
             self.highest = max(self.highest, miou)
 
         if trainer.is_global_zero:
-            with _weights_to_keep(trainer, pl_module) as module:
+            with _weights_to_keep(trainer, pl_module.trained) as module:
                 trained = self._trained(module, metrics)
             for name in ("last", "best") if is_best else ("last",):
                 save(trained, self.folder / f"{name}.safetensors")
@@ -316,12 +309,7 @@ class Bar(RichProgressBar):
 
 
 class EpochLines(Callback):
-    """Prints one line per epoch; used if there is no terminal for a progress bar.
-
-    Args:
-        say: prints a line.
-        name: of the stage.
-    """
+    """Prints one line per epoch; used if there is no terminal for a progress bar."""
 
     def __init__(self, say: Callable[[str], None], name: str) -> None:
         self.say = say
@@ -348,25 +336,29 @@ class Pictures(Callback):
     """Draws predictions of some validation scans, seen from above, for the logger.
 
     Args:
-        scans: with labels; none in a process that does not log.
-        taxonomy: the classes and their colours.
-        label: returns the predicted (P,) train ids of a batch of one scan.
+        score: returns the (P, K) scores of a batch of one scan.
     """
 
     def __init__(
-        self, scans: Sequence[Scan], taxonomy: Taxonomy, label: Callable[[PointBatch], Tensor]
+        self,
+        plan: Plan,
+        intensity: TrainedIntensity | None,
+        score: Callable[[PointBatch], Tensor],
     ) -> None:
-        self.scans = scans
-        self.taxonomy = taxonomy
-        self.label = label
+        dataset = plan.scans.dataset
+        is_drawn = plan.processes.first and plan.logger in WITH_PICTURES
+        records = evenly_spaced(plan.scans.val, PICTURED_SCANS) if is_drawn else []
+        self.scans = [match_scan(dataset.read(record), intensity) for record in records]
+        self.taxonomy = dataset.taxonomy
+        self.score = score
 
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
         interval = max((trainer.max_epochs or 1) // PICTURE_ROUNDS, 1)
         is_due = (trainer.current_epoch + 1) % interval == 0
         if not (self.scans and is_due):
             return
 
-        with _weights_to_keep(trainer, pl_module) as part:
+        with _weights_to_keep(trainer, pl_module.trained) as part:
             parameter = next(part.parameters())
             part.eval()
             for scan in self.scans:
@@ -377,7 +369,7 @@ class Pictures(Callback):
     @torch.no_grad()
     def _draw(self, scan: Scan, batch: PointBatch, trainer: L.Trainer) -> None:
         ids = np.zeros(len(scan), dtype=np.uint8)  # 0 for invalid points
-        ids[scan.valid] = self.label(batch).cpu().numpy()
+        ids[scan.valid] = self.score(batch).argmax(dim=1).cpu().numpy() + 1
 
         predictions = {"prediction": ids}
         view = TopView(scan.points, self.taxonomy, predictions, scan.labels, title=scan.name)
@@ -399,9 +391,8 @@ def _speed_of(trainer: L.Trainer) -> Speed:
 
 
 @contextmanager
-def _weights_to_keep(trainer: L.Trainer, module: L.LightningModule) -> Iterator[nn.Module]:
+def _weights_to_keep(trainer: L.Trainer, part: nn.Module) -> Iterator[nn.Module]:
     """Yield the trained part, with the averaged weights within the block if there are any."""
-    part = _trained_part(module)
     callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
     averages = [callback for callback in callbacks if isinstance(callback, AverageWeights)]
     if not averages:
@@ -416,30 +407,10 @@ def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor.clone() for name, tensor in tensors.items()}
 
 
-def _trained_part(module: L.LightningModule) -> nn.Module:
-    """Return the part of the model that a stage trains."""
-    part = module.trained
-    assert isinstance(part, nn.Module)
-    return part
-
-
-def check_logger(name: LoggerName) -> None:
-    """Check that the library of a logger is installed.
-
-    Raises:
-        InputError: if it is not.
-    """
-    if name in LIBRARIES and find_spec(name) is None:
-        raise InputError(
-            f"expected {name} for --logger {name}, found none; pip install 'amvnet[{name}]'"
-        )
-
-
 def make_logger(name: LoggerName, folder: Path) -> Logger:
     """Return the logger of a stage.
 
     Args:
-        name: which logger.
         folder: of the stage, in the folder of its run; what the logger writes goes there.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 from torch.nn import functional as F
+from torch.utils.data import DataLoader
 
 from amvnet.config.schema import HeadTraining
 from amvnet.errors import InputError
@@ -18,23 +18,16 @@ from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.sensors.intensity import trained_intensity
+from amvnet.training.callbacks import KeepWeights, Pictures
 from amvnet.training.head_points import (
     HeadBatch,
     HeadPoints,
     PointDraw,
     PointGatherer,
-    make_head_loader,
+    PointSampler,
 )
 from amvnet.training.plan import Plan
-from amvnet.training.stage import (
-    Loaders,
-    Stage,
-    build_model,
-    class_weights_of,
-    fit,
-    keep_weights,
-    pictures,
-)
+from amvnet.training.stage import Loaders, Stage, class_weights_of, fit
 from amvnet.weights.file import UNCERTAIN, Weights
 
 VAL_FACTOR = 64  # a validation batch is as large as this many training batches
@@ -124,10 +117,6 @@ class HeadStage(Stage):
 def train_head(plan: Plan, weights: Weights) -> None:
     """Train the point head on scores of frozen networks, and write its weights after each epoch.
 
-    Args:
-        plan: of the run.
-        weights: to begin with, whose networks score the scans.
-
     Raises:
         InputError: if a network is missing, or the scans have too few points for the head.
     """
@@ -149,7 +138,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
     train = gatherer.gather(plan.scans.train, folder / "train", config.views, plan.say)
     val = gatherer.gather(plan.scans.val, folder / "val") if plan.scans.val else None
 
-    model = build_model(plan, "point_head", weights)
+    model = plan.build(weights)
     assert model.point_head is not None
     stage = HeadStage(
         model.point_head,
@@ -160,10 +149,14 @@ def train_head(plan: Plan, weights: Weights) -> None:
         weights=class_weights_of(plan) if config.class_weights else None,
         processes=plan.processes,
     )
-    callbacks: list[Callback] = [keep_weights(plan, "head", weights, intensity)]
+    callbacks: list[Callback] = [KeepWeights(plan, "head", weights, intensity)]
     # Pictures show batches of points, which do not say whose scores to read from files.
     if plan.scores is None:
-        callbacks.append(pictures(plan, intensity, _score_with(model.point_head, plan, weights)))
+
+        def score(batch: PointBatch) -> Tensor:
+            return model.to(batch.points.device)(batch).merged
+
+        callbacks.append(Pictures(plan, intensity, score))
     fit(stage, plan, _make_loaders(plan, train, val), callbacks)
 
     # The gathered points take much space, and no process needs them any more.
@@ -178,25 +171,15 @@ def _make_loaders(plan: Plan, train: HeadPoints, val: HeadPoints | None) -> Load
     seed = plan.recipe.training.seed
     labels = train.labels() if config.balance else None
     draw = PointDraw(len(train), config.drawn, labels, config.balance)
-    train_loader = make_head_loader(
-        train, config.batch, shuffle=True, seed=seed, processes=plan.processes, draw=draw
-    )
+    train_loader = _loader(train, PointSampler(draw, config.batch, seed, True, plan.processes))
     if val is None:
         return train_loader, None
 
     batch = VAL_FACTOR * config.batch
-    val_loader = make_head_loader(val, batch, shuffle=False, seed=seed, processes=plan.processes)
-    return train_loader, val_loader
+    sampler = PointSampler(PointDraw(len(val)), batch, seed, False, plan.processes)
+    return train_loader, _loader(val, sampler)
 
 
-def _score_with(head: PointHead, plan: Plan, weights: Weights) -> Callable[[PointBatch], Tensor]:
-    """Return what gives the (P, K) scores of a batch by AMVNet while its head is trained."""
-    model = weights.build()
-    if plan.scans.dataset.is_normalised:
-        model.range_view = model.range_view.by_ring()
-    model.point_head = head
-
-    def score(batch: PointBatch) -> Tensor:
-        return model.to(batch.points.device)(batch).merged
-
-    return score
+def _loader(points: HeadPoints, sampler: PointSampler) -> DataLoader[HeadBatch]:
+    """Return a loader of this process's parts of the batches."""
+    return DataLoader(points, batch_size=None, sampler=sampler)  # type: ignore[arg-type]

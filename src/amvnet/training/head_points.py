@@ -15,7 +15,6 @@ from typing import IO
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils import data
 
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.distributed import ALONE, Processes, device_of
@@ -30,7 +29,7 @@ from amvnet.progress import Say, Tenths, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.augment import disturb
-from amvnet.training.loaders import Key, ScanSet, collate
+from amvnet.training.loaders import EpochOrder, Key, ScanSet, collate
 from amvnet.training.plan import Plan
 from amvnet.weights.file import Weights
 
@@ -133,31 +132,21 @@ class PointDraw:
         return np.minimum(index, self.size - 1)
 
 
-class PointSampler(data.Sampler[np.ndarray]):
+class PointSampler(EpochOrder):
     """Draws batches of indices; with several processes, each takes its part of every batch.
 
     Args:
-        draw: draws the points of an epoch.
         batch: points in a batch of all processes.
-        seed: of the order.
         shuffle: whether to shuffle the points, as in training. A smaller last batch is then left
             out, as batch norm learns nothing good from a few points.
-        processes: those that share the batches.
     """
 
     def __init__(
         self, draw: PointDraw, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
     ) -> None:
+        super().__init__(seed, shuffle, processes)
         self.draw = draw
         self.batch = batch
-        self.seed = seed
-        self.shuffle = shuffle
-        self.processes = processes
-        self.epoch = 0
-
-    def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, which the order depends on; Lightning calls this."""
-        self.epoch = epoch
 
     def __len__(self) -> int:
         if self.shuffle:
@@ -167,26 +156,10 @@ class PointSampler(data.Sampler[np.ndarray]):
     def __iter__(self) -> Iterator[np.ndarray]:
         order = np.arange(self.draw.size)
         if self.shuffle:
-            order = self.draw(np.random.default_rng([self.seed, self.epoch]))
+            order = self.draw(self.rng())
         for number in range(len(self)):
             batch = order[number * self.batch : (number + 1) * self.batch]
             yield batch[self.processes.rank :: self.processes.size]
-
-
-def make_head_loader(
-    points: HeadPoints,
-    batch: int,
-    seed: int,
-    shuffle: bool,
-    processes: Processes = ALONE,
-    draw: PointDraw | None = None,
-) -> data.DataLoader[HeadBatch]:
-    """Make a loader of this process's parts of the batches; arguments are as for `PointSampler`.
-
-    Without `draw`, an epoch has all points.
-    """
-    sampler = PointSampler(draw or PointDraw(len(points)), batch, seed, shuffle, processes)
-    return data.DataLoader(points, batch_size=None, sampler=sampler)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -214,11 +187,9 @@ class PointGatherer:
         are drawn from all labelled points instead.
 
         Args:
-            records: the scans.
             folder: receives the points; its earlier content is removed.
             views: how often each scan is scored, each time augmented differently; 0 to score it
                 once, without augmentation. Other models' scores are of the scans as they are.
-            say: told the progress, line by line.
 
         Raises:
             InputError: if the scans have too few labelled points.
@@ -250,9 +221,7 @@ class PointGatherer:
         """Return what scores a scan."""
         if self.plan.scores is not None:
             return self._read_scores
-        model = self.weights.build().to(self._device)
-        if self.plan.scans.dataset.is_normalised:
-            model.range_view = model.range_view.by_ring()
+        model = self.plan.build(self.weights).to(self._device)
 
         def score(record: ScanRecord, scan: Scan, batch: PointBatch) -> tuple[Tensor, Tensor]:
             return model.score(*model.project(batch))
@@ -274,7 +243,10 @@ class PointGatherer:
         self, scans: ScanSet, keys: Sequence[Key], folder: Path, assertion: Assertion, say: Say
     ) -> HeadPoints:
         """Gather the points that an assertion finds uncertain, of some views of scans."""
-        _make_empty(folder, self._processes)
+        if self._processes.first:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+        self._processes.wait()
         with (folder / str(self._processes.rank)).open("wb") as file:
             counts, matrices = self._score_share(scans, keys, file, assertion, say)
 
@@ -389,13 +361,7 @@ def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
 def _ensemble_matrices(f: Tensor, g: Tensor, labels: Tensor, uncertain: Tensor) -> np.ndarray:
     """Return the ensemble's confusion matrices over the certain and over the uncertain points.
 
-    Args:
-        f, g: (P, K) probabilities of the two networks.
-        labels: (P,) train ids.
-        uncertain: (P,) bool.
-
-    Returns:
-        (2, K + 1, K + 1) int64.
+    They are (2, K + 1, K + 1) int64, given scores (P, K), train ids (P,) and (P,) bool.
     """
     prediction = (geometric_mean(f, g).argmax(dim=1) + 1).cpu().numpy()
     truth = labels.cpu().numpy()
@@ -407,25 +373,14 @@ def _ensemble_matrices(f: Tensor, g: Tensor, labels: Tensor, uncertain: Tensor) 
     return np.stack([over_certain, over_uncertain])
 
 
-def _make_empty(folder: Path, processes: Processes) -> None:
-    """Remove a folder's content, before any process goes on."""
-    if processes.first:
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-    processes.wait()
-
-
 def _join(
     folder: Path, counts_by_rank: Sequence[Sequence[int]], point_bytes: int, processes: Processes
 ) -> Path:
-    """Join the files of all processes into one, with the points in the order of the scans.
+    """Join the files of all processes, named by rank, with the points in the order of the scans.
 
     Args:
-        folder: has a file of each process, named by its rank.
         counts_by_rank: for each process, the points of each of its scans; processes take the scans
             in turns.
-        point_bytes: bytes of a point.
-        processes: those that share the folder.
     """
     path = folder / "points"
     if processes.first:

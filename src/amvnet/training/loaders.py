@@ -68,10 +68,7 @@ class ScanSet(data.Dataset[Scan]):
     processes. Augmented scans are those of the epoch (`Dataset.at_epoch`).
 
     Args:
-        dataset: reads the scans.
-        records: the scans.
         augment: how they are augmented, or None for scans as they are.
-        seed: of the augmentation.
         intensity: what the intensities of each scan are brought to, before its augmentation.
     """
 
@@ -141,29 +138,34 @@ class ScanSet(data.Dataset[Scan]):
         return match_scan(scan, self.intensity)
 
 
-class EpochSampler(data.Sampler[Key]):
-    """Draws every scan once per epoch, in an order that depends on seed and epoch.
+class EpochOrder(data.Sampler[Any]):
+    """The base of samplers whose order depends on seed and epoch, if `shuffle`."""
 
-    With several processes, each takes its part of every batch. In training all processes draw
-    equally many scans: if the scans cannot be shared equally, the first ones are drawn again.
-
-    Args:
-        size: number of scans.
-        seed: of the order.
-        shuffle: whether to shuffle the scans, as in training.
-        processes: those that share the scans.
-    """
-
-    def __init__(self, size: int, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
-        self.size = size
+    def __init__(self, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
         self.seed = seed
         self.shuffle = shuffle
         self.processes = processes
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, which the order depends on; Lightning calls this."""
+        """Set the epoch; Lightning calls this."""
         self.epoch = epoch
+
+    def rng(self) -> np.random.Generator:
+        """Return the generator of the epoch's order."""
+        return np.random.default_rng([self.seed, self.epoch])
+
+
+class EpochSampler(EpochOrder):
+    """Draws every scan once per epoch.
+
+    With several processes, each takes its part of every batch. In training all processes draw
+    equally many scans: if the scans cannot be shared equally, the first ones are drawn again.
+    """
+
+    def __init__(self, size: int, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
+        super().__init__(seed, shuffle, processes)
+        self.size = size
 
     def __len__(self) -> int:
         return len(self._indices())
@@ -174,10 +176,9 @@ class EpochSampler(data.Sampler[Key]):
     def _indices(self) -> Sequence[int]:
         """Return this process's part of the epoch's scans."""
         if self.shuffle:
-            rng = np.random.default_rng([self.seed, self.epoch])
             scans_per_process = -(-self.size // self.processes.size)  # rounded up
             total = scans_per_process * self.processes.size
-            order = np.resize(rng.permutation(self.size), total)  # repeats the first ones
+            order = np.resize(self.rng().permutation(self.size), total)  # repeats the first ones
         else:
             order = np.arange(self.size)
         return self.processes.share(order.tolist())
@@ -229,11 +230,8 @@ def make_loader(
     A batch with a scan that cannot be read is an error instead.
 
     Args:
-        scans: the scans of all processes.
         batch: scans in a batch of one process.
         workers: processes that read scans; 0 to read in this one.
-        shuffle: whether to shuffle the scans, as in training.
-        processes: those that share the scans.
     """
     return data.DataLoader(
         ErrorsAsItems(scans),  # type: ignore[arg-type]  # the sampler gives keys, not indices
@@ -257,8 +255,6 @@ def count_classes(
 
     Args:
         path: an .npz file of counts; written unless it already has those of these scans.
-        processes: those that share the scans.
-        say: told the progress, line by line.
 
     Returns:
         (K,) int64.
@@ -304,8 +300,6 @@ def sensor_record(
     `sensors.record`. Broken scans are left out: the training names them.
 
     Args:
-        dataset: reads the scans.
-        records: the scans.
         intensity: what the intensities of the scans are brought to.
     """
     scans = []

@@ -18,7 +18,7 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
-from amvnet.training.callbacks import Speed
+from amvnet.training.callbacks import KeepWeights, Pictures, Speed
 from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
@@ -30,16 +30,8 @@ from amvnet.training.losses import (
     network_loss,
 )
 from amvnet.training.plan import Plan
-from amvnet.training.record import PART_OF
-from amvnet.training.stage import (
-    Loaders,
-    Stage,
-    build_model,
-    class_weights_of,
-    fit,
-    keep_weights,
-    pictures,
-)
+from amvnet.training.run_folder import PART_OF
+from amvnet.training.stage import Loaders, Stage, class_weights_of, fit
 from amvnet.weights.file import Weights
 
 Batch = tuple[PointBatch, Tensor]  # points, and their (P,) train ids
@@ -50,10 +42,6 @@ class NetworkStage(Stage):
     """The base of the two networks' stages, which learn from batches of scans by AdamW.
 
     A subclass defines `logits` and `loss`.
-
-    Args:
-        view: projects the points to the input of the network.
-        net: the network.
 
     The other arguments are those of `Stage`.
     """
@@ -84,13 +72,10 @@ class NetworkStage(Stage):
         return batch[0].count
 
     def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
-        """Run the network on a batch of B scans.
+        """Return what the loss is computed on, and the (P, K) logits of all points.
 
         Args:
             labels: (P,) train ids.
-
-        Returns:
-            What the loss is computed on, and the (P, K) logits of all points.
         """
         raise NotImplementedError
 
@@ -201,13 +186,11 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
     return Scored(voxel_logits, voxel_labels, scan, scans)
 
 
-def train_network(plan: Plan, name: str, weights: Weights) -> None:
-    """Train a network, and write its weights after each epoch.
+def train_network(plan: Plan, name: str, weights: Weights, steps: int | None = None) -> Speed:
+    """Train a network in the stage rv or bev, and write its weights after each epoch.
 
-    Args:
-        plan: of the run.
-        name: of the stage: rv or bev.
-        weights: to begin with.
+    With a number of `steps`, take only so many and write nothing. Return how fast it was, and the
+    memory that it took.
 
     Raises:
         InputError: if the weights do not fit the recipe, or a scan is broken.
@@ -220,34 +203,18 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
             "--init, or set it to 0"
         )
 
-    model = build_model(plan, PART_OF[name], weights)
-    stage = make_stage(plan, name, model, class_weights_of(plan) if config.class_weights else None)
+    model = plan.build(weights)
     intensity = _intensity(plan, weights)
+    loaders = make_loaders(plan, config, intensity)
+    if steps is not None:
+        # To compute class weights would need every scan; their values do not change the speed.
+        uniform = class_weights(np.ones(weights.taxonomy.size)) if config.class_weights else None
+        return fit(make_stage(plan, name, model, uniform), plan, loaders, steps=steps)
+
+    stage = make_stage(plan, name, model, class_weights_of(plan) if config.class_weights else None)
     score = model.score_range_view if name == "rv" else model.score_polar_view
-    callbacks = [
-        keep_weights(plan, name, weights, intensity),
-        pictures(plan, intensity, score),
-    ]
-    fit(stage, plan, make_loaders(plan, config, intensity), callbacks)
-
-
-def try_network(plan: Plan, name: str, weights: Weights, steps: int) -> Speed:
-    """Take some steps of the training of a network; write nothing.
-
-    Args:
-        plan: of the run.
-        name: of the stage: rv or bev.
-        weights: to begin with.
-        steps: how many.
-
-    Returns:
-        How fast they were, and the memory that they took.
-    """
-    config = getattr(plan.recipe.training, name)
-    # To compute class weights would need every scan; their values do not change the speed.
-    uniform = class_weights(np.ones(weights.taxonomy.size)) if config.class_weights else None
-    stage = make_stage(plan, name, build_model(plan, PART_OF[name], weights), uniform)
-    return fit(stage, plan, make_loaders(plan, config, _intensity(plan, weights)), steps=steps)
+    callbacks = [KeepWeights(plan, name, weights, intensity), Pictures(plan, intensity, score)]
+    return fit(stage, plan, loaders, callbacks)
 
 
 def make_stage(
@@ -264,13 +231,7 @@ def make_stage(
 def make_loaders(
     plan: Plan, config: NetworkTraining, intensity: TrainedIntensity | None
 ) -> Loaders:
-    """Return the batches of scans to learn from, and to validate with.
-
-    Args:
-        plan: of the run.
-        config: of the stage.
-        intensity: what the intensities of the scans are brought to.
-    """
+    """Return the batches of scans to learn from, and to validate with."""
     training = plan.recipe.training
     scans = plan.scans
     shared: dict[str, Any] = {"workers": training.workers, "processes": plan.processes}

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Literal
 
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
@@ -17,9 +19,12 @@ from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.inference.reading import open_for_weights
 from amvnet.inference.scores import ScorePair
+from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Say, say_nothing
-from amvnet.training.callbacks import LoggerName, check_logger
 from amvnet.weights.file import Weights, load
+
+LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
+LIBRARIES = ("wandb", "mlflow")  # loggers that need a library of the same name
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,31 @@ class Plan:
                 f"found {taxonomy}; use the recipe of that benchmark"
             )
 
+    def build(self, weights: Weights) -> AMVNet:
+        """Return the model of some weights; parts that they lack are initialised at random.
+
+        The rows of its range view are rings if the scans are normalised.
+
+        Raises:
+            InputError: if the parameters do not fit the sizes, which are those of the recipe for a
+                part to train.
+        """
+        try:
+            model = weights.build(with_head=True)
+        except InputError as error:
+            raise InputError(f"{error}, or use the recipe of the weights") from None
+        if self.scans.dataset.is_normalised:
+            model.range_view = model.range_view.by_ring()
+        return model
+
+
+def check_logger(name: LoggerName) -> None:
+    """Raise InputError if the library of a logger is not installed."""
+    if name in LIBRARIES and find_spec(name) is None:
+        raise InputError(
+            f"expected {name} for --logger {name}, found none; pip install 'amvnet[{name}]'"
+        )
+
 
 def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
     """Return a recipe with the classes, sensor and sizes of weights, if it asks for them.
@@ -107,12 +137,6 @@ def without_mean(recipe: Recipe, init: Weights | None, classes: Taxonomy, say: S
     """Return a recipe that keeps no share of initial weights if these have other classes.
 
     Their last layers are new then, and of no use in a mean.
-
-    Args:
-        recipe: of the training.
-        init: weights to begin with.
-        classes: of the data.
-        say: told what is left out.
     """
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
@@ -137,9 +161,6 @@ def open_for_training(
     Args:
         data: as `open_dataset` takes it.
         taxonomy: a YAML file of other classes.
-        recipe: of the training.
-        out: folder of the run.
-        init: weights to begin with.
 
     Raises:
         InputError: as `open_dataset`.
@@ -158,10 +179,6 @@ def open_parts(
     Args:
         specs: each DATA, or, after the first, DATA@SHARE. The datasets that name no share have that
             of the recipe, `training.others`; if it is 0, all of their scans are taken.
-        taxonomy: a YAML file of other classes.
-        recipe: of the training.
-        out: folder of the run.
-        init: weights to begin with.
 
     Returns:
         The first dataset, and those to mix in with their training scans.

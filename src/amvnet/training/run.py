@@ -14,9 +14,9 @@ import torch
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
 from amvnet.training.head import train_head
-from amvnet.training.networks import train_network, try_network
+from amvnet.training.networks import train_network
 from amvnet.training.plan import Plan
-from amvnet.training.record import (
+from amvnet.training.run_folder import (
     PART_OF,
     StageFolder,
     check_begun,
@@ -32,15 +32,7 @@ TRIAL_STEPS = 2  # the second of them is timed
 def train(
     plan: Plan, stage: StageName | Literal["all"] = "all", init: Weights | None = None
 ) -> Path:
-    """Train one stage, or all stages of the recipe.
-
-    Args:
-        plan: of the run.
-        stage: name of the stage, or "all".
-        init: weights to begin with.
-
-    Returns:
-        The weights file, with all parts that have been trained so far.
+    """Train one stage, or all; return the weights file, with all parts trained so far.
 
     Raises:
         InputError: if the head is to be trained without trained networks, or the folder holds a
@@ -71,15 +63,7 @@ def train(
 
 
 def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
-    """Train one stage, unless an earlier run has finished it.
-
-    Args:
-        plan: of the run.
-        name: of the stage.
-        weights: to begin with.
-
-    Returns:
-        The weights with the trained part.
+    """Train one stage unless an earlier run has finished it; return weights with the new part.
 
     Raises:
         InputError: if the weights to begin with do not fit the recipe, or a scan is broken.
@@ -155,18 +139,10 @@ def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
 
 
 def _check_init(plan: Plan, init: Weights, names: Sequence[str]) -> None:
-    """Check that no part of the initial weights would be ignored.
+    """Raise InputError if a part of the initial weights would be ignored.
 
     A finished stage of this folder, or one that is resumed, goes on from its own weights. If it
     was begun with the same initial weights, or has become them, nothing is ignored.
-
-    Args:
-        plan: of the run.
-        init: the initial weights.
-        names: of the stages to train.
-
-    Raises:
-        InputError: if a part would be ignored.
     """
     empty = Weights(plan.recipe.model, plan.scans.dataset.taxonomy)
     for name, part in PART_OF.items():
@@ -211,7 +187,7 @@ def _try_out(plan: Plan, name: str, folder: Path) -> str:
         plan, scans=dataclasses.replace(plan.scans, train=scans, val=()), out=folder, resume=False
     )
     try:
-        speed = try_network(trial, name, _first_weights(plan, None), TRIAL_STEPS)
+        speed = train_network(trial, name, _first_weights(plan, None), TRIAL_STEPS)
     except torch.OutOfMemoryError:
         raise InputError(
             f"{name}: expected steps that fit into the GPU's memory, found {config.batch} scans "

@@ -7,7 +7,7 @@ import math
 import pickle
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -20,37 +20,29 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
-from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes, device_of, environment
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.memory import keep_freed_memory
-from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.sync_batch_norm import synchronise_batch_norms
 from amvnet.models.views.points import PointBatch
-from amvnet.sensors.intensity import TrainedIntensity, match_scan
 from amvnet.training.callbacks import (
-    WITH_PICTURES,
     AverageWeights,
     Bar,
     Curves,
     EpochLines,
-    KeepWeights,
-    Pictures,
     SeedBatches,
     Speed,
     make_logger,
 )
-from amvnet.training.loaders import count_classes, sensor_record
+from amvnet.training.loaders import count_classes
 from amvnet.training.losses import class_weights
 from amvnet.training.plan import Plan
-from amvnet.training.record import LAST, PART_OF, description, stage_settings
-from amvnet.weights.file import Weights
+from amvnet.training.run_folder import LAST
 
 MOMENTUM_CYCLE = 0.1  # the one-cycle schedule lowers the momentum by this much
 LOGGED_EVERY = 10  # batches, of the loss
-PICTURED_SCANS = 2
 
 Precision = Literal["32-true", "bf16-mixed", "16-mixed", "64-true"]
 SINGLE: Final = "32-true"
@@ -65,10 +57,7 @@ class Stage(L.LightningModule):
     """The base of all stages: class weights, metrics of the validation, the one-cycle schedule.
 
     Args:
-        config: of this stage.
-        taxonomy: the K classes.
         weights: (K,) class weights of the loss, or None for equal weights.
-        processes: those that share the training.
     """
 
     name: str  # the value of --stage
@@ -115,11 +104,7 @@ class Stage(L.LightningModule):
         return tuple(self._in_precision(values) for values in batch)
 
     def check_finite(self, loss: Tensor, where: str) -> None:
-        """Check a loss before it spoils the weights.
-
-        Raises:
-            InputError: if it is infinite or NaN.
-        """
+        """Check a loss before it spoils the weights; raise InputError if it is infinite or NaN."""
         if not torch.isfinite(loss):
             option = f"--training.{self.name}.lr"
             raise InputError(
@@ -196,70 +181,11 @@ class KeepSignals(Callback):
             signal.signal(signal.SIGTERM, self._handler)
 
 
-def build_model(plan: Plan, part: str, weights: Weights) -> AMVNet:
-    """Return a model whose part to train has the parameters of the weights, if these have any.
-
-    Raises:
-        InputError: if these parameters have other sizes.
-    """
-    model = build_amvnet(weights.model, weights.taxonomy.size)
-    if part in weights.parts:
-        try:
-            getattr(model, part).load_state_dict(weights.part(part))
-        except RuntimeError:
-            raise InputError(
-                f"expected weights whose {part} has the recipe's sizes, found others; "
-                "use the recipe of the weights"
-            ) from None
-
-    if plan.scans.dataset.is_normalised:
-        model.range_view = model.range_view.by_ring()
-    return model
-
-
 def class_weights_of(plan: Plan) -> np.ndarray:
     """Return the (K,) weights of the classes in the loss (section 4.2 of the paper)."""
     path = plan.out / "class_counts.npz"
     scans = plan.scans
     return class_weights(count_classes(scans.dataset, scans.train, path, plan.processes, plan.say))
-
-
-def keep_weights(
-    plan: Plan, name: str, weights: Weights, intensity: TrainedIntensity | None
-) -> KeepWeights:
-    """Return the callback that writes the trained part after each epoch.
-
-    Args:
-        plan: of the run.
-        name: of the stage.
-        weights: that the stage begins with.
-        intensity: what the intensities of the scans are brought to.
-    """
-    settings = stage_settings(plan, name, weights)
-    # Only the first process writes.
-    scans = plan.scans
-    is_first = plan.processes.first
-    sensor = sensor_record(scans.dataset, scans.train, intensity) if is_first else {}
-    return KeepWeights(
-        plan.out / name, PART_OF[name], weights, settings, description(plan, settings, sensor)
-    )
-
-
-def pictures(
-    plan: Plan, intensity: TrainedIntensity | None, score: Callable[[PointBatch], Tensor]
-) -> Pictures:
-    """Return the callback that draws validation scans.
-
-    Args:
-        plan: of the run.
-        intensity: what the intensities of the scans are brought to.
-        score: returns the (P, K) scores of a batch.
-    """
-    dataset = plan.scans.dataset
-    is_drawn = plan.processes.first and plan.logger in WITH_PICTURES
-    records = evenly_spaced(plan.scans.val, PICTURED_SCANS) if is_drawn else []
-    scans = [match_scan(dataset.read(record), intensity) for record in records]
-    return Pictures(scans, dataset.taxonomy, lambda batch: score(batch).argmax(dim=1) + 1)
 
 
 def fit(
@@ -269,20 +195,18 @@ def fit(
     callbacks: Sequence[Callback] = (),
     steps: int | None = None,
 ) -> Speed:
-    """Train a stage in its folder of the run.
+    """Train a stage in its folder of the run; return how fast it was.
 
     Args:
         callbacks: write at the end of each epoch, before the checkpoint, which therefore never
             claims more than they have written.
         steps: end after this many, for a trial; then nothing is validated or written.
 
-    Returns:
-        How fast it was.
-
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
     """
     quiet_lightning()
+    stage.train()
     train, val = loaders
     device = device_of(plan.recipe.training.accelerator)
     precision = SINGLE if stage.in_float32 else precision_of(plan.recipe.training)
@@ -302,20 +226,34 @@ def fit(
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
 
     speed = Speed()
+    is_trial = steps is not None
+    folder = plan.out / stage.name
+    has_bar = plan.bars and plan.processes.first
+    # The statistics of synchronised batch norms are the same everywhere, and processes may validate
+    # unequal shares.
+    ddp = DDPStrategy(broadcast_buffers=False)
     trainer = L.Trainer(
         # Lightning's own way to double precision does not convert our batches.
         precision=SINGLE if precision == DOUBLE else precision,
+        accelerator=plan.recipe.training.accelerator,
+        devices=plan.processes.here,
+        num_nodes=plan.processes.nodes,
+        strategy=ddp if plan.processes.size > 1 else "auto",
+        plugins=[environment()],
         max_epochs=stage.config.epochs,
         max_steps=-1 if steps is None else steps,
         limit_val_batches=0 if val is None else None,
         accumulate_grad_batches=stage.accumulate,
         gradient_clip_val=stage.clip,
-        callbacks=[speed, *callbacks, *_shared_callbacks(stage, plan, is_trial=steps is not None)],
+        callbacks=[speed, *callbacks, *_shared_callbacks(stage, plan, is_trial)],
+        default_root_dir=folder,
+        logger=False if is_trial else make_logger(plan.logger, folder),
+        enable_checkpointing=not is_trial,
+        enable_progress_bar=has_bar,
+        enable_model_summary=False,
         log_every_n_steps=min(LOGGED_EVERY, len(train)),
         num_sanity_val_steps=0,
         use_distributed_sampler=False,
-        **_outputs(stage, plan, is_trial=steps is not None),
-        **_devices(plan),
     )
     trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
     return speed
@@ -338,32 +276,6 @@ def _shared_callbacks(stage: Stage, plan: Plan, is_trial: bool) -> list[Callback
     has_bar = plan.bars and plan.processes.first
     callbacks.append(Bar() if has_bar else EpochLines(plan.say, stage.name))
     return callbacks
-
-
-def _outputs(stage: Stage, plan: Plan, is_trial: bool) -> dict[str, Any]:
-    """Return the arguments of Lightning's trainer about what it writes and shows."""
-    folder = plan.out / stage.name
-    return {
-        "default_root_dir": folder,
-        "logger": False if is_trial else make_logger(plan.logger, folder),
-        "enable_checkpointing": not is_trial,
-        "enable_progress_bar": plan.bars and plan.processes.first,
-        "enable_model_summary": False,
-    }
-
-
-def _devices(plan: Plan) -> dict[str, Any]:
-    """Return the arguments of Lightning's trainer about devices and processes."""
-    # The statistics of synchronised batch norms are the same everywhere, and processes may validate
-    # unequal shares.
-    ddp = DDPStrategy(broadcast_buffers=False)
-    return {
-        "accelerator": plan.recipe.training.accelerator,
-        "devices": plan.processes.here,
-        "num_nodes": plan.processes.nodes,
-        "strategy": ddp if plan.processes.size > 1 else "auto",
-        "plugins": [environment()],
-    }
 
 
 def precision_of(training: TrainingConfig) -> Precision:
@@ -390,11 +302,7 @@ def _multiplies_bfloat16(device: str) -> bool:
 
 
 def _epochs_done(checkpoint: Path) -> int:
-    """Return how many epochs a checkpoint has seen.
-
-    Raises:
-        InputError: if the file is broken.
-    """
+    """Return how many epochs a checkpoint has seen; raise InputError if it is broken."""
     try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
         return state["epoch"] + 1

@@ -13,10 +13,10 @@ import torch
 from amvnet.data.taxonomy import Taxonomy, taxonomy_named
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import LoadedScan, normaliser_for
+from amvnet.inference.reading import LoadedScan, check_scan, normaliser_for
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Origin, Segmentation, expand_labels, expand_to_scan
-from amvnet.inference.segmenter import Segmenter, check_scan
+from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import cosine_similarity
 from amvnet.models.methods import geometric_mean
 from amvnet.progress import Progress, Say, no_progress, say_nothing

@@ -8,6 +8,8 @@ import html
 import json
 import math
 import re
+import tempfile
+import webbrowser
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,8 +22,9 @@ import numpy as np
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.files import atomic_write
+from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
-from amvnet.viewing.frames import RIGHT, UNLABELLED, UNSCORED, Frame
+from amvnet.viewing.frames import RIGHT, UNLABELLED, UNSCORED, Frame, frame_of
 
 # Points of one scan. Of larger scans the page shows every second or third point, so that phones
 # keep up.
@@ -67,6 +70,33 @@ class Packed:
     height: tuple[float, float]
     intensity: float
     ground: float
+
+
+def show(result: Segmentation, path: Path | str | None = None, open_browser: bool = True) -> Path:
+    """Write a self-contained HTML page that shows a segmented scan in 3D, and open it.
+
+    It shows the labels, those of each network, uncertain points, and errors if the scan has labels.
+
+    Args:
+        result: of a `Segmenter`.
+        path: the file, NAME.html; by default in a temporary folder.
+        open_browser: whether to open the page in a browser.
+
+    Returns:
+        The path of the page.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    origin = result.require_origin()
+    if path is None:
+        path = Path(tempfile.mkdtemp(prefix="amvnet-")) / "scan.html"
+
+    title = Path(origin.scan.name).name or "scan"
+    page = write_page(path, [frame_of(result, origin)], origin.taxonomy, title)
+    if open_browser:
+        webbrowser.open(page.resolve().as_uri())
+    return page
 
 
 def write_page(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy, title: str) -> Path:

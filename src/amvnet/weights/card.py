@@ -5,11 +5,12 @@ It says what the weights are, how to use them, what they were trained on and how
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import yaml
 
+from amvnet.models.methods import widest_method
 from amvnet.weights.file import Weights
 
 TITLES = {
@@ -34,14 +35,15 @@ def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
     """Return the card of a weights file, without the metadata of `front_matter`.
 
     Args:
-        weights: the weights that the card describes.
         name: the name by which `amvnet.load` finds the weights.
         licence: the licence that their owner grants; None if it is not stated.
     """
+    taxonomy = weights.taxonomy
+    classes = f"{taxonomy.size} of {taxonomy.name}: {', '.join(taxonomy.classes)}."
     sections = [
         f"# {name}\n\n{_summary(weights)}",
         f"## How to use\n\n{_usage(weights, name)}",
-        f"## Classes\n\n{_classes(weights)}",
+        f"## Classes\n\n{classes}",
         f"## Sizes\n\n{_list(_sizes(weights))}",
         f"## Metrics\n\n{_metrics(weights)}",
     ]
@@ -88,25 +90,13 @@ def _usage(weights: Weights, name: str) -> str:
     else:
         method = ""
         if "point_head" not in weights.parts:
-            method = f', method="{_best_method(weights.parts)}"'
+            method = f', method="{widest_method(weights.parts)}"'
         call = f'segmenter = amvnet.load("{name}"{method})\nresult = segmenter(points)'
 
     return (
         f"```python\nimport amvnet\n\n{call}\n```\n\n"
         "`points` is (N, 4): x, y, z in metres and intensity in [0, 1]."
     )
-
-
-def _best_method(parts: Sequence[str]) -> str:
-    """Return the best method for weights that lack the point head."""
-    if len(parts) > 1:
-        return "ensemble"
-    return "rv" if "range_net" in parts else "bev"
-
-
-def _classes(weights: Weights) -> str:
-    taxonomy = weights.taxonomy
-    return f"{taxonomy.size} of {taxonomy.name}: {', '.join(taxonomy.classes)}."
 
 
 def _sizes(weights: Weights) -> list[tuple[str, str]]:
@@ -158,7 +148,6 @@ def _training(weights: Weights, part: str) -> str:
         count += tensor.numel()
 
     rows = [("values", f"{count:,}")]
-
     # The data come first, then the settings in their own order.
     record = weights.training.get(part, {})
     for key, title in DATA.items():

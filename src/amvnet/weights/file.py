@@ -156,10 +156,6 @@ class Weights:
         Parameters whose size depends on the number of classes are new: the last layers, and those
         of the head that see the scores. All others are taken.
 
-        Args:
-            taxonomy: the classes.
-            seed: of the new parameters.
-
         Returns:
             The weights, without records of a training, and the names of the new parameters.
         """
@@ -197,11 +193,11 @@ class Weights:
         sizes = {key: getattr(model, key) for key in SIZES[name]}
         return dataclasses.replace(self, model=dataclasses.replace(self.model, **sizes))
 
-    def build(self) -> AMVNet:
+    def build(self, with_head: bool = False) -> AMVNet:
         """Return the model, in evaluation mode.
 
-        A network that the weights lack is initialised at random. If they lack the point head,
-        `point_head` of the model is None.
+        A network that the weights lack is initialised at random. If they lack the point head, it is
+        too if `with_head`, else `point_head` of the model is None.
 
         Raises:
             InputError: if the parameters do not fit the sizes.
@@ -210,7 +206,7 @@ class Weights:
         for part in self.parts:
             self._load_part(part, getattr(model, part))
 
-        if "point_head" not in self.parts:
+        if "point_head" not in self.parts and not with_head:
             model.point_head = None
         return model.eval()
 
@@ -257,8 +253,6 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
     """Write a weights file, whole or not at all.
 
     Args:
-        weights: the weights.
-        path: the file.
         half: write matrices and kernels as float16, for inference only; halves the file.
 
     Returns:
@@ -368,10 +362,6 @@ def _read_tensors(file: Any, weights: Weights) -> dict[str, Tensor]:
     """Read the parameters, if they are those of whole parts of the described model.
 
     Names, sizes and types are checked before anything is read.
-
-    Args:
-        file: an open safetensors file.
-        weights: what its description says.
 
     Raises:
         InputError: if they are not, or not finite.

@@ -96,12 +96,7 @@ def client() -> Any:
 
 
 def hub_errors(name: str, advice: str) -> AbstractContextManager[None]:
-    """Turn any error of the hub's client into one line that says what to do.
-
-    Args:
-        name: the beginning of the message.
-        advice: what to do.
-    """
+    """Turn any error of the hub's client into one line that says what to do."""
 
     # The classes of the errors depend on the version of the client, and of its HTTP library.
     def message(error: BaseException) -> str:

@@ -28,7 +28,7 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
     from amvnet.inference.predict import predict
     from amvnet.inference.segmenter import Segmenter
 
-    segmenter = Segmenter(weights, keep_memory=True)
+    segmenter = Segmenter(weights)
     data = out / "data"
     with progress("simulating") as step:
         simulate(data, sequences=SEQUENCES, scans=SCANS, seed=seed, progress=step)

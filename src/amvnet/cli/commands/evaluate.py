@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import json as json_format
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, show
 from amvnet.cli.options import (
+    ComputeChoice,
     Split,
     join_processes,
-    make_segmenter,
+    labelled_scans,
     open_data,
     parse_classes,
     parse_methods,
-    parse_names,
 )
 from amvnet.errors import InputError
-from amvnet.models.methods import EngineName, Precision, TtaName, widest_method
+from amvnet.models.methods import widest_method
 
 if TYPE_CHECKING:
     from amvnet.evaluation.metrics import Evaluation
@@ -27,36 +25,30 @@ if TYPE_CHECKING:
 
 def evaluate(
     data: str,
+    compute: ComputeChoice,
     weights: str | None = None,
     predictions: Path | None = None,
     split: Split = "val",
     sequences: str | None = None,
     methods: str = "rv,bev,ensemble,amvnet",
-    tta: TtaName | None = None,
     tau: float | None = None,
     json: Path | None = None,
     pictures: Path | None = None,
     taxonomy: Path | None = None,
     classes: str | None = None,
     mapped: bool = False,
-    device: str = "auto",
-    engine: EngineName = "auto",
-    precision: Precision = "auto",
-    at_once: int | None = None,
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
 
     Args:
         data: the dataset.
+        compute: where and how the networks are computed.
         weights: a weights file, or the name of a built-in one: all methods are scored.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
         split: the official split to score.
         sequences: sequences or scenes, separated by commas, to score instead.
         methods: what to score of weights, separated by commas; rv-knn is rv with a vote of
             neighbours in the range image, arithmetic and maximum are the other ensembles.
-        tta: test-time augmentation of weights, the mean of the networks' probabilities over flips
-            or quarter turns (yaw) of the scan, 4 times the work of the networks, or over both, 8
-            times.
         tau: points whose probabilities by the two networks have a cosine similarity of at most this
             go to the head, in [0, 1]; fewer points take less time; default: that of the weights.
         json: file for all figures.
@@ -65,15 +57,7 @@ def evaluate(
         classes: score these classes instead, to which those of the data and of the weights are
             mapped: coarse, or a YAML file.
         mapped: the predictions have the ids of --classes, as predict --classes writes them.
-        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
-            (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
-            here that changes none.
-        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
-        at_once: scans that are segmented at the same time on a CPU; default: one per
-            core, if the memory suffices.
     """
-    from amvnet.data.datasets.base import choose_records
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
@@ -81,7 +65,6 @@ def evaluate(
     from amvnet.weights.file import load
 
     processes = join_processes()
-    names = parse_names(sequences)
     class_map = parse_classes(classes)
     if mapped and (class_map is None or predictions is None):
         raise InputError(
@@ -92,30 +75,17 @@ def evaluate(
         has_own = taxonomy is not None or class_map is not None
         opened = open_data(data, taxonomy) if has_own else None
         dataset = open_for_weights(data, loaded, opened)
-        records = dataset.labelled(choose_records(dataset, names, split))
+        records = labelled_scans(dataset, sequences, split)
         method_names = parse_methods(methods)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in method_names]
-        segmenter = make_segmenter(
-            loaded,
-            device,
-            engine,
-            precision,
-            at_once,
-            method=widest_method(parts),
-            tta=tta,
-            tau=tau,
-            processes=processes,
-        )
+        segmenter = compute.segmenter(loaded, widest_method(parts), tau, processes)
         labeller = label_by_weights(dataset, segmenter, method_names, class_map)
     elif predictions is not None and weights is None:
-        for option, value in (("tta", tta), ("tau", tau)):
-            if value is not None:
-                raise InputError(
-                    f"--{option}: expected --weights, found --predictions; leave --{option} out"
-                )
+        if tau is not None:
+            raise InputError("--tau: expected --weights, found --predictions; leave --tau out")
         dataset = open_data(data, taxonomy)
-        records = dataset.labelled(choose_records(dataset, names, split))
+        records = labelled_scans(dataset, sequences, split)
         labeller = label_from_files(dataset, predictions, class_map, mapped)
     else:
         raise InputError(
@@ -137,24 +107,19 @@ def evaluate(
             processes=processes,
         )
     if processes.first:
-        show_evaluation(evaluation, data, json, {"tta": tta, "tau": tau})
+        show_evaluation(evaluation, data, json, tau)
 
 
 def show_evaluation(
-    evaluation: Evaluation,
-    dataset: str,
-    path: Path | None,
-    settings: Mapping[str, Any] = MappingProxyType({}),
+    evaluation: Evaluation, dataset: str, path: Path | None, tau: float | None = None
 ) -> None:
-    """Print the table, and write the same figures as JSON if there is a path.
-
-    Both have the settings that are not None.
-    """
+    """Print the table, and write the same figures as JSON if there is a path."""
     from amvnet.cli.tables import evaluation_table
     from amvnet.files import atomic_write
 
     figures = evaluation.report(dataset)
-    figures |= {name: value for name, value in settings.items() if value is not None}
+    if tau is not None:
+        figures["tau"] = tau
     show(evaluation_table(figures, evaluation.taxonomy))
     if path is not None:
         with atomic_write(path) as part:

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import (
-    ScanChoice,
-    parse_scores,
-)
+from amvnet.cli.options import ScanChoice, ScoresChoice
 from amvnet.errors import InputError
 from amvnet.progress import counted
 
 
 def fuse(
     inputs: list[str],
-    scores_a: Path,
-    scores_b: Path,
     out: Path,
+    models: ScoresChoice,
     choice: ScanChoice,
     head: str | None = None,
     tau: float | None = None,
-    key_a: str | None = None,
-    key_b: str | None = None,
-    logits: Literal["a", "b", "both"] | None = None,
     taxonomy: str | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -32,18 +24,13 @@ def fuse(
 
     Args:
         inputs: datasets, scan files, or folders of scans.
-        scores_a: folder of one model's class probabilities, an .npz or .npy of shape (N, K) for
-            each scan, where predict --scores writes its own.
-        scores_b: folder of the other model's.
         out: folder for the labels.
+        models: their scores.
         choice: which scans of the inputs.
         head: weights with a point head, trained with these scores or with networks; without, the
             ensemble is used.
         tau: points whose scores have a cosine similarity of at most this are uncertain; default:
             the head's.
-        key_a: which array of each .npz in --scores-a; not needed if there is one.
-        key_b: which array of each .npz in --scores-b.
-        logits: which of the two are scores before softmax.
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the
             head's or the inputs'.
         overwrite: replace files in the folder that amvnet did not write, too.
@@ -53,8 +40,9 @@ def fuse(
     from amvnet.inference.pipeline import OutputOptions
     from amvnet.weights.file import load
 
-    pair = parse_scores(scores_a, scores_b, key_a, key_b, logits)
-    assert pair is not None
+    pair = models.parse()
+    if pair is None:
+        raise InputError("expected --scores-a and --scores-b, found none; give two models' scores")
     weights = None if head is None else load(head)
     if weights is not None and taxonomy is not None:
         raise InputError(

@@ -7,13 +7,13 @@ from typing import Literal
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
+    ComputeChoice,
     ScanChoice,
     SensorChoice,
     join_processes,
-    make_segmenter,
     parse_classes,
 )
-from amvnet.models.methods import EngineName, MethodName, Precision, TtaName
+from amvnet.models.methods import MethodName
 from amvnet.progress import counted
 
 FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
@@ -25,19 +25,15 @@ def predict(
     out: Path,
     choice: ScanChoice,
     known: SensorChoice,
+    compute: ComputeChoice,
     method: MethodName = "amvnet",
-    tta: TtaName | None = None,
     tau: float | None = None,
     scores: bool = False,
     resume: bool = False,
     format: FormatName = "label",
     uncertain: bool = False,
     classes: str | None = None,
-    device: str = "auto",
-    engine: EngineName = "auto",
-    precision: Precision = "auto",
     batch: int = 1,
-    at_once: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Segment datasets, scans, bags, or folders of scans.
@@ -48,9 +44,8 @@ def predict(
         out: folder for the labels.
         choice: which scans of the inputs.
         known: what is known of the sensor of scan files.
+        compute: where and how the networks are computed.
         method: the whole of AMVNet, or a part of it.
-        tta: test-time augmentation, the mean of the networks' probabilities over flips or quarter
-            turns (yaw) of the scan, 4 times the work of the networks, or over both, 8 times.
         tau: points whose probabilities by the two networks have a cosine similarity of at most this
             go to the head, in [0, 1]; fewer points take less time; default: that of the weights.
         scores: also write the probabilities of both networks.
@@ -61,14 +56,7 @@ def predict(
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         classes: write the ids of these classes, to which those of the weights are mapped: coarse,
             or a YAML file.
-        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
-            (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
-            here that changes none.
-        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
         batch: scans that go through the networks at a time; more than one suits a GPU.
-        at_once: scans that are segmented at the same time on a CPU; default: one per
-            core, if the memory suffices.
         overwrite: replace files in the folder that amvnet did not write, too.
     """
     from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
@@ -78,17 +66,7 @@ def predict(
     class_map = parse_classes(classes)
     processes = join_processes()
     sensor = known.parse()
-    segmenter = make_segmenter(
-        load(weights),
-        device,
-        engine,
-        precision,
-        at_once,
-        method=method,
-        tta=tta,
-        tau=tau,
-        processes=processes,
-    )
+    segmenter = compute.segmenter(load(weights), method, tau, processes)
 
     with progress("segmenting") as step:
         written = predict_inputs(
@@ -96,7 +74,7 @@ def predict(
             segmenter,
             OutputOptions(out, format, scores, uncertain, overwrite),
             options=choice.parse(),
-            execution=ExecutionOptions(batch, at_once, resume, processes),
+            execution=ExecutionOptions(batch, compute.at_once, resume, processes),
             sensor=sensor,
             classes=class_map,
             progress=step,

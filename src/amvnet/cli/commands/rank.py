@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import Split, make_segmenter, parse_names
-from amvnet.models.methods import EngineName, Precision
+from amvnet.cli.options import ComputeChoice, Split, labelled_scans
 from amvnet.progress import counted
 
 
@@ -14,13 +13,10 @@ def rank(
     data: str,
     weights: str,
     out: Path,
+    compute: ComputeChoice,
     split: Split = "all",
     sequences: str | None = None,
     pictures: Path | None = None,
-    device: str = "auto",
-    engine: EngineName = "auto",
-    precision: Precision = "auto",
-    at_once: int | None = None,
     overwrite: bool = False,
 ) -> None:
     """Rank clusters of points, and scans, whose labels both views contradict, to check them.
@@ -29,19 +25,12 @@ def rank(
         data: the dataset, with labels.
         weights: a weights file with both networks, or the name of a built-in one.
         out: the table of the clusters, FILE.csv; that of the scans is FILE-scans.csv.
+        compute: where and how the networks are computed.
         split: the official split.
         sequences: sequences or scenes instead, separated by commas.
         pictures: folder for drawings of the first clusters from above.
-        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
-            (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
-            here that changes none.
-        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
-        at_once: scans that are segmented at the same time on a CPU; default: one per
-            core, if the memory suffices.
         overwrite: replace files that amvnet did not write, too.
     """
-    from amvnet.data.datasets.base import choose_records
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.ranking.label_errors import rank as rank_records
@@ -60,9 +49,8 @@ def rank(
     with protecting(files, overwrite):
         loaded = load(weights)
         dataset = open_for_weights(data, loaded)
-        chosen = choose_records(dataset, parse_names(sequences), split)
-        records = dataset.labelled(chosen)
-        segmenter = make_segmenter(loaded, device, engine, precision, at_once, method="ensemble")
+        records = labelled_scans(dataset, sequences, split)
+        segmenter = compute.segmenter(loaded, "ensemble")
 
         with progress("scoring") as step:
             ranking = rank_records(dataset, records, segmenter, step)

@@ -6,18 +6,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from amvnet.cli.console import on_terminal, say
-from amvnet.cli.options import (
-    describe_records,
-    join_processes,
-    parse_names,
-    parse_scores,
-)
+from amvnet.cli.options import ScoresChoice, describe_records, join_processes, parse_names
 
 
 def train(
     recipe: Any,
     data: list[str],
     out: Path,
+    models: ScoresChoice,
     stage: Literal["rv", "bev", "head", "all"] = "all",
     init: str | None = None,
     resume: bool = False,
@@ -27,11 +23,6 @@ def train(
     dry_run: bool = False,
     logger: Literal["tensorboard", "csv", "wandb", "mlflow"] = "tensorboard",
     taxonomy: Path | None = None,
-    scores_a: Path | None = None,
-    scores_b: Path | None = None,
-    key_a: str | None = None,
-    key_b: str | None = None,
-    logits: Literal["a", "b", "both"] | None = None,
 ) -> None:
     """Train the two networks and the point head.
 
@@ -44,6 +35,7 @@ def train(
             and validated, and the training scans of the others are mixed in; DATA@0.5 makes half of
             each epoch.
         out: folder of the run.
+        models: with --stage head, two models to train a head for.
         stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them. Of weights for
             other classes, all layers but the last ones are taken.
@@ -56,12 +48,6 @@ def train(
         dry_run: only take two steps of each network, and say what these and the training cost.
         logger: where the curves go; wandb and mlflow need their library.
         taxonomy: a semantic-kitti.yaml with other classes.
-        scores_a: with --stage head: a folder of another model's scores, to train a head for it and
-            --scores-b.
-        scores_b: a folder of the other model's scores.
-        key_a: which array of each .npz in --scores-a.
-        key_b: which array of each .npz in --scores-b.
-        logits: which of the two are scores before softmax.
     """
     from amvnet.data.datasets.joined import join
     from amvnet.data.datasets.select import split_records
@@ -81,7 +67,6 @@ def train(
     )
     scans = join(scans, parts)
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
-    scores = parse_scores(scores_a, scores_b, key_a, key_b, logits)
 
     plan = Plan(
         recipe,
@@ -92,7 +77,7 @@ def train(
         bars=on_terminal(),
         processes=processes,
         logger=logger,
-        scores=scores,
+        scores=models.parse(),
     )
     if dry_run:
         for line in try_out(plan, stage):

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import ScanChoice, SensorChoice, make_segmenter
+from amvnet.cli.options import ComputeChoice, ScanChoice, SensorChoice
 from amvnet.errors import InputError
-from amvnet.models.methods import EngineName, Precision
+from amvnet.models.methods import widest_method
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
@@ -20,16 +20,13 @@ def view(
     inputs: list[str],
     choice: ScanChoice,
     known: SensorChoice,
+    compute: ComputeChoice,
     labels: Path | None = None,
     weights: str | None = None,
     html: Path | None = None,
     save: Path | None = None,
     scans: int = 5,
     taxonomy: str | None = None,
-    device: str = "auto",
-    engine: EngineName = "auto",
-    precision: Precision = "auto",
-    at_once: int | None = None,
 ) -> None:
     """Look at scans, labels, uncertain points and errors in 3D: in Rerun, or in a browser.
 
@@ -37,6 +34,7 @@ def view(
         inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
         choice: which scans of the inputs.
         known: what is known of the sensor of scan files.
+        compute: where and how the networks are computed.
         labels: a folder of labels as predict writes them, in any of its formats, or the label file
             of one scan.
         weights: instead, a weights file, or the name of a built-in one: the labels of every method
@@ -45,13 +43,6 @@ def view(
         save: write a recording of Rerun instead of opening a window.
         scans: at most this many, evenly spaced.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
-        device: cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU.
-        engine: what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8
-            (the same in 8-bit integers, calibrated once; a few labels change), or auto, the fastest
-            here that changes none.
-        precision: of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32.
-        at_once: scans that are segmented at the same time on a CPU; default: one per
-            core, if the memory suffices.
     """
     from amvnet.files import make_folder
     from amvnet.viewing.frames import LabelSource, choose_frames
@@ -72,10 +63,10 @@ def view(
 
     segmenter = None
     if weights is not None:
-        segmenter = make_segmenter(load(weights), device, engine, precision, at_once)
+        loaded = load(weights)
+        segmenter = compute.segmenter(loaded, widest_method(loaded.parts))
     source = LabelSource(segmenter, labels, taxonomy)
-    options = choice.parse()
-    frames = choose_frames(inputs, scans, source, options, sensor, say)
+    frames = choose_frames(inputs, scans, source, choice.parse(), sensor=sensor, say=say)
     _show(frames, _title(inputs, weights), html, save)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -21,25 +21,20 @@ from amvnet.data.datasets.joined import Joined, own_records
 from amvnet.errors import InputError
 from amvnet.files import atomic_write, parse_yaml
 from amvnet.models.methods import BOTH_NETWORKS
-from amvnet.training.callbacks import SETTINGS
 from amvnet.training.plan import Plan
 from amvnet.weights.file import SIZES, Weights, load
 
 # The stages in order, and the part of the weights that each trains.
 PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 LAST = "last.ckpt"  # in a stage's folder: what --resume continues from
+SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
 MOST_CHANGES = 6  # settings that a message names
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")
 
 
 @dataclass(frozen=True)
 class StageFolder:
-    """The folder of a stage, which says how far the stage is.
-
-    Attributes:
-        plan: of the run.
-        name: of the stage.
-    """
+    """The folder of a stage, which says how far the stage is."""
 
     plan: Plan
     name: str
@@ -157,11 +152,6 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
     """Return what the trained weights of a stage depend on, for YAML.
 
     Paths are left out, so that the data may move to another folder before the stage is resumed.
-
-    Args:
-        plan: of the run.
-        name: name of the stage.
-        weights: the weights that the stage begins with.
     """
     recipe = to_dict(plan.recipe)
     training_keys = [name, "augment", "seed", "precision"]
@@ -181,13 +171,7 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
 
 
 def description(plan: Plan, settings: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
-    """Return the record of a stage's training that its weights carry.
-
-    Args:
-        plan: of the run.
-        settings: of the stage.
-        sensor: what was measured of the sensor of the training scans.
-    """
+    """Return the record of a stage's training that its weights carry."""
     scans = plan.scans
     scores = {"scores": settings["scores"]} if "scores" in settings else {}
     return {
@@ -202,11 +186,6 @@ def description(plan: Plan, settings: dict[str, Any], sensor: dict[str, Any]) ->
 
 def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     """Check that a stage can begin in a folder, or be resumed there.
-
-    Args:
-        folder: of the stage.
-        settings: of the stage, from `stage_settings`.
-        resume: whether to resume the stage if it was begun before.
 
     Raises:
         InputError: if the stage was begun before, and is not to be resumed or had other settings.
@@ -243,29 +222,31 @@ def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
     return complete
 
 
-def describe_changes(earlier: Any, settings: Any, name: str = "") -> list[str]:
+def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[str]:
     """Return what differs between the settings of a stage, as "training.rv.lr 0.1 instead of 0.2".
 
     Digests, which say nothing to people, are not shown: "another scans.train".
-
-    Args:
-        earlier: those of the earlier run, nested dictionaries.
-        settings: those of this one.
-        name: of the settings, with dots.
     """
-    if earlier == settings:
-        return []
-    if isinstance(settings, dict):
-        if not isinstance(earlier, dict):
-            earlier = {}
-        changes: list[str] = []
-        for key in [*settings, *(key for key in earlier if key not in settings)]:
-            inner = f"{name}.{key}".removeprefix(".")
-            changes += describe_changes(earlier.get(key), settings.get(key), inner)
-        return changes
-    if name.split(".")[0] not in ("model", "training"):
-        return [f"another {name}"]
-    return [f"{name} {settings} instead of {earlier}"]
+    before = dict(_flat(earlier))
+    now = dict(_flat(settings))
+    changes = []
+    for name in now | before:
+        if now.get(name) == before.get(name):
+            continue
+        if name.startswith(("model.", "training.")):
+            changes.append(f"{name} {now.get(name)} instead of {before.get(name)}")
+        else:
+            changes.append(f"another {name}")
+    return changes
+
+
+def _flat(tree: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested dictionaries, each with its keys, joined by dots."""
+    if not isinstance(tree, dict):
+        yield name, tree
+        return
+    for key, value in tree.items():
+        yield from _flat(value, f"{name}.{key}".removeprefix("."))
 
 
 def sequence_names(records: Sequence[ScanRecord]) -> list[str]:

@@ -6,8 +6,13 @@ from pathlib import Path
 
 import yaml
 
-from amvnet.training.callbacks import SETTINGS
-from amvnet.training.record import LAST, MOST_CHANGES, check_begun, describe_changes
+from amvnet.training.run_folder import (
+    LAST,
+    MOST_CHANGES,
+    SETTINGS,
+    check_begun,
+    describe_changes,
+)
 
 from fixtures.worlds import fails
 
