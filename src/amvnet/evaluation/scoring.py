@@ -190,7 +190,7 @@ def labels_by_method(
     scores = segmenter.run(batch)
     labels = {}
     for name in methods:
-        values = scores.merged
+        values: Tensor | None = scores.merged
         if name != segmenter.method:
             values = _scores_by(name, segmenter, scores, batch)
         if values is not None:
