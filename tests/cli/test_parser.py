@@ -13,9 +13,8 @@ import pytest
 from amvnet.cli.completion import SHELLS
 from amvnet.cli.main import VERBS, main
 from amvnet.cli.options import ScanChoice
-from amvnet.cli.parser import Command, join_negative_values, make_parser, run_with
+from amvnet.cli.parser import Command, field_texts, join_negative_values, make_parser, run_with
 from amvnet.cli.recipe_options import OFTEN_SET, add_recipe, with_options
-from amvnet.config.field_texts import field_texts
 from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.models.methods import EngineName
 

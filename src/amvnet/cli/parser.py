@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import dataclasses
+import functools
 import inspect
 import re
+import sys
 from argparse import BooleanOptionalAction
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 import docstring_parser
 from jsonargparse import ArgumentParser
 
 from amvnet.cli.console import say_lines
-from amvnet.config.field_texts import field_texts
 from amvnet.errors import InputError, did_you_mean, shown
 
 # The groups of a verb's options in its help; the others come before them.
@@ -295,3 +298,19 @@ def join_negative_values(arguments: Sequence[str]) -> list[str]:
         else:
             joined.append(word)
     return joined
+
+
+def field_texts(cls: type) -> dict[str, str]:
+    """Return the line of documentation under each field of a dataclass."""
+    texts: dict[str, str] = {}
+    for field, text in pairwise(_class_bodies(cls.__module__)[cls.__name__]):
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+            texts[field.target.id] = text.value.value  # type: ignore[attr-defined,union-attr]
+    return texts
+
+
+@functools.cache
+def _class_bodies(module: str) -> dict[str, list[ast.stmt]]:
+    """Return the statements of each class of a module, by name."""
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    return {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}

@@ -7,8 +7,7 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from amvnet.cli.parser import metavar_of
-from amvnet.config.field_texts import field_texts
+from amvnet.cli.parser import field_texts, metavar_of
 from amvnet.config.nested import replace_values
 from amvnet.config.schema import Recipe
 from amvnet.errors import InputError

@@ -197,7 +197,7 @@ def train_network(plan: Plan, name: str, weights: Weights, steps: int | None = N
     """
     config = getattr(plan.recipe.training, name)
     # Before the scans are read for the class weights.
-    if config.initial and PART_OF[name] not in weights.parts:
+    if steps is None and config.initial and PART_OF[name] not in weights.parts:
         raise InputError(
             f"training.{name}.initial: expected weights to begin with, found none; give "
             "--init, or set it to 0"
