@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, color_of
+from amvnet.data.taxonomy import Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, did_you_mean, shown
 from amvnet.files import read_yaml
 
@@ -101,34 +101,19 @@ def class_map(name: str) -> ClassMap:
 
 def _parse(name: str, tree: Any) -> ClassMap:
     classes = tree.get("classes") if isinstance(tree, Mapping) else None
-    if not isinstance(classes, Mapping) or not classes:
-        raise InputError(
-            "expected classes with the names of others, such as ground: [road, sidewalk], "
-            f"found {shown(classes)}; write them"
-        )
+    entries = class_entries(classes, "from", "ground: [road, sidewalk]")
 
     sources: dict[str, int] = {}
-    colors = [(0, 0, 0)]
     raw_ids = [0]
-    for train_id, (title, entry) in enumerate(classes.items(), start=1):
-        values = entry if isinstance(entry, Mapping) else {"from": entry}
+    for train_id, (title, values) in enumerate(entries.items(), start=1):
         for source in _names(title, values.get("from", [])):
             if source in sources:
                 raise InputError(f"expected each class once, found {source} twice; correct the map")
             sources[source] = train_id
-        colors.append(color_of(title, values.get("color"), train_id))
-        raw_ids.append(_id(title, values.get("id", train_id)))
+        raw_ids.append(values.get("id", train_id))
 
-    target = Taxonomy(
-        name=name if name not in TAXONOMIES else f"own-{name}",
-        classes=tuple(map(str, classes)),
-        colors=tuple(colors),
-        raw_to_train={raw: train_id for train_id, raw in enumerate(raw_ids)},
-        train_to_raw=tuple(raw_ids),
-        splits={},
-        counts_absent=False,
-    )
-    return ClassMap(target, sources)
+    raw_to_train: dict[int | str, int] = {raw: index for index, raw in enumerate(raw_ids)}
+    return ClassMap(user_taxonomy(name, entries, raw_to_train, raw_ids), sources)
 
 
 def _names(title: Any, values: Any) -> Sequence[str]:
@@ -137,11 +122,3 @@ def _names(title: Any, values: Any) -> Sequence[str]:
         if not isinstance(name, str):
             raise InputError(f"{title}: expected names of classes, found {shown(name)}; correct it")
     return names
-
-
-def _id(title: Any, value: Any) -> int:
-    if type(value) is not int:
-        raise InputError(
-            f"{title}: expected a whole number as id, found {shown(value)}; correct it"
-        )
-    return value

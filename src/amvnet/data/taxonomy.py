@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +25,11 @@ VALUE = 0.95
 GOLDEN_ANGLE = 0.381966  # of the circle of hues
 UNKNOWN = -1  # in lookup tables: no train id belongs to this raw id
 
-# The tables of a YAML label map, and its name for each split.
-_YAML_TABLES = (
-    "labels",
-    "color_map",
-    "learning_map",
-    "learning_map_inv",
-    "learning_ignore",
-    "split",
-)
+# A YAML label map has these tables, and its own name for each split.
+_YAML_TABLES = "labels, color_map, learning_map, learning_map_inv, learning_ignore and split"
 _YAML_SPLITS = {"train": "train", "val": "valid", "test": "test"}
+
+Color = tuple[int, int, int]  # RGB in 0..255
 
 
 @dataclass(frozen=True)
@@ -55,72 +51,48 @@ class Taxonomy:
 
     name: str
     classes: tuple[str, ...]
-    colors: tuple[tuple[int, int, int], ...]
+    colors: tuple[Color, ...]
     raw_to_train: Mapping[int | str, int]
     train_to_raw: tuple[int, ...]
     splits: Mapping[str, tuple[str, ...]]
     counts_absent: bool
 
     def __post_init__(self) -> None:
-        self._check_types()
-        self._check_length("colours", len(self.colors))
-        self._check_length("raw ids", len(self.train_to_raw))
-        self._check_different("classes", self.classes)
-        self._check_different("ids", self.train_to_raw)
-
-        wrong_train_ids = set(self.raw_to_train.values()) - set(range(self.size + 1))
-        if wrong_train_ids:
-            raise InputError(
-                f"taxonomy {self.name}: expected train ids 0..{self.size}, "
-                f"found {shown(sorted(wrong_train_ids))}; correct the table"
-            )
-
-        raw_ids = self.raw_ids
-        if raw_ids and (min(raw_ids) < 0 or max(raw_ids) > INSTANCE_MASK):
-            raise InputError(
-                f"taxonomy {self.name}: expected raw ids 0..{INSTANCE_MASK}, "
-                f"found {shown(min(raw_ids))}..{shown(max(raw_ids))}; correct the table"
-            )
-
-    def _check_types(self) -> None:
-        """Check what a file of a stranger may hold in place of names and numbers."""
         check_text("taxonomy", self.name)
         for name in self.classes:
             check_text(f"taxonomy {self.name}: classes", name)
-        if not 1 <= self.size <= MOST_CLASSES:
+        for sequence in chain.from_iterable(self.splits.values()):
+            check_text(f"taxonomy {self.name}: splits", sequence)
+        self._check(1 <= self.size <= MOST_CLASSES, f"1 to {MOST_CLASSES} classes", self.size)
+
+        channels = list(chain.from_iterable(self.colors))
+        raw_ids = [raw for raw in self.raw_to_train if not isinstance(raw, str)]
+        train_ids = list(self.raw_to_train.values())
+        for number in (*channels, *self.train_to_raw, *train_ids, *raw_ids):
+            self._check(type(number) is int, "whole numbers as ids and colours", number)
+        self._check_range("colours", channels, 255)
+        self._check_range("train ids", train_ids, self.size)
+        self._check_range("raw ids", self.raw_ids, INSTANCE_MASK)
+
+        for kind, values in (("colours", self.colors), ("raw ids", self.train_to_raw)):
+            expected = f"{self.size + 1} {kind} (ignored and {self.size} classes)"
+            self._check(len(values) == self.size + 1, expected, len(values))
+        self._check_different("classes", self.classes)
+        self._check_different("ids", self.train_to_raw)
+
+    def _check(self, holds: bool, expected: str, found: Any) -> None:
+        """Raise an InputError unless a condition holds: a file of a stranger may hold anything."""
+        if not holds:
             raise InputError(
-                f"taxonomy {self.name}: expected 1 to {MOST_CLASSES} classes, found {self.size}; "
+                f"taxonomy {self.name}: expected {expected}, found {shown(found)}; "
                 "correct the table"
             )
 
-        numbers = [*self.train_to_raw, *self.raw_to_train.values()]
-        numbers += [raw for raw in self.raw_to_train if not isinstance(raw, str)]
-        for color in self.colors:
-            numbers += color
-        for number in numbers:
-            if type(number) is not int:
-                raise InputError(
-                    f"taxonomy {self.name}: expected whole numbers as ids and colours, "
-                    f"found {shown(number)}; correct the table"
-                )
+    def _check_range(self, kind: str, numbers: Sequence[int], last: int) -> None:
+        wrong = [number for number in numbers if not 0 <= number <= last]
+        self._check(not wrong, f"{kind} 0..{last}", wrong)
 
-        if any(not 0 <= value <= 255 for color in self.colors for value in color):
-            raise InputError(
-                f"taxonomy {self.name}: expected colours from 0 to 255, found others; correct them"
-            )
-
-        for sequences in self.splits.values():
-            for sequence in sequences:
-                check_text(f"taxonomy {self.name}: splits", sequence)
-
-    def _check_length(self, kind: str, length: int) -> None:
-        if length != self.size + 1:
-            raise InputError(
-                f"taxonomy {self.name}: expected {self.size + 1} {kind} "
-                f"(ignored and {self.size} classes), found {length}; give one per train id"
-            )
-
-    def _check_different(self, kind: str, values: tuple[Any, ...]) -> None:
+    def _check_different(self, kind: str, values: Sequence[Any]) -> None:
         for value in values:
             if values.count(value) > 1:
                 raise InputError(
@@ -257,43 +229,23 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
     """
     path = Path(path)
     config = read_yaml(path, "a label map")
-    missing = _missing_tables(config)
-    if missing:
-        raise InputError(
-            f"{path}: expected the tables {', '.join(_YAML_TABLES)}, "
-            f"found no {', '.join(missing)}; add them"
-        )
-
     try:
+        if not isinstance(config, Mapping):
+            raise InputError(f"expected the tables {_YAML_TABLES}, found none; add them")
         return _from_config(path.stem, config)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except KeyError as error:
         raise InputError(
-            f"{path}: expected tables that fit each other, found no entry {error}; complete them"
+            f"{path}: expected the tables {_YAML_TABLES} that fit each other, found no entry "
+            f"{error}; add it"
         ) from None
-    except (TypeError, ValueError, OverflowError) as error:  # OverflowError: .inf as an id
+    # AttributeError: a table that is none; OverflowError: .inf as an id.
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(
-            f"{path}: expected whole numbers as ids and colours, found {shown(error)}; correct them"
+            f"{path}: expected tables of whole numbers as ids and colours, found {shown(error)}; "
+            "correct them"
         ) from None
-
-
-def _missing_tables(config: Any) -> list[str]:
-    """Return the names of the tables that a YAML label map lacks."""
-    if not isinstance(config, dict):
-        return list(_YAML_TABLES)
-
-    missing = []
-    for table in _YAML_TABLES:
-        if not isinstance(config.get(table), dict):
-            missing.append(table)
-
-    if "split" not in missing:
-        for split in _YAML_SPLITS.values():
-            if split not in config["split"]:
-                missing.append(f"split.{split}")
-
-    return missing
 
 
 def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
@@ -341,33 +293,64 @@ def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
     )
 
 
-def color_of(title: Any, values: Any, train_id: int) -> tuple[int, int, int]:
-    """Return the colour that a user gives a class, or one unlike the others if there is none.
+def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, Any]]:
+    """Return what a user's YAML file says of each class, by name: values by key, with a colour.
 
     Args:
-        title: of the class, for the message.
-        values: of the YAML file; None stands for none.
-        train_id: of the class.
+        classes: of the file; the entry of a class is a mapping, or only the value of `key`.
+        key: the only one that a class must have.
+        example: of an entry, for the message.
 
     Raises:
-        InputError: if it is no list of three whole numbers.
+        InputError: if there are no classes, or a colour is no list of three whole numbers.
     """
-    if values is None:
-        hue = train_id * GOLDEN_ANGLE % 1
-        red, green, blue = colorsys.hsv_to_rgb(hue, SATURATION, VALUE)
-        return round(255 * red), round(255 * green), round(255 * blue)
-
-    is_triple = isinstance(values, list) and len(values) == 3
-    if not is_triple or any(type(value) is not int for value in values):
+    if not isinstance(classes, Mapping) or not classes:
         raise InputError(
-            f"classes: {title}: expected a color such as [255, 0, 0], found {shown(values)}; "
-            "correct it"
+            f"classes: expected names with {key}, such as {example}, found {shown(classes)}; "
+            "write them"
         )
-    red, green, blue = values
-    return red, green, blue
+
+    entries = {}
+    for train_id, (title, entry) in enumerate(classes.items(), start=1):
+        values = dict(entry) if isinstance(entry, Mapping) else {key: entry}
+        color = values.get("color")
+        if color is None:
+            hue = train_id * GOLDEN_ANGLE % 1
+            rgb = np.array(colorsys.hsv_to_rgb(hue, SATURATION, VALUE))
+            color = (255 * rgb).round().astype(int).tolist()
+        is_triple = isinstance(color, list) and len(color) == 3
+        if not is_triple or any(type(value) is not int for value in color):
+            raise InputError(
+                f"classes: {title}: expected a color such as [255, 0, 0], found {shown(color)}; "
+                "correct it"
+            )
+        entries[title] = {**values, "color": color}
+    return entries
 
 
-def _rgb(values: Iterable[Any]) -> tuple[int, int, int]:
+def user_taxonomy(
+    name: str,
+    entries: Mapping[Any, Mapping[str, Any]],
+    raw_to_train: Mapping[int | str, int],
+    train_to_raw: Sequence[int],
+) -> Taxonomy:
+    """Return the taxonomy of a user's classes, given their entries as `class_entries` does.
+
+    Raises:
+        InputError: as `Taxonomy`.
+    """
+    return Taxonomy(
+        name=f"own-{name}" if name in TAXONOMIES else name,
+        classes=tuple(map(str, entries)),
+        colors=((0, 0, 0), *(_rgb(values["color"]) for values in entries.values())),
+        raw_to_train=raw_to_train,
+        train_to_raw=tuple(train_to_raw),
+        splits={},
+        counts_absent=False,
+    )
+
+
+def _rgb(values: Iterable[Any]) -> Color:
     red, green, blue = values
     return int(red), int(green), int(blue)
 

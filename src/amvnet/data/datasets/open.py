@@ -6,7 +6,7 @@ from pathlib import Path
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
-from amvnet.data.datasets.own import OwnScans, is_description, open_own
+from amvnet.data.datasets.own import is_description, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.simulated import SENSORS, SimulatedStreets
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
@@ -30,16 +30,21 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
         taxonomy: the classes, if they are not the benchmark's own.
 
     Raises:
-        InputError: if the path does not exist or does not have the layout, or simulated streets are
-            to have other classes.
+        InputError: if the path does not exist or does not have the layout, or the dataset brings
+            its own classes and `taxonomy` is given.
     """
-    kind, _, rest = str(spec).partition(":")
+    kind, _, rest = spec.partition(":")
+    if taxonomy is not None and (kind in SIMULATED or is_own(spec)):
+        raise InputError(
+            f"{spec}: expected its own classes, found those of {taxonomy.name}; "
+            "leave --taxonomy out, or write simulated streets with amvnet simulate"
+        )
     if kind in SIMULATED:
-        return _open_simulated(kind, rest, taxonomy)
-    if is_own(str(spec)):
-        return _open_own(str(spec).removeprefix(f"{OWN}:"), taxonomy)
+        return SimulatedStreets(Path(rest).expanduser(), SIMULATED[kind])
+    if is_own(spec):
+        return open_own(spec.removeprefix(f"{OWN}:"))
 
-    path, version = _split_version(rest if kind in READERS else str(spec))
+    path, version = _split_version(rest if kind in READERS else spec)
     if not path.is_dir():
         raise InputError(f"{path}: expected the folder of a dataset, found none; check the path")
 
@@ -75,12 +80,14 @@ def open_if_dataset(spec: str, taxonomy: Taxonomy | None) -> Dataset | None:
     """
     if not is_dataset(spec):
         return None
-    if is_own(spec):
-        own = open_own(spec.removeprefix(f"{OWN}:"))
-        is_same = taxonomy is None or own.taxonomy.classes == taxonomy.classes
-        # Without its labels, a scan can be labelled by weights of any classes.
-        return own if is_same or taxonomy is None else own.with_classes(taxonomy)
-    return open_dataset(spec) if taxonomy is None else open_with_classes(spec, taxonomy)
+    if taxonomy is None:
+        return open_dataset(spec)
+    if not is_own(spec):
+        return open_with_classes(spec, taxonomy)
+
+    own = open_own(spec.removeprefix(f"{OWN}:"))
+    # Without its labels, a scan can be labelled by weights of any classes.
+    return own if own.taxonomy.classes == taxonomy.classes else own.with_classes(taxonomy)
 
 
 def is_own(spec: str) -> bool:
@@ -104,26 +111,6 @@ def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
             f"{dataset.root}: expected the classes of {dataset.taxonomy.name}, found those of "
             f"{taxonomy.name}; use weights, a head or a --taxonomy with the dataset's classes"
         )
-
-
-def _open_simulated(kind: str, path: str, taxonomy: Taxonomy | None) -> SimulatedStreets:
-    """Return the simulated streets of a sensor."""
-    if taxonomy is not None:
-        raise InputError(
-            f"{kind}: expected the classes of its benchmark, found those of {taxonomy.name}; "
-            "leave --taxonomy out, or write the streets with amvnet simulate"
-        )
-    return SimulatedStreets(Path(path).expanduser(), SIMULATED[kind])
-
-
-def _open_own(path: str, taxonomy: Taxonomy | None) -> OwnScans:
-    """Return the scans that a user's YAML file describes."""
-    if taxonomy is not None:
-        raise InputError(
-            f"{path}: expected the classes of the file, found those of {taxonomy.name}; "
-            "leave --taxonomy out"
-        )
-    return open_own(path)
 
 
 def _split_version(text: str) -> tuple[Path, str | None]:

@@ -19,7 +19,7 @@ from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_label_field, read_scan_labels
-from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, Taxonomy, color_of
+from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, shown
 from amvnet.files import read_yaml
 from amvnet.scan import Scan
@@ -339,7 +339,6 @@ def _parse(path: Path, tree: Any) -> Description:
             "name the folder of the data as root"
         )
 
-    name = _text(tree, "name", path.stem)
     sensor = tree.get("sensor")
     if sensor is not None and not isinstance(sensor, str | Mapping):
         raise InputError(
@@ -349,7 +348,7 @@ def _parse(path: Path, tree: Any) -> Description:
     return Description(
         path,
         root,
-        taxonomy=_parse_classes(f"own-{name}" if name in TAXONOMIES else name, tree),
+        taxonomy=_parse_classes(_text(tree, "name", path.stem), tree),
         scans=scans,
         labels=_parse_labels(tree.get("labels")),
         split=_parse_split(tree.get("split") or {}),
@@ -360,24 +359,15 @@ def _parse(path: Path, tree: Any) -> Description:
 
 def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
     """Return the classes: names with raw ids and, if the user likes, colours."""
-    classes = tree["classes"]
-    if not isinstance(classes, Mapping) or not classes:
-        raise InputError(
-            f"classes: expected names with ids, such as road: [1, 2], found {shown(classes)}; "
-            "write them"
-        )
-
-    colors = [(0, 0, 0)]
+    entries = class_entries(tree["classes"], "ids", "road: [1, 2]")
     train_to_raw = []
     raw_to_train: dict[int | str, int] = {}
-    for train_id, (title, entry) in enumerate(classes.items(), start=1):
-        values = entry if isinstance(entry, Mapping) else {"ids": entry}
+    for train_id, (title, values) in enumerate(entries.items(), start=1):
         _check_keys(f"classes: {title}", values, ("ids", "color"), required=("ids",))
         ids = _ids(f"classes: {title}", values["ids"])
         if not ids:
             raise InputError(f"classes: {title}: expected ids, found none; name one or more")
         train_to_raw.append(ids[0])
-        colors.append(color_of(title, values.get("color"), train_id))
         for raw_id in ids:
             _add(raw_to_train, raw_id, train_id)
 
@@ -387,16 +377,7 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
     if not ignored:  # points without a label have to get some id
         ignored = [next(raw for raw in range(INSTANCE_MASK) if raw not in raw_to_train)]
         raw_to_train[ignored[0]] = 0
-
-    return Taxonomy(
-        name=name,
-        classes=tuple(map(str, classes)),
-        colors=tuple(colors),
-        raw_to_train=raw_to_train,
-        train_to_raw=(ignored[0], *train_to_raw),
-        splits={},
-        counts_absent=False,
-    )
+    return user_taxonomy(name, entries, raw_to_train, (ignored[0], *train_to_raw))
 
 
 def _add(raw_to_train: dict[int | str, int], raw_id: int, train_id: int) -> None:
