@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -19,7 +18,7 @@ from amvnet.errors import InputError
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
-from amvnet.sensors.lidars import Sensor, make_sensor, sensor_from
+from amvnet.sensors.lidars import Sensor, make_sensor
 from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
@@ -215,8 +214,7 @@ def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
 
 def _described_sensor(dataset: OwnScans) -> Sensor:
     """Return what the file of a dataset says of the sensor."""
-    sensor = dataset.description.sensor
     try:
-        return sensor_from(sensor) if isinstance(sensor, Mapping) else make_sensor(sensor)
+        return make_sensor(dataset.description.sensor)
     except InputError as error:
         raise InputError(f"{dataset.spec}: sensor: {error}") from None

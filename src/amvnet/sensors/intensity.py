@@ -66,6 +66,12 @@ class TrainedIntensity:
         return np.interp(draws, PROBABILITIES, self.quantiles).astype(np.float32)
 
 
+def network_records(training: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
+    """Return the names of both networks and their training records, of those that have one."""
+    parts = [(part, training.get(part)) for part in ("range_net", "polar_net")]
+    return [(part, record) for part, record in parts if isinstance(record, Mapping)]
+
+
 def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntensity | None:
     """Return the intensities that weights were trained with; None if nothing tells them.
 
@@ -76,11 +82,7 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
     quantiles: Sequence[float] | None = QUANTILES.get(sensor)
     shares = []
     matched = []
-    for part in ("range_net", "polar_net"):
-        record = training.get(part)
-        if not isinstance(record, Mapping):
-            continue
-
+    for part, record in network_records(training):
         carried = record.get(KEY)
         if carried == NO_INTENSITY and record.get(MATCHED) is not True:
             quantiles = NO_INTENSITY

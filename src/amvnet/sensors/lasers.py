@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -61,6 +62,19 @@ class SensorGeometry:
             return None
         return self.fov_up, self.fov_down
 
+    @classmethod
+    def median(cls, geometries: Sequence[SensorGeometry]) -> SensorGeometry:
+        """Return the median of each value that is known."""
+        medians: dict[str, Any] = {}
+        for key in MEASURES:
+            values = [getattr(geometry, key) for geometry in geometries]
+            known = [value for value in values if value is not None]
+            if known:
+                medians[key] = float(np.median(known))
+        if "beams" in medians:
+            medians["beams"] = round(medians["beams"])
+        return cls(**medians)
+
     def has_ends_of(self, other: SensorGeometry) -> bool:
         """Return whether the field of view is that of another sensor, as far as both are known."""
         return _is_near(self.fov_up, other.fov_up) and _is_near(self.fov_down, other.fov_down)
@@ -73,14 +87,14 @@ class SensorGeometry:
                 return False
         return self.has_ends_of(other)
 
+    def known(self) -> dict[str, Any]:
+        """Return the values that are known, by name."""
+        return {key: value for key, value in vars(self).items() if value is not None}
+
     def override(self, sensor: Sensor) -> SensorGeometry:
         """Return the geometry with what is known of the sensor in place of what was measured."""
-        known: dict[str, Any] = {}
-        for key in MEASURES:
-            value = getattr(sensor, key)
-            if value is not None:
-                known[key] = value
-        return dataclasses.replace(self, **known)
+        stated = SensorGeometry(*(getattr(sensor, key) for key in MEASURES))
+        return dataclasses.replace(self, **stated.known())
 
 
 def _is_near(angle: float | None, other: float | None) -> bool:

@@ -155,31 +155,27 @@ _DATA_SHEETS: dict[str, tuple[int, float, float]] = {
 SENSORS = {name: Sensor(name, *sheet) for name, sheet in _DATA_SHEETS.items()}
 
 
-def make_sensor(sensor: str | None = None, **options: Any) -> Sensor:
-    """Return a sensor by its name or its YAML file, with some attributes overridden.
+def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -> Sensor:
+    """Return a sensor with some attributes overridden.
 
     Args:
-        sensor: a name in `SENSORS`, or a YAML file with attributes of `Sensor`; None stands for an
-            unknown sensor.
+        sensor: a name in `SENSORS`, a YAML file with attributes of `Sensor`, or these; None stands
+            for an unknown sensor.
         options: attributes of `Sensor` that override those; None overrides nothing. `rotate` and
             `offset` may be texts of three numbers separated by commas.
 
     Raises:
-        InputError: if there is no such sensor or file, or a value is impossible.
+        InputError: if there is no such sensor, file or attribute, or a value is impossible.
     """
-    base = Sensor() if sensor is None else _read_sensor(sensor)
+    if sensor is None:
+        base = Sensor()
+    elif isinstance(sensor, Mapping):
+        base = Sensor(**_convert(sensor))
+    else:
+        base = _read_sensor(sensor)
 
     changes = {key: value for key, value in options.items() if value is not None}
     return dataclasses.replace(base, **_convert(changes, are_options=True))
-
-
-def sensor_from(attributes: Mapping[Any, Any]) -> Sensor:
-    """Return the sensor with some attributes, as a YAML file has them.
-
-    Raises:
-        InputError: if there is no such attribute, or a value is impossible.
-    """
-    return Sensor(**_convert(attributes))
 
 
 def _read_sensor(text: str) -> Sensor:
@@ -199,59 +195,10 @@ def _read_sensor(text: str) -> Sensor:
         raise InputError(
             f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md"
         )
-
     try:
-        attributes = {"name": path.stem, **_convert(tree)}
-        return Sensor(**attributes)
+        return make_sensor({"name": path.stem, **tree})
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def _convert(values: Mapping[Any, Any], are_options: bool = False) -> dict[str, Any]:
-    """Convert values to the types of the attributes of `Sensor`.
-
-    Args:
-        are_options: whether messages should name the keys as options of the command line.
-
-    Raises:
-        InputError: if a key is no attribute, or a value cannot be converted.
-    """
-    names = [field.name for field in dataclasses.fields(Sensor)]
-    attributes = {}
-    for key, value in values.items():
-        if key not in names:
-            raise InputError(f"expected one of {', '.join(names)}, found {key!r}; correct the key")
-
-        try:
-            attributes[key] = _converter(key)(value)
-        except (ValueError, TypeError, OverflowError):
-            title = f"--{key}".replace("_", "-") if are_options else key
-            raise InputError(
-                f"{title}: expected {_example(key)}, found {value!r}; correct the value"
-            ) from None
-
-    return attributes
-
-
-def _converter(key: str) -> Callable[[Any], Any]:
-    """Return the function that converts values of an attribute."""
-    if key in ("name", "unit", "axes"):
-        return str
-    if key == "beams":
-        return _to_whole
-    if key in ("rotate", "offset"):
-        return _to_triple
-
-    return float
-
-
-def _example(key: str) -> str:
-    if key == "rotate":
-        return "yaw,pitch,roll such as 90,0,0"
-    if key == "offset":
-        return "x,y,z such as 0,0,1.2"
-
-    return "a number"
 
 
 def _to_whole(value: Any) -> int:
@@ -264,3 +211,39 @@ def _to_triple(value: Any) -> Triple:
     numbers = value.split(",") if isinstance(value, str) else value
     a, b, c = map(float, numbers)
     return a, b, c
+
+
+# What converts a value of a file or an option to an attribute of `Sensor`, and what it takes.
+_CONVERTERS: dict[str, tuple[Callable[[Any], Any], str]] = {
+    **dict.fromkeys(("name", "unit", "axes"), (str, "a text")),
+    **dict.fromkeys(("fov_up", "fov_down", "height", "intensity_scale"), (float, "a number")),
+    "beams": (_to_whole, "a whole number"),
+    "rotate": (_to_triple, "yaw,pitch,roll such as 90,0,0"),
+    "offset": (_to_triple, "x,y,z such as 0,0,1.2"),
+}
+
+
+def _convert(values: Mapping[Any, Any], are_options: bool = False) -> dict[str, Any]:
+    """Convert values to the types of the attributes of `Sensor`.
+
+    Args:
+        are_options: whether messages should name the keys as options of the command line.
+
+    Raises:
+        InputError: if a key is no attribute, or a value cannot be converted.
+    """
+    attributes = {}
+    for key, value in values.items():
+        if key not in _CONVERTERS:
+            names = ", ".join(_CONVERTERS)
+            raise InputError(f"expected one of {names}, found {key!r}; correct the key")
+
+        convert, expected = _CONVERTERS[key]
+        try:
+            attributes[key] = convert(value)
+        except (ValueError, TypeError, OverflowError):
+            title = f"--{key}".replace("_", "-") if are_options else key
+            raise InputError(
+                f"{title}: expected {expected}, found {value!r}; correct the value"
+            ) from None
+    return attributes

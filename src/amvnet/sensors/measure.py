@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from amvnet.errors import InputError
 from amvnet.scan import Scan
 from amvnet.sensors.frame import STEADY_TILT, Frame, find_frame, median_frame
 from amvnet.sensors.intensity import are_of_one_range, quantiles_of
-from amvnet.sensors.lasers import MEASURES, SensorGeometry, field_of_view, measure_lasers
+from amvnet.sensors.lasers import SensorGeometry, field_of_view, measure_lasers
 from amvnet.sensors.lidars import Sensor
 
 MEASURED = 5  # scans of a recording that are measured; later ones get the median of these
@@ -226,20 +225,11 @@ class Recording:
 
 def median_of(estimates: Sequence[Estimate]) -> Estimate:
     """Return the median of each value that is known."""
-    medians: dict[str, Any] = {}
-    for key in MEASURES:
-        values = [getattr(estimate.lasers, key) for estimate in estimates]
-        known = [value for value in values if value is not None]
-        if known:
-            medians[key] = float(np.median(known))
-    if "beams" in medians:
-        medians["beams"] = round(medians["beams"])
-
     frames = [estimate.frame for estimate in estimates]
     quantiles = [each.quantiles for each in estimates if each.quantiles is not None]
     return Estimate(
         median_frame(frames),
-        SensorGeometry(**medians),
+        SensorGeometry.median([estimate.lasers for estimate in estimates]),
         quantiles=np.median(quantiles, axis=0) if quantiles else None,
         count=int(np.median([estimate.count for estimate in estimates])),
         is_steady=_are_steady(frames),

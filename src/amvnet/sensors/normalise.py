@@ -17,7 +17,7 @@ from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.frame import Frame
 from amvnet.sensors.intensity import IntensityMap, TrainedIntensity, intensity_map
-from amvnet.sensors.lasers import MEASURES, SensorGeometry, elevations
+from amvnet.sensors.lasers import SensorGeometry, elevations
 from amvnet.sensors.lidars import SENSORS, Sensor
 from amvnet.sensors.measure import (
     MEASURED,
@@ -221,8 +221,7 @@ class Normaliser:
             if self.expected.view.rows != "ring" or lasers.field_of_view is None:
                 lasers = measured.lasers.override(self.sensor)
 
-        values = {key: getattr(lasers, key) for key in MEASURES} | {"height": height}
-        return {key: value for key, value in values.items() if value is not None}
+        return dataclasses.replace(lasers, height=height).known()
 
     def _check_height(self, cloud: Cloud, frame: Frame) -> None:
         """Raise InputError if the ground is too far below the sensor for coordinates in metres."""

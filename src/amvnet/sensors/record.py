@@ -13,6 +13,7 @@ from amvnet.errors import InputError
 from amvnet.scan import Scan
 from amvnet.sensors.ground import MIN_DISTANCE
 from amvnet.sensors.intensity import KEY as INTENSITY
+from amvnet.sensors.intensity import network_records
 from amvnet.sensors.lasers import MEASURES, SensorGeometry, elevations, measure
 from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
 from amvnet.sensors.normalise import Normaliser
@@ -31,9 +32,8 @@ def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
         name: of the sensor, as the weights carry it; counts only for what no record tells.
     """
     known = dataclasses.replace(SENSORS.get(name, Sensor(name)), height=HEIGHTS.get(name))
-    for part in ("range_net", "polar_net"):
-        record = training.get(part)
-        carried = record.get(KEY) if isinstance(record, Mapping) else None
+    for _, record in network_records(training):
+        carried = record.get(KEY)
         if isinstance(carried, Mapping):
             known = _replace(known, carried)
     return known
@@ -41,12 +41,8 @@ def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
 
 def is_trained_as_is(training: Mapping[str, Any]) -> bool:
     """Return whether weights were trained on scans that were not normalised, by their records."""
-    for part in ("range_net", "polar_net"):
-        record = training.get(part)
-        carried = record.get(KEY) if isinstance(record, Mapping) else None
-        if isinstance(carried, Mapping) and carried.get(AS_IS) is True:
-            return True
-    return False
+    carried = [record.get(KEY) for _, record in network_records(training)]
+    return any(isinstance(each, Mapping) and each.get(AS_IS) is True for each in carried)
 
 
 def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
@@ -79,14 +75,8 @@ def measure_sensor(scans: Iterable[Scan]) -> dict[str, float]:
         if len(points):
             measured.append(_with_laser_ends(measure(points, ring), points, ring))
 
-    record: dict[str, float] = {}
-    for key in MEASURES:
-        values = [getattr(geometry, key) for geometry in measured]
-        known = [value for value in values if value is not None]
-        if known:
-            median = float(np.median(known))
-            record[key] = round(median) if key == "beams" else round(median, 3)
-    return record
+    known = SensorGeometry.median(measured).known()
+    return {key: round(value, 3) for key, value in known.items()}
 
 
 def _with_laser_ends(
