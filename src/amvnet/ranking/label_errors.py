@@ -109,9 +109,6 @@ def rank(
     A few scans are in memory at a time, and 35 bytes for each cluster.
 
     Args:
-        dataset: the dataset that has the scans.
-        records: the scans.
-        segmenter: the two networks.
         progress: called at the start and after each scan, with the number of scans done and in
             all.
 
@@ -290,8 +287,6 @@ def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
     """Write the clusters to a CSV file, and the scans to another one next to it.
 
     Args:
-        ranking: the clusters and the scans.
-        taxonomy: names of the classes.
         path: the file of the clusters, NAME.csv.
 
     Returns:

@@ -37,13 +37,7 @@ def possible_files(folder: Path) -> list[Path]:
 
 
 def _view_of_cluster(row: np.void, scan: Scan, segmenter: Segmenter) -> TopView:
-    """Return a cluster of a scan and its surroundings, by both views and by the labels.
-
-    Args:
-        row: the cluster.
-        scan: with labels.
-        segmenter: the two networks.
-    """
+    """Return a cluster of a scan and its surroundings, by both views and by the labels."""
     doubts = find_doubts(scan, segmenter)
     _, cluster_ids = find_clusters(doubts)
     in_cluster = cluster_ids == cluster_ids[row["point"]]

@@ -156,7 +156,6 @@ def check_quantiles(values: Any, source: str) -> list[float]:
 
     Args:
         values: of the file.
-        source: where they are from, for the message.
 
     Raises:
         InputError: if they cannot be quantiles.

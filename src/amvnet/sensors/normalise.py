@@ -65,10 +65,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     The row follows the elevation at which the sensor saw the point, before the move.
 
     Args:
-        cloud: the contents of the scan's file.
-        estimate: what was measured of its sensor.
         sensor: what is known of it, which counts more.
-        expected: what the weights expect.
 
     Raises:
         InputError: if no point is usable.
@@ -163,9 +160,6 @@ class Normaliser:
 
     def assign(self, cloud: Cloud, source: str) -> tuple[Scan, str]:
         """Return the scan, and a title of its sensor: the source, and whether it is the usual one.
-
-        Args:
-            source: as of a call.
 
         Raises:
             InputError: as of a call.

@@ -67,7 +67,6 @@ def write(
     memory at a time.
 
     Args:
-        rules: the rules of the archive.
         folder: predictions, under the file names of `rules`.
         out: NAME.zip; it appears whole or not at all.
         sources: the data that the method uses, if the benchmark asks for them.

@@ -87,11 +87,6 @@ class Rules:
     def check_size(self, name: str, size: int, path: Path) -> None:
         """Check the size of a prediction before it is read.
 
-        Args:
-            name: its name in the archive.
-            size: its bytes.
-            path: the file, for messages.
-
         Raises:
             InputError: if it does not have one id per point.
         """
@@ -109,10 +104,6 @@ class Rules:
 
     def check_ids(self, data: bytes, path: Path) -> None:
         """Check the ids of a prediction whose size has been checked.
-
-        Args:
-            data: its bytes.
-            path: the file, for messages.
 
         Raises:
             InputError: if an id is not one of the benchmark, or a point needs a class and has none.

@@ -164,10 +164,6 @@ def choose_frames(
     """Choose up to `count` scans of the inputs, evenly spaced, to look at.
 
     Args:
-        inputs: as of `list_inputs`.
-        count: the largest number of scans.
-        source: where their labels come from, if anywhere.
-        options: which scans of the inputs to choose from.
         sensor: what is known of the sensor of scan files; the rest is measured for the weights.
         say: is told what was assumed of the sensor.
 

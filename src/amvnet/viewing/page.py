@@ -103,10 +103,7 @@ def write_page(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy, ti
     """Write scans as one self-contained page; it appears whole or not at all.
 
     Args:
-        path: the HTML file.
         frames: the scans, in the order of the page's slider.
-        taxonomy: names and colours of the classes.
-        title: the page's title.
 
     Returns:
         The path that was written.

@@ -60,7 +60,6 @@ def save_recording(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy
     Args:
         path: the file, NAME.rrd.
         frames: the scans, at least one; each is a step of the timeline `scan`.
-        taxonomy: names and colours of the classes.
 
     Returns:
         The path that was written.
@@ -85,7 +84,6 @@ def open_window(frames: Iterable[Frame], taxonomy: Taxonomy) -> None:
 
     Args:
         frames: the scans, at least one; each is a step of the timeline `scan`.
-        taxonomy: names and colours of the classes.
 
     Raises:
         InputError: if Rerun is not installed, or cannot open a window.

@@ -77,7 +77,6 @@ class Dataset(ABC):
         """Read one scan.
 
         Args:
-            record: the scan.
             labels: whether to read its (N,) train ids, if it has any.
 
         Raises:
@@ -110,8 +109,6 @@ class Dataset(ABC):
         """Read the (N,) uint8 train ids (0..K) that were predicted for a scan.
 
         Args:
-            record: the scan.
-            folder: a folder of predictions.
             taxonomy: the classes of the prediction; None means those of the dataset.
 
         Raises:
@@ -131,9 +128,6 @@ class Dataset(ABC):
         """Write (N,) train ids as raw ids; the file appears whole or not at all.
 
         Args:
-            record: the scan.
-            folder: a folder of predictions.
-            ids: the train ids.
             taxonomy: the classes of the prediction; None means those of the dataset.
 
         Raises:

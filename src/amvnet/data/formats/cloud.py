@@ -235,7 +235,6 @@ def require(path: Path | str, extra: str, *packages: str) -> None:
     """Check that the packages that read a file are installed.
 
     Args:
-        path: the file.
         extra: the extra of this package that installs them.
         packages: what they are imported as.
 
@@ -252,9 +251,6 @@ def require(path: Path | str, extra: str, *packages: str) -> None:
 
 def find_columns(names: Sequence[str]) -> dict[str, int]:
     """Find x, y, z, intensity and ring among the columns of a file.
-
-    Args:
-        names: the names of all columns, in order.
 
     Returns:
         The index of each column by the key of `COLUMN_NAMES`, without those that the file lacks.
@@ -291,7 +287,6 @@ def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
 
     Args:
         columns: for each column, its NumPy type and its offset in a record, bytes.
-        size: bytes of a record.
     """
     formats, offsets = zip(*columns.values(), strict=True)
     return np.dtype(

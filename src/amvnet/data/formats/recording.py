@@ -15,7 +15,6 @@ class Recording:
     """The scans of one file. One at a time is in memory.
 
     Args:
-        path: the file.
         count: how many scans it claims to have.
         scans: yields what reads each scan, in order.
         advice: what to do if a scan is broken.

@@ -22,11 +22,6 @@ SHOWN = 5  # unknown ids in a message
 def read_ids(path: Path, dtype: DTypeLike, count: int) -> np.ndarray:
     """Read the raw ids of one scan, (N,) of a number type.
 
-    Args:
-        path: the file.
-        dtype: number type of the ids.
-        count: points of the scan.
-
     Raises:
         InputError: if the file is missing, or as `check_size` raises it.
     """
@@ -51,10 +46,6 @@ def write_ids(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint3
 def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
     """Check that there is one id per point, and return the ids as an array.
 
-    Args:
-        path: the file to name in the message.
-        count: the number of points.
-
     Raises:
         InputError: if the shape of the ids is not (count,).
     """
@@ -72,9 +63,6 @@ def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> Non
 
     Args:
         name: the beginning of the message.
-        size: bytes in the file.
-        count: points of the scan.
-        dtype: number type of the ids.
 
     Raises:
         InputError: if the size is not that of `count` labels of `dtype`.
@@ -103,7 +91,6 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
     Args:
         name: the beginning of the message.
         raw: (N,) raw ids, integers.
-        taxonomy: the classes.
 
     Returns:
         (N,) uint8 train ids in 0..K.

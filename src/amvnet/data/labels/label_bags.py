@@ -58,11 +58,8 @@ def write_part(
     """Write the labels of one scan as a part of the bag, and return its path.
 
     Args:
-        folder: the folder of predictions.
         name: of the scan, such as `drive/000012`.
         kind: the bag, one of `KINDS`.
-        message: the scan's own message.
-        points: the points and their labels.
     """
     store = _types(kind)
     values = encode_labels(store.types, message, points)
@@ -81,8 +78,6 @@ def join_parts(folder: Path, names: Sequence[str], kind: str) -> list[Path]:
     The parts are removed if none is missing, so that a later run can add what is.
 
     Args:
-        folder: the folder of predictions.
-        names: of all scans.
         kind: one of `KINDS`.
 
     Returns:

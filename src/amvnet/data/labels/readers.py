@@ -42,7 +42,6 @@ def read_labels(path: Path, count: int, field: str | None = None) -> np.ndarray:
     `.las`, `.laz`; any other file holds integers of 8, 16, 32 or 64 bits and nothing else.
 
     Args:
-        path: the file.
         count: the number of points of the scan.
         field: the column or array to read; None means the only one, or one with a usual name.
 
@@ -74,7 +73,6 @@ def read_label_field(path: Path, count: int, field: str, layout: RowLayout = UNK
     """Read the raw labels of a scan from a field of the scan's file.
 
     Args:
-        path: the file of the scan.
         count: the number of points of the scan.
         field: name of the column; of `.npz`, also of an array next to the points; of arrays and
             text without names, the number of the column, from 0.
