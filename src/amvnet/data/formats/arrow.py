@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from amvnet.data.formats.cloud import (
     reading,
     require_columns,
 )
+from amvnet.data.formats.fields import Arrays, Choose
 from amvnet.errors import InputError
 
 EXPECTED = "a Feather file"
@@ -35,8 +37,7 @@ def read_feather(path: Path) -> Cloud:
     Raises:
         InputError: if the file is not Feather, is truncated, or has no x, y, z.
     """
-    table = _read_columns(path, None)
-    cloud = make_cloud(table, str(path))
+    cloud = make_cloud(read_columns(path, partial(require_columns, path=path)), str(path))
     calibration = path.absolute().parents[min(2, len(path.absolute().parents) - 1)] / CALIBRATION
     if not calibration.is_file():
         return cloud
@@ -54,7 +55,8 @@ def _lidar_position(path: Path) -> np.ndarray:
     Raises:
         InputError: if the calibration is broken or names no LiDAR.
     """
-    table = _read_columns(path, ("sensor_name", *POSITION))
+    names = ("sensor_name", *POSITION)
+    table = read_columns(path, lambda all_names: {name: all_names.index(name) for name in names})
     is_lidar = np.isin(table["sensor_name"].astype(str), LIDARS)
     if not is_lidar.any():
         raise InputError(
@@ -63,11 +65,14 @@ def _lidar_position(path: Path) -> np.ndarray:
     return np.stack([table[name][is_lidar].mean() for name in POSITION])
 
 
-def _read_columns(path: Path, names: tuple[str, ...] | None) -> dict[str, np.ndarray]:
-    """Return columns of a table, (N,) each.
+def read_columns(path: Path, choose: Choose) -> Arrays:
+    """Read some columns of a table.
 
     Args:
-        names: of the columns; None for those of a scan, by the keys of `COLUMN_NAMES`.
+        choose: returns the columns to read, given the names of all.
+
+    Raises:
+        InputError: if the file is not Feather or is truncated.
     """
     with reading(path, EXPECTED, ADVICE):
         import pyarrow
@@ -78,7 +83,7 @@ def _read_columns(path: Path, names: tuple[str, ...] | None) -> dict[str, np.nda
             except pyarrow.ArrowInvalid:
                 raise InputError(f"{path}: expected {EXPECTED} of version 2; {ADVICE}") from None
             all_names = reader.schema.names
-            columns = _choose(all_names, names, path)
+            columns = choose(all_names)
             options = pyarrow.ipc.IpcReadOptions(included_fields=sorted(set(columns.values())))
             reader = pyarrow.ipc.open_file(file, options=options)
 
@@ -95,10 +100,3 @@ def _read_columns(path: Path, names: tuple[str, ...] | None) -> dict[str, np.nda
                 values.append(batch.column(all_names[index]).to_numpy(zero_copy_only=False))
             arrays[key] = np.concatenate(values) if values else np.empty(0, np.float32)
         return arrays
-
-
-def _choose(all_names: list[str], names: tuple[str, ...] | None, path: Path) -> dict[str, int]:
-    """Return the indices of columns, given the names of all."""
-    if names is None:
-        return require_columns(all_names, path)
-    return {name: all_names.index(name) for name in names}

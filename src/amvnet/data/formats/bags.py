@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -68,16 +68,13 @@ def open_bag(path: Path, ending: str, topic: str | None = None) -> Recording:
 
 
 def _read_messages(path: Path, ending: str, topic: str) -> Iterator[Decode]:
+    # A ROS 2 bag serialises in the same way in every storage format.
+    is_ros1 = ending == ".bag"
     with closing(_open_reader(path, ending)) as reader:
-        # A ROS 2 bag serialises in the same way in every storage format.
-        is_ros1 = ending == ".bag"
-        deserialise = _deserialiser(is_ros1)
-        for connection, time, data in reader.messages(connections=_connections(reader, topic)):
-            if connection.msgtype == CLOUD_TYPE:
-                read = partial(_read_pointcloud2, deserialise)
-            else:
-                read = partial(_read_livox, is_ros1)
-            yield partial(read, data, topic, time)
+        connections = [c for c in reader.connections if c.topic == topic and c.msgtype in TYPES]
+        for connection, time, data in reader.messages(connections=connections):
+            read = _read_pointcloud2 if connection.msgtype == CLOUD_TYPE else _read_livox
+            yield partial(read, data, is_ros1, topic, time)
 
 
 def _open_reader(path: Path, ending: str) -> Any:
@@ -124,31 +121,26 @@ def _check_unpacked(folder: Path) -> None:
                     )
 
 
-def _deserialiser(is_ros1: bool) -> Callable[[bytes, str], Any]:
-    """Return the function that turns the bytes of a message and its type's name into a message."""
+@cache
+def types_of(is_ros1: bool) -> Any:
+    """Return the store of the types of messages of rosbags."""
     from rosbags.typesys import Stores, get_typestore
 
-    if is_ros1:
-        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
-    return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr
+    return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
-def _read_pointcloud2(
-    deserialise: Callable[[bytes, str], Any], data: bytes, topic: str, time: int, name: str
-) -> Cloud:
+def _read_pointcloud2(data: bytes, is_ros1: bool, topic: str, time: int, name: str) -> Cloud:
+    types = types_of(is_ros1)
+    deserialise = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
     values = deserialise(data, CLOUD_TYPE)
     message = replace(Message.of(values), topic=topic, time=time)
     return replace(read_message(values, name), message=message)
 
 
-def _read_livox(is_ros1: bool, data: bytes, topic: str, time: int, name: str) -> Cloud:
+def _read_livox(data: bytes, is_ros1: bool, topic: str, time: int, name: str) -> Cloud:
     stamp, frame = read_header(data, is_ros1)
     cloud = read_custom_message(data, is_ros1, name)
     return replace(cloud, message=Message(stamp, frame, topic=topic, time=time))
-
-
-def _connections(reader: Any, topic: str) -> list[Any]:
-    return [c for c in reader.connections if c.topic == topic and c.msgtype in TYPES]
 
 
 def _count_messages(reader: Any) -> dict[str, int]:

@@ -11,8 +11,7 @@ from uuid import uuid4
 
 import numpy as np
 
-from amvnet.data.formats import las, numpy_files, pcd, ply, text
-from amvnet.data.formats.arrow import read_feather
+from amvnet.data.formats import arrow, las, numpy_files, pcd, ply, text
 from amvnet.data.formats.bags import open_bag
 from amvnet.data.formats.cloud import Cloud, Message, make_cloud, require, require_columns
 from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, PACKED, TEXT, ending_of
@@ -45,6 +44,7 @@ COLUMN_READERS: dict[str, Callable[[Path, Choose], Arrays]] = {
     ".ply": ply.read_columns,
     ".las": las.read_columns,
     ".laz": las.read_columns,
+    ".feather": arrow.read_columns,
     **dict.fromkeys(TEXT, text.read_columns),
 }
 RECORDINGS: dict[str, Callable[[Path, str, str | None], Recording]] = {
@@ -185,7 +185,7 @@ def _read(path: Path, ending: str, layout: RowLayout) -> Cloud:
     if ending in ROW_READERS:
         return ROW_READERS[ending](path, layout)
     if ending == ".feather":
-        return read_feather(path)
+        return arrow.read_feather(path)
     columns = COLUMN_READERS[ending](path, partial(require_columns, path=path))
     return make_cloud(columns, str(path))
 

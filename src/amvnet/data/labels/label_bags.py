@@ -13,6 +13,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from amvnet.data.formats.bags import types_of
 from amvnet.data.formats.cloud import Message
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE
 from amvnet.data.labels.messages import encode_labels
@@ -61,7 +62,7 @@ def write_part(
         name: of the scan, such as `drive/000012`.
         kind: the bag, one of `KINDS`.
     """
-    store = _types(kind)
+    store = types_of(is_ros1=kind == "bag")
     values = encode_labels(store.types, message, points)
     serialise = store.serialize_ros1 if kind == "bag" else store.serialize_cdr
     data = np.frombuffer(serialise(values, CLOUD_TYPE), np.uint8)
@@ -105,12 +106,6 @@ def _parts(bag: Path) -> Path:
     return bag.with_name(f".{bag.name}.parts")
 
 
-def _types(kind: str) -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC if kind == "bag" else Stores.ROS2_HUMBLE)
-
-
 def _write_bag(path: Path, parts: Sequence[Path], kind: str) -> None:
     """Write a bag of the parts; it appears whole or not at all."""
     from rosbags.rosbag1 import Writer as Writer1
@@ -142,7 +137,6 @@ def _write_messages(writer: Any, parts: Sequence[Path], kind: str) -> None:
                 time = int(arrays["time"])
                 data = arrays["data"].tobytes()
             if topic not in connections:
-                connections[topic] = writer.add_connection(
-                    topic, CLOUD_TYPE, typestore=_types(kind)
-                )
+                types = types_of(is_ros1=kind == "bag")
+                connections[topic] = writer.add_connection(topic, CLOUD_TYPE, typestore=types)
             writer.write(connections[topic], time, data)

@@ -279,9 +279,4 @@ def _uncertain_column(uncertain: np.ndarray | None) -> Columns:
 def _to_records(columns: Columns) -> np.ndarray:
     """Return (N,) records of the columns, packed and little endian."""
     fields = [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()]
-    (count,) = set(map(len, columns.values()))  # raises if the columns differ in length
-
-    table = np.empty(count, fields)
-    for name, values in columns.items():
-        table[name] = values
-    return table
+    return np.rec.fromarrays(list(columns.values()), dtype=fields)
