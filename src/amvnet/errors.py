@@ -85,6 +85,16 @@ def one_line_errors(
         raise InputError(message(error)) from error
 
 
+@contextmanager
+def errors_of(source: object) -> Iterator[None]:
+    """Begin the messages of errors of the input in this block with the file that they are about."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(str(source)) else f"{source}: {text}") from None
+
+
 # What PyTorch, CUDA, the loader of libraries and the system say.
 NO_MEMORY = re.compile(
     r"out of memory|(can't|cannot) allocate|failed to map segment", re.IGNORECASE

@@ -14,7 +14,7 @@ class NewestOnly(Generic[T]):
 
     Args:
         work: is called with each item, in the thread.
-        fail: is told of the exception that ended the thread; the later items are dropped.
+        fail: called with the exception that ended the thread; the later items are dropped.
     """
 
     def __init__(self, work: Callable[[T], None], fail: Callable[[Exception], None]) -> None:

@@ -194,7 +194,7 @@ def to_ros(labelled: LabelledCloud, has_points: bool) -> PointCloud2:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until it is told to stop; return the exit code.
+    """Run the node until it is stopped; return the exit code.
 
     0 after the shutdown, 2 if a parameter is wrong (one line on stderr), 1 after any other error.
     """

@@ -81,7 +81,7 @@ class CloudSegmenter:
     Args:
         settings: the parameters of the node.
         topic: where the messages come from, for what is said.
-        say: is told once what was assumed of the sensor.
+        say: called once with what was assumed of the sensor.
 
     Raises:
         InputError: if a parameter is wrong.

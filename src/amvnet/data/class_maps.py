@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy, class_entries, user_taxonomy
-from amvnet.errors import InputError, did_you_mean, shown
+from amvnet.errors import InputError, did_you_mean, errors_of, shown
 from amvnet.files import read_yaml
 
 COARSE_NAME = "coarse"
@@ -92,11 +92,8 @@ def class_map(name: str) -> ClassMap:
             f"--classes: expected {COARSE_NAME} or a YAML file, found {name!r}"
             + did_you_mean(name, [COARSE_NAME], advice)
         )
-    try:
+    with errors_of(path):
         return _parse(path.stem, read_yaml(path, "a map of classes"))
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
 
 
 def _parse(name: str, tree: Any) -> ClassMap:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.config.bounds import check_text
-from amvnet.errors import InputError, shown
+from amvnet.errors import InputError, errors_of, shown
 from amvnet.files import read_yaml
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
@@ -229,12 +229,13 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
     """
     path = Path(path)
     config = read_yaml(path, "a label map")
+    if not isinstance(config, Mapping):
+        raise InputError(f"{path}: expected the tables {_YAML_TABLES}, found none; add them")
     try:
-        if not isinstance(config, Mapping):
-            raise InputError(f"expected the tables {_YAML_TABLES}, found none; add them")
-        return _from_config(path.stem, config)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+        with errors_of(path):
+            return _from_config(path.stem, config)
+    except InputError:  # a ValueError, too
+        raise
     except KeyError as error:
         raise InputError(
             f"{path}: expected the tables {_YAML_TABLES} that fit each other, found no entry "

@@ -9,6 +9,7 @@ from itertools import groupby
 from typing import Any
 
 from amvnet.data.class_maps import ClassMap
+from amvnet.data.formats.cloud import require
 from amvnet.data.formats.detect import BAGS, FOLDER
 from amvnet.data.labels import label_bags
 from amvnet.errors import InputError
@@ -105,7 +106,7 @@ def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
         InputError: if scans are in other files, or in these bags, or a bag of the user would be
             replaced.
     """
-    label_bags.check_rosbags()
+    require("bags", "formats", "rosbags")
     bags = set()
     for scan in scans:
         if not isinstance(scan, FileScan):

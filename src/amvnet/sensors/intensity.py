@@ -67,13 +67,13 @@ class TrainedIntensity:
 
 
 def network_records(training: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return the names of both networks and their training records, of those that have one."""
+    """Return the names and the training records of the networks that have one."""
     parts = [(part, training.get(part)) for part in ("range_net", "polar_net")]
     return [(part, record) for part, record in parts if isinstance(record, Mapping)]
 
 
 def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntensity | None:
-    """Return the intensities that weights were trained with; None if nothing tells them.
+    """Return the intensities that weights were trained with; None if they are unknown.
 
     Args:
         training: the training records of the weights by part.
@@ -134,7 +134,7 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
 def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Return the quantiles of a source, increasing, and what they become; linear in between.
 
-    Equal quantiles of the source, such as many zeros, become the mean of those of the training.
+    Equal quantiles of the source, such as many zeros, become the mean of the training's quantiles.
     """
     levels, index = np.unique(quantiles, return_inverse=True)
     becomes = np.bincount(index, weights=trained) / np.bincount(index)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, errors_of
 from amvnet.files import read_yaml
 
 # Metres over the ground on the cars of the datasets that weights are trained for: KITTI, nuScenes.
@@ -91,7 +91,7 @@ class Sensor:
     def to_level(self, xyz: np.ndarray) -> np.ndarray:
         """Return the (N, 3) points of a file in metres and in the package's axes.
 
-        What is not known of the frame is taken as in order. If the points have to be scaled, turned
+        What is not known of the frame needs no change. If the points have to be scaled, turned
         or moved, they are float64, and lost points, at the file's origin, become NaN.
         """
         scale = UNITS[self.unit or "m"]
@@ -195,10 +195,8 @@ def _read_sensor(text: str) -> Sensor:
         raise InputError(
             f"{path}: expected keys such as beams: 16, found none; see docs/own_sensor.md"
         )
-    try:
+    with errors_of(path):
         return make_sensor({"name": path.stem, **tree})
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def _to_whole(value: Any) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from amvnet.data.formats.cloud import Cloud
-from amvnet.errors import InputError
+from amvnet.errors import InputError, errors_of
 from amvnet.scan import Scan
 from amvnet.sensors.frame import STEADY_TILT, Frame, find_frame, median_frame
 from amvnet.sensors.intensity import are_of_one_range, quantiles_of
@@ -67,11 +67,8 @@ class Gauge:
             InputError: if the unit of the coordinates is in doubt, or no point is usable.
         """
         usable = np.isfinite(cloud.xyz).all(axis=1) & (cloud.xyz != 0).any(axis=1)
-        try:
+        with errors_of(cloud.name):
             frame = find_frame(cloud.xyz[usable], self.sensor)
-        except InputError as error:
-            raise InputError(f"{cloud.name}: {error}") from None
-
         lasers = self.lasers(cloud, frame)
         return Estimate(frame, lasers, quantiles_of(cloud.intensity), len(cloud.xyz))
 

@@ -30,7 +30,7 @@ from amvnet.sensors.measure import (
 )
 
 HIGHEST = 4.5  # metres: no vehicle carries its sensor higher; the coordinates may be in feet
-OUTSIDE = 0.16  # share of points outside a field of view from which on it is too narrow
+OUTSIDE = 0.16  # if a larger share of the points is outside a field of view, it is too narrow
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Normaliser:
         expected: what the weights expect; None turns scans only as the sensor says, for people to
             look at.
         sensor: what is known of the sensor of the scans; the rest is measured.
-        say: is told once for each sensor of a recording what was assumed.
+        say: called once for each sensor of a recording, with what was assumed.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class Normaliser:
         """Return the scan, and a title of its sensor: the source, and whether it is the usual one.
 
         Raises:
-            InputError: as of a call.
+            InputError: if no point is usable, or the unit of the coordinates is in doubt.
         """
         if self.expected is None:
             return self._turn(cloud, source), source
@@ -202,8 +202,8 @@ class Normaliser:
     def target(self) -> dict[str, float]:
         """Return what weights that are trained on the normalised scans should carry of the sensor.
 
-        The height is that which the scans are moved to. The lasers are those of the scans, but if
-        the rows of the range image are lasers, those that decide the rows.
+        The height is the one that the scans are moved to. The lasers are the scans' own; if the
+        rows of the range image are lasers, the lasers that decide the rows.
         """
         assert self.expected is not None
         medians = [median for each in self._recordings.values() for median in each.medians]
@@ -313,7 +313,7 @@ def _rows(
 ) -> np.ndarray | None:
     """Return each point's (N,) row in the range image, 0 the lowest; 0 for lost points.
 
-    None if the weights need rings, and neither the scan nor its elevations tell them.
+    None if the weights need rings, and neither the scan nor its elevations give them.
     """
     ring = scan.ring if expected.view.rows == "ring" else None
     # Lasers that no data sheet describes need not be evenly spaced.

@@ -113,7 +113,7 @@ def write(
 
 
 def _check_missing(rules: Rules, names: list[str], folder: Path) -> None:
-    """Check that no required prediction is missing, given the names of those that are there."""
+    """Check that no required prediction is missing, given the names of the present ones."""
     missing = sorted(set(rules.required) - set(names))
     if missing:
         others = f" and {len(missing) - 1} more" if len(missing) > 1 else ""

@@ -165,7 +165,7 @@ def choose_frames(
 
     Args:
         sensor: what is known of the sensor of scan files; the rest is measured for the weights.
-        say: is told what was assumed of the sensor.
+        say: called with what was assumed of the sensor.
 
     Raises:
         InputError: if an input or the labels are missing, one label file is named for several

@@ -15,7 +15,7 @@ from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
 from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
 from amvnet.files import checked_token
 from amvnet.scan import Scan
 
@@ -212,20 +212,13 @@ class NuScenes(Dataset):
         table = np.full(256, UNKNOWN, dtype=np.int16)
 
         for row in self._table("category"):
-            if "index" not in row:
+            train_id = self.taxonomy.raw_to_train.get(row["name"])
+            if "index" not in row or train_id is None:
                 raise InputError(
-                    f"{path}: expected an index in every category, found one without; "
-                    "replace the file by that of nuScenes-lidarseg"
+                    f"{path}: expected the categories of nuScenes-lidarseg, each with an index, "
+                    f"found {shown(row)}; replace the file by the one of nuScenes-lidarseg"
                 )
-
-            if row["name"] not in self.taxonomy.raw_to_train:
-                raise InputError(
-                    f"{path}: expected the categories of nuScenes, found {row['name']!r}; "
-                    "correct the table"
-                )
-
-            table[row["index"]] = self.taxonomy.raw_to_train[row["name"]]
-
+            table[row["index"]] = train_id
         return table
 
     def _categories_to_train(self, indices: np.ndarray, path: Path) -> np.ndarray:

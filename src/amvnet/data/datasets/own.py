@@ -20,7 +20,7 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.labels.readers import read_label_field, read_scan_labels
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
-from amvnet.errors import InputError, shown
+from amvnet.errors import InputError, errors_of, shown
 from amvnet.files import read_yaml
 from amvnet.scan import Scan
 
@@ -319,11 +319,8 @@ def open_own(path: Path | str) -> OwnScans:
     """
     path = Path(path).expanduser()
     tree = read_yaml(path, "a description of scans and classes")
-    try:
+    with errors_of(path):
         dataset = OwnScans(_parse(path, tree))
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}") from None
     dataset.sequences("all")
     return dataset
 

@@ -231,8 +231,8 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
         yield
 
 
-def require(path: Path | str, extra: str, *packages: str) -> None:
-    """Check that the packages that read a file are installed.
+def require(source: Path | str, extra: str, *packages: str) -> None:
+    """Check that the packages for a file or a format are installed.
 
     Args:
         extra: the extra of this package that installs them.
@@ -244,7 +244,7 @@ def require(path: Path | str, extra: str, *packages: str) -> None:
     missing = [package for package in packages if find_spec(package) is None]
     if missing:
         raise InputError(
-            f"{path}: expected the package {' and '.join(missing)} to read it, found none; "
+            f"{source}: expected the package {' and '.join(missing)}, found none; "
             f'run pip install "amvnet[{extra}]"'
         )
 

@@ -37,7 +37,7 @@ UNREADABLE = {
         "MMDetection3D",
     ),
     ".parquet": (
-        "Parquet, as of Waymo's version 2",
+        "Parquet, the format of Waymo's version 2",
         "convert it to KITTI's .bin, for example with OpenPCDet or MMDetection3D",
     ),
     ".lvx": ("a recording of Livox Viewer", "convert it to a bag with Livox's lvx_to_rosbag"),

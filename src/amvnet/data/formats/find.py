@@ -24,7 +24,7 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
 
-POSE_COLUMNS = 12  # of poses, as of KITTI: a 3 x 4 matrix in each line of a text file
+POSE_COLUMNS = 12  # of poses as in KITTI: a 3 x 4 matrix in each line of a text file
 KITTI_RAW = "velodyne_points/data"  # the folder of the scans of a drive of KITTI's raw data
 RAW_DRIVES = ("", "*_sync/", "*_extract/", "*/*_sync/", "*/*_extract/")  # where it may lie
 ARGOVERSE = "sensors/lidar"  # the folder of the scans of a log of Argoverse 2

@@ -37,8 +37,8 @@ SAMPLE_VALUES = 100_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # whole rows of eith
 def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read rows of 3 to 6 float32 or float64, or as the user says.
 
-    The values tell the columns and their type. If they do not, it is nuScenes' five columns if the
-    name ends in `.pcd.bin`, else KITTI's four.
+    The columns and their type are inferred from the values. If that fails, the columns are
+    nuScenes' five if the name ends in `.pcd.bin`, else KITTI's four.
 
     Args:
         layout: what the user says.
@@ -78,7 +78,7 @@ def _complete(path: Path, layout: RowLayout) -> RowLayout:
     """Return a layout with what the user did not say taken from the values.
 
     Raises:
-        InputError: if the values do not tell the columns.
+        InputError: if the columns cannot be inferred.
     """
     dtypes = layout.dtypes or (guess_dtype(path) or DTYPES[0],)
     columns = layout.columns or guess_columns(path, dtypes[0])
@@ -140,10 +140,7 @@ def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
 
 @np.errstate(invalid="ignore", over="ignore")
 def columns_of(path: Path) -> int | None:
-    """Tell the number of columns, 4 or 5, from the values of a file, whatever its name.
-
-    None if the values fit neither layout.
-    """
+    """Return the number of columns, 4 or 5, that the values of a file fit; None if neither."""
     size = path.stat().st_size
     if not size or size % 4 or size > MAX_POINTS * 4 * NUSCENES_COLUMNS:
         return None

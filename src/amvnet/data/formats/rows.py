@@ -21,14 +21,14 @@ COUNTS = (3, 4, 5, 6)
 # The sample of a file: blocks spread over it, each of whole rows of every number of columns.
 BLOCKS = 20
 BLOCK = 3000  # values
-FEWEST = 600  # values: fewer tell nothing
-ENOUGH = FEWEST * 8  # bytes of a file whose values tell, of whatever type they are
+FEWEST = 600  # values: from fewer, nothing is inferred
+ENOUGH = FEWEST * 8  # bytes of a file from which the layout is inferred, with numbers of any type
 
 # Magnitudes of coordinates, intensities and times. Bytes that are read as numbers of another type
 # have any magnitude.
 SMALLEST = 1e-6
 LARGEST = 1e10
-USUAL = 0.95  # share of the values with such magnitudes from which on the type is plausible
+USUAL = 0.95  # least share of values with such magnitudes if the type is plausible
 FARTHEST = 1e7  # metres: map coordinates are nearer
 
 # Histograms of the values of a column: bins are even near 0 and grow with the values.
@@ -142,7 +142,7 @@ def named_cloud(
 
 
 def guess_dtype(path: Path) -> str | None:
-    """Tell the type of the numbers in a file of nothing but these: that of the usual magnitudes.
+    """Infer the type of the numbers in a file: with it, their magnitudes are usual.
 
     Returns:
         One of `DTYPES`; None if the values are too few or of no magnitude that is measured.
@@ -157,7 +157,7 @@ def guess_dtype(path: Path) -> str | None:
 
 
 def guess_columns(path: Path, dtype: str) -> tuple[str, ...] | None:
-    """Tell the columns of a file of nothing but rows from their values.
+    """Infer the columns of a file of nothing but rows from the values.
 
     The number of columns is the one that separates the values best: columns that hold one quantity
     each are less varied than mixtures of several.
@@ -176,7 +176,7 @@ def guess_columns(path: Path, dtype: str) -> tuple[str, ...] | None:
 
 
 def guess_rows(path: Path) -> RowLayout | None:
-    """Tell the columns and their type from the values of a file; None if they fit no layout."""
+    """Infer the columns and their type from the values of a file; None if they fit no layout."""
     dtype = guess_dtype(path)
     columns = None if dtype is None else guess_columns(path, dtype)
     if dtype is None or columns is None:

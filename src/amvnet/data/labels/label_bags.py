@@ -18,24 +18,12 @@ from amvnet.data.formats.cloud import Message
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE
 from amvnet.data.labels.messages import encode_labels
 from amvnet.data.labels.writers import LabelledPoints
-from amvnet.errors import InputError
 from amvnet.files import atomic_write, inside, make_folder, publish
 
 Kind = Literal["bag", "mcap"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 JOINED = "joined"  # folder of a bag that is being written
 SUFFIX = "/labels"  # after the topic of the scans
-
-
-def check_rosbags() -> None:
-    """Raise an InputError unless rosbags is there."""
-    try:
-        import rosbags  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "expected the package rosbags to write bags, found none; "
-            'run pip install "amvnet[formats]"'
-        ) from None
 
 
 def bag_path(name: str, kind: str) -> Path:

@@ -38,7 +38,7 @@ def read_scan_labels(
 def read_labels(path: Path, count: int, field: str | None = None) -> np.ndarray:
     """Read the raw labels of a scan from a file of labels.
 
-    The ending tells the format: `.npy`, `.npz`, text with a number per line, `.pcd`, `.ply`,
+    The ending decides the format: `.npy`, `.npz`, text with a number per line, `.pcd`, `.ply`,
     `.las`, `.laz`; any other file holds integers of 8, 16, 32 or 64 bits and nothing else.
 
     Args:
@@ -117,7 +117,7 @@ def _check(labels: np.ndarray, path: Path, count: int) -> np.ndarray:
 
 
 def _read_integers(path: Path, count: int) -> np.ndarray:
-    """Read a file of nothing but integers, whose size tells their type."""
+    """Read a file of nothing but integers; its size decides their type."""
     size = path.stat().st_size
     if count and size % count == 0 and size // count in INTEGERS:
         return np.fromfile(path, dtype=INTEGERS[size // count], count=count)

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from amvnet.data.formats.cloud import split_records
+from amvnet.data.formats.cloud import require, split_records
 from amvnet.data.labels.ids import check_count, write_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -75,13 +75,7 @@ def check_kind(kind: str) -> None:
         )
 
     if kind == "las":
-        try:
-            import laspy  # noqa: F401
-        except ImportError:
-            raise InputError(
-                "expected the package laspy to write LAS, found none; "
-                'run pip install "amvnet[formats]"'
-            ) from None
+        require("LAS", "formats", "laspy")
 
 
 def write_scan_labels(
