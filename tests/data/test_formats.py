@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pytest
 from pypcd4 import Encoding, PointCloud
@@ -486,6 +487,18 @@ def test_text_of_two_bytes_a_letter_is_read(tmp_path: Path, encoding: str) -> No
     mark = "" if encoding == "utf-16" else "\ufeff"
     path.write_bytes(f"{mark}X;Y;Z;Intensity\r\n{rows}".encode(encoding))
     np.testing.assert_allclose(read_scan(path).points, some_points(), atol=1e-6)
+
+
+def test_a_dimension_of_las_with_rings_is_read(tmp_path: Path) -> None:
+    las = laspy.read(write_las(tmp_path / "a.las", some_points()))
+    assert read_cloud(tmp_path / "a.las").ring is None
+    las.add_extra_dim(laspy.ExtraBytesParams("ring", "u1"))
+    las["ring"] = np.arange(60) % 16
+    las.write(str(tmp_path / "a.las"))
+
+    ring = read_cloud(tmp_path / "a.las").ring
+    assert ring is not None
+    assert ring.tolist() == list(np.arange(60) % 16)
 
 
 def test_map_coordinates_are_refused_with_advice(tmp_path: Path) -> None:
