@@ -12,7 +12,7 @@ demo: .venv/installed  ## simulate streets, segment, score and draw them
 test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 measures which lines they run
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile $(if $(COVERAGE),--cov=amvnet --cov=lidarstreets --cov-report=term:skip-covered)
 
-test-slow: .venv/installed  ## the tests that take minutes, too
+test-slow: .venv/installed .venv/fleet  ## the tests that take minutes, and those of fleets, too
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"
 
 bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN="--scan FILE" for a scan of yours
@@ -36,6 +36,11 @@ format: .venv/installed
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt torch
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[simulate,formats,export,test]"
+	touch $@
+
+# 600 MB, so that `make test` does without.
+.venv/fleet: .venv/installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[fleet]" "moto[server]>=5" duckdb "dask[dataframe]"
 	touch $@
 
 .venv/docs: .venv/installed

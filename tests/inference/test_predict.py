@@ -178,13 +178,13 @@ import sys, time
 from amvnet.cli.main import main
 from amvnet.inference.pipeline import Pipeline
 
-write = Pipeline._write
+write = Pipeline.write
 
 def write_slowly(*arguments):
     time.sleep(0.1)
     return write(*arguments)
 
-Pipeline._write = write_slowly
+Pipeline.write = write_slowly
 sys.exit(main())
 """
 

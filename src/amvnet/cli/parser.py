@@ -44,7 +44,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "offset",
     ),
     "scores of two other models": ("scores_a", "scores_b", "key_a", "key_b", "logits"),
-    "how it is computed": ("device", "engine", "precision", "batch", "at_once"),
+    "how it is computed": ("device", "engine", "precision", "batch", "at_once", "ray", "workers"),
 }
 # What a value of a type is called.
 TYPE_WORDS = {int: "a whole number", float: "a number"}
@@ -264,6 +264,12 @@ def _add_option(target: Any, parameter: Parameter) -> None:
             required=True,
             help=f"{text} (required)",
             metavar=flag[2:].upper(),
+        )
+        return
+
+    if kind == str | bool:  # its value may be left out
+        target.add_argument(
+            flag, nargs="?", const=True, default=default, help=text, metavar="ADDRESS"
         )
         return
 

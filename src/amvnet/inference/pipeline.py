@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -266,6 +266,26 @@ class Pipeline:
             The entry of each scan when its files are written, in order; or of a scan that is
             broken, a line that says why, which may come before its turn.
         """
+        writing = deque[Future[Entry]]()
+        # Reading, computing and writing go on at the same time, each on other scans.
+        with closing(self.results(scans)) as results, ThreadPoolExecutor(1) as writer:
+            for scan, loaded, result in results:
+                if loaded is None or isinstance(result, InputError):
+                    yield str(result)
+                    continue
+                writing.append(writer.submit(self.write, scan, loaded, result))
+                # Those that are written are yielded at once, so that the journal has them.
+                while writing and (len(writing) > AHEAD or writing[0].done()):
+                    yield writing.popleft().result()
+            while writing:
+                yield writing.popleft().result()
+
+    def results(self, scans: Sequence[InputScan]) -> Generator[Outcome]:
+        """Read and segment scans, of which only a few are in memory at a time.
+
+        Yields:
+            Each scan with its result; a scan that cannot be read may come before its turn.
+        """
         groups = stream_groups(
             scans,
             load=lambda scan: scan.load(),
@@ -273,19 +293,8 @@ class Pipeline:
             batch=self.execution.batch,
             at_once=self.execution.at_once or 1,
         )
-        writing = deque[Future[Entry]]()
-        # Reading, computing and writing go on at the same time, each on other scans.
-        with closing(groups), ThreadPoolExecutor(1) as writer:
-            for scan, loaded, result in chain.from_iterable(groups):
-                if loaded is None or isinstance(result, InputError):
-                    yield str(result)
-                    continue
-                writing.append(writer.submit(self._write, scan, loaded, result))
-                # Those that are written are yielded at once, so that the journal has them.
-                while writing and (len(writing) > AHEAD or writing[0].done()):
-                    yield writing.popleft().result()
-            while writing:
-                yield writing.popleft().result()
+        with closing(groups):
+            yield from chain.from_iterable(groups)
 
     def _segment_group(
         self, group: Sequence[tuple[InputScan, Future[LoadedScan]]]
@@ -319,7 +328,7 @@ class Pipeline:
                 return [(loaded[0][0], None, error)]
         return list(chain.from_iterable(self._segment_loaded([pair]) for pair in loaded))
 
-    def _write(self, scan: InputScan, loaded: LoadedScan, result: Segmentation) -> Entry:
+    def write(self, scan: InputScan, loaded: LoadedScan, result: Segmentation) -> Entry:
         """Write the files of a scan, the labels last: where they are, the others are too."""
         folder = self.output.folder
         scores_path = inside(folder, scan.scores_path)

@@ -151,6 +151,14 @@ class Recording:
         self._estimates: list[list[Estimate]] = []  # those of each median
         self._is_learnt = False
 
+    @classmethod
+    def of(cls, gauge: Gauge, medians: Sequence[Estimate]) -> Recording:
+        """Return a recording that was measured before; without medians, each scan gets its own."""
+        recording = cls(gauge)
+        recording.medians = list(medians)
+        recording._is_learnt = True
+        return recording
+
     def learn(self, first: Sequence[Callable[[], Cloud]]) -> None:
         """Measure the first scans; later ones add nothing.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -189,11 +189,17 @@ class Normaliser:
     def measure(self, source: str) -> Recording:
         """Return what is measured of a source: the first time, of the scans that were announced."""
         if source not in self._recordings:
-            assert self.expected is not None
-            gauge = Gauge(self.sensor, self.expected.sensor.height)
-            self._recordings[source] = Recording(gauge)
+            self._recordings[source] = Recording(self._gauge())
             self._recordings[source].learn(self._first.pop(source, []))
         return self._recordings[source]
+
+    def recall(self, source: str, medians: Sequence[Estimate]) -> None:
+        """Normalise the scans of a source by what `measure` found before, in another process."""
+        self._recordings[source] = Recording.of(self._gauge(), medians)
+
+    def _gauge(self) -> Gauge:
+        assert self.expected is not None
+        return Gauge(self.sensor, self.expected.sensor.height)
 
     def for_sensor(self, sensor: Sensor) -> Normaliser:
         """Return a normaliser to the same weights for scans of a described sensor."""

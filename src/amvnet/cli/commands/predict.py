@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
@@ -13,8 +16,12 @@ from amvnet.cli.options import (
     join_processes,
     parse_classes,
 )
+from amvnet.errors import InputError, shown
 from amvnet.models.methods import MethodName
 from amvnet.progress import counted
+
+if TYPE_CHECKING:
+    from amvnet.data.formats.rows import RowLayout
 
 FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
 
@@ -22,7 +29,7 @@ FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
 def predict(
     inputs: list[str],
     weights: str,
-    out: Path,
+    out: str,
     choice: ScanChoice,
     known: SensorChoice,
     compute: ComputeChoice,
@@ -35,13 +42,16 @@ def predict(
     classes: str | None = None,
     batch: int = 1,
     overwrite: bool = False,
+    ray: str | bool = False,
+    workers: str | None = None,
 ) -> None:
     """Segment datasets, scans, bags, or folders of scans.
 
     Args:
-        inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin'.
+        inputs: datasets, scan files, bags, folders of these, or patterns such as 'drive/*.bin';
+            with --ray, scan files, folders of these, or manifests (.parquet, .csv), also as URLs.
         weights: a weights file, or the name of a built-in one.
-        out: folder for the labels.
+        out: folder for the labels; with --ray also a URL.
         choice: which scans of the inputs.
         known: what is known of the sensor of scan files.
         compute: where and how the networks are computed.
@@ -58,12 +68,47 @@ def predict(
             or a YAML file.
         batch: scans that go through the networks at a time; more than one suits a GPU.
         overwrite: replace files in the folder that amvnet did not write, too.
+        ray: share the scans among the workers of a Ray cluster, and write a table of results;
+            without an address, Ray starts on this machine.
+        workers: of --ray, their number, or MIN:MAX; default: one for each GPU, or for each 4 cores.
     """
-    from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
-    from amvnet.inference.predict import predict as predict_inputs
     from amvnet.weights.file import load
 
     class_map = parse_classes(classes)
+    if ray:
+        cluster = _import_cluster()
+        labelling = cluster.Labelling(
+            load(weights),
+            out,
+            kind=format,
+            scores=scores,
+            uncertain=uncertain,
+            method=method,
+            tau=tau,
+            batch=batch,
+            sensor=known.parse(),
+            layout=_layout(choice),
+            classes=class_map,
+            **asdict(compute),
+        )
+        with progress("segmenting") as step:
+            written = cluster.label_fleet(
+                inputs,
+                labelling,
+                address=None if ray is True else ray,
+                workers=_parse_workers(workers),
+                resume=resume,
+                overwrite=overwrite,
+                progress=step,
+                say=say,
+            )
+        say(f"{counted(written, 'label file')} in {out}; the table of results is in {out}/results")
+        return
+
+    from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
+    from amvnet.inference.predict import predict as predict_inputs
+
+    _refuse_urls([*inputs, out])
     processes = join_processes()
     sensor = known.parse()
     segmenter = compute.segmenter(load(weights), method, tau, processes)
@@ -72,7 +117,7 @@ def predict(
         written = predict_inputs(
             inputs,
             segmenter,
-            OutputOptions(out, format, scores, uncertain, overwrite),
+            OutputOptions(Path(out), format, scores, uncertain, overwrite),
             options=choice.parse(),
             execution=ExecutionOptions(batch, compute.at_once, resume, processes),
             sensor=sensor,
@@ -81,3 +126,55 @@ def predict(
             say=say,
         )
     say(f"{counted(written, 'label file')} in {out}")
+
+
+def _import_cluster() -> Any:
+    """Import what needs Ray.
+
+    Raises:
+        InputError: if it is not installed.
+    """
+    try:
+        from amvnet.fleet import cluster
+    except ImportError as error:
+        raise InputError(
+            f'--ray: expected the package {error.name}, found none; run pip install "amvnet[fleet]"'
+        ) from None
+    return cluster
+
+
+def _layout(choice: ScanChoice) -> RowLayout:
+    """Return what rows of numbers hold.
+
+    Raises:
+        InputError: if there are options of datasets or bags.
+    """
+    options = choice.parse()
+    if choice != ScanChoice(columns=choice.columns, dtype=choice.dtype):
+        raise InputError(
+            "expected scan files for --ray, found --split, --sequences or --topic, which are of "
+            "datasets and bags; leave one out"
+        )
+    return options.layout
+
+
+def _refuse_urls(texts: Sequence[str]) -> None:
+    """Raise InputError if one of the texts is a URL."""
+    for text in texts:
+        if "://" in text:
+            raise InputError(f"{text}: expected a path, found a URL; say --ray to use it")
+
+
+def _parse_workers(text: str | None) -> tuple[int, int] | None:
+    """Parse a number of workers, or the least and the largest number.
+
+    Raises:
+        InputError: if it is neither.
+    """
+    if text is None:
+        return None
+    match = re.fullmatch(r"([1-9]\d{0,5})(?::([1-9]\d{0,5}))?", text)
+    least, most = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+    if least > most:
+        raise InputError(f"--workers: expected a number or MIN:MAX, found {shown(text)}; say 1:8")
+    return least, most

@@ -1,0 +1,398 @@
+"""Label scan files on the workers of a cluster; the callables that Ray Data runs."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from amvnet.data.class_maps import ClassMap
+from amvnet.data.formats.cloud import Cloud
+from amvnet.data.formats.detect import ending_of
+from amvnet.data.formats.find import NamedScan
+from amvnet.data.formats.registry import read_file
+from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.labels.writers import check_kind
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import InputError, did_you_mean
+from amvnet.export.engines import use_engine
+from amvnet.fleet.drives import describe_drive, parse_estimates
+from amvnet.fleet.manifest import split_name
+from amvnet.fleet.storage import Place
+from amvnet.inference.listing import FileScan, InputScan
+from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
+from amvnet.inference.predict import segment_by
+from amvnet.inference.reading import FileReader, LoadedScan, normaliser_for
+from amvnet.inference.scan_stream import AHEAD
+from amvnet.inference.segmentation import Segmentation, uncertain_share
+from amvnet.inference.segmenter import Segmenter
+from amvnet.memory import keep_freed_memory
+from amvnet.models.assertion import Disagreement
+from amvnet.models.methods import METHODS, EngineName, MethodName, Precision, check_method
+from amvnet.progress import Say, say_nothing
+from amvnet.sensors.lidars import SENSORS, Sensor
+from amvnet.weights.file import Weights
+
+TRANSFERS = 8  # files that are read from, or written to, object storage at the same time
+
+UNKNOWN_SENSOR = Sensor()
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """How the scans of a fleet are labelled, and what is written: the same on every worker.
+
+    Attributes:
+        weights: trained weights.
+        out: URL or path of the output folder.
+        kind: the format of the labels, one of `writers.KINDS`.
+        scores: whether to write the probabilities of both networks, too.
+        uncertain: whether to write the uncertain points, too.
+        method, tau, device, precision: as of `Segmenter`.
+        engine: as of `use_engine`.
+        batch: scans that go through the networks together.
+        at_once: on a CPU, scans that are segmented at the same time; None means one for each core.
+        sensor: what is known of the sensor of all scans.
+        layout: of rows of numbers without names, what they hold.
+        classes: maps the classes of the weights to those that are written; None writes these.
+
+    Raises:
+        InputError: if the format is unknown, or the method has no uncertain points to write.
+    """
+
+    weights: Weights
+    out: str
+    kind: str = "label"
+    scores: bool = False
+    uncertain: bool = False
+    method: MethodName = "amvnet"
+    tau: float | None = None
+    device: str = "auto"
+    precision: Precision = "auto"
+    engine: EngineName = "auto"
+    batch: int = 1
+    at_once: int | None = None
+    sensor: Sensor = UNKNOWN_SENSOR
+    layout: RowLayout = UNKNOWN
+    classes: ClassMap | None = None
+
+    def __post_init__(self) -> None:
+        check_kind(self.kind)
+        check_method(self.method, self.weights.parts)
+        if self.tau is not None:
+            Disagreement(self.tau)
+        if self.uncertain and not METHODS[self.method].has_two_networks:
+            raise InputError(
+                f"expected a method of two networks for --uncertain, found {self.method}; "
+                "use amvnet"
+            )
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        """The classes that are written."""
+        return self.weights.taxonomy if self.classes is None else self.classes.target
+
+    @property
+    def usual_uncertain(self) -> float | None:
+        """The share of uncertain points that is usual for the weights; None for another tau."""
+        is_usual = self.tau in (None, self.weights.model.assertion.threshold)
+        return self.weights.usual_uncertain if is_usual else None
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """What the written files depend on, as JSON types."""
+        weights = self.weights
+        return {
+            "weights": {part: weights.digest(part) for part in weights.parts},
+            "method": self.method,
+            "tau": self.tau,
+            "precision": self.precision,
+            "engine": "int8" if self.engine == "int8" else "",  # no other engine changes labels
+            "format": self.kind,
+            "scores": self.scores,
+            "uncertain": self.uncertain,
+            "sensor": repr(self.sensor),
+            "layout": repr(self.layout),
+            "classes": "" if self.classes is None else repr(self.classes),
+        }
+
+    def sensor_named(self, name: str) -> Sensor:
+        """Return what is known of a LiDAR, given its name in a manifest; empty if unknown.
+
+        Raises:
+            InputError: if there is no such LiDAR.
+        """
+        if not name:
+            return self.sensor
+        if name not in SENSORS:
+            raise InputError(
+                f"expected the name of a LiDAR in the column sensor, found {name!r}"
+                f"{did_you_mean(name, SENSORS, 'leave it empty if it is another one')}"
+            )
+        known = {key: value for key, value in vars(self.sensor).items() if value not in (None, "")}
+        return replace(SENSORS[name], **known)
+
+    def make_segmenter(self) -> Segmenter:
+        """Return the segmenter of a worker.
+
+        Raises:
+            InputError: if the options do not fit the weights or the machine.
+        """
+        segmenter = Segmenter(self.weights, self.device, self.method, self.precision, self.tau)
+        if segmenter.device == "cpu":
+            keep_freed_memory()
+        if self.at_once is not None:
+            segmenter.at_once = self.at_once
+        use_engine(segmenter, self.engine)
+        return segmenter
+
+    def make_reader(self, sensor: str, say: Say = say_nothing) -> FileReader:
+        """Return what reads the scans of a drive, given the name of its LiDAR."""
+        return FileReader(normaliser_for(self.weights, self.sensor_named(sensor), say))
+
+
+def results_schema(taxonomy: Taxonomy) -> pa.Schema:
+    """Return the columns of the table of results for some classes."""
+    counts = pa.struct([(name, pa.int32()) for name in taxonomy.classes])
+    means = pa.struct([(name, pa.float32()) for name in taxonomy.classes])
+    return pa.schema(
+        {
+            "scan": pa.string(),
+            "drive": pa.string(),
+            "path": pa.string(),
+            "labels": pa.string(),  # URL of the label file
+            "points": pa.int32(),  # that are valid
+            "uncertain": pa.float32(),  # share of the points
+            "class_points": counts,
+            "class_uncertain": counts,
+            "class_confidence": means,  # of the largest score of each point
+            "sensor": pa.string(),
+            "seconds": pa.float32(),  # of the worker
+            "worker": pa.string(),
+            "weights": pa.string(),  # digest
+            "error": pa.string(),
+            "is_fatal": pa.bool_(),  # whether no other scan can be written either
+        }
+    )
+
+
+class LabelScans:
+    """Labels scan files, for `map_batches` of Ray Data with `batch_format="pyarrow"`.
+
+    A batch has a row for each scan with the columns `path`, `name`, `drive`, `sensor` and
+    `estimates`, of which only the first is needed. Scans of one drive should follow one another:
+    what is measured of its sensor is in `estimates` (`measure_drive`), or else it is measured on
+    the first scans of the drive in the batch.
+    """
+
+    def __init__(self, labelling: Labelling) -> None:
+        self.labelling = labelling
+        self._segmenter = labelling.make_segmenter()
+        self._schema = results_schema(labelling.taxonomy)
+        self._out = Place.of(labelling.out)
+        self._worker = f"{socket.gethostname()}:{os.getpid()}"
+        digests = "".join(labelling.settings["weights"].values())
+        self._digest = hashlib.sha256(digests.encode()).hexdigest()[:16]
+
+    def __call__(self, batch: pa.Table) -> pa.Table:
+        """Return the rows of the table of results for the scans of a batch."""
+        rows: list[Row] = []
+        whole = [_complete(row) for row in batch.to_pylist()]
+        for _, scans in groupby(whole, key=itemgetter("drive")):
+            drive = list(scans)
+            try:
+                rows += self._label(drive)
+            except Exception as error:  # a fault in a library, for example
+                if len(drive) > 1:
+                    raise  # the scans are tried again one by one
+                line = f"{drive[0]['path']}: expected a scan, found {type(error).__name__}: {error}"
+                rows.append(self._row(drive[0], error=" ".join(line.split())))
+        return pa.Table.from_pylist(rows, self._schema)
+
+    def _label(self, drive: Sequence[Row]) -> list[Row]:
+        """Label scans of one drive."""
+        start = time.perf_counter()
+        rows = []
+        with (
+            TemporaryDirectory(prefix="amvnet-") as temporary,
+            ThreadPoolExecutor(TRANSFERS) as pool,
+        ):
+            folder = Path(temporary)
+            reader = self._reader(drive[0])
+            layout = self.labelling.layout
+            scans = list_scans_of(drive, reader, layout, pool, folder / "scans")
+            pipeline = self._pipeline(scans, self._out.local or folder / "labels")
+            row_of = {scan.name: row for scan, row in zip(scans, drive, strict=True)}
+
+            writing = deque[Future[Row]]()
+            with closing(pipeline.results(scans)) as results:
+                for scan, loaded, result in results:
+                    row = row_of[scan.name]
+                    if loaded is None or isinstance(result, InputError):
+                        line = str(result).replace(str(scan.path), row["path"])
+                        rows.append(self._row(row, error=line))
+                        continue
+                    job = pool.submit(self._write, pipeline, scan, loaded, result, row)
+                    writing.append(job)
+                    while len(writing) > AHEAD:
+                        rows.append(writing.popleft().result())
+            rows += [job.result() for job in writing]
+
+        seconds = (time.perf_counter() - start) / len(drive)
+        return [row | {"seconds": seconds} for row in rows]
+
+    def _reader(self, row: Row) -> FileReader:
+        """Return what reads the scans of a drive, given one of its rows."""
+        reader = self.labelling.make_reader(row["sensor"])
+        if row["estimates"]:
+            assert reader.normaliser is not None
+            reader.normaliser.recall(row["drive"], parse_estimates(row["estimates"]))
+        return reader
+
+    def _pipeline(self, scans: Sequence[InputScan], folder: Path) -> Pipeline:
+        labelling = self.labelling
+        return Pipeline(
+            scans,
+            segment_by(self._segmenter, labelling.classes),
+            OutputOptions(folder, labelling.kind, labelling.scores, labelling.uncertain),
+            labelling.taxonomy,
+            ExecutionOptions(labelling.batch, self._segmenter.at_once),
+        )
+
+    def _write(
+        self,
+        pipeline: Pipeline,
+        scan: InputScan,
+        loaded: LoadedScan,
+        result: Segmentation,
+        row: Row,
+    ) -> Row:
+        """Write the files of a scan, the labels last, and return its row of results."""
+        paths = pipeline.output.paths_of(scan)
+        try:
+            entry = pipeline.write(scan, loaded, result)
+            if self._out.local is None:
+                for path in reversed(paths):
+                    place = self._out / path.as_posix()
+                    place.write((pipeline.output.folder / path).read_bytes())
+        except InputError as error:
+            return self._row(row, error=str(error))
+        except OSError as error:
+            place_name = error.filename or self._out.url
+            return self._row(row, error=f"{place_name}: {error.strerror or error}", is_fatal=True)
+
+        labels = (self._out / paths[0].as_posix()).url
+        counts = statistics(result, self.labelling.taxonomy)
+        return self._row(row, labels=labels, points=entry.points, sensor=entry.sensor, **counts)
+
+    def _row(self, row: Row, **values: Any) -> Row:
+        """Return a row of results: what is known of the scan, and some values."""
+        return {
+            "scan": row["name"],
+            "drive": row["drive"],
+            "path": row["path"],
+            "worker": self._worker,
+            "weights": self._digest,
+            "is_fatal": False,
+            **values,
+        }
+
+
+def _complete(row: Row) -> Row:
+    """Return the row of a scan with all columns; what is not known is empty."""
+    name = row.get("name") or split_name(Path(row["path"]).name)[0]
+    others = {key: row.get(key) or "" for key in ("drive", "sensor", "estimates")}
+    return {"path": row["path"], "name": name, **others}
+
+
+def statistics(result: Segmentation, taxonomy: Taxonomy) -> Row:
+    """Return what the table of results says of the labels of a scan."""
+    ids = result.labels
+    size = taxonomy.size + 1
+    counts = np.bincount(ids, minlength=size)
+    uncertain = np.bincount(ids[result.uncertain], minlength=size)
+    sums = np.bincount(ids, weights=result.scores.max(axis=1, initial=0), minlength=size)
+    means = [total / count if count else None for total, count in zip(sums, counts, strict=True)]
+
+    names = taxonomy.classes
+    return {
+        "uncertain": uncertain_share(ids, result.uncertain),
+        "class_points": dict(zip(names, counts[1:].tolist(), strict=True)),
+        "class_uncertain": dict(zip(names, uncertain[1:].tolist(), strict=True)),
+        "class_confidence": dict(zip(names, means[1:], strict=True)),
+    }
+
+
+def list_scans_of(
+    drive: Sequence[Row],
+    reader: FileReader,
+    layout: RowLayout,
+    pool: ThreadPoolExecutor,
+    folder: Path,
+) -> list[FileScan]:
+    """Return the scans of a drive, whose files are fetched ahead of their reading.
+
+    Args:
+        drive: rows with the columns `path`, `name` and `drive`.
+        reader: reads the scans.
+        layout: of rows of numbers without names, what they hold.
+        pool: fetches the files.
+        folder: for the files that are not on this machine.
+    """
+    scans = []
+    for index, row in enumerate(drive):
+        place = folder / str(index)
+        fetching = pool.submit(_fetch, row["path"], place)
+        read = partial(_read, fetching, layout)
+        path = place / Path(row["path"]).name
+        scan = NamedScan(row["name"], row["drive"], path, "", read)
+        reader.expect(scan)
+        scans.append(FileScan(scan, reader))
+    return scans
+
+
+def _fetch(url: str, folder: Path) -> Path:
+    return Place.of(url).fetch(folder)
+
+
+def _read(fetching: Future[Path], layout: RowLayout) -> Cloud:
+    path = fetching.result()
+    return read_file(path, ending_of(path), layout)
+
+
+def measure_drive(labelling: Labelling, drive: Sequence[Row]) -> Row:
+    """Measure the sensor of a drive on its first scans; return its row in the table of drives.
+
+    Args:
+        drive: rows of the first scans with the columns `path`, `name`, `drive` and `sensor`.
+    """
+    assumed: list[str] = []
+    source, sensor = drive[0]["drive"], drive[0]["sensor"]
+    reader = labelling.make_reader(sensor, assumed.append)
+    with TemporaryDirectory(prefix="amvnet-") as folder, ThreadPoolExecutor(TRANSFERS) as pool:
+        scans = list_scans_of(drive, reader, labelling.layout, pool, Path(folder))
+        assert reader.normaliser is not None
+        estimates = reader.normaliser.measure(source).medians
+        for scan in scans:
+            with suppress(InputError):  # the line about the first scan that can be read
+                scan.load()
+                break
+        line = assumed[0].replace(str(scan.path), scan.name) if assumed else ""
+    return describe_drive(source, sensor, line, estimates)

@@ -1,0 +1,170 @@
+"""Files and folders by URL, such as s3://bucket/drive, or by a path."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import pyarrow as pa
+from pyarrow import fs
+
+from amvnet.errors import InputError, one_line_errors
+from amvnet.files import atomic_write
+
+# Without it, pyarrow uploads even a small file in three requests.
+OPTIONS = {"s3": "?allow_delayed_open=true"}
+
+
+@dataclass(frozen=True)
+class Place:
+    """A file or a folder on this machine or in object storage; it need not exist.
+
+    Attributes:
+        url: as a user would write it.
+        filesystem: that of pyarrow which has it.
+        path: in the filesystem.
+    """
+
+    url: str
+    filesystem: fs.FileSystem
+    path: str
+
+    @classmethod
+    def of(cls, url: str) -> Place:
+        """Return the place of a URL or a path.
+
+        Raises:
+            InputError: if there is no such storage, or its package is not installed.
+        """
+        scheme, is_url, rest = url.partition("://")
+        if not is_url:
+            path = str(Path(url).expanduser().absolute())
+            return cls(path, fs.LocalFileSystem(), path)
+
+        bucket, slash, path = rest.rstrip("/").partition("/")
+        filesystem, root = _open(scheme, bucket)
+        return cls(url.rstrip("/"), filesystem, f"{root.rstrip('/')}{slash}{path}")
+
+    def __truediv__(self, name: str) -> Place:
+        return Place(f"{self.url}/{name}", self.filesystem, f"{self.path}/{name}")
+
+    @property
+    def local(self) -> Path | None:
+        """The path, if it is on this machine."""
+        return Path(self.path) if isinstance(self.filesystem, fs.LocalFileSystem) else None
+
+    def kind(self) -> fs.FileType:
+        """Return whether it is a file, a folder or nothing.
+
+        Raises:
+            InputError: if the storage cannot be reached.
+        """
+        with reaching(self.url):
+            return self.filesystem.get_file_info(self.path).type
+
+    def children(self) -> tuple[list[str], list[str]]:
+        """Return the sorted names of the files in a folder, and those of its folders.
+
+        Raises:
+            InputError: if the folder cannot be listed.
+        """
+        files: list[str] = []
+        folders: list[str] = []
+        with reaching(self.url):
+            for info in self.filesystem.get_file_info(fs.FileSelector(self.path)):
+                names = folders if info.type == fs.FileType.Directory else files
+                names.append(info.base_name)
+        return sorted(files), sorted(folders)
+
+    def fetch(self, folder: Path) -> Path:
+        """Return the path of a file on this machine; if it is elsewhere, of a copy in a folder.
+
+        Raises:
+            InputError: if it cannot be read.
+        """
+        if self.local is not None:
+            return self.local
+        copy = folder / Path(self.path).name
+        folder.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(self.read())
+        return copy
+
+    def read(self) -> bytes:
+        """Return the content of a file.
+
+        Raises:
+            InputError: if it cannot be read.
+        """
+        with reaching(self.url), self.filesystem.open_input_stream(self.path) as stream:
+            return bytes(stream.read())
+
+    def write(self, content: bytes) -> None:
+        """Write a file; it appears whole or not at all.
+
+        Raises:
+            InputError: if it is on this machine and cannot be written.
+            OSError: if there is no space, or the storage does not take it.
+        """
+        if self.local is not None:
+            with atomic_write(self.local) as part:
+                part.write_bytes(content)
+            return
+        try:
+            with self.filesystem.open_output_stream(self.path) as stream:
+                stream.write(content)
+        except OSError as error:
+            raise OSError(errno.EIO, _first_line(error), self.url) from None
+
+    def remove(self) -> None:
+        """Remove a file."""
+        self.filesystem.delete_file(self.path)
+
+
+@contextmanager
+def reaching(url: str) -> Iterator[None]:
+    """Turn the errors of a storage into an `InputError` of one line.
+
+    Raises:
+        InputError: if the block cannot reach the storage.
+    """
+    with one_line_errors(
+        lambda error: (
+            f"{url}: expected a file or a folder that can be read, found {_first_line(error)}; "
+            "check the URL and the credentials"
+        ),
+        only=(OSError, pa.ArrowException),
+    ):
+        yield
+
+
+@cache
+def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
+    """Return the filesystem of a bucket and the path of the bucket in it.
+
+    pyarrow has some storages itself; fsspec has the others.
+    """
+    root = f"{scheme}://{bucket}"
+    try:
+        return fs.FileSystem.from_uri(f"{root}{OPTIONS.get(scheme, '/')}")
+    except pa.ArrowInvalid:
+        pass
+    try:
+        from fsspec.core import url_to_fs
+
+        other, path = url_to_fs(root)
+    except (ImportError, ValueError) as error:
+        raise InputError(
+            f"{root}: expected a storage that can be opened, found {_first_line(error)}; "
+            "install its package, or use s3://, gs:// or file://"
+        ) from None
+    return fs.PyFileSystem(fs.FSSpecHandler(other)), path
+
+
+def _first_line(error: BaseException) -> str:
+    """Return what an error says, without the number that each request has."""
+    lines = str(error).splitlines() or [type(error).__name__]
+    return lines[0].partition(" (Request ID")[0]

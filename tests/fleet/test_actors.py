@@ -1,0 +1,204 @@
+"""What a worker does with its scans: the labels of `predict`, and a row for each."""
+
+from __future__ import annotations
+
+import errno
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.fleet.actors import Labelling, LabelScans, measure_drive, results_schema, statistics
+from amvnet.fleet.manifest import list_blocks
+from amvnet.fleet.storage import Place
+from amvnet.inference.segmentation import Segmentation
+from amvnet.weights.file import load
+
+from fixtures.s3_server import Bucket
+from fixtures.worlds import fails, succeed
+
+
+@pytest.fixture(scope="module")
+def labelling(fleet: Path) -> Labelling:
+    return Labelling(load(fleet / "w.safetensors"), "nowhere")
+
+
+def label(labelling: Labelling, inputs: Sequence[str]) -> list[dict[str, Any]]:
+    """Label scans as the workers of a cluster do; return the rows of results."""
+    worker = LabelScans(labelling)
+    rows = []
+    for block in list_blocks(inputs):
+        drive = measure_drive(labelling, block.rows()[:5])
+        table = [row | {"estimates": drive["estimates"]} for row in block.rows()]
+        result = worker(pa.Table.from_pylist(table))
+        assert result.schema == results_schema(labelling.taxonomy)
+        rows += result.to_pylist()
+    return rows
+
+
+def test_labels_in_a_bucket_are_those_of_predict(
+    labelling: Labelling, labels: dict[str, bytes], bucket: Bucket
+) -> None:
+    rows = label(replace(labelling, out="s3://fleet/labels"), ["s3://fleet/scans"])
+    assert set(bucket.keys("labels")) == set(labels)
+    for name, content in labels.items():
+        assert bucket[f"labels/{name}"] == content
+    assert [row["labels"] for row in rows] == [
+        f"s3://fleet/labels/{row['scan']}.label" for row in rows
+    ]
+
+
+def test_labels_in_a_folder_are_those_of_predict_in_each_format(
+    labelling: Labelling, fleet: Path, tmp_path: Path
+) -> None:
+    options = {"kind": "ply", "scores": True, "uncertain": True}
+    label(replace(labelling, out=str(tmp_path / "out"), **options), [f"{fleet}/scans"])  # type: ignore[arg-type]
+    succeed(
+        f"predict '{fleet}/scans/*/*.bin' --weights {fleet}/w.safetensors --out {tmp_path}/whole "
+        "--format ply --scores --uncertain"
+    )
+    paths = [path for path in (tmp_path / "whole").rglob("*/*") if path.is_file()]
+    assert len(paths) == 60
+    for path in paths:
+        copy = tmp_path / "out" / path.relative_to(tmp_path / "whole")
+        assert copy.read_bytes() == path.read_bytes(), path
+
+
+def test_workers_normalise_by_what_was_measured_and_not_by_their_own_scans(
+    labelling: Labelling, fleet: Path, tmp_path: Path
+) -> None:
+    """A worker that gets only the last scans of a drive gives them the labels of the whole."""
+    (block,) = list(list_blocks([f"{fleet}/scans/drive4"]))
+    drive = measure_drive(labelling, block.rows())
+    assert drive["height"] == pytest.approx(2.5, abs=0.05)
+    other = json.dumps([json.loads(drive["estimates"])[0] | {"quantiles": None}])
+
+    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+    for estimates, is_same in ((drive["estimates"], True), (other, False)):
+        rows = [row | {"estimates": estimates} for row in block.rows()]
+        worker(pa.Table.from_pylist(rows[-1:]))
+        expected = (fleet / "labels/drive4/000003.label").read_bytes()
+        assert ((tmp_path / "000003.label").read_bytes() == expected) == is_same
+
+
+def test_only_paths_are_needed(labelling: Labelling, fleet: Path, tmp_path: Path) -> None:
+    """In a user's own pipeline, the sensor is measured on the batch."""
+    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+    paths = sorted((fleet / "scans/drive1").glob("*.bin"))
+    worker(pa.table({"path": list(map(str, paths))}))
+    for path in paths:
+        expected = fleet / f"labels/drive1/{path.stem}.label"
+        assert (tmp_path / f"{path.stem}.label").read_bytes() == expected.read_bytes()
+
+
+def test_broken_scans_have_a_row_with_one_line_and_the_others_labels(
+    labelling: Labelling, labels: dict[str, bytes], fleet: Path, bucket: Bucket
+) -> None:
+    bucket.upload(fleet / "scans/drive0", "broken")
+    bucket["broken/000001.bin"] = b"123"
+    bucket["broken/000002.pcd"] = b"VERSION"
+    rows = label(replace(labelling, out="s3://fleet/broken-out"), ["s3://fleet/broken"])
+    errors = {row["path"]: row["error"] for row in rows if row["error"]}
+    assert set(errors) == {"s3://fleet/broken/000001.bin", "s3://fleet/broken/000002.pcd"}
+    for path, error in errors.items():
+        assert error.startswith(f"{path}: expected")
+        assert "\n" not in error
+    assert len(rows) == 5
+    assert bucket["broken-out/000003.label"] == labels["drive0/000003.label"]
+
+
+def test_a_scan_that_is_gone_is_a_broken_one(labelling: Labelling, tmp_path: Path) -> None:
+    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+    for path in (f"{tmp_path}/gone.bin", "s3://fleet/gone.bin"):
+        (row,) = worker(pa.table({"path": [path]})).to_pylist()
+        assert row["error"].startswith(f"{path}: expected")
+
+
+def test_a_fault_of_a_library_is_a_row_if_it_is_known_of_which_scan(
+    labelling: Labelling, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+    monkeypatch.setattr("amvnet.fleet.actors.read_file", lambda *_: 1 / 0)
+    paths = [f"{fleet}/scans/drive0/{index:06d}.bin" for index in range(2)]
+    with pytest.raises(ZeroDivisionError):
+        worker(pa.table({"path": paths}))
+    (row,) = worker(pa.table({"path": paths[:1]})).to_pylist()
+    assert row["error"] == f"{paths[0]}: expected a scan, found ZeroDivisionError: division by zero"
+
+
+def test_a_full_disk_is_fatal(
+    labelling: Labelling, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "/full/000000.label")
+
+    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+    monkeypatch.setattr("amvnet.inference.pipeline.Pipeline.write", fail)
+    (row,) = worker(pa.table({"path": [f"{fleet}/scans/drive0/000000.bin"]})).to_pylist()
+    assert row["is_fatal"]
+    assert row["error"] == "/full/000000.label: No space left on device"
+
+
+def test_a_bucket_that_takes_no_labels_is_fatal(labelling: Labelling, fleet: Path) -> None:
+    worker = LabelScans(replace(labelling, out="s3://no-such-bucket/out"))
+    (row,) = worker(pa.table({"path": [f"{fleet}/scans/drive0/000000.bin"]})).to_pylist()
+    assert row["is_fatal"]
+    assert row["error"].startswith("s3://no-such-bucket/out/000000.label: ")
+
+
+def test_the_row_of_a_scan_counts_its_labels(
+    labelling: Labelling, fleet: Path, tmp_path: Path
+) -> None:
+    rows = label(replace(labelling, out=str(tmp_path)), [f"{fleet}/scans/drive0"])
+    for row in rows:
+        raw = np.fromfile(row["labels"], np.uint32)
+        ids = SEMANTICKITTI.to_train(raw)
+        assert row["points"] == np.count_nonzero(ids)
+        for index, name in enumerate(SEMANTICKITTI.classes):
+            assert row["class_points"][name] == np.count_nonzero(ids == index + 1)
+        share = sum(row["class_uncertain"].values()) / row["points"]
+        assert row["uncertain"] == pytest.approx(share, abs=1e-6)
+        assert (row["error"], row["is_fatal"]) == (None, False)
+        assert row["seconds"] > 0
+
+
+def test_confidence_is_the_mean_largest_score_of_a_class() -> None:
+    k = SEMANTICKITTI.size
+    scores = np.zeros((3, k), np.float32)
+    scores[[0, 1, 2], [0, 0, 5]] = [0.5, 0.75, 1.0]
+    result = Segmentation(np.array([1, 1, 6], np.uint8), np.array([True, False, False]), scores)
+    values = statistics(result, SEMANTICKITTI)
+    confidence = {name: value for name, value in values["class_confidence"].items() if value}
+    assert confidence == {"car": 0.625, "person": 1.0}
+    assert values["class_uncertain"]["car"] == 1
+    assert values["uncertain"] == pytest.approx(1 / 3)
+
+
+def test_wrong_options_are_refused_before_any_work(labelling: Labelling) -> None:
+    fails(lambda: replace(labelling, kind="mcap"), "mcap")
+    fails(lambda: replace(labelling, method="rv", uncertain=True), "--uncertain")
+    fails(lambda: replace(labelling, tau=2.0), "tau")
+    fails(lambda: labelling.sensor_named("vlp61"), "vlp16")
+
+
+def test_a_manifest_names_the_sensor_of_a_drive_and_options_count_more(
+    labelling: Labelling,
+) -> None:
+    known = replace(labelling.sensor, height=1.1)
+    sensor = replace(labelling, sensor=known).sensor_named("vlp16")
+    assert (sensor.name, sensor.beams, sensor.height) == ("vlp16", 16, 1.1)
+
+
+def test_files_of_any_storage_of_fsspec_are_read_and_written() -> None:
+    place = Place.of("memory://bucket/folder") / "file"
+    place.write(b"content")
+    assert Place.of("memory://bucket/folder").children() == (["file"], [])
+    assert place.read() == b"content"
+    place.remove()
+    fails(place.read, "memory://bucket/folder/file")
