@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -261,32 +261,48 @@ def said_by(command: str, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_only_new_scans_of_a_growing_folder_are_segmented(
-    world: Path, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The labels, and the share of uncertain points, are those of a run over all scans."""
-    out = tmp_path / "out"
+    """Ten are added to a hundred; the labels and the uncertain share are those of a whole run."""
     scans = tmp_path / "scans"
-    scans.mkdir()
-    paths = sorted((world / "scans").glob("*.bin"))
-    for path in paths[:9]:
-        shutil.copy(path, scans)
-    command = f"predict {scans} --weights {world}/{WEIGHTS} --out {out} --resume"
+    weights = f"--weights {world}/{WEIGHTS}"
+    grow(scans, range(100))
+    command = f"predict {scans} {weights} --out {tmp_path}/out --resume"
     succeed(command)
-    times = times_of(out)
+    times = times_of(tmp_path / "out")
+    assert len(times) == 100
 
-    for path in paths[9:]:
-        shutil.copy(path, scans)
+    new = grow(scans, range(100, 110))
     said = said_by(command, capsys)
-    check_same(out, whole)
-    assert times.items() <= times_of(out).items()
-    assert said.replace(str(out), "OUT") == said_by(
-        f"predict {scans} --weights {world}/{WEIGHTS} --out {tmp_path}/again", capsys
-    ).replace(f"{tmp_path}/again", "OUT")
+    later_times = times_of(tmp_path / "out")
+    assert times.items() <= later_times.items()
+    assert later_times.keys() - times.keys() == new
 
-    # Nothing is left to do, and a label that is gone or was changed is made again.
+    said_of_whole = said_by(f"predict {scans} {weights} --out {tmp_path}/whole", capsys)
+    assert said.replace(f"{tmp_path}/out", "OUT") == said_of_whole.replace(
+        f"{tmp_path}/whole", "OUT"
+    )
+    check_same(tmp_path / "out", tmp_path / "whole")
+
+
+def grow(folder: Path, seeds: Iterable[int]) -> set[str]:
+    """Write a scan for each seed into a folder; return the names of their labels."""
+    folder.mkdir(exist_ok=True)
+    for seed in seeds:
+        street(seed, count=200)[0].tofile(folder / f"{seed:06d}.bin")
+    return {f"{seed:06d}.label" for seed in seeds}
+
+
+def test_a_finished_run_makes_only_labels_that_are_gone_or_changed(
+    world: Path, whole: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    command = predict(world, out, "--resume")
     times = times_of(out)
     succeed(command)
     assert times_of(out) == times
+
     (out / "000003.label").unlink()
     (out / "000005.label").write_bytes(b"other")
     assert "000005.label" in refusal(command)
