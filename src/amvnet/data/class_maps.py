@@ -102,14 +102,15 @@ def _parse(name: str, tree: Any) -> ClassMap:
 
     sources: dict[str, int] = {}
     raw_ids = [0]
+    raw_to_train: dict[int | str, int] = {0: 0}
     for train_id, (title, values) in enumerate(entries.items(), start=1):
         for source in _names(title, values.get("from", [])):
             if source in sources:
                 raise InputError(f"expected each class once, found {source} twice; correct the map")
             sources[source] = train_id
         raw_ids.append(values.get("id", train_id))
+        raw_to_train[raw_ids[-1]] = train_id
 
-    raw_to_train: dict[int | str, int] = {raw: index for index, raw in enumerate(raw_ids)}
     return ClassMap(user_taxonomy(name, entries, raw_to_train, raw_ids), sources)
 
 

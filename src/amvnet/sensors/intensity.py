@@ -8,7 +8,7 @@ decisions rest on quantiles: a few wild values change nothing.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
@@ -66,10 +66,12 @@ class TrainedIntensity:
         return np.interp(draws, PROBABILITIES, self.quantiles).astype(np.float32)
 
 
-def network_records(training: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return the names and the training records of the networks that have one."""
-    parts = [(part, training.get(part)) for part in ("range_net", "polar_net")]
-    return [(part, record) for part, record in parts if isinstance(record, Mapping)]
+def network_records(training: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield the names and the training records of the networks that have one."""
+    for part in ("range_net", "polar_net"):
+        record = training.get(part)
+        if isinstance(record, Mapping):
+            yield part, record
 
 
 def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntensity | None:

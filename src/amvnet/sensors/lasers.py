@@ -93,7 +93,7 @@ class SensorGeometry:
 
     def override(self, sensor: Sensor) -> SensorGeometry:
         """Return the geometry with what is known of the sensor in place of what was measured."""
-        stated = SensorGeometry(*(getattr(sensor, key) for key in MEASURES))
+        stated = SensorGeometry(sensor.beams, sensor.fov_up, sensor.fov_down, sensor.height)
         return dataclasses.replace(self, **stated.known())
 
 

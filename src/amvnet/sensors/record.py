@@ -41,8 +41,11 @@ def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
 
 def is_trained_as_is(training: Mapping[str, Any]) -> bool:
     """Return whether weights were trained on scans that were not normalised, by their records."""
-    carried = [record.get(KEY) for _, record in network_records(training)]
-    return any(isinstance(each, Mapping) and each.get(AS_IS) is True for each in carried)
+    for _, record in network_records(training):
+        carried = record.get(KEY)
+        if isinstance(carried, Mapping) and carried.get(AS_IS) is True:
+            return True
+    return False
 
 
 def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:

@@ -101,15 +101,16 @@ def write(
             if (folder / name).is_file():
                 _add(archive, name, (folder / name).read_bytes())
 
+        unmatched = 0
         for done, name in enumerate(names):
             progress(done, len(names))
+            unmatched += rules.points[name] is None
             data = (folder / name).read_bytes()
             rules.check_ids(data, folder / name)
             _add(archive, name, data)
 
     progress(len(names), len(names))
-    counts = [rules.points[name] for name in names]
-    return Submission(len(names), unmatched=counts.count(None), official=rules.official)
+    return Submission(len(names), unmatched, rules.official)
 
 
 def _check_missing(rules: Rules, names: list[str], folder: Path) -> None:

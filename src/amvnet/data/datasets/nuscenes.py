@@ -119,7 +119,11 @@ class NuScenes(Dataset):
             InputError: if the split is unknown.
         """
         check_split(self.root, split, SPLITS)
-        return tuple(scene for scene in sorted(self._records_by_scene) if self._is_in(scene, split))
+        scenes = []
+        for scene in sorted(self._records_by_scene):
+            if self._is_in(scene, split):
+                scenes.append(scene)
+        return tuple(scenes)
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these scenes, in order."""

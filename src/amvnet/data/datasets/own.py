@@ -25,8 +25,10 @@ from amvnet.files import read_yaml
 from amvnet.scan import Scan
 
 ENDINGS = (".yaml", ".yml")
-KEYS = ("name", "root", "classes", "ignored", "scans", "labels", "split", "sensor")
-ROW_KEYS = ("columns", "dtype")
+KEYS = (
+    *("name", "root", "classes", "ignored", "scans", "labels", "split", "sensor"),
+    *("columns", "dtype"),
+)
 SPLITS = ("train", "val", "test")
 
 # Turns what a file holds into a scan, given the recording that it is from.
@@ -247,7 +249,7 @@ class OwnScans(Dataset):
         Raises:
             InputError: if it is in two.
         """
-        folders = [parent.as_posix() for parent in Path(name).parents]
+        folders = map(Path.as_posix, Path(name).parents)
         texts = {name, path.relative_to(self.root).as_posix(), self._folder_of(name), *folders}
         splits = []
         for split, names in self._names.items():
@@ -327,7 +329,7 @@ def open_own(path: Path | str) -> OwnScans:
 
 def _parse(path: Path, tree: Any) -> Description:
     """Return what the YAML file says."""
-    _check_keys("the file", tree, (*KEYS, *ROW_KEYS), required=("classes", "scans"))
+    _check_keys("the file", tree, KEYS, required=("classes", "scans"))
     root = (path.parent / Path(_text(tree, "root", ".")).expanduser()).absolute()
     scans = _text(tree, "scans")
     if Path(scans).is_absolute() or ".." in Path(scans).parts:
@@ -350,7 +352,10 @@ def _parse(path: Path, tree: Any) -> Description:
         labels=_parse_labels(tree.get("labels")),
         split=_parse_split(tree.get("split") or {}),
         sensor=sensor,
-        layout=RowLayout(*(_texts(key, tree.get(key, ())) for key in ROW_KEYS)),
+        layout=RowLayout(
+            columns=_texts("columns", tree.get("columns", ())),
+            dtypes=_texts("dtype", tree.get("dtype", ())),
+        ),
     )
 
 

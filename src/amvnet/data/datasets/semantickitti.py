@@ -85,7 +85,10 @@ class SemanticKitti(Dataset):
 
     def _sequences_on_disk(self) -> tuple[str, ...]:
         """Return the names of the sequences on disk, sorted."""
-        return tuple(sorted(path.parent.name for path in self._folder.glob("*/velodyne")))
+        names = []
+        for path in self._folder.glob("*/velodyne"):
+            names.append(path.parent.name)
+        return tuple(sorted(names))
 
     def _records(self, sequence: str) -> list[ScanRecord]:
         """Return the scans of one sequence, in order.

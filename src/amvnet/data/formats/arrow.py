@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ def read_feather(path: Path) -> Cloud:
     moved = (cloud.xyz - position).astype(cloud.xyz.dtype)
     place = ", ".join(f"{value:.2f}" for value in position)
     note = f"Argoverse 2, moved from the vehicle's origin to the LiDARs at {place}"
-    return Cloud(moved, cloud.intensity, cloud.ring, cloud.name, None, note, cloud.xyz)
+    return replace(cloud, xyz=moved, note=note, file_xyz=cloud.xyz)
 
 
 def _lidar_position(path: Path) -> np.ndarray:

@@ -42,8 +42,11 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
         done = 0
         with laspy.open(path, read_evlrs=False, laz_backend=laspy.LazBackend.Lazrs) as file:
             # The names of the integers that stand for coordinates differ only in their case.
-            dimensions = file.header.point_format.dimension_names
-            names = [*"xyz", *(name for name in dimensions if name not in "XYZ")]
+            names = ["x", "y", "z"]
+            for name in file.header.point_format.dimension_names:
+                if name not in "XYZ":
+                    names.append(name)
+
             chosen = choose(names)
             columns = {}
             for key, index in chosen.items():

@@ -70,7 +70,8 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
     with reading(path, KIND, ADVICE), path.open("rb") as file:
         encoding, elements = _read_header(file, path)
         index = [element.name for element in elements].index("vertex")
-        before, vertex = elements[:index], elements[index]
+        before = elements[:index]
+        vertex = elements[index]
         if any("list" in element.types for element in elements[: index + 1]):
             raise InputError(
                 f"{path}: expected vertices without lists, found a list; write the points alone"

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.formats.cloud import MAX_POINTS, MOST_RINGS, Cloud, check_point_count
+from amvnet.data.formats.cloud import (
+    MAX_POINTS,
+    MOST_RINGS,
+    Cloud,
+    check_point_count,
+    split_records,
+)
 from amvnet.data.formats.rows import (
     ADVICE,
     COUNTS,
@@ -100,7 +106,7 @@ def _read_rows(path: Path, layout: RowLayout) -> Cloud:
 
     check_point_count(size // record.itemsize, path)
     records = np.fromfile(path, dtype=record)
-    columns = [records[name] for name in record.names or ()]
+    columns = list(split_records(records).values())
     return named_cloud(columns, layout.columns, str(path), layout.describe())
 
 

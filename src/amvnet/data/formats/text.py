@@ -172,7 +172,12 @@ def _match(
                     return None
             is_named = len(names) == len(values)
             return TextTable(
-                separator, decimal, skipped, len(values), encoding, names if is_named else ()
+                separator,
+                decimal,
+                skipped,
+                count=len(values),
+                encoding=encoding,
+                names=names if is_named else (),
             )
 
         candidates = tuple(map(_clean_name, _split(_uncomment(line), separator)))
