@@ -85,6 +85,7 @@ def class_map(name: str) -> ClassMap:
     """
     if name == COARSE_NAME:
         return _parse(name, {"classes": _COARSE})
+
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
         advice = "give coarse or a YAML file"
@@ -92,6 +93,7 @@ def class_map(name: str) -> ClassMap:
             f"--classes: expected {COARSE_NAME} or a YAML file, found {name!r}"
             + did_you_mean(name, [COARSE_NAME], advice)
         )
+
     with errors_of(path):
         return _parse(path.stem, read_yaml(path, "a map of classes"))
 

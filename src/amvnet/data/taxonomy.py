@@ -231,6 +231,7 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
     config = read_yaml(path, "a label map")
     if not isinstance(config, Mapping):
         raise InputError(f"{path}: expected the tables {_YAML_TABLES}, found none; add them")
+
     try:
         with errors_of(path):
             return _from_config(path.stem, config)
@@ -319,6 +320,7 @@ def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, A
             hue = train_id * GOLDEN_ANGLE % 1
             rgb = np.array(colorsys.hsv_to_rgb(hue, SATURATION, VALUE))
             color = (255 * rgb).round().astype(int).tolist()
+
         is_triple = isinstance(color, list) and len(color) == 3
         if not is_triple or any(type(value) is not int for value in color):
             raise InputError(

@@ -316,6 +316,7 @@ def _cluster_rows(ranking: Ranking, taxonomy: Taxonomy) -> Iterator[list[Any]]:
     names = ("", *taxonomy.classes)
     for row in ranking.clusters:
         x, y, z = row["xyz"]
+
         yield [
             ranking.records[row["scan"]].name,
             f"{row['score']:.4f}",

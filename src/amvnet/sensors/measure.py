@@ -195,6 +195,7 @@ class Recording:
         """Return the same as `estimate` for a scan that adds nothing to the medians."""
         quantiles = quantiles_of(cloud.intensity)
         measured: Estimate | None = None
+
         for index, median in enumerate(self.medians):
             if not are_of_one_range(quantiles, median.quantiles):
                 continue
@@ -202,6 +203,7 @@ class Recording:
                 if self._gauge.may_have_recorded(cloud, median):
                     return index, median
                 continue
+
             # The frame of each scan is its own, so that its lasers are known only in that.
             measured = measured or self._gauge(cloud)
             if measured.lasers.is_like(median.lasers):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy, taxonomy_named
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
@@ -189,8 +190,7 @@ def choose_frames(
             "give a folder"
         )
 
-    indices = np.linspace(0, len(scans) - 1, min(count, len(scans))).round().astype(int)
-    return Frames(taxonomy, [scans[index] for index in indices], source)
+    return Frames(taxonomy, evenly_spaced(scans, count), source)
 
 
 def frame_of(result: Segmentation, origin: Origin) -> Frame:

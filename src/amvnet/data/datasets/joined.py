@@ -118,6 +118,7 @@ class Joined(Dataset):
         records = self.parts[member - 1].records
         turn = epoch * self.places[member - 1] + place
         original = records[_order(member, len(records))[turn % len(records)]]
+
         return MixedRecord(
             name=f"{member + 1}.{place}/{original.name}",
             sequence=f"{member + 1}/{original.sequence}",

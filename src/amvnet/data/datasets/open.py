@@ -39,6 +39,7 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
             f"{spec}: expected its own classes, found those of {taxonomy.name}; "
             "leave --taxonomy out, or write simulated streets with amvnet simulate"
         )
+
     if kind in SIMULATED:
         return SimulatedStreets(Path(rest).expanduser(), SIMULATED[kind])
     if is_own(spec):
@@ -52,6 +53,7 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
     options = {} if taxonomy is None else {"taxonomy": taxonomy}
     if issubclass(reader, NuScenes):
         return reader(path, version=version, **options)
+
     if version is not None:
         raise InputError(
             f"{path}: expected no version after @, found {version}; only nuScenes has versions"

@@ -110,6 +110,7 @@ class OwnScans(Dataset):
         for record, split_of_scan in self._listing:
             if split in ("all", split_of_scan):
                 names.add(record.sequence)
+
         if not names:
             raise InputError(
                 f"{self.spec}: expected scans of the split {split}, found none; name them under "
@@ -133,6 +134,7 @@ class OwnScans(Dataset):
     def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
         """Return the scans that have labels."""
         labelled = [record for record in records if record.labels_path is not None]
+
         if records and not labelled:
             place = self.description.labels
             found = "no labels in the description"
@@ -141,6 +143,7 @@ class OwnScans(Dataset):
                 found = f"no {os.path.normpath(place.path_of(scan.path, scan.name))}"
             if len(records) > 1:
                 found += f" and none for the other scans ({len(records) - 1})"
+
             raise InputError(
                 f"{self.spec}: expected labelled scans, found {found}; "
                 "correct labels in the file, or name other sequences"
@@ -190,6 +193,7 @@ class OwnScans(Dataset):
         label_paths = set()
         if place is not None and place.file is not None:
             label_paths = {place.path_of(path, scan_stem(path)) for path in paths}
+
         scans: dict[str, NamedScan] = {}
         for path in paths:
             if path not in label_paths:
@@ -223,6 +227,7 @@ class OwnScans(Dataset):
             sequence = self._folder_of(name)
             if len(splits_of_folder[sequence]) > 1:
                 sequence = f"{sequence}-{splits[name] or 'rest'}"
+
             place = self.description.labels
             labels_path = None if place is None else place.path_of(scan.path, scan.name)
             record = ScanRecord(
@@ -255,6 +260,7 @@ class OwnScans(Dataset):
         for split, names in self._names.items():
             if texts & names or any(fnmatchcase(name, pattern) for pattern in _patterns(names)):
                 splits.append(split)
+
         if len(splits) > 1:
             raise InputError(
                 f"{self.spec}: expected a scan in one split, found {name} in "
@@ -406,11 +412,13 @@ def _parse_labels(entry: Any) -> LabelPlace | None:
         return None
     if isinstance(entry, str):
         entry = {"file": entry}
+
     _check_keys("labels", entry, ("file", "field"))
     file = _text(entry, "file", "") or None
     column = entry.get("field")
     if file is None and column is None:
         raise InputError("labels: expected a file or a field, found neither; name one")
+
     if file is not None and "{name}" not in file:
         if not file.startswith("."):
             raise InputError(
@@ -434,6 +442,7 @@ def _check_keys(title: str, tree: Any, keys: Sequence[str], required: Sequence[s
             f"{title}: expected the keys {', '.join(keys)}, found {shown(tree)}; "
             "see docs/own_data.md"
         )
+
     for key in tree:
         if key not in keys:
             raise InputError(

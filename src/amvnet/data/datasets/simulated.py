@@ -155,6 +155,7 @@ class SimulatedStreets(Dataset):
             InputError: if a file is broken.
         """
         folder = record.points_path
+
         try:
             return Scan(
                 np.load(folder / "points.npy"),

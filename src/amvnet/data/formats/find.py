@@ -107,6 +107,7 @@ def list_scans(
         # Files of several folders can have the same names.
         name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
         name = name.replace(f"/{KITTI_RAW}/", "/").replace(f"/{ARGOVERSE}/", "/")
+
         try:
             scans = _scans_of(file, name, topic, layout)
         except InputError as error:
@@ -204,6 +205,7 @@ def is_scan_file(path: Path) -> bool:
         return False
     if path.is_dir():
         return is_bag_folder(path)
+
     # A packed file counts if its name says that it is a scan, such as scan.bin.gz.
     name = path.name.lower()
     ending = named_ending(path)

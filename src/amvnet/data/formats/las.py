@@ -51,6 +51,7 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
             columns = {}
             for key, index in chosen.items():
                 columns[key] = np.empty(count, "u2" if names[index] == "intensity" else "f8")
+
             for points in file.chunk_iterator(CHUNK):
                 for key, values in columns.items():
                     values[done : done + len(points)] = points[names[chosen[key]]]

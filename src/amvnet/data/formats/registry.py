@@ -133,6 +133,7 @@ def first_of(names: Sequence[str], wanted: Sequence[str], path: Path) -> str:
     for name in wanted:
         if name in names:
             return name
+
     listing = ", ".join(names)[:200] or "none"
     raise InputError(
         f"{path}: expected a column of labels ({', '.join(wanted)}), found {listing!a}; "
@@ -182,6 +183,7 @@ def _read(path: Path, ending: str, layout: RowLayout) -> Cloud:
         with unpacked(path) as inner:
             cloud = _read(inner, _ending_of_one(inner), layout)
             return replace(cloud, name=str(path))
+
     if ending in ROW_READERS:
         return ROW_READERS[ending](path, layout)
     if ending == ".feather":

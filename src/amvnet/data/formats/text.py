@@ -170,6 +170,7 @@ def _match(
                 row = _split(other, separator)
                 if len(row) != len(values) or not _are_numbers(row, names, decimal):
                     return None
+
             is_named = len(names) == len(values)
             return TextTable(
                 separator,
@@ -230,6 +231,7 @@ def _read_values(path: Path, table: TextTable, indices: range | list[int]) -> np
         lines: Iterator[str] = islice(file, table.skipped, None)
         if table.decimal == ",":
             lines = (line.replace(",", ".") for line in lines)
+
         values = np.loadtxt(
             lines,
             delimiter=table.separator,

@@ -106,6 +106,7 @@ def _check(labels: np.ndarray, path: Path, count: int) -> np.ndarray:
             f"{path}: expected {count} labels, one per point, found {len(labels)}; "
             "give the labels of this scan"
         )
+
     is_number = labels.dtype.kind in "fiu"
     if not is_number or not np.array_equal(labels, np.round(labels)):
         raise InputError(
