@@ -198,7 +198,8 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     sources = []
     for name in ("truth", *METHODS, "labels"):
         if name in planes:
-            sources.append({"key": name, "title": _capitalise(title_of(name))})
+            method = title_of(name)
+            sources.append({"key": name, "title": method[:1].upper() + method[1:]})
 
     lowest = min(scan.height[0] for scan in packed)
     highest = max(scan.height[1] for scan in packed)
@@ -287,10 +288,6 @@ def _class_ids(planes: Mapping[str, np.ndarray], names: Sequence[str]) -> frozen
         if name in planes:
             ids.update(np.unique(planes[name]).tolist())
     return frozenset(ids)
-
-
-def _capitalise(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _note(left_out: int, stride: int) -> str:

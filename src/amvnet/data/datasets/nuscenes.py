@@ -121,7 +121,8 @@ class NuScenes(Dataset):
         check_split(self.root, split, SPLITS)
         scenes = []
         for scene in sorted(self._records_by_scene):
-            if self._is_in(scene, split):
+            official = self._split(scene)
+            if split in ("all", official, official.removeprefix("mini_")):
                 scenes.append(scene)
         return tuple(scenes)
 
@@ -273,15 +274,6 @@ class NuScenes(Dataset):
             labels_path=labels_path,
             prediction=f"lidarseg/{self._split(scene)}/{token}_lidarseg.bin",
         )
-
-    def _is_in(self, scene: str, split: str) -> bool:
-        """Return whether a scene belongs to a split."""
-        if split == "mini_val":
-            return scene in MINI_VAL
-        if split == "mini_train":
-            return scene in MINI_TRAIN
-
-        return split in ("all", self._split(scene).removeprefix("mini_"))
 
     def _split(self, scene: str) -> str:
         """Return the official split of a scene in this version: "train", "mini_val", ..."""
