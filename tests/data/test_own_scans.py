@@ -13,7 +13,8 @@ import yaml
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import OwnScans, open_own
 from amvnet.data.datasets.select import split_records
-from amvnet.data.labels.readers import read_labels
+from amvnet.data.labels.readers import read_scan_labels
+from amvnet.data.taxonomy import SEMANTICKITTI
 
 from fixtures.scan_writers import some_points, write_las, write_ply
 from fixtures.worlds import fails
@@ -189,10 +190,10 @@ def test_labels_that_do_not_fit_are_refused(site: Path) -> None:
     np.full(60, 5, np.uint32).tofile(path)
     fails(lambda: only_scan(site.parent), path, "found 5")
     np.save(site / "a.half.npy", np.full(60, 0.5))
-    fails(lambda: read_labels(site / "a.half.npy", 60), "whole numbers")
+    fails(lambda: read_scan_labels(site / "a.half.npy", 60, SEMANTICKITTI), "whole numbers")
     for large in (np.inf, 2.0**40):
         np.save(site / "a.large.npy", np.full(60, large))
-        fails(lambda: read_labels(site / "a.large.npy", 60), "32 bits")
-    fails(lambda: read_labels(site / "none.npy", 60), "no file")
+        fails(lambda: read_scan_labels(site / "a.large.npy", 60, SEMANTICKITTI), "32 bits")
+    fails(lambda: read_scan_labels(site / "none.npy", 60, SEMANTICKITTI), "no file")
     np.save(site / "evil.npy", np.array([{}], object), allow_pickle=True)
-    fails(lambda: read_labels(site / "evil.npy", 1), "evil.npy")
+    fails(lambda: read_scan_labels(site / "evil.npy", 1, SEMANTICKITTI), "evil.npy")

@@ -17,8 +17,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.labels.ids import train_ids
-from amvnet.data.labels.readers import read_label_field, read_scan_labels
+from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, errors_of, shown
 from amvnet.files import read_yaml
@@ -288,10 +287,8 @@ class OwnScans(Dataset):
         path = record.labels_path
         if place is None or path is None:
             return None
-        if place.file is not None:
-            return read_scan_labels(path, count, self.taxonomy, place.field)
-        raw = read_label_field(path, count, str(place.field), self.description.layout)
-        return train_ids(path, raw, self.taxonomy)
+        layout = self.description.layout
+        return read_scan_labels(path, count, self.taxonomy, place.field, layout)
 
 
 def _patterns(names: frozenset[str]) -> list[str]:

@@ -25,52 +25,17 @@ ADVICE = "write the labels again, one whole number per point"
 
 
 def read_scan_labels(
-    path: Path, count: int, taxonomy: Taxonomy, field: str | None = None
+    path: Path,
+    count: int,
+    taxonomy: Taxonomy,
+    field: str | None = None,
+    layout: RowLayout = UNKNOWN,
 ) -> np.ndarray:
-    """Read the labels of a scan as (N,) uint8 train ids; the arguments are those of `read_labels`.
+    """Read the labels of a scan from a file of labels, or from a field of the scan's file.
 
-    Raises:
-        InputError: as `read_labels`, or if an id is unknown.
-    """
-    return train_ids(path, read_labels(path, count, field), taxonomy)
-
-
-def read_labels(path: Path, count: int, field: str | None = None) -> np.ndarray:
-    """Read the raw labels of a scan from a file of labels.
-
-    The ending decides the format: `.npy`, `.npz`, text with a number per line, `.pcd`, `.ply`,
-    `.las`, `.laz`; any other file holds integers of 8, 16, 32 or 64 bits and nothing else.
-
-    Args:
-        count: the number of points of the scan.
-        field: the column or array to read; None means the only one, or one with a usual name.
-
-    Returns:
-        (N,) int64.
-
-    Raises:
-        InputError: if the file is missing or broken, or has another number of labels.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: expected the labels of a scan, found no file; check the path")
-
-    ending = path.suffix.lower()
-    with reading(path, "labels", ADVICE):
-        if ending in TEXT and field is None:
-            labels = _read_numbers(path)
-        elif ending == ".npy" and field is None:
-            labels = read_array(path)
-        elif ending == ".npz" and field is None:
-            labels = _usual_array(path)
-        elif ending in COLUMN_READERS:
-            labels = _read_field(path, ending, field)
-        else:
-            labels = _read_integers(path, count)
-    return _check(labels, path, count)
-
-
-def read_label_field(path: Path, count: int, field: str, layout: RowLayout = UNKNOWN) -> np.ndarray:
-    """Read the raw labels of a scan from a field of the scan's file.
+    Without a field, the ending decides the format: `.npy`, `.npz`, text with a number per line, or
+    the usual column of `.pcd`, `.ply`, `.las`, `.laz`, `.feather`; any other file holds integers of
+    8, 16, 32 or 64 bits and nothing else.
 
     Args:
         count: the number of points of the scan.
@@ -79,23 +44,48 @@ def read_label_field(path: Path, count: int, field: str, layout: RowLayout = UNK
         layout: of rows without names, what they hold.
 
     Returns:
-        (N,) int64.
+        (N,) uint8 train ids.
 
     Raises:
-        InputError: if there is no such field, or it does not hold whole numbers.
+        InputError: if the file is missing or broken, lacks the field, or has another number of
+            labels or an unknown id.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: expected the labels of a scan, found no file; check the path")
+
+    with reading(path, "labels", ADVICE):
+        raw = _read_usual(path, count) if field is None else _read_field(path, field, layout)
+    return train_ids(path, _check(raw, path, count), taxonomy)
+
+
+def _read_field(path: Path, field: str, layout: RowLayout) -> np.ndarray:
+    """Read a column of a file, or an array of an archive."""
     ending = ending_of(path)
-    with reading(path, f"the field {field} with labels", ADVICE):
-        if ending.endswith(".bin"):
-            labels = _read_raw_column(path, layout, field)
-        elif ending in COLUMN_READERS:
-            labels = _read_field(path, ending, field)
-        else:
-            raise InputError(
-                f"{path}: expected a file with fields of labels ({', '.join(COLUMN_READERS)}), "
-                f"found {ending or 'a bag'}; write the labels into files next to the scans"
-            )
-    return _check(labels, path, count)
+    if ending.endswith(".bin"):
+        return _read_raw_column(path, layout, field)
+    if ending == ".npz" and field in member_names(path):
+        return read_array(path, field)
+    if ending in COLUMN_READERS:
+        return read_column(path, ending, (field,))
+    raise InputError(
+        f"{path}: expected a file with fields of labels ({', '.join(COLUMN_READERS)}), "
+        f"found {ending or 'a bag'}; write the labels into files next to the scans"
+    )
+
+
+def _read_usual(path: Path, count: int) -> np.ndarray:
+    """Read the labels of a file of labels."""
+    ending = path.suffix.lower()
+    if ending in TEXT:
+        return _read_numbers(path)
+    if ending == ".npy":
+        return read_array(path)
+    if ending == ".npz":
+        names = member_names(path)
+        return read_array(path, names[0] if len(names) == 1 else first_of(names, ARRAYS, path))
+    if ending in COLUMN_READERS:
+        return read_column(path, ending, COLUMNS)
+    return _read_integers(path, count)
 
 
 def _check(labels: np.ndarray, path: Path, count: int) -> np.ndarray:
@@ -136,19 +126,6 @@ def _read_numbers(path: Path) -> np.ndarray:
         if not is_title or first.startswith("#"):
             file.seek(0)
         return np.loadtxt(file, delimiter=",", max_rows=MAX_POINTS + 1, ndmin=1)
-
-
-def _usual_array(path: Path) -> np.ndarray:
-    """Read the array of labels in an archive."""
-    names = member_names(path)
-    return read_array(path, names[0] if len(names) == 1 else first_of(names, ARRAYS, path))
-
-
-def _read_field(path: Path, ending: str, field: str | None) -> np.ndarray:
-    """Read a column of a file, or an array of an archive."""
-    if ending == ".npz" and field in member_names(path):
-        return read_array(path, field)
-    return read_column(path, ending, COLUMNS if field is None else (field,))
 
 
 def _read_raw_column(path: Path, layout: RowLayout, field: str) -> np.ndarray:
