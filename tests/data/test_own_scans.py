@@ -158,7 +158,7 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("changes", "word"),
     [
-        ({"classes": [1, 2]}, "names with ids"),
+        ({"classes": [1, 2]}, "road: [1, 2]"),
         ({"classes": {"a": "road"}}, "'road'"),
         ({"classes": {"a": 1, "b": [2, 1]}}, "1 twice"),
         ({"classes": {"a": {"ids": 1, "color": "red"}}}, "color"),

@@ -308,8 +308,7 @@ def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, A
     """
     if not isinstance(classes, Mapping) or not classes:
         raise InputError(
-            f"classes: expected names with {key}, such as {example}, found {shown(classes)}; "
-            "write them"
+            f"classes: expected entries such as {example}, found {shown(classes)}; write them"
         )
 
     entries = {}

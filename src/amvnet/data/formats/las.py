@@ -1,7 +1,7 @@
 """Dimensions of LAS and LAZ files, by laspy.
 
-On broken bytes, lazrs 0.8 can take any amount of memory or abort its process, so that points
-are read in the process with limits.
+On broken bytes, lazrs 0.8 can take any amount of memory or abort its process, so that points are
+read in the process with limits.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
             # The names of the integers that stand for coordinates differ only in their case.
             names = ["x", "y", "z"]
             for name in file.header.point_format.dimension_names:
-                if name not in "XYZ":
+                if name not in ("X", "Y", "Z"):
                     names.append(name)
 
             chosen = choose(names)

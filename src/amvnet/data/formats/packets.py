@@ -44,8 +44,7 @@ CONVERTERS = {
 def open_capture(path: Path) -> Recording:
     """Open the scans in a capture of a Velodyne's packets, a turn of the sensor each.
 
-    Lost returns are not in the packets, so not in the scans either. The packets name
-    the model.
+    Lost returns are not in the packets, so not in the scans either. The packets name the model.
 
     Raises:
         InputError: if the packets are another sensor's or broken, or velodyne-decoder is missing.
