@@ -176,13 +176,10 @@ class NuScenes(Dataset):
         if version is not None and version in present:
             return version
 
+        expected = version or "one folder v1.0-*"
+        advice = "give the folder that holds it"
         if present:
-            expected = version or "one folder v1.0-*"
             advice = f"give one of them as {self.root}@{present[0]}"
-        else:
-            expected = version or "a folder v1.0-*"
-            advice = "give the folder that holds it"
-
         raise InputError(
             f"{self.root}: expected {expected}, found {', '.join(present) or 'none'}; {advice}"
         )

@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 from amvnet.data.formats.cloud import Cloud
@@ -26,8 +27,8 @@ from amvnet.errors import InputError
 
 POSE_COLUMNS = 12  # of poses as in KITTI: a 3 x 4 matrix in each line of a text file
 KITTI_RAW = "velodyne_points/data"  # the folder of the scans of a drive of KITTI's raw data
-RAW_DRIVES = ("", "*_sync/", "*_extract/", "*/*_sync/", "*/*_extract/")  # where it may lie
 ARGOVERSE = "sensors/lidar"  # the folder of the scans of a log of Argoverse 2
+DEPTHS = ("", "*/", "*/*/")  # of recordings in a folder: itself, drives, and days of drives
 
 
 @dataclass(frozen=True)
@@ -155,10 +156,9 @@ def _scans_in(folder: Path) -> list[Path]:
 
 def _drives_in(folder: Path) -> list[Path]:
     """Return the scans of the recordings in a folder: drives of KITTI, logs of Argoverse 2."""
-    patterns = [drives + KITTI_RAW for drives in RAW_DRIVES]
     paths: list[Path] = []
-    for pattern in (*patterns, f"*/{ARGOVERSE}"):
-        for data in sorted(folder.glob(pattern)):
+    for depth, scans in product(DEPTHS, (KITTI_RAW, ARGOVERSE)):
+        for data in sorted(folder.glob(depth + scans)):
             paths += _scans_in(data)
     return paths
 

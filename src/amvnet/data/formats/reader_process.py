@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -184,18 +183,14 @@ def serve() -> None:
         request = json.loads(line)
         os.chdir(request["folder"])  # of the other process, which may have changed since the last
         _set_limits(request["size"])
+        module, _, function = request["function"].partition(":")
         try:
             with reading(request["arguments"][0], "a file that can be read", ADVICE):
-                values = _function(request["function"])(*request["arguments"])
+                values = getattr(import_module(module), function)(*request["arguments"])
         except InputError as error:
             values = {"error": str(error)}
         _send(replies, values)
         del values  # before the next file takes memory
-
-
-def _function(name: str) -> Callable[..., dict[str, Any]]:
-    module, _, function = name.partition(":")
-    return cast("Callable[..., dict[str, Any]]", getattr(import_module(module), function))
 
 
 def _set_limits(size: int) -> None:
