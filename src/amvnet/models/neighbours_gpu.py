@@ -67,27 +67,31 @@ def split_into_blocks(xyz: Tensor) -> Blocks:
     size = -(-len(xyz) >> levels)  # rounded up
 
     # Copies of the last point fill the blocks up. They may widen a box, but are never a neighbour.
-    index = torch.arange(size << levels, device=xyz.device)[None]
+    count = size << levels
+    padded = torch.cat([xyz, xyz[-1:].expand(count - len(xyz), 3)])
+    index = torch.arange(count, device=xyz.device)[None]
     if levels % 2:
-        index = _split(xyz, index, 2)
+        index = _split(padded, index, 2)
     # Cutting into quarters takes half as many sorts, and the boxes are nearly as good.
     for _ in range(levels // 2):
-        index = _split(xyz, index, 4)
+        index = _split(padded, index, 4)
 
-    points = xyz[index.clamp_max(len(xyz) - 1)]  # (M, B, 3)
+    points = padded[index]  # (M, B, 3)
+    low, high = points.aminmax(dim=1)
     is_copy = (index >= len(xyz))[..., None]
     return Blocks(
         index=index.clamp_max(len(xyz)),
         points=points.masked_fill(is_copy, torch.inf).transpose(1, 2).contiguous(),
-        low=points.amin(dim=1),
-        high=points.amax(dim=1),
+        low=low,
+        high=high,
     )
 
 
 def _split(xyz: Tensor, index: Tensor, ways: int) -> Tensor:
     """Cut each part across the longest side of its box: (M, B) -> (M * ways, B / ways)."""
-    points = xyz[index.clamp_max(len(xyz) - 1)]  # (M, B, 3)
-    axis = (points.amax(dim=1) - points.amin(dim=1)).argmax(dim=1)
+    points = xyz[index]  # (M, B, 3)
+    low, high = points.aminmax(dim=1)
+    axis = (high - low).argmax(dim=1)
     positions = points.gather(2, axis[:, None, None].expand(-1, points.shape[1], 1))[..., 0]
     return index.gather(1, positions.argsort(dim=1)).view(len(index) * ways, -1)
 
@@ -125,8 +129,7 @@ def _nearest_in_blocks(xyz: Tensor, blocks: Blocks, own: Tensor, n: int) -> tupl
     # Squared distances in float32 to all points of the nearest blocks
     index = blocks.index[near[:, :-1]].flatten(1)  # (U, NEAREST * B)
     offsets = blocks.points[near[:, :-1]] - queries[:, None, :, None]  # (U, NEAREST, 3, B)
-    squares = offsets.square_()
-    distance = (squares[:, :, 0] + squares[:, :, 1] + squares[:, :, 2]).flatten(1)
+    distance = offsets.square_().sum(dim=2).flatten(1)
     distance.masked_fill_(index == own[:, None], torch.inf)
 
     # The best of them ranked again in double precision
@@ -145,8 +148,8 @@ def _gaps(blocks: Blocks, queries: Tensor) -> Tensor:
     total = queries.new_zeros(len(queries), len(blocks.low))
     for axis in range(3):
         values = queries[:, axis, None]
-        outside = torch.maximum(blocks.low[:, axis] - values, values - blocks.high[:, axis])
-        total += outside.clamp_min_(0).square_()
+        outside = values - values.clamp(blocks.low[:, axis], blocks.high[:, axis])
+        total.addcmul_(outside, outside)
     return total
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 
 import numpy as np
@@ -75,6 +76,16 @@ class PointBatch:
         """Return the batch with a function applied to each of its tensors."""
         ring = None if self.ring is None else function(self.ring)
         return replace(self, points=function(self.points), scan=function(self.scan), ring=ring)
+
+    @cached_property
+    def cylindrical(self) -> Tensor:
+        """(3, P) radius, azimuth and height: metres and radians.
+
+        In double precision, so that a point at a cell's border falls the same way on any device.
+        """
+        # Contiguous, for which some functions take a fraction of the time.
+        x, y, z = self.points.T[:3].contiguous().double()
+        return torch.stack([torch.sqrt(x * x + y * y), torch.atan2(y, x), z])
 
     def slices(self) -> list[slice]:
         """Return the slice of each scan's points."""

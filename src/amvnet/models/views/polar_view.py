@@ -139,6 +139,19 @@ class PolarView:
 
     def __init__(self, config: PolarViewConfig) -> None:
         self.config = config
+        self._axes_on: dict[torch.device, Tensor] = {}
+
+    def _axes(self, device: torch.device) -> Tensor:
+        """Return (3, 3) float64: start, end and number of the cells along radius, angle, height."""
+        if device not in self._axes_on:
+            c = self.config
+            axes = [
+                [c.radius_min, -math.pi, c.z_min],
+                [c.radius_max, math.pi, c.z_max],
+                [c.radial, c.angular, c.vertical],
+            ]
+            self._axes_on[device] = torch.tensor(axes, dtype=torch.float64, device=device)
+        return self._axes_on[device]
 
     def project(self, batch: PointBatch) -> PolarGrid:
         """Return the polar grids of a batch of scans.
@@ -148,19 +161,17 @@ class PolarView:
         """
         c = self.config
 
-        # In double precision, so that a point at a cell's border falls the same way on any device.
-        x, y, z = batch.points[:, :3].double().unbind(1)
-        radius = torch.sqrt(x * x + y * y)
-        angle = torch.atan2(y, x)
-        radial_cell, radius_offset = _cells(radius, c.radius_min, c.radius_max, c.radial)
-        angular_cell, angle_offset = _cells(angle, -math.pi, math.pi, c.angular)
-        voxel, height_offset = _cells(z, c.z_min, c.z_max, c.vertical)
+        # Python's numbers would be copied to a GPU.
+        low, high, cells = (column[:, None] for column in self._axes(batch.points.device))
+        polar = batch.cylindrical
+        cell = ((polar - low) / (high - low) * cells).floor().clamp_min(0).minimum(cells - 1)
+        offset = polar - (low + (cell + 0.5) * (high - low) / cells)
+        radial_cell, angular_cell, voxel = cell.long()
 
-        polar = torch.stack([radius_offset, angle_offset, height_offset, radius, angle, z], dim=1)
         # Not by a list of columns, which would have to be copied to a GPU.
         xy = batch.points[:, :2]
         intensity = batch.points[:, 3:]
-        features = torch.cat([polar.to(batch.points.dtype), xy, intensity], dim=1)
+        features = torch.cat([offset.T.to(xy.dtype), polar.T.to(xy.dtype), xy, intensity], dim=1)
 
         pillar = (batch.scan * c.radial + radial_cell) * c.angular + angular_cell
         pillars = batch.count * c.radial * c.angular
@@ -183,20 +194,3 @@ class PolarView:
             seen_slot=seen_slot,
             shape=(batch.count, c.radial, c.angular, c.vertical),
         )
-
-
-def _cells(values: Tensor, low: float, high: float, cells: int) -> tuple[Tensor, Tensor]:
-    """Divide one axis of the grid into equal cells.
-
-    Args:
-        values: (P,) coordinates along the axis.
-        low: the start of the first cell.
-        high: the end of the last cell.
-        cells: the number of cells.
-
-    Returns:
-        (P,) int64, the cell that each value is in or nearest to; and (P,) its offset from that
-        cell's centre.
-    """
-    cell = ((values - low) / (high - low) * cells).floor().clamp(0, cells - 1)
-    return cell.long(), values - (low + (cell + 0.5) * (high - low) / cells)

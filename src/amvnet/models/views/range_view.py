@@ -77,18 +77,16 @@ class RangeView:
 
     def columns(self, batch: PointBatch) -> Tensor:
         """Return the (P,) columns by azimuth: front (+x) in the middle, left (+y) to its left."""
-        # In double precision, so that a point at a pixel's border falls the same way on any device.
-        x = batch.points[:, 0].double()
-        y = batch.points[:, 1].double()
-        return _cells(0.5 - torch.atan2(y, x) / (2 * math.pi), self.config.width)
+        azimuth = batch.cylindrical[1]
+        return _cells(0.5 - azimuth / (2 * math.pi), self.config.width)
 
     def rows(self, batch: PointBatch) -> Tensor:
         """Return the (P,) rows by elevation or by laser; 0 is the top."""
         if self.config.rows == "ring":
             return self._rows_by_ring(batch.ring)
 
-        x, y, z = batch.points[:, :3].double().unbind(1)
-        elevation = torch.rad2deg(torch.atan2(z, torch.sqrt(x * x + y * y)))
+        radius, _, height = batch.cylindrical
+        elevation = torch.rad2deg(torch.atan2(height, radius))
         c = self.config
         return _cells((c.fov_up - elevation) / (c.fov_up - c.fov_down), c.height)
 
