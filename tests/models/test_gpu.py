@@ -15,6 +15,7 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from amvnet import Scan, Segmenter, load, simulate
 from amvnet import read as read_scan
@@ -358,6 +359,46 @@ def test_on_a_cpu_auto_is_float32_on_the_cpu_and_the_commands_say_so(
 def test_a_precision_that_a_cpu_lacks_is_refused(precision: Any) -> None:
     weights = fresh_weights()
     fails(lambda: Segmenter(weights, "cpu", precision=precision), "expected", precision)
+
+
+class Launches(TorchDispatchMode):
+    """Counts the operators that compute or copy, each of which a GPU has to be told to run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        is_view = any(
+            value.alias_info and not value.alias_info.is_write for value in func._schema.returns
+        )
+        self.count += not is_view and "empty" not in str(func)
+        return func(*args, **(kwargs or {}))
+
+
+def test_a_gpu_is_told_few_times_what_to_do_around_the_networks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = whole_model().eval()
+    rng = np.random.default_rng(0)
+    points = rng.normal(0, (20, 20, 1, 0.1), (100_000, 4)).astype(np.float32)
+    batch = PointBatch.of([Scan(points)])
+
+    # The code that a GPU runs, on tensors that are none of the CPU's
+    monkeypatch.setattr(Tensor, "is_cpu", False)
+    monkeypatch.setattr(Tensor, "is_cuda", True)
+    with torch.no_grad():
+        with Launches() as project:
+            image, grid = model.project(batch)
+        f, g = model.score(image, grid)
+        uncertain = torch.arange(len(points)) % 40 == 0
+        with Launches() as fuse:
+            h = model.refine(batch, f, g, uncertain)
+            model.merge(f, g, model.compare(batch, f, g) & uncertain, h)
+    assert project.count <= 75
+    assert project.count + fuse.count <= 230
 
 
 def street_scans(*counts: int) -> list[Scan]:
