@@ -134,7 +134,7 @@ def plan(names: int) -> None:
     """List and plan made-up names in drives of a thousand, as the driver does before it labels."""
     from amvnet.fleet import cluster
     from amvnet.fleet.actors import Labelling
-    from amvnet.fleet.cluster import FleetRun, PoolSize
+    from amvnet.fleet.cluster import FleetRun
     from amvnet.fleet.drives import describe_drive
     from amvnet.fleet.manifest import list_blocks, windows
     from amvnet.fleet.results import Results
@@ -155,7 +155,7 @@ def plan(names: int) -> None:
 
     with TemporaryDirectory() as folder:
         labelling = Labelling(load(WEIGHTS), folder)
-        run = FleetRun(labelling, Results(Place.of(folder), {}), PoolSize(1, 1, {}))
+        run = FleetRun(labelling, Results(Place.of(folder), {}), (1, 1), {})
         Place.of = classmethod(lambda cls, url: MadeUp(url, None, ""))  # type: ignore[method-assign, assignment]
         before = peak()
         start = time.perf_counter()

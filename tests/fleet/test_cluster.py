@@ -19,7 +19,7 @@ ray = pytest.importorskip("ray")
 
 from amvnet.fleet import cluster  # noqa: E402
 from amvnet.fleet.actors import Labelling, results_schema  # noqa: E402
-from amvnet.fleet.cluster import FleetRun, PoolSize, connect  # noqa: E402
+from amvnet.fleet.cluster import FleetRun, connect  # noqa: E402
 from amvnet.fleet.manifest import Block  # noqa: E402
 from amvnet.fleet.results import Results  # noqa: E402
 from amvnet.fleet.storage import Place  # noqa: E402
@@ -197,7 +197,7 @@ def labelling_of(fleet: Path, out: str) -> Labelling:
 
 def test_two_scans_of_one_name_are_refused(fleet: Path, tmp_path: Path) -> None:
     labelling = labelling_of(fleet, str(tmp_path))
-    run = FleetRun(labelling, Results(Place.of(str(tmp_path)), {}), PoolSize(1, 1, {}))
+    run = FleetRun(labelling, Results(Place.of(str(tmp_path)), {}), (1, 1), {})
     blocks = [Block("a", ["1", "2"], ["x/1.bin", "x/2.bin"]), Block("b", ["2"], ["y/2.bin"])]
     fails(lambda: list(run.plan(blocks)), "found 2 twice")
 
@@ -229,7 +229,7 @@ def run_of(
     monkeypatch.setattr(cluster, "measure_drive", _not_measured)
     labelling = labelling_of(fleet, str(tmp_path))
     return lambda: FleetRun(
-        labelling, Results(Place.of(str(tmp_path)), {}), PoolSize(1, 1, {"num_cpus": 1})
+        labelling, Results(Place.of(str(tmp_path)), {}), (1, 1), {"num_cpus": 1}
     )
 
 

@@ -76,6 +76,13 @@ def test_a_scan_that_two_runs_have_done_keeps_one_row(tmp_path: Path) -> None:
     assert sorted(read(tmp_path / "out")) == [(name, None) for name in "abc"]
 
 
+def test_no_rows_are_no_part(tmp_path: Path) -> None:
+    results = Results(Place.of(str(tmp_path)), SETTINGS)
+    results.add(rows(""))
+    results.flush()
+    assert not list(tmp_path.glob("results/part-*"))
+
+
 def test_parts_are_written_by_size_and_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,10 +6,12 @@ import errno
 import logging
 import os
 import re
+import signal
+import threading
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from itertools import chain
 from typing import Any
 
@@ -43,12 +45,14 @@ ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-\[\]]+:\d+")
 SAID = 10  # drives of which is said what was assumed
 MOST_FAULTS = 1000  # lines about broken scans
 
+Workers = tuple[int, int]  # the least and the largest number
+
 
 def label_fleet(
     inputs: Sequence[str],
     labelling: Labelling,
     address: str | None = None,
-    workers: tuple[int, int] | None = None,
+    workers: Workers | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = no_progress,
@@ -60,8 +64,7 @@ def label_fleet(
         inputs: as `list_blocks` takes them.
         labelling: how scans are labelled, and where the results go.
         address: as `connect` takes it.
-        workers: the least and the largest number of workers; None means as many as the cluster has
-            GPUs, or four cores for.
+        workers: their numbers; None means as many as the cluster has GPUs, or four cores for.
         resume: go on with an earlier run into the same folder.
         overwrite: write into a folder that has other files.
         say: is told what was assumed of the sensors, and at the end how sure the labels are.
@@ -84,8 +87,8 @@ def label_fleet(
     results = Results(out, labelling.settings, resume, overwrite)
 
     connect(address)
-    size = pool_size(labelling, workers)
-    run = FleetRun(labelling, results, size, progress, say)
+    pool = pool_size(labelling, workers)
+    run = FleetRun(labelling, results, *pool, progress=progress, say=say)
     try:
         run.label(chain([first], blocks))
     finally:
@@ -116,14 +119,27 @@ def connect(address: str | None = None) -> None:
     context.print_on_execution_start = False
     context.max_errored_blocks = -1  # what they should have given is noticed, and tried again
     logging.getLogger("ray.data").setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", module=r"ray\.")
+    warnings.filterwarnings("ignore", category=ray.util.annotations.RayDeprecationWarning)
     try:
-        ray.init(**options)
-    except (ConnectionError, OSError, ValueError, RuntimeError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        with _own_signals():
+            ray.init(**options)
+    except Exception as error:  # Ray raises this class itself
+        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
             f"--ray {address or ''}: expected a Ray cluster, found {reason}; start one with "
             "ray start --head, or leave the address out"
         ) from None
+
+
+@contextmanager
+def _own_signals() -> Iterator[None]:
+    """Keep the handlers of signals: Ray's would abort the process without a word."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    if threading.current_thread() is threading.main_thread():
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def _check_address(address: str | None) -> None:
@@ -154,25 +170,10 @@ def _check_inputs(inputs: Sequence[str], out: Place, labelling: Labelling) -> No
             )
 
 
-@dataclass(frozen=True)
-class PoolSize:
-    """How many workers there are, and what each of them needs.
+def pool_size(labelling: Labelling, workers: Workers | None) -> tuple[Workers, dict[str, float]]:
+    """Return how many workers there are, and what each needs, as options of Ray.
 
-    Attributes:
-        least, most: number of workers; Ray starts more if there is work for them.
-        resources: of each, as options of Ray.
-    """
-
-    least: int
-    most: int
-    resources: dict[str, float]
-
-
-def pool_size(labelling: Labelling, workers: tuple[int, int] | None) -> PoolSize:
-    """Return the workers for the cluster: one for each GPU, or else for each few cores.
-
-    Args:
-        workers: the least and the largest number, if the user says it.
+    There is one for each GPU, or else for each few cores, unless the user says the numbers.
 
     Raises:
         InputError: if the device is a GPU, and the cluster has none.
@@ -183,12 +184,10 @@ def pool_size(labelling: Labelling, workers: tuple[int, int] | None) -> PoolSize
     if labelling.device.startswith("cuda") and not gpus:
         raise InputError("--device: expected a cluster with a GPU, found none; leave it out")
     if gpus and labelling.device != "cpu":
-        least, most = workers or (1, gpus)
-        return PoolSize(least, most, {"num_gpus": 1, "num_cpus": 1})
+        return workers or (1, gpus), {"num_gpus": 1, "num_cpus": 1}
 
     each = max(min(CORES, cores // (workers or (1, 1))[1]), 1)
-    least, most = workers or (1, max(cores // each, 1))
-    return PoolSize(least, most, {"num_cpus": each})
+    return workers or (1, max(cores // each, 1)), {"num_cpus": each}
 
 
 class FleetRun:
@@ -197,7 +196,8 @@ class FleetRun:
     Args:
         labelling: how scans are labelled.
         results: takes the rows; has what an earlier run has done.
-        size: of the pool of workers.
+        workers: the least and the largest number of them.
+        resources: what each needs, as options of Ray.
 
     Attributes:
         first: the first scans of each drive that is not measured yet.
@@ -207,13 +207,15 @@ class FleetRun:
         self,
         labelling: Labelling,
         results: Results,
-        size: PoolSize,
+        workers: Workers,
+        resources: Mapping[str, float],
         progress: Progress = no_progress,
         say: Say = say_nothing,
     ) -> None:
         self.labelling = labelling
         self.results = results
-        self.size = size
+        self.workers = workers
+        self.resources = resources
         self._progress = progress
         self._say = say
         self._names = NameSet()
@@ -296,12 +298,12 @@ class FleetRun:
         if not blocks:
             return []
         tables = [self.to_table(block) for block in blocks]
+        least, most = self.workers
         pool = ray.data.ActorPoolStrategy(
-            min_size=self.size.least,
-            max_size=self.size.most,
+            min_size=min(least, len(blocks)),
+            max_size=most,
             max_tasks_in_flight_per_actor=queued,
         )
-        warnings.filterwarnings("ignore", category=ray.util.annotations.RayDeprecationWarning)
         dataset = ray.data.from_blocks(tables).map_batches(
             LabelScans,
             fn_constructor_args=[self.labelling],
@@ -310,7 +312,7 @@ class FleetRun:
             compute=pool,
             max_restarts=-1,
             max_task_retries=RETRIES,
-            **self.size.resources,
+            **self.resources,
         )
         labelled: set[str] = set()
         try:

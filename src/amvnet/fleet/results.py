@@ -111,7 +111,8 @@ class Results:
 
     def add(self, rows: pa.Table) -> None:
         """Add rows, and write a part if it is time."""
-        self._pending.append(rows)
+        if len(rows):
+            self._pending.append(rows)
         now = time.monotonic()
         patience = max(PART_SECONDS, PART_SHARE * (now - self._start))
         size = sum(table.nbytes for table in self._pending)
