@@ -77,6 +77,7 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
     frame = Frame(unit, sensor.axes or "x-forward")
     level = frame.complete(dataclasses.replace(sensor, unit=unit)).to_level(xyz)
     level = level.astype(np.float64)
+
     ground = find_ground(level)
 
     is_described = sensor.axes is not None or sensor.rotate is not None
@@ -88,6 +89,7 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
 
     if ground is None:
         return frame
+
     if sensor.rotate is None and ground.is_sure and ground.tilt > SAME_TILT:
         return _level(frame, level, ground)
     return dataclasses.replace(frame, height=ground.height, tilt=ground.tilt)
@@ -152,6 +154,7 @@ def median_frame(frames: Sequence[Frame]) -> Frame:
     axes = mode(frame.axes for frame in frames)
     alike = [frame for frame in frames if (frame.unit, frame.axes) == (unit, axes)] or list(frames)
     heights = [frame.height for frame in frames if frame.height is not None]
+
     return Frame(
         unit,
         axes,

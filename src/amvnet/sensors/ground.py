@@ -148,6 +148,7 @@ def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
 
     slopes = np.hypot(planes[:, 0], planes[:, 1])
     planes = planes[slopes < np.tan(np.radians(MAX_SLOPE))]
+
     if not len(planes):
         return None
 

@@ -121,6 +121,7 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
     """
     if trained is None or not trained.is_matched:
         return scan
+
     valid = scan.valid
     intensity = scan.points[valid, 3]
     quantiles = quantiles_of(intensity)

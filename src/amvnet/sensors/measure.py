@@ -104,6 +104,7 @@ class Gauge:
         """
         known = self.sensor.height
         usual = self.usual_height
+
         if self.is_on_ground(frame):
             assert frame.height is not None
             above = known if known is not None else usual
@@ -128,6 +129,7 @@ class Gauge:
         known = estimate.lasers.field_of_view
         if known is None:
             return True
+
         if 1 / QUICK_COUNT < ratio < QUICK_COUNT:
             ends = field_of_view(self._seen(some, estimate.frame).points)
             if ends is not None and np.abs(np.subtract(ends, known)).max() < QUICK_ANGLE:
@@ -169,6 +171,7 @@ class Recording:
             if not self._is_learnt:
                 with suppress(InputError):
                     self._add(self._gauge(read()))
+
         self._is_learnt = bool(self.medians)
 
     def estimate(self, cloud: Cloud) -> tuple[int | None, Estimate]:
@@ -216,6 +219,7 @@ class Recording:
         if index == len(self.medians):
             self._estimates.append([])
             self.medians.append(estimate)
+
         self._estimates[index].append(estimate)
         self.medians[index] = median_of(self._estimates[index])
         self._is_learnt = sum(map(len, self._estimates)) == MEASURED

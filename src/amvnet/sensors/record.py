@@ -57,6 +57,7 @@ def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
             continue
         if abs(value) < LARGEST:  # also false for NaN
             measures[key] = round(value) if key == "beams" else float(value)
+
     try:
         return dataclasses.replace(sensor, **measures)
     except InputError:  # a file of a stranger may hold any numbers
@@ -92,6 +93,7 @@ def _with_laser_ends(
     is_distant = np.hypot(points[:, 0], points[:, 1]) > MIN_DISTANCE
     elevation = elevations(points[is_distant])
     ring = ring[is_distant]
+
     ends = [float(np.median(elevation[ring == laser])) for laser in (ring.min(), ring.max())]
     if min(ends) == max(ends):
         return geometry

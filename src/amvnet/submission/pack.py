@@ -89,6 +89,7 @@ def write(
 
     names = [name for name in sorted(rules.points) if (folder / name).is_file()]
     _check_missing(rules, names, folder)
+
     for name in names:
         rules.check_size(name, (folder / name).stat().st_size, folder / name)
 
@@ -129,9 +130,11 @@ def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
     """Add a file, or a folder (NAME/), by an entry that is the same everywhere and at any time."""
     entry = zipfile.ZipInfo(name, LONG_AGO)
     entry.create_system = UNIX
+
     if name.endswith("/"):
         entry.external_attr = (stat.S_IFDIR | 0o755) << 16 | FOLDER_BIT
     else:
         entry.external_attr = (stat.S_IFREG | 0o644) << 16
         entry.compress_type = zipfile.ZIP_DEFLATED
+
     archive.writestr(entry, data, compresslevel=LEVEL)

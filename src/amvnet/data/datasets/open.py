@@ -103,7 +103,7 @@ def is_dataset(spec: str) -> bool:
     kind = spec.partition(":")[0]
     if kind in READERS or kind in SIMULATED or is_own(spec) or version is not None:
         return True
-    return path.is_dir() and any(reader.matches(path) for reader in READERS.values())
+    return path.is_dir() and bool(_readers_of(path))
 
 
 def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
@@ -123,9 +123,14 @@ def _split_version(text: str) -> tuple[Path, str | None]:
     return Path(path).expanduser(), version
 
 
+def _readers_of(path: Path) -> list[Reader]:
+    """Return the readers whose layout a folder has."""
+    return [reader for reader in READERS.values() if reader.matches(path)]
+
+
 def _guess_reader(path: Path) -> Reader:
-    """Return the reader of a folder's layout."""
-    readers = [reader for reader in READERS.values() if reader.matches(path)]
+    """Return the only reader whose layout a folder has."""
+    readers = _readers_of(path)
     if len(readers) == 1:
         return readers[0]
     found = "both" if readers else "neither"

@@ -91,11 +91,13 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
         InputError: as `read_npy`.
     """
     array = read_array(path)
-    if array.dtype.names is not None:
-        names = array.dtype.names
-        return {key: array[names[index]] for key, index in choose(names).items()}
+    names = array.dtype.names
     numbers = range(min(array.shape[-1], MOST_COLUMNS))
-    return {key: array[..., index] for key, index in choose(tuple(map(str, numbers))).items()}
+
+    columns = {}
+    for key, index in choose(names or tuple(map(str, numbers))).items():
+        columns[key] = array[..., index] if names is None else array[names[index]]
+    return columns
 
 
 def member_names(path: Path) -> list[str]:
