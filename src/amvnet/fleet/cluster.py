@@ -332,7 +332,9 @@ class FleetRun:
     def to_table(self, block: Block) -> pa.Table:
         """Return a block as `LabelScans` takes it."""
         estimates = self.results.drives[block.drive]["estimates"]
-        return pa.Table.from_pylist([row | {"estimates": estimates} for row in block.rows()])
+        alike = {"drive": block.drive, "sensor": block.sensor, "estimates": estimates}
+        columns = {key: pa.repeat(value, len(block.names)) for key, value in alike.items()}
+        return pa.table({"path": list(block.urls), "name": list(block.names), **columns})
 
     def _take(self, rows: pa.Table) -> None:
         """Add rows to the results, and count them.

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -73,12 +73,12 @@ class NameSet:
 
     def add(self, names: Sequence[str]) -> np.ndarray:
         """Add names; return for each, (N,) bool, whether it is new."""
-        is_new = ~self.has(names)
-        for index, name in enumerate(names):
-            digest = _digest(name)
-            is_new[index] &= digest not in self._recent
-            if is_new[index]:
-                self._recent.add(digest)
+        digests = _digests(names)
+        is_first = np.zeros(len(names), bool)
+        is_first[np.unique(digests, return_index=True)[1]] = True
+        is_new = is_first & ~self._has(digests)
+
+        self._recent.update(digests[is_new].tolist())
         if len(self._recent) > MOST_RECENT:
             recent = np.fromiter(self._recent, np.uint64, len(self._recent))
             self._sorted = np.union1d(self._sorted, recent)
@@ -87,16 +87,21 @@ class NameSet:
 
     def has(self, names: Sequence[str]) -> np.ndarray:
         """Return for each name, (N,) bool, whether it is in the set."""
-        digests = np.array([_digest(name) for name in names], np.uint64)
+        return self._has(_digests(names)) if len(self) else np.zeros(len(names), bool)
+
+    def _has(self, digests: np.ndarray) -> np.ndarray:
         is_recent = [digest in self._recent for digest in digests.tolist()]
         places = np.searchsorted(self._sorted, digests)
-        padded = np.append(self._sorted, 0)
-        is_sorted = (places < len(self._sorted)) & (padded[places] == digests)
+        is_sorted = np.zeros(len(digests), bool)
+        inside = places < len(self._sorted)
+        is_sorted[inside] = self._sorted[places[inside]] == digests[inside]
         return is_sorted | np.array(is_recent, bool)
 
 
-def _digest(name: str) -> int:
-    return int.from_bytes(blake2b(name.encode(errors="surrogatepass"), digest_size=8).digest())
+def _digests(names: Sequence[str]) -> np.ndarray:
+    """Return (N,) uint64 digests of names."""
+    content = [blake2b(name.encode(errors="surrogatepass"), digest_size=8) for name in names]
+    return np.frombuffer(b"".join(each.digest() for each in content), np.uint64)
 
 
 def list_blocks(inputs: Iterable[str]) -> Iterator[Block]:
@@ -121,7 +126,8 @@ def list_blocks(inputs: Iterable[str]) -> Iterator[Block]:
         elif kind == FileType.File and place.path.lower().endswith(MANIFESTS):
             blocks = _read_manifest(place)
         elif kind == FileType.File:
-            blocks = _in_blocks(place.url.rpartition("/")[0], "", [PurePosixPath(place.path).name])
+            file = File.of(PurePosixPath(place.path).name)
+            blocks = _in_blocks(place.url.rpartition("/")[0], "", [file])
         else:
             raise InputError(
                 f"{text}: expected scan files, a folder of them or a manifest, found nothing; "
@@ -142,48 +148,59 @@ def _walk(folder: Place, prefix: str) -> Iterator[Block]:
     Args:
         prefix: the beginning of the names of the scans.
     """
-    files, folders = folder.children()
-    present = set(files)
-    scans = [name for name in files if _is_scan(name, present)]
-    yield from _in_blocks(folder.url, prefix, scans)
+    names, folders = folder.children()
+    present = set(names)
+    files = [File.of(name) for name in names]
+    yield from _in_blocks(folder.url, prefix, [file for file in files if file.is_scan(present)])
     for name in folders:
         if not name.startswith("."):
             yield from _walk(folder / name, f"{prefix}{name}/")
 
 
-def _in_blocks(folder: str, prefix: str, files: Sequence[str]) -> Iterator[Block]:
+class File(NamedTuple):
+    """A file's name, without its ending, and the ending; `.bin.gz` ends in `.gz`."""
+
+    name: str
+    stem: str
+    ending: str
+
+    @classmethod
+    def of(cls, name: str) -> File:
+        """Return the parts of a name."""
+        return cls(name, *split_name(name))
+
+    def is_scan(self, present: set[str]) -> bool:
+        """Return whether it is a scan by its name, and not of predictions.
+
+        Args:
+            present: the names of all files in the folder.
+        """
+        if self.name.startswith(".") or self.name.endswith(".uncertain.npy"):
+            return False
+        if self.ending == ".npz" and f"{self.stem}.label" in present:
+            return False
+        if self.ending in PACKED:
+            inner = named_ending(Path(self.name[: -len(self.ending)])) or ""
+            return inner not in ("", *PACKED, *TEXT)
+        return self.ending not in ("", *TEXT)
+
+
+def _in_blocks(folder: str, prefix: str, files: Sequence[File]) -> Iterator[Block]:
     """Yield the scans of one folder; files of different formats are different drives."""
-    by_ending: dict[str, list[str]] = {}
+    by_ending: dict[str, list[File]] = {}
     for file in files:
-        by_ending.setdefault(split_name(file)[1], []).append(file)
+        by_ending.setdefault(file.ending, []).append(file)
 
     for ending, alike in by_ending.items():
         if ending in RECORDINGS:
             raise InputError(
-                f"{folder}/{alike[0]}: expected files of one scan for --ray, found a recording; "
-                "segment it without --ray"
+                f"{folder}/{alike[0].name}: expected files of one scan for --ray, found a "
+                "recording; segment it without --ray"
             )
         for start in range(0, len(alike), BLOCK):
             part = alike[start : start + BLOCK]
-            names = [f"{prefix}{split_name(file)[0]}" for file in part]
-            yield Block(f"{folder}/*{ending}", names, [f"{folder}/{file}" for file in part])
-
-
-def _is_scan(name: str, present: set[str]) -> bool:
-    """Return whether a file in a folder is a scan by its name, and not of predictions.
-
-    Args:
-        present: the names of all files in the folder.
-    """
-    stem, ending = split_name(name)
-    if name.startswith(".") or name.endswith(".uncertain.npy"):
-        return False
-    if ending == ".npz" and f"{stem}.label" in present:
-        return False
-    if ending in PACKED:
-        inner = named_ending(Path(name[: -len(ending)])) or ""
-        return inner not in ("", *PACKED, *TEXT)
-    return ending not in ("", *TEXT)
+            names = [f"{prefix}{file.stem}" for file in part]
+            yield Block(f"{folder}/*{ending}", names, [f"{folder}/{file.name}" for file in part])
 
 
 def split_name(name: str) -> tuple[str, str]:
