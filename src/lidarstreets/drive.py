@@ -10,7 +10,7 @@ from lidarstreets.course import Course, Drive, draw_course
 from lidarstreets.layouts import SimulatedScan
 from lidarstreets.mesh import Mesh, join
 from lidarstreets.sensing.lidar import RayScene, trace
-from lidarstreets.sensing.returns import laser_gains, receive
+from lidarstreets.sensing.returns import Lasers, draw_lasers, receive
 from lidarstreets.sensing.sensors import LidarModel, draw_device, sensor_of
 from lidarstreets.sites.populate import populate
 from lidarstreets.sites.site import MOVING_CLEARANCE, Site, covers
@@ -47,7 +47,7 @@ def drive_street(
     *street_seeds, device_seed = seed.spawn(streets + 1)
     device_rng = np.random.default_rng(device_seed)
     device = draw_device(sensor, device_rng)
-    gains = laser_gains(device, device_rng)
+    lasers = draw_lasers(device, device_rng)
 
     start_pose = np.eye(4)
     start_time = 0.0
@@ -57,7 +57,7 @@ def drive_street(
     for street, street_seed in enumerate(street_seeds):
         count = min(drive.scans_per_street, scans - street * drive.scans_per_street)
         rng = np.random.default_rng(street_seed)
-        for scan in _drive_one_street(device, gains, count, rng, drive):
+        for scan in _drive_one_street(device, lasers, count, rng, drive):
             pose = start_pose @ scan.pose
             time = start_time + scan.time
             yield replace(scan, pose=pose, time=time)
@@ -68,7 +68,7 @@ def drive_street(
 
 
 def _drive_one_street(
-    sensor: LidarModel, gains: np.ndarray, scans: int, rng: np.random.Generator, drive: Drive
+    sensor: LidarModel, lasers: Lasers, scans: int, rng: np.random.Generator, drive: Drive
 ) -> Iterator[SimulatedScan]:
     """Yield the scans of one street, with poses relative to the first of them."""
     style = draw_style(rng)
@@ -88,7 +88,7 @@ def _drive_one_street(
 
         pose = _tilted_pose(ground, sensor, course.pose_at(index), rng)
         hits = trace(scenes, sensor, pose, ground, rng, speed=speed)
-        points, labels, ring = receive(hits, sensor, gains, rng)
+        points, labels, ring = receive(hits, sensor, lasers, rng)
 
         if first_pose is None:
             first_pose = pose

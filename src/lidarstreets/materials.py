@@ -80,7 +80,7 @@ class Reflection:
         spread: standard deviation of the intensity between returns of one body, relative to its
             mean.
         shade: standard deviation of the logarithm of the reflectivity between bodies.
-        dark: share of returns with intensity 0: glossy surfaces reflect most light elsewhere.
+        dark: share of dark returns: glossy surfaces reflect most light elsewhere.
         drop: share of the pulses that never return, whatever the range.
         rough: mean height in metres of relief, such as grass, that is too fine for triangles.
         ghost: share of returns from a mirrored body and so from farther along the ray.
@@ -98,23 +98,28 @@ class Reflection:
 class Surface(IntEnum):
     """A kind of surface; the value is its row in `REFLECTIONS`."""
 
-    ASPHALT = Reflection(0.30, spread=0.11, shade=0.14, dark=0.004)
-    PAVING = Reflection(0.33, spread=0.09, shade=0.12, dark=0.003)
-    GRASS = Reflection(0.39, spread=0.12, shade=0.10, dark=0.004, rough=0.018)
+    ASPHALT = Reflection(0.28, spread=0.11, shade=0.14, dark=0.004)
+    PAVING = Reflection(0.32, spread=0.09, shade=0.12, dark=0.003)
+    GRASS = Reflection(0.39, spread=0.12, shade=0.10, dark=0.001, rough=0.018)
     GRAVEL = Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004)
     ROAD_PAINT = Reflection(0.55, spread=0.20, shade=0.15)
-    PLASTER = Reflection(0.42, spread=0.10, shade=0.25, drop=0.01)
-    BRICK = Reflection(0.38, spread=0.12, shade=0.25, drop=0.01, rough=0.002)
+    PLASTER = Reflection(0.43, spread=0.10, shade=0.20, drop=0.01)
+    BRICK = Reflection(0.39, spread=0.12, shade=0.20, drop=0.01, rough=0.002)
     GLASS = Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65, ghost=0.04)
     WOOD = Reflection(0.38, spread=0.13, shade=0.25, rough=0.003)
-    LEAF = Reflection(0.36, spread=0.23, shade=0.17, dark=0.05, drop=0.03)
-    BARK = Reflection(0.37, spread=0.28, shade=0.20, dark=0.05, rough=0.010)
-    METAL = Reflection(0.28, spread=0.26, shade=0.50, dark=0.12, drop=0.03, rough=0.004)
+    LEAF = Reflection(0.38, spread=0.23, shade=0.17, dark=0.006, drop=0.03)
+    BARK = Reflection(0.39, spread=0.28, shade=0.20, dark=0.01, rough=0.010)
+    METAL = Reflection(0.33, spread=0.26, shade=0.40, dark=0.08, drop=0.03, rough=0.004)
     SIGN_FACE = Reflection(0.50, spread=0.20, shade=0.40)
     CLOTH = Reflection(0.46, spread=0.20, shade=0.25, rough=0.006)
     SKIN = Reflection(0.45, spread=0.20, shade=0.10, dark=0.03)
-    DARK_PAINT = Reflection(0.04, spread=0.50, shade=0.90, dark=0.30, drop=0.12, rough=0.002)
-    LIGHT_PAINT = Reflection(0.26, spread=0.30, shade=0.45, dark=0.08, drop=0.05, rough=0.002)
+    # Cars: most of a pulse is reflected elsewhere, whatever the colour.
+    DARK_PAINT = Reflection(0.13, spread=0.50, shade=0.50, dark=0.45, drop=0.18, rough=0.002)
+    LIGHT_PAINT = Reflection(0.34, spread=0.30, shade=0.40, dark=0.22, drop=0.12, rough=0.002)
+    # Load boxes, caravans and machines.
+    COATING = Reflection(0.42, spread=0.25, shade=0.25, dark=0.05, drop=0.03, rough=0.002)
+    # Tubes, rims and spokes of a bicycle.
+    CYCLE = Reflection(0.40, spread=0.30, shade=0.25, dark=0.05, drop=0.05)
     RUBBER = Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.10)
     PLATE = Reflection(0.95, spread=0.10, shade=0.10, dark=0.0)
     PLASTIC = Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03)
@@ -122,7 +127,7 @@ class Surface(IntEnum):
     # The window of a house. Unlike a car's, it has curtains and frames that reflect.
     WINDOW = Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01, ghost=0.02)
     STONE = Reflection(0.36, spread=0.16, shade=0.25, rough=0.014)
-    TWIG = Reflection(0.28, spread=0.28, shade=0.20, dark=0.08, drop=0.05)
+    TWIG = Reflection(0.30, spread=0.28, shade=0.20, dark=0.03, drop=0.05)
 
     reflection: Reflection
 

@@ -108,9 +108,12 @@ def test_the_loss_of_the_head_equals_its_formula_with_class_weights(weighted: bo
     assert loss.item() == pytest.approx(total / total_weight, rel=1e-5)
 
 
-def one_cycle(step: int, steps: int, peak: float, warmup: float) -> float:
+def one_cycle(step: int, steps: int, peak: float, warmup: float, held: int = 0) -> float:
     """Return the learning rate of a step: a cosine up to the peak, and one down to almost 0."""
     top = warmup * steps - 1
+    # The held steps repeat the one at the peak.
+    step -= min(max(step - math.ceil(top), 0), held)
+    steps -= held
     first, last = peak / 25, peak / 25e4
 
     def cosine(start: float, end: float, share: float) -> float:
@@ -122,9 +125,15 @@ def one_cycle(step: int, steps: int, peak: float, warmup: float) -> float:
 
 
 @pytest.mark.parametrize("accumulate", [1, 2])
-@pytest.mark.parametrize("warmup", [0.2, 0.5])
+@pytest.mark.parametrize(("warmup", "hold", "held"), [(0.2, 0, 0), (0.5, 0, 0), (0.2, 0.5, 6)])
 def test_the_learning_rate_of_a_whole_run_is_one_cycle(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, accumulate: int, warmup: float
+    world: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    accumulate: int,
+    warmup: float,
+    hold: float,
+    held: int,
 ) -> None:
     """Five scans in batches of two: the last step of each epoch is incomplete."""
     rates: list[float] = []
@@ -136,11 +145,13 @@ def test_the_learning_rate_of_a_whole_run_is_one_cycle(
 
     monkeypatch.setattr(NetworkStage, "on_before_optimizer_step", note)
     options = ["--training.bev.accumulate", accumulate, "--training.bev.warmup", warmup]
+    options += ["--training.bev.hold", hold]
     options += ["--training.bev.lr", 0.003, "--training.bev.epochs", 4]
     assert run_cli(*arguments(world, tmp_path, "bev", *options)) == (0, "")
 
     steps = 4 * 3
-    assert rates == pytest.approx([one_cycle(step, steps, 0.003, warmup) for step in range(steps)])
+    expected = [one_cycle(step, steps, 0.003, warmup, held) for step in range(steps)]
+    assert rates == pytest.approx(expected)
     assert momenta[0] == max(momenta) == pytest.approx(0.95)
     assert 0.85 <= min(momenta) < 0.87
 

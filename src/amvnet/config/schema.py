@@ -272,6 +272,8 @@ class NetworkTraining(Checked):
     """AdamW's weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the learning rate's peak (open)."""
+    hold: Annotated[float, Range(0, 0.9)] = 0.0
+    """Share of the steps at the learning rate's peak, before it falls (open)."""
     region: NotNegative = 1.0
     """Weight of the region loss (Dice or Lovász-softmax) relative to cross-entropy (open)."""
     region_loss: Literal["default", "dice", "lovasz"] = "default"
@@ -296,6 +298,11 @@ class NetworkTraining(Checked):
             holds=self.batch % self.accumulate == 0,
             expected=f"a batch that is a multiple of {self.accumulate}",
             found=str(self.batch),
+        )
+        self.check(
+            holds=self.warmup + self.hold < 1,
+            expected=f"a hold below {1 - self.warmup:g}, as the warm-up is {self.warmup:g}",
+            found=f"{self.hold:g}",
         )
 
 

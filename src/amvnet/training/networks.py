@@ -67,6 +67,7 @@ class NetworkStage(Stage):
         self.clip = config.clip
         self.ema = config.ema
         self.initial = config.initial
+        self.hold = config.hold
 
     def size_of(self, batch: Batch) -> int:
         return batch[0].count

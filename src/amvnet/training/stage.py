@@ -70,6 +70,7 @@ class Stage(L.LightningModule):
     clip: float | None = None
     ema = 0.0
     initial = 0.0
+    hold = 0.0
 
     def __init__(
         self,
@@ -140,7 +141,8 @@ class Stage(L.LightningModule):
     def one_cycle(self, optimizer: torch.optim.Optimizer, momentum: float = 0.95) -> Any:
         """Return an optimizer with the one-cycle schedule, as Lightning expects it.
 
-        The learning rate rises to its peak and falls again, while the momentum does the opposite.
+        The learning rate rises to its peak, may stay there and falls again, while the momentum does
+        the opposite.
 
         Args:
             momentum: highest momentum of SGD, or highest first beta of AdamW.
@@ -148,16 +150,24 @@ class Stage(L.LightningModule):
         # The schedule needs two steps before its peak, more than a very short training has.
         least = math.ceil(2 / self.config.warmup)
         steps = max(int(self.trainer.estimated_stepping_batches), least)
+        held = int(self.hold * steps)
+        peak = math.ceil(self.config.warmup * steps - 1)
+        self._held = range(peak + 1, peak + 1 + held)
 
         schedule = torch.optim.lr_scheduler.OneCycleLR(
             optimizer,
             max_lr=self.config.lr,
-            total_steps=steps,
-            pct_start=self.config.warmup,
+            total_steps=steps - held,
+            pct_start=self.config.warmup * steps / (steps - held),
             base_momentum=momentum - MOMENTUM_CYCLE,
             max_momentum=momentum,
         )
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
+        """Advance the learning rate, but not while it is held at its peak."""
+        if self.trainer.global_step not in self._held:
+            scheduler.step()
 
     def empty_matrix(self) -> np.ndarray:
         """Return a (K + 1, K + 1) confusion matrix without counts."""

@@ -71,7 +71,7 @@ def post(rng: np.random.Generator) -> Mesh:
     if kind < 0.3:
         body = tube((0, 0, -0.1), (0, 0, 0.75), 0.12, 0.1)
         arms = tube((0, -0.2, 0.5), (0, 0.2, 0.5), 0.06)
-        return part([body, arms], Surface.DARK_PAINT, Label.POLE)
+        return part([body, arms], Surface.METAL, Label.POLE)
 
     height = rng.uniform(0.5, 1.3)
     radius = rng.uniform(0.03, 0.08)

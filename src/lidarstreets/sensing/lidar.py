@@ -19,7 +19,7 @@ from lidarstreets.sensing.sensors import LidarModel
 SHADOW_EDGE = 6.0  # degrees by which the edges of the car's shadow differ between lasers
 MOST_CROSSINGS = 16  # surfaces of clumps of leaves that a pulse may cross on its way in and out
 BEYOND = 0.002  # metres behind a surface at which a ray continues
-LEAF_COSINE = 0.5  # mean cosine of the angle of incidence: leaves point in all directions
+LEAF_COSINE = 0.5  # mean cosine of the angle of incidence: leaves and blades point anywhere
 
 
 def require_embree() -> tuple[ModuleType, ModuleType]:
@@ -251,12 +251,12 @@ def trace(
         surface[bare[label[bare] == ground_label]] = ground_surface
     tint[bare] = ground.tint(x, y, label[bare])
 
-    is_foliage = nearest.depth[hit] > 0
+    has_leaves = (nearest.depth[hit] > 0) | (surface == Surface.GRASS)
 
     return Hits(
         direction=rays.direction[hit],
         distance=distance,
-        cosine=np.where(is_foliage, LEAF_COSINE, np.abs(nearest.facing[hit])),
+        cosine=np.where(has_leaves, LEAF_COSINE, np.abs(nearest.facing[hit])),
         surface=surface,
         tint=tint,
         label=label,

@@ -1,14 +1,19 @@
 """Which pulses of a LiDAR return, at which range, and how bright."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from lidarstreets.materials import REFLECTIONS, Label
 from lidarstreets.sensing.lidar import Hits
 from lidarstreets.sensing.sensors import LidarModel
 
-# Power of a return, relative to a head-on one at 10 m, at which the device reports half of the
-# reflectivity.
-HALF_POWER = 0.007
+# How the brightness falls with the range, as a power of it; see `LidarModel.half_range`.
+FADING = 3.0
+# Metres within which a surface is near to a laser that is focused far away.
+NEAR = 9.0
+# Brightness from where returns are recorded as 0 to where they are not: the scale of a logistic.
+BRIGHTNESS_STEP = 0.02
 # Metres: smallest and largest step in depth within which one pulse gives one return in between.
 SMALLEST_MIXED_STEP = 0.3
 LARGEST_MIXED_STEP = 3.0
@@ -17,21 +22,38 @@ RELIEF_SPREAD = 0.65
 # Metres: smallest and mean distance by which a ghost, a mirrored body, lies behind the mirror.
 GHOST_NEAREST = 0.5
 GHOST_MEAN = 6.0
+OWN_LASERS = 8  # the lowest lasers, which see racks and other parts of the car itself
+OWN_REACH = 2.0  # metres to the farthest of these parts
+DARK_SHARE = 0.35  # of the reflectivity, for returns of which most light is reflected elsewhere
 NEIGHBOUR_ANGLE = 0.5  # degrees between neighbouring shots of one laser, at most
 
 
-def laser_gains(sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:
-    """Draw the factors by which the lasers of one device differ in brightness.
+@dataclass(frozen=True)
+class Lasers:
+    """How the lasers of one device differ; rows go from the lowest laser up.
 
-    Returns:
-        (L,) factors from the lowest laser up; a few are far from 1.
+    Attributes:
+        gain: (L,) factors on the intensity; a few are far from 1.
+        near_loss: (L,) shares of the brightness of near surfaces that are lost.
     """
-    gains = 1 + sensor.gain_spread * rng.standard_t(3, len(sensor.elevations))
-    return np.clip(gains, 0.3, 1.3)
+
+    gain: np.ndarray
+    near_loss: np.ndarray
+
+
+def draw_lasers(sensor: LidarModel, rng: np.random.Generator) -> Lasers:
+    """Draw the lasers of one device."""
+    count = len(sensor.elevations)
+    gain = 1 + sensor.gain_spread * rng.standard_t(3, count)
+
+    # The mean of this beta distribution is a third.
+    near_loss = 3 * sensor.near_loss * rng.beta(1, 2, count)
+    near_loss[: count // 2] = 0
+    return Lasers(np.clip(gain, 0.3, 1.3), near_loss)
 
 
 def receive(
-    hits: Hits, sensor: LidarModel, gains: np.ndarray, rng: np.random.Generator
+    hits: Hits, sensor: LidarModel, lasers: Lasers, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the points that the sensor measures, with noise, intensity and lost returns.
 
@@ -39,9 +61,9 @@ def receive(
         (N, 4) float32 x, y, z, intensity; (N,) uint32 class ids with the instance in the upper
         half; (N,) uint8 rings.
     """
-    base, spread, shade, dark, drop, relief, ghost = REFLECTIONS[hits.surface].T
+    _, _, _, _, drop, relief, ghost = REFLECTIONS[hits.surface].T
     count = len(hits.distance)
-    reflectivity = base * np.exp(shade * hits.tint)
+    reflectivity = _reflectivity(hits)
 
     # The received power falls with the square of the range; a return is lost if noise covers it.
     reach = sensor.reach * np.sqrt(reflectivity * np.maximum(hits.cosine, 1e-3))
@@ -53,13 +75,13 @@ def receive(
     distance[is_ghost] += beyond.astype(np.float32)
     chance[(distance < sensor.min_range) | (distance > sensor.max_range)] = 0
 
-    # The device compensates for range and incidence until the power is too small.
-    power = hits.cosine * (10 / np.maximum(hits.distance, 1)) ** 2
-    noise = np.maximum(1 + spread * rng.standard_normal(count, np.float32), 0) ** (1 / sensor.gamma)
-    brightness = reflectivity * power / (power + HALF_POWER) * noise * gains[hits.ring]
-    brightness[rng.random(count, np.float32) < dark] = 0
-    intensity = np.round(sensor.gain * brightness**sensor.gamma, sensor.decimals)
-    intensity = np.clip(intensity, 0, 0.99)
+    intensity = _intensity(hits, sensor, lasers, rng)
+
+    # Parts of the car itself are too near and too glossy to be bright.
+    is_own = _hits_own_car(hits, sensor, rng)
+    distance[is_own] = rng.uniform(sensor.min_range, OWN_REACH, is_own.sum())
+    intensity[is_own] = 0
+    chance[is_own] = 1
 
     xyz = hits.direction * distance[:, None]
     if sensor.motion_corrected:
@@ -67,8 +89,10 @@ def receive(
 
     returned = rng.random(count, np.float32) < chance
     points = np.column_stack([xyz, intensity])[returned].astype(np.float32)
-    instances = np.where(is_ghost, 0, hits.instance)[returned].astype(np.uint32)
-    classes = np.where(is_ghost, np.uint16(Label.OUTLIER), hits.label)[returned].astype(np.uint32)
+    has_no_class = is_ghost | is_own
+    instances = np.where(has_no_class, 0, hits.instance)[returned].astype(np.uint32)
+    classes = np.where(has_no_class, np.uint16(Label.OUTLIER), hits.label)
+    classes = classes[returned].astype(np.uint32)
     labels = classes | instances << np.uint32(16)
     rings = hits.ring[returned]
     if not sensor.keeps_lost_returns:
@@ -82,6 +106,49 @@ def receive(
         np.concatenate([labels, lost_labels]),
         np.concatenate([rings, lost_rings]),
     )
+
+
+def _reflectivity(hits: Hits) -> np.ndarray:
+    """Return the (N,) reflectivities of the surfaces that were hit."""
+    base, _, shade, *_ = REFLECTIONS[hits.surface].T
+    return base * np.exp(shade * hits.tint)
+
+
+def _intensity(
+    hits: Hits, sensor: LidarModel, lasers: Lasers, rng: np.random.Generator
+) -> np.ndarray:
+    """Return the (N,) intensities that the device reports, most of them in [0, 1]."""
+    _, spread, _, dark, *_ = REFLECTIONS[hits.surface].T
+    count = len(hits.distance)
+
+    # The device compensates for range and incidence until the power is too small.
+    power = hits.cosine * (10 / np.maximum(hits.distance, 1)) ** 2
+    is_near = np.exp(-((hits.distance / NEAR) ** 4))
+    noise = np.maximum(1 + spread * rng.standard_normal(count, np.float32), 0) ** (1 / sensor.gamma)
+
+    brightness = _reflectivity(hits) * noise * power / (power + sensor.half_power)
+    brightness /= 1 + (hits.distance / sensor.half_range) ** FADING
+    brightness *= 1 - lasers.near_loss[hits.ring] * is_near
+
+    brightness[rng.random(count, np.float32) < dark] *= DARK_SHARE
+
+    # Weak pulses return, but the device does not tell how bright they were.
+    if sensor.least_brightness:
+        excess = (brightness - sensor.least_brightness) / BRIGHTNESS_STEP
+        brightness[rng.logistic(size=count) > excess] = 0
+
+    brightness *= lasers.gain[hits.ring]
+    intensity = np.round(sensor.gain * brightness**sensor.gamma, sensor.decimals)
+    return np.clip(intensity, 0, 0.99)
+
+
+def _hits_own_car(hits: Hits, sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:
+    """Return whether each pulse ends at the car itself: (N,) bool."""
+    could_hit = np.flatnonzero(hits.ring < OWN_LASERS)
+    count = min(rng.poisson(sensor.own_returns), len(could_hit))
+    is_own = np.zeros(len(hits.ring), dtype=bool)
+    is_own[rng.choice(could_hit, count, replace=False)] = True
+    return is_own
 
 
 def _measured_distance(

@@ -37,6 +37,9 @@ class LidarModel:
     # Spread of the gains between lasers: scale of a Student's t distribution with three degrees
     # of freedom.
     gain_spread: float
+    # Power of a return, relative to a head-on one of a white surface at 10 m, at which the device
+    # reports half of the reflectivity.
+    half_power: float
     # Seconds per rotation; the sensor looks ahead in the middle of it.
     rotation_period: float
     # Direction of the rotation, seen from above.
@@ -49,6 +52,15 @@ class LidarModel:
     shadow: tuple[tuple[float, float, float, float], ...]
     # Share of the returns that are lost, whatever they hit.
     drop: float = 0.01
+    # Range in metres at which the device reports half of the reflectivity, whatever the power.
+    half_range: float = np.inf
+    # Brightness below which most returns have the intensity 0; 0 if none has because of it.
+    least_brightness: float = 0.0
+    # Mean share by which the upper half of the lasers, which are focused far away, sees near
+    # surfaces darker.
+    near_loss: float = 0.0
+    # Mean number of returns from the racks and the roof of the car itself.
+    own_returns: float = 0.0
     # True if the motion of the sensor during a rotation is removed from the points.
     motion_corrected: bool = True
     # Angles in degrees between the device and the car: nose up, and left side up.
@@ -87,7 +99,7 @@ HDL64E = LidarModel(
     elevations=_HDL64E_ELEVATIONS,
     azimuth_steps=2180,
     height=1.73,
-    min_range=1.5,
+    min_range=1.3,
     max_range=80.0,
     range_noise=0.0085,
     reach=560.0,
@@ -96,12 +108,17 @@ HDL64E = LidarModel(
     gamma=1.0,
     decimals=2,
     gain_spread=0.12,
+    half_power=0.003,
     rotation_period=0.1,
     counter_clockwise=True,
     keeps_lost_returns=False,
     layout="semantickitti",
     height_spread=0.06,
     shadow=_HDL64E_SHADOW,
+    half_range=44.0,
+    least_brightness=0.14,
+    near_loss=0.2,
+    own_returns=27.0,
 )
 
 _HDL32E_SHADOW = (
@@ -126,6 +143,7 @@ HDL32E = LidarModel(
     gamma=2.6,
     decimals=3,
     gain_spread=0.05,
+    half_power=0.007,
     rotation_period=0.05,
     counter_clockwise=False,
     keeps_lost_returns=True,

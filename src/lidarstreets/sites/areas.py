@@ -121,7 +121,7 @@ def _put_large(area: Plot, x: float, distance: float, heading: float) -> float:
     yaw = heading + np.pi * (rng.random() < 0.5) + rng.normal(scale=0.1)
     if rng.random() < 0.15:
         size = (rng.uniform(3, 6.1), 2.4, rng.uniform(1.2, 2.6))
-        container = part([box(size)], Surface.LIGHT_PAINT, Label.OTHER_OBJECT)
+        container = part([box(size)], Surface.COATING, Label.OTHER_OBJECT)
         area.put(container, x + size[0] / 2, distance, yaw, margin=-np.inf)
         return size[0]
 

@@ -30,11 +30,11 @@ def fill_background(site: Site, side: int) -> None:
             continue
 
         t = side * (front + rng.uniform(32, 45))
-        if rng.random() < 0.45:
+        if rng.random() < 0.6:
             plot = Plot(site, side, x, BACKGROUND_STEP)
             plant_thickets(plot, front + rng.uniform(24, 34))
 
-        if rng.random() < 0.35 and has_houses:
+        if rng.random() < 0.2 and has_houses:
             _put_background_house(site, x, t)
         else:
             site.put(trees.random_tree(rng, rng.uniform(6, 14), fine=False), x, t)

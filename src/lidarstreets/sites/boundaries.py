@@ -81,7 +81,7 @@ def enclose(plot: Plot, drive_x: float | None, depth: float) -> None:
     """Put boundaries around a plot, with a gap for a drive that begins at `drive_x`."""
     rng = plot.rng
     boundary = draw_boundary(rng)
-    front = plot.front + rng.choice([0.15, 0.5, 1.0, 2.5], p=[0.4, 0.4, 0.12, 0.08])
+    front = plot.front + rng.choice([0.15, 0.5, 1.0, 2.5], p=[0.3, 0.35, 0.2, 0.15])
     back = plot.front + depth
 
     gap = None

@@ -118,7 +118,7 @@ def _meadow(plot: Plot) -> None:
     rng = plot.rng
     front = plot.front
 
-    if rng.random() < 0.2:
+    if rng.random() < 0.1:
         gravel = (front + 1, front + rng.uniform(4, 20))
         plot.pave((plot.x, plot.end), gravel, Label.OTHER_GROUND)
     elif rng.random() < 0.5:

@@ -12,16 +12,16 @@ from lidarstreets.streets.plans import SideRoad
 
 # Shares of the vehicles that park along the street, and of those that drive.
 PARKED_VEHICLES = {
-    cars.car: 0.884,
-    trucks.truck: 0.04,
-    machines.trailer: 0.026,
+    cars.car: 0.860,
+    trucks.truck: 0.054,
+    machines.trailer: 0.036,
     two_wheelers.motorcycle: 0.042,
     buses.bus: 0.004,
     machines.machine: 0.004,
 }
 DRIVING_VEHICLES = {
-    cars.car: 0.860,
-    trucks.truck: 0.075,
+    cars.car: 0.880,
+    trucks.truck: 0.055,
     buses.bus: 0.015,
     two_wheelers.motorcyclist: 0.04,
     machines.machine: 0.006,

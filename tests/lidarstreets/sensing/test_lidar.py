@@ -15,7 +15,7 @@ from lidarstreets.solids import box, hull
 
 pytest.importorskip("embreex")
 from lidarstreets.sensing.lidar import RayScene, trace
-from lidarstreets.sensing.returns import laser_gains, receive
+from lidarstreets.sensing.returns import draw_lasers, receive
 
 HDL64E = SENSORS["hdl64e"]
 # A sensor without noise, losses or motion; the tests turn on what they need.
@@ -27,6 +27,10 @@ EXACT = replace(
     gain_spread=0.0,
     decimals=6,
     rotation_period=0.0,
+    half_range=np.inf,
+    least_brightness=0.0,
+    near_loss=0.0,
+    own_returns=0.0,
 )
 
 Points = tuple[np.ndarray, np.ndarray]
@@ -54,7 +58,7 @@ def scan_mesh(
         pose = np.eye(4)
     rng = np.random.default_rng(seed)
     hits = trace([RayScene(mesh)], sensor, pose, PlainRoad(), rng, speed=speed)
-    return receive(hits, sensor, laser_gains(sensor, rng), rng)
+    return receive(hits, sensor, draw_lasers(sensor, rng), rng)
 
 
 def wall(x: float, y: tuple[float, float] = (-30, 30)) -> Mesh:
@@ -86,7 +90,8 @@ def ground() -> Points:
     pose = np.eye(4)
     pose[:3, 3] = (3.0, -2.0, HDL64E.height)
 
-    points, labels, ring = scan_mesh(plane, replace(HDL64E, rotation_period=0.0), pose)
+    sensor = replace(HDL64E, rotation_period=0.0, own_returns=0.0)
+    points, labels, ring = scan_mesh(plane, sensor, pose)
     assert (labels == Label.ROAD).all()
     return points, ring
 
@@ -244,9 +249,59 @@ def test_far_grazing_ground_is_darker(ground: Points) -> None:
     assert far < 0.6 * near
 
 
-def test_gains_differ_between_lasers() -> None:
-    gains = laser_gains(HDL64E, np.random.default_rng(0))
-    assert gains.shape == (64,)
-    assert 0.05 < gains.std() < 0.3
-    assert gains.min() >= 0.3
-    assert (laser_gains(EXACT, np.random.default_rng(0)) == 1).all()
+def test_lasers_differ_in_gain_and_the_upper_ones_see_near_surfaces_darker() -> None:
+    lasers = draw_lasers(HDL64E, np.random.default_rng(0))
+    assert lasers.gain.shape == lasers.near_loss.shape == (64,)
+    assert 0.05 < lasers.gain.std() < 0.3
+    assert lasers.gain.min() >= 0.3
+    assert (lasers.near_loss[:32] == 0).all()
+    assert 0.1 < lasers.near_loss[32:].mean() < 0.3
+
+    exact = draw_lasers(EXACT, np.random.default_rng(0))
+    assert (exact.gain == 1).all()
+    assert (exact.near_loss == 0).all()
+
+    sensor = replace(EXACT, near_loss=0.3)
+    near, _, near_ring = scan_mesh(wall(5), sensor)
+    far, _, far_ring = scan_mesh(wall(20), sensor)
+    assert brightness(near[near_ring >= 32]) < 0.85 * brightness(near[near_ring < 32])
+    assert brightness(far[far_ring >= 32]) == pytest.approx(brightness(far[far_ring < 32]), rel=0.1)
+
+
+def brightness(points: np.ndarray) -> float:
+    """Return the mean intensity of the points that have one."""
+    return float(points[points[:, 3] > 0, 3].mean())
+
+
+def test_brightness_is_half_at_half_the_range_and_weak_returns_have_none() -> None:
+    """A dark wall 40 m away is at the limit; the same wall 10 m away is not."""
+    fading = replace(EXACT, half_range=40.0)
+    plain, _, _ = scan_mesh(wall(40, (-2, 2)), EXACT)
+    faded, _, _ = scan_mesh(wall(40, (-2, 2)), fading)
+    assert brightness(faded) == pytest.approx(brightness(plain) / 2, rel=0.02)
+
+    sensor = replace(fading, least_brightness=brightness(faded))
+    far, _, _ = scan_mesh(wall(40, (-2, 2)), sensor)
+    near, _, _ = scan_mesh(wall(10, (-2, 2)), sensor)
+    assert len(far) == pytest.approx(len(faded), rel=0.02)
+    assert 0.3 < (far[:, 3] == 0).mean() < 0.7
+    assert (near[:, 3] == 0).mean() < 0.05
+
+
+def test_the_car_itself_returns_a_few_dark_points_in_firing_order() -> None:
+    sensor = replace(EXACT, own_returns=30.0)
+    points, labels, ring = scan_mesh(wall(20), sensor)
+    distance = np.linalg.norm(points[:, :3], axis=1)
+    own = distance < 3
+    assert 10 < own.sum() < 60
+    assert (labels[own] == Label.OUTLIER).all()
+    assert (points[own, 3] == 0).all()
+
+    elevation = np.degrees(np.arcsin(points[own, 2] / distance[own]))
+    lasers = np.array(sensor.elevations)[::-1][ring[own]]
+    np.testing.assert_allclose(elevation, lasers, atol=1e-3)
+
+    # From the top down, and once around for each laser.
+    assert (np.diff(ring.astype(int)) <= 0).all()
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
+    assert (np.diff(azimuth)[np.diff(ring) == 0] > -0.1).all()

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidarstreets.bodies.vehicles.parts import draw_paint, glass, plates_and_lamps, wheels
+from lidarstreets.bodies.vehicles.parts import glass, plates_and_lamps, wheels
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place
 from lidarstreets.solids import box, copies
@@ -69,7 +69,7 @@ def _section(
         painted.append(machinery)
 
     return join(
-        part(painted, draw_paint(rng, 0.75), Label.BUS),
+        part(painted, Surface.COATING, Label.BUS),
         glass([windows], Label.BUS, bool(rng.random() < 0.5)),
         part([seats], Surface.CLOTH, Label.BUS),
         plates_and_lamps(Label.BUS, half, width, floor + 0.3, floor + 0.3),

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lidarstreets.bodies.vehicles.parts import draw_paint, glass, lamps, wheels
+from lidarstreets.bodies.vehicles.parts import glass, lamps, wheels
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, scaled
@@ -29,7 +29,7 @@ def trailer(rng: np.random.Generator) -> Mesh:
         copies(box((length, 0.05, board), (0, 0, floor)), y=[-width / 2, width / 2]),
         copies(box((0.05, width, board), (0, 0, floor)), x=[-length / 2, length / 2]),
     ]
-    pieces = [part([*tub, *_drawbar(length, floor)], draw_paint(rng, 0.6), Label.TRAILER)]
+    pieces = [part([*tub, *_drawbar(length, floor)], Surface.COATING, Label.TRAILER)]
 
     cover = rng.random()
     if cover < 0.35:
@@ -152,7 +152,7 @@ def _tractor(rng: np.random.Generator) -> Mesh:
     hull = box((2.8, 0.7, 0.6), (0.0, 0, 0.55))
     exhaust = tube((1.4, 0.3, 1.4), (1.4, 0.3, 2.5), 0.05, sides=5)
 
-    paint = draw_paint(rng, 0.6)
+    paint = Surface.COATING
     pieces = [
         part([prism(bonnet, 0.75), roof, fenders, hull], paint, _MACHINE),
         glass([cabin], _MACHINE, bool(rng.random() < 0.6)),
@@ -215,5 +215,5 @@ def _roller(rng: np.random.Generator) -> Mesh:
 
     return join(
         part(drums, Surface.METAL, _MACHINE),
-        part([body, posts, roof], draw_paint(rng, 0.8), _MACHINE),
+        part([body, posts, roof], Surface.COATING, _MACHINE),
     )

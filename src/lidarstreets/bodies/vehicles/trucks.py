@@ -223,7 +223,7 @@ def _panels(load: Load, pitch: float, rib: float) -> np.ndarray:
 def _box_load(rng: np.random.Generator, load: Load) -> list[Mesh]:
     """Return a closed box, a container or a tarpaulin over bows, perhaps with a tail lift."""
     pitch = rng.uniform(0.4, 1.6)
-    surface = Surface.PLASTIC if rng.random() < 0.6 else draw_paint(rng, 0.8)
+    surface = Surface.PLASTIC if rng.random() < 0.6 else Surface.COATING
     pieces = [part([_panels(load, pitch, rng.uniform(0.0, 0.05))], surface, Label.TRUCK)]
 
     details = [
@@ -250,7 +250,7 @@ def _flatbed(rng: np.random.Generator, load: Load) -> list[Mesh]:
         ),
         box((0.06, load.width, rng.uniform(0.4, 1.3)), (load.front, 0, load.floor)),
     ]
-    pieces = [part(boards, draw_paint(rng, 0.6), Label.TRUCK)]
+    pieces = [part(boards, Surface.COATING, Label.TRUCK)]
 
     goods = []
     if rng.random() < 0.7:
@@ -293,7 +293,7 @@ def _tipper(rng: np.random.Generator, load: Load) -> list[Mesh]:
     )
 
     return [
-        part([trough, ribs], draw_paint(rng, 0.6), Label.TRUCK),
+        part([trough, ribs], Surface.COATING, Label.TRUCK),
         part([heap], Surface.GRAVEL, Label.TRUCK),
     ]
 
@@ -312,7 +312,7 @@ def _tanker(rng: np.random.Generator, load: Load) -> list[Mesh]:
     saddle = box((load.length * 0.9, 0.9, 0.3), (load.middle, 0, load.floor - 0.15))
 
     return [
-        part([tank], Surface.METAL if rng.random() < 0.4 else Surface.LIGHT_PAINT, Label.TRUCK),
+        part([tank], Surface.METAL if rng.random() < 0.4 else Surface.COATING, Label.TRUCK),
         part([hatches, ladder, saddle], Surface.METAL, Label.TRUCK),
     ]
 
@@ -339,7 +339,7 @@ def _mixer(rng: np.random.Generator, load: Load) -> list[Mesh]:
     ]
 
     return [
-        part(drum, draw_paint(rng, 0.8), Label.TRUCK),
+        part(drum, Surface.COATING, Label.TRUCK),
         part(frame, Surface.METAL, Label.TRUCK),
     ]
 
@@ -362,8 +362,8 @@ def _refuse(rng: np.random.Generator, load: Load) -> list[Mesh]:
     )
 
     return [
-        part([prism(profile, load.width), ribs], draw_paint(rng, 0.85), Label.TRUCK),
-        part([prism(tail, load.width * 0.96)], draw_paint(rng, 0.6), Label.TRUCK),
+        part([prism(profile, load.width), ribs], Surface.COATING, Label.TRUCK),
+        part([prism(tail, load.width * 0.96)], Surface.COATING, Label.TRUCK),
     ]
 
 
@@ -379,7 +379,7 @@ def _fire_engine(rng: np.random.Generator, load: Load) -> list[Mesh]:
     rungs = copies(box((0.05, 0.6, 0.05)), x=np.arange(load.rear, load.front, 0.5), z=top + 0.15)
 
     return [
-        part([body], draw_paint(rng, 0.7), Label.TRUCK),
+        part([body], Surface.COATING, Label.TRUCK),
         part([shutters, rails, rungs], Surface.METAL, Label.TRUCK),
     ]
 

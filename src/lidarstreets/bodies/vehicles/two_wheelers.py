@@ -13,8 +13,8 @@ STAND_LEAN = 0.2  # largest angle in radians at which a parked two-wheeler leans
 
 def bicycle(rng: np.random.Generator, label: Label = Label.BICYCLE) -> Mesh:
     """Return a bicycle of any size, with or without mudguards, basket, bags and child seat."""
-    radius = rng.uniform(0.30, 0.36) if rng.random() < 0.85 else rng.uniform(0.2, 0.3)
-    wheelbase = rng.uniform(0.95, 1.2)
+    radius = rng.uniform(0.32, 0.36) if rng.random() < 0.88 else rng.uniform(0.2, 0.32)
+    wheelbase = rng.uniform(1.0, 1.18)
     saddle = rng.uniform(0.78, 1.02)
     bar = saddle + rng.uniform(-0.02, 0.2)
     has_low_frame = rng.random() < 0.5
@@ -40,7 +40,7 @@ def _wheels(label: Label, radius: float, rim: float, wheelbase: float) -> Mesh:
             dz = (radius - rim) * np.sin(angle)
             start = (x - dx, 0.0, radius - dz)
             solids.append(tube(start, (x + dx, 0.0, radius + dz), 0.006, sides=3))
-    return part(solids, Surface.RUBBER, label)
+    return part(solids, Surface.CYCLE, label)
 
 
 def _frame(
@@ -67,7 +67,7 @@ def _frame(
         box((0.26, 0.15, 0.07), (-0.22, 0, saddle - 0.07)),
         box((0.1, 0.3, 0.05), (-0.05, 0, 0.25)),
     ]
-    return part(solids, Surface.METAL, label)
+    return part(solids, Surface.CYCLE, label)
 
 
 def _bicycle_load(
