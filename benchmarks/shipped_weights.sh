@@ -26,13 +26,16 @@ train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --out "$out/
 # Both networks at the same time, one on each core of a small machine.
 networks=(--train-sequences "$(seq -s, 0 999)" --training.rv.region_loss lovasz)
 for stage in rv bev; do
-    networks+=("--training.$stage.epochs" 10 "--training.$stage.batch" 8 "--training.$stage.lr" 0.003)
-    networks+=("--training.$stage.ema" 0.999)
+    networks+=("--training.$stage.epochs" 10 "--training.$stage.batch" 8 "--training.$stage.lr" 0.002)
+    networks+=("--training.$stage.warmup" 0.05 "--training.$stage.hold" 0.55 "--training.$stage.ema" 0.99)
 done
+networks+=(--training.bev.accumulate 4) # eight scans at once take 15 GB
 export OMP_WAIT_POLICY=passive # two trainings share the cores
 trap 'kill $(jobs -p) 2>/dev/null || true' EXIT
 mkdir -p "$out"
 for stage in rv bev; do
+    # The second network takes the classes that the first one has counted.
+    while [[ $stage == bev && ! -f $out/run/class_counts.npz ]] && kill -0 %1; do sleep 5; done
     OMP_NUM_THREADS=1 "${train[@]}" "${networks[@]}" --stage $stage "$@" > "$out/$stage.log" 2>&1 &
 done
 wait %1

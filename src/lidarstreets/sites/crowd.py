@@ -24,7 +24,7 @@ OCCASIONS = {
 }
 # Occasions per person that `Style.people` counts, and parked two-wheelers per such person.
 PEOPLE_FACTOR = 1.4
-TWO_WHEELER_FACTOR = 0.8
+TWO_WHEELER_FACTOR = 0.6
 END_MARGIN = 2.0  # metres: nobody is nearer to the end of a street
 
 

@@ -9,8 +9,8 @@ from lidarstreets.streets.places import Places
 from lidarstreets.streets.plans import Plan
 
 # Median reflectivities of asphalt and of other pavements, measured on KITTI's scans.
-ASPHALT = 0.27
-PAVEMENT = 0.32
+ASPHALT = 0.255
+PAVEMENT = 0.315
 # Metres along and across the street: cells within which the surface has been repaired or not.
 CELL = (7.0, 1.6)
 CELLS = 64  # cells in each direction before they repeat
@@ -26,9 +26,9 @@ class GroundBrightness:
         if rng.random() < 0.12:
             wanted[Label.ROAD] = rng.uniform(0.33, 0.44)  # concrete or cobbles
 
-        # Half of the sidewalks, lots and paved verges are asphalt or as bright as it.
+        # A third of the sidewalks, lots and paved verges are asphalt or as bright as it.
         for label in (Label.SIDEWALK, Label.PARKING, Label.OTHER_GROUND):
-            if rng.random() < 0.5:
+            if rng.random() < 1 / 3:
                 wanted[label] = wanted[Label.ROAD] * rng.lognormal(0, 0.06)
             else:
                 wanted[label] = rng.lognormal(np.log(PAVEMENT), 0.15)

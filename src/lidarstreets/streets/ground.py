@@ -30,6 +30,7 @@ HUMP_REACH = 1.8  # metres along the street from the top of a hump to its foot
 DRIVE_KERB = 0.2
 DRIVE_RAMP = 0.8
 SWERVE = 8.0  # metres: vehicles leave their lane this far before the ring of a roundabout
+RARELY_PARKED = 0.3  # of the places in a parking lane: below, few cars park in a street
 
 
 class Ground(MiddleLine):
@@ -181,7 +182,9 @@ class Ground(MiddleLine):
             inside &= (plot_t > patch.t[0]) & (plot_t < patch.t[1])
             label[plots[inside]] = patch.label
 
-        label[(places.kerb < 0) & (places.road >= 0)] = Label.PARKING
+        # Where few cars park, the benchmarks call the lane at the kerb road.
+        is_used = self.style.parked > RARELY_PARKED
+        label[(places.kerb < 0) & (places.road >= 0)] = Label.PARKING if is_used else Label.ROAD
         on_road = places.road < 0
         label[on_road] = Label.ROAD
         if self.style.painted:
