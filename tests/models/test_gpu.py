@@ -21,6 +21,7 @@ from amvnet import Scan, Segmenter, load, simulate
 from amvnet import read as read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.journal import Entry, Journal
+from amvnet.inference.listing import ScanOptions
 from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.models import neighbours_gpu as block_search
@@ -493,6 +494,7 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
         "sensor": repr(Sensor()),
+        "layout": repr(ScanOptions().layout),
         "scores": False,
         "uncertain": False,
         "format": "label",
