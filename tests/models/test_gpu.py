@@ -489,10 +489,13 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
     assert run_cli(*arguments) == (0, "")
     names = files(tmp_path)
 
-    weights = Segmenter(world / "w.safetensors").weights
+    segmenter = Segmenter(world / "w.safetensors")
+    weights = segmenter.weights
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
+        "precision": "float32",
+        "tau": segmenter.tau,
         "sensor": repr(Sensor()),
         "layout": repr(ScanOptions().layout),
         "scores": False,
