@@ -164,8 +164,8 @@ def test_names_of_scans_write_nothing_elsewhere(name: str, kind: str, link: str)
         with suppress(InputError):
             write(base, [scan], kind)
         with suppress(InputError):  # the names are checked once more when a file is written
-            ids = np.ones(COUNT, np.uint8)
-            scan.write_labels(base / "out", scan.load(), ids, kind=kind, taxonomy=NUSCENES)
+            (result,) = label([scan], [scan.load().scan])
+            scan.write_labels(base / "out", scan.load(), result, kind, NUSCENES)
 
 
 @settings(deadline=None, max_examples=100)

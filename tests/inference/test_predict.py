@@ -326,6 +326,21 @@ def test_scans_before_the_first_ones_change_how_all_are_normalised(
     check_same(out, whole)
 
 
+def test_a_scan_that_was_rewritten_is_segmented_again(world: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    scans = tmp_path / "scans"
+    shutil.copytree(world / "scans", scans)
+    command = f"predict {scans} --weights {world}/{WEIGHTS} --out {out} --resume"
+    succeed(command)
+
+    times = times_of(out)
+    shutil.copy(scans / "000005.bin", scans / "000009.bin")
+    succeed(command)
+    changed = {name for name, time in times_of(out).items() if time != times[name]}
+    assert changed == {"000009.label"}
+    assert (out / "000009.label").read_bytes() == (out / "000005.label").read_bytes()
+
+
 def test_a_broken_scan_is_tried_again(world: Path, whole: Path, tmp_path: Path) -> None:
     """A folder grows while a scan is still being copied."""
     scans = tmp_path / "scans"

@@ -21,15 +21,15 @@ class Entry(NamedTuple):
 
     Attributes:
         scan: its name.
-        first: a digest of the names of the first scans of its recording, by which the scan is
-            normalised; empty if it is not.
+        origin: a digest of the sizes and times of its file, and of the first ones of its recording
+            if the scan is normalised by these.
         sensor: a title of what recorded it.
         points: how many of its points are valid.
         uncertain: how many are uncertain.
     """
 
     scan: str
-    first: str
+    origin: str
     sensor: str
     points: int
     uncertain: int

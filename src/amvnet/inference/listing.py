@@ -23,6 +23,7 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
 from amvnet.inference.reading import FileReader, LoadedScan, normalised_by
+from amvnet.inference.segmentation import Segmentation
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Normaliser
@@ -95,23 +96,14 @@ class InputScan(Protocol):
         """
 
     def write_labels(
-        self,
-        folder: Path,
-        loaded: LoadedScan,
-        ids: np.ndarray,
-        *,
-        kind: str,
-        taxonomy: Taxonomy,
-        uncertain: np.ndarray | None = None,
+        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
     ) -> Path:
         """Write labels into a folder of predictions; return the path of the file.
 
         Args:
             loaded: what `load` returned.
-            ids: (N,) train ids.
             kind: the format for scan files; datasets have their own.
             taxonomy: turns the train ids of scan files into raw ids; datasets have their own.
-            uncertain: (N,) bool, the uncertain points; None if unknown.
         """
 
 
@@ -145,16 +137,9 @@ class DatasetScan:
         return self.dataset.read_prediction(self.record, path)
 
     def write_labels(
-        self,
-        folder: Path,
-        loaded: LoadedScan,
-        ids: np.ndarray,
-        *,
-        kind: str,
-        taxonomy: Taxonomy,
-        uncertain: np.ndarray | None = None,
+        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
     ) -> Path:
-        return self.dataset.write_prediction(self.record, folder, ids, self.written)
+        return self.dataset.write_prediction(self.record, folder, result.labels, self.written)
 
 
 def _title_of(record: ScanRecord) -> str:
@@ -194,17 +179,13 @@ class FileScan:
         return read_scan_labels(path, count, taxonomy)
 
     def write_labels(
-        self,
-        folder: Path,
-        loaded: LoadedScan,
-        ids: np.ndarray,
-        *,
-        kind: str,
-        taxonomy: Taxonomy,
-        uncertain: np.ndarray | None = None,
+        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
     ) -> Path:
+        ids = result.labels
+        uncertain = result.uncertain if result.has_two_networks else None
         xyz = loaded.file_xyz
         assert xyz is not None
+
         if kind in label_bags.KINDS:
             assert loaded.message is not None  # predict checks that the scan is from a bag
             points = label_points(xyz, ids, taxonomy, uncertain)

@@ -80,27 +80,24 @@ class ExecutionOptions:
 
     Attributes:
         batch: scans that go through the networks together; the labels are the same up to rounding.
-        at_once: on a CPU, scans that are segmented at the same time, each with its share of the
-            threads. None means as many as there are threads and memory for; 1 on a GPU, or with an
-            engine other than torch, which shares out the threads itself.
+        at_once: scans that are segmented at the same time, each with its share of the threads.
         resume: leave out the scans that an earlier run into the same folder has done.
         processes: those that share the scans.
 
     Raises:
-        InputError: if a number is below 1.
+        InputError: if the batch is below 1.
     """
 
     batch: int = 1
-    at_once: int | None = None
+    at_once: int = 1
     resume: bool = False
     processes: Processes = ALONE
 
     def __post_init__(self) -> None:
-        for option, count in (("batch", self.batch), ("at-once", self.at_once)):
-            if count is not None and count < 1:
-                raise InputError(
-                    f"expected one scan or more at a time, found {count}; set --{option}"
-                )
+        if self.batch < 1:
+            raise InputError(
+                f"expected one scan or more in a batch, found {self.batch}; set --batch"
+            )
 
 
 # Segments scans in memory, given where each is from; an InputError says that one is broken.
@@ -118,7 +115,7 @@ class Pipeline:
         segment: segments scans that have been read.
         output: what is written, and where.
         taxonomy: the classes of the labels.
-        execution: how many scans at a time; an `at_once` of None means 1 here.
+        execution: how many scans at a time, and by which processes.
     """
 
     scans: Sequence[InputScan]
@@ -177,8 +174,8 @@ class Pipeline:
     def _read_done(self, settings: Mapping[str, Any], written: WrittenFiles) -> dict[str, Entry]:
         """Return what an earlier run has done that is as this run would do it.
 
-        The files have to be there, as they were written, and the scan has to be normalised by the
-        same scans: the first ones of its recording.
+        The files have to be there, as they were written, and the scan has to be the same, and
+        normalised by the same first ones of its recording.
         """
         if not self.execution.resume:
             return {}
@@ -190,24 +187,26 @@ class Pipeline:
                 continue
             paths = self.output.paths_of(scan)
             is_there = all((self.output.folder / path).is_file() for path in paths)
-            is_same = entry.first == self._first_of[scan.source]
+            is_same = entry.origin == self._origins[entry.scan]
             if not is_there or not is_same or any(map(written.is_foreign, paths)):
                 del done[entry.scan]
         return done
 
     @cached_property
-    def _first_of(self) -> dict[str, str]:
-        """A digest of the names of the first scans by recording; empty if none is measured."""
-        names: dict[str, list[str]] = {}
+    def _origins(self) -> dict[str, str]:
+        """Digests for `Entry.origin` by scan."""
+        first_of: dict[str, list[Any]] = {}  # by recording
         for scan in self.scans:
-            first = names.setdefault(scan.source, [])
+            first = first_of.setdefault(scan.source, [])
             if scan.is_normalised and len(first) < MEASURED:
-                first.append(scan.name)
-        digests = {}
-        for source, first in names.items():
-            digest = hashlib.sha256(json.dumps(first).encode()).hexdigest()
-            digests[source] = digest[:DIGITS] if first else ""
-        return digests
+                first.append((scan.name, *_size_and_time(scan.path)))
+
+        origins = {}
+        for scan in self.scans:
+            values = (_size_and_time(scan.path), first_of[scan.source])
+            digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()
+            origins[_key(scan)] = digest[:DIGITS]
+        return origins
 
     def _begin(
         self,
@@ -291,7 +290,7 @@ class Pipeline:
             load=lambda scan: scan.load(),
             compute=self._segment_group,
             batch=self.execution.batch,
-            at_once=self.execution.at_once or 1,
+            at_once=self.execution.at_once,
         )
         with closing(groups):
             yield from chain.from_iterable(groups)
@@ -337,18 +336,11 @@ class Pipeline:
         if self.output.uncertain:
             write_uncertain(scores_path.with_suffix(UNCERTAIN_ENDING), result.uncertain)
 
-        has_two_networks = result.rv is not None and result.bev is not None
-        scan.write_labels(
-            folder,
-            loaded,
-            result.labels,
-            kind=self.output.kind,
-            taxonomy=self.taxonomy,
-            uncertain=result.uncertain if has_two_networks else None,
-        )
+        scan.write_labels(folder, loaded, result, self.output.kind, self.taxonomy)
+
         points = int(np.count_nonzero(loaded.scan.valid))
         uncertain = int(np.count_nonzero(result.uncertain))
-        return Entry(_key(scan), self._first_of[scan.source], loaded.sensor, points, uncertain)
+        return Entry(_key(scan), self._origins[_key(scan)], loaded.sensor, points, uncertain)
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:
@@ -387,6 +379,15 @@ def _check_folder(scan: InputScan, output: OutputOptions) -> None:
             f"{scan.path}: expected another folder for the labels, found the scan's own; "
             "change --out"
         )
+
+
+def _size_and_time(path: Path) -> tuple[int, int]:
+    """Return a file's size, and when it changed last; zeros if there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return 0, 0
+    return status.st_size, status.st_mtime_ns
 
 
 def _key(scan: InputScan) -> str:

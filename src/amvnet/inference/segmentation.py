@@ -129,6 +129,11 @@ class Segmentation:
         return ", ".join(texts)
 
     @property
+    def has_two_networks(self) -> bool:
+        """Whether both networks ran, so that it is known which points are uncertain."""
+        return self.rv is not None and self.bev is not None
+
+    @property
     def class_names(self) -> tuple[str, ...]:
         """K + 1 names of the classes, by id; the name of id 0 is "unlabelled"."""
         return self.require_origin().taxonomy.names
@@ -150,7 +155,7 @@ class Segmentation:
 
         None for a single network, and for the late fusion alone.
         """
-        if self.origin is None or self.rv is None or self.bev is None:
+        if self.origin is None or not self.has_two_networks:
             return None
         share = uncertain_share(self.labels, self.uncertain)
         return Verdict(share, self.origin.usual_uncertain)
@@ -185,14 +190,13 @@ class Segmentation:
             raise InputError(f"{path}: expected another file than the scan's; rename it")
 
         xyz = origin.scan.points[:, :3] if origin.file_xyz is None else origin.file_xyz
-        has_two_networks = self.rv is not None and self.bev is not None
         return write_scan_labels(
             path.with_suffix(""),
             kind,
             xyz,
             self.labels,
             origin.taxonomy,
-            uncertain=self.uncertain if has_two_networks else None,
+            uncertain=self.uncertain if self.has_two_networks else None,
         )
 
     def require_origin(self) -> Origin:

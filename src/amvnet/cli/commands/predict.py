@@ -119,7 +119,7 @@ def predict(
             segmenter,
             OutputOptions(Path(out), format, scores, uncertain, overwrite),
             options=choice.parse(),
-            execution=ExecutionOptions(batch, compute.at_once, resume, processes),
+            execution=ExecutionOptions(batch, resume=resume, processes=processes),
             sensor=sensor,
             classes=class_map,
             progress=step,
