@@ -72,16 +72,10 @@ def load(
     Args:
         weights: the path of a weights file, the name of built-in weights (`sim-hdl64e`,
             `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
-        device: "cpu", "cuda", "cuda:1", ..., or "auto": "cuda" if there is one and the engine runs
-            there, else "cpu".
-        method: "amvnet", or a part of it: "rv", "rv-knn" (with a vote of neighbours in the range
-            image), "bev", "ensemble", "arithmetic" or "maximum".
-        precision: of the two networks: "float32", "bfloat16", on a GPU "float16", or "auto":
-            bfloat16 on a GPU that has it, else float32.
+        device, method, precision, tau: as for `Segmenter`; "auto" chooses a device that the engine
+            runs on.
         engine: what runs the networks: "torch", "compile", "onnx", "int8", or "auto", the fastest
             that gives the same labels here.
-        tau: the cosine similarity up to which points are uncertain, in [0, 1]; None means as the
-            weights say.
 
     Raises:
         InputError: if there are no such weights, they lack a part that the method needs, or the

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from amvnet.data.palette import UNCERTAIN, WRONG
 from amvnet.data.taxonomy import NUSCENES
-from amvnet.errors import InputError
 from amvnet.evaluation.top_view import TopView, draw_scan
 
 BLOCK = 400  # points of one class in one block, dense enough to fill pixels
@@ -76,11 +75,3 @@ def test_every_part_is_optional(tmp_path: Path, with_truth: bool, with_uncertain
 def test_truth_alone_is_enough(tmp_path: Path) -> None:
     points, ids = blocks([2])
     assert draw_scan(tmp_path / "a.png", TopView(points, NUSCENES, {}, truth=ids)).is_file()
-
-
-def test_what_does_not_fit_is_named() -> None:
-    points, ids = blocks([2])
-    with pytest.raises(InputError, match="neither"):
-        TopView(points, NUSCENES, {})
-    with pytest.raises(InputError, match="'rv'"):
-        TopView(points, NUSCENES, {"rv": ids[1:]})

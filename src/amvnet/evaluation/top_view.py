@@ -12,7 +12,6 @@ import numpy as np
 
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError
 from amvnet.files import atomic_write
 
 REACH = 50.0  # metres shown on each side of the sensor
@@ -59,9 +58,6 @@ class TopView:
         title: a line above all panels.
         reach: metres shown on each side.
         marked: the name of the points in `uncertain`, for their panel and the legend.
-
-    Raises:
-        InputError: if there is nothing to draw, or an array does not have one value per point.
     """
 
     points: np.ndarray
@@ -72,19 +68,6 @@ class TopView:
     title: str = ""
     reach: float = REACH
     marked: str = "uncertain"
-
-    def __post_init__(self) -> None:
-        if not self.predictions and self.truth is None:
-            raise InputError("expected a prediction or the truth to draw, found neither; give one")
-
-        count = len(self.points)
-        arrays = {**self.predictions, "truth": self.truth, "uncertain": self.uncertain}
-        for name, values in arrays.items():
-            if values is not None and np.shape(values) != (count,):
-                raise InputError(
-                    f"expected {count} values for {name!r}, one per point, "
-                    f"found {np.shape(values)}; give the values of this scan"
-                )
 
 
 def draw_scan(path: Path | str, view: TopView) -> Path:

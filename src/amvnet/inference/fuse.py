@@ -32,12 +32,7 @@ Head = PointHead | Weights | Path | str | None
 
 
 class Fusion:
-    """Fuses two models' scores of scans.
-
-    Args:
-        head: a trained point head, or weights that hold one; None gives the ensemble.
-        tau: points whose scores have a cosine similarity of at most this are uncertain; by default
-            the threshold that the weights were trained with, or the paper's without weights.
+    """Fuses two models' scores of scans; `head` and `tau` are as for `fuse`.
 
     Raises:
         InputError: if the weights hold no head.

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 import torch
@@ -243,53 +242,40 @@ class PointGatherer:
         self, scans: ScanSet, keys: Sequence[Key], folder: Path, assertion: Assertion, say: Say
     ) -> HeadPoints:
         """Gather the points that an assertion finds uncertain, of some views of scans."""
-        if self._processes.first:
+        processes = self._processes
+        if processes.first:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
-        self._processes.wait()
-        with (folder / str(self._processes.rank)).open("wb") as file:
-            counts, matrices = self._score_share(scans, keys, file, assertion, say)
+        processes.wait()
 
-        counts_by_rank = self._processes.gather(counts)
-        certain, uncertain = np.sum(self._processes.gather(matrices), axis=0)
+        # Score this process's share of the scans.
+        ids = self.weights.taxonomy.size + 1
+        matrices = np.zeros((2, ids, ids), dtype=np.int64)
+        counts = []
+        share = processes.share(keys)
+        limit = self.plan.recipe.training.head.points
+        most = -(-limit // len(keys))  # points of a scan, rounded up
+        scorer = self._scorer()
+        tenths = Tenths()
+        with (folder / str(processes.rank)).open("wb") as file:
+            for number, key in enumerate(share, start=1):
+                points, scan_matrices = self._gather_scan(scans, key, scorer, assertion, most)
+                points.tofile(file)
+                counts.append(len(points))
+                matrices += scan_matrices
+                if tenths.ends(number, len(share)):
+                    say(f"head: scored {number * len(keys) // len(share)} of {len(keys)} scans")
+
+        counts_by_rank = processes.gather(counts)
+        certain, uncertain = np.sum(processes.gather(matrices), axis=0)
         labelled = certain[1:].sum() + uncertain.sum()
-
         return HeadPoints(
-            path=_join(folder, counts_by_rank, self._dtype.itemsize, self._processes),
+            path=_join(folder, counts_by_rank, self._dtype.itemsize, processes),
             dtype=self._dtype,
             size=sum(map(sum, counts_by_rank)),
             certain=certain,
             uncertain_share=float(uncertain.sum() / max(labelled, 1)),
         )
-
-    def _score_share(
-        self, scans: ScanSet, keys: Sequence[Key], file: IO[bytes], assertion: Assertion, say: Say
-    ) -> tuple[list[int], np.ndarray]:
-        """Score this process's share of the scans, and write their points to a file.
-
-        Returns:
-            How many points each scan of the share has in the file, and the (2, K + 1, K + 1)
-            confusion matrices of the ensemble over their certain and their uncertain points.
-        """
-        ids = self.plan.scans.dataset.taxonomy.size + 1
-        matrices = np.zeros((2, ids, ids), dtype=np.int64)
-        counts = []
-
-        share = self._processes.share(keys)
-        limit = self.plan.recipe.training.head.points
-        most = -(-limit // len(keys))  # points of a scan, rounded up
-        scorer = self._scorer()
-        tenths = Tenths()
-        for number, key in enumerate(share, start=1):
-            points, scan_matrices = self._gather_scan(scans, key, scorer, assertion, most)
-            points.tofile(file)
-            counts.append(len(points))
-            matrices += scan_matrices
-
-            if tenths.ends(number, len(share)):
-                say(f"head: scored {number * len(keys) // len(share)} of {len(keys)} scans")
-
-        return counts, matrices
 
     @torch.inference_mode()
     def _gather_scan(
