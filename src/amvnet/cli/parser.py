@@ -250,36 +250,22 @@ def _add_option(target: Any, parameter: Parameter) -> None:
     """Add one parameter of a verb as an option to the parser, or to a group of it."""
     flag = flag_of(parameter.name)
     kind = parameter.kind
-    default = parameter.default
-    text = parameter.text.replace("%", "%%")
-    if kind is bool:
-        action = BooleanOptionalAction if default else "store_true"
-        target.add_argument(flag, action=action, default=default, help=text)
-        return
-
-    if get_origin(kind) is list:  # may be given several times
-        target.add_argument(
-            flag,
-            action="append",
-            required=True,
-            help=f"{text} (required)",
-            metavar=flag[2:].upper(),
-        )
-        return
-
-    if kind == str | bool:  # its value may be left out
-        target.add_argument(
-            flag, nargs="?", const=True, default=default, help=text, metavar="ADDRESS"
-        )
-        return
-
-    metavar = metavar_of(parameter.name, kind)
-    if default is inspect.Parameter.empty:
-        target.add_argument(
-            flag, type=kind, required=True, help=f"{text} (required)", metavar=metavar
-        )
+    options: dict[str, Any] = {"help": parameter.text.replace("%", "%%")}
+    if parameter.default is inspect.Parameter.empty:
+        options["required"] = True
+        options["help"] += " (required)"
     else:
-        target.add_argument(flag, type=kind, default=default, help=text, metavar=metavar)
+        options["default"] = parameter.default
+
+    if kind is bool:
+        options["action"] = BooleanOptionalAction if parameter.default else "store_true"
+    elif get_origin(kind) is list:  # may be given several times
+        options |= {"action": "append", "metavar": flag[2:].upper()}
+    elif kind == str | bool:  # its value may be left out
+        options |= {"nargs": "?", "const": True, "metavar": "ADDRESS"}
+    else:
+        options |= {"type": kind, "metavar": metavar_of(parameter.name, kind)}
+    target.add_argument(flag, **options)
 
 
 def metavar_of(name: str, kind: Any) -> str:
