@@ -65,10 +65,10 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     """
     import torch
 
-    if torch.compiler.is_compiling() or torch.is_grad_enabled() or not do_threads_sleep():
-        return [run(part) for part in parts]
-    threads = torch.get_num_threads()
-    if min(threads, len(parts)) < 2:
+    is_plain = torch.compiler.is_compiling() or torch.is_grad_enabled() or not do_threads_sleep()
+    threads = 1 if is_plain else torch.get_num_threads()
+    workers = min(threads, len(parts))
+    if workers < 2:
         return [run(part) for part in parts]
 
     # All of these are settings of a thread.
@@ -84,7 +84,6 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
         ):
             return run(part)
 
-    workers = min(threads, len(parts))
     with thread_pool(workers, threads_each=threads // workers) as pool:
         return list(pool.map(run_alone, parts))
 

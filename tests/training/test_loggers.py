@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+from lightning.pytorch.loggers import MLFlowLogger, WandbLogger
 from matplotlib.figure import Figure
 
 from amvnet.evaluation.top_view import TopView
@@ -67,12 +68,18 @@ def test_nothing_is_drawn_for_a_logger_without_pictures(
 def test_pictures_go_to_loggers_that_take_them() -> None:
     calls: list[Any] = []
 
-    class WandbLogger:
-        def log_image(self, *arguments: Any) -> None:
+    class FakeWandb(WandbLogger):
+        def __init__(self) -> None:
+            pass
+
+        def log_image(self, *arguments: Any) -> None:  # type: ignore[override]
             calls.append(arguments)
 
-    class MLFlowLogger:
+    class FakeMLFlow(MLFlowLogger):
         run_id = "7"
+
+        def __init__(self) -> None:
+            pass
 
         @property
         def experiment(self) -> Any:
@@ -82,7 +89,7 @@ def test_pictures_go_to_loggers_that_take_them() -> None:
             calls.append(arguments)
 
     figure = Figure()
-    fakes: list[Any] = [WandbLogger(), MLFlowLogger(), None]
+    fakes: list[Any] = [FakeWandb(), FakeMLFlow(), None]
     for logger in fakes:
         log_figure(logger, "a", figure, 3)
     assert calls == [("a", [figure]), ("7", figure, "a/0003.png")]

@@ -16,7 +16,13 @@ import numpy as np
 import torch
 import yaml
 from lightning.pytorch.callbacks import Callback, RichProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.loggers import (
+    CSVLogger,
+    Logger,
+    MLFlowLogger,
+    TensorBoardLogger,
+    WandbLogger,
+)
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
@@ -393,14 +399,12 @@ def _speed_of(trainer: L.Trainer) -> Speed:
 @contextmanager
 def _weights_to_keep(trainer: L.Trainer, part: nn.Module) -> Iterator[nn.Module]:
     """Yield the trained part, with the averaged weights within the block if there are any."""
-    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    averages = [callback for callback in callbacks if isinstance(callback, AverageWeights)]
-    if not averages:
-        yield part
-        return
-
-    with averages[0].inserted(part):
-        yield part
+    for callback in trainer.callbacks:  # type: ignore[attr-defined]
+        if isinstance(callback, AverageWeights):
+            with callback.inserted(part):
+                yield part
+            return
+    yield part
 
 
 def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -418,37 +422,23 @@ def make_logger(name: LoggerName, folder: Path) -> Logger:
     """
     check_logger(name)
     title = f"{folder.parent.name}/{folder.name}"
-    makers: dict[str, Callable[[], Logger]] = {
-        "tensorboard": lambda: TensorBoardLogger(folder, name="", version=""),
-        # In a folder of its own, as metrics.csv in the stage's folder has a row per epoch.
-        "csv": lambda: CSVLogger(folder, name="csv", version=""),
-        "wandb": lambda: _wandb(title, folder),
-        "mlflow": lambda: _mlflow(title, folder),
-    }
-    return makers[name]()
-
-
-def _wandb(title: str, folder: Path) -> Logger:
-    from lightning.pytorch.loggers import WandbLogger
-
-    return WandbLogger(name=title, project=PROJECT, save_dir=folder)
-
-
-def _mlflow(title: str, folder: Path) -> Logger:
-    from lightning.pytorch.loggers import MLFlowLogger
-
-    # The variable MLFLOW_TRACKING_URI of the user counts more than the folder.
-    return MLFlowLogger(PROJECT, run_name=title, save_dir=str(folder / "mlruns"))
+    if name == "tensorboard":
+        return TensorBoardLogger(folder, name="", version="")
+    if name == "wandb":
+        return WandbLogger(name=title, project=PROJECT, save_dir=folder)
+    if name == "mlflow":
+        # The variable MLFLOW_TRACKING_URI of the user counts more than the folder.
+        return MLFlowLogger(PROJECT, run_name=title, save_dir=str(folder / "mlruns"))
+    # In a folder of its own, as metrics.csv in the stage's folder has a row per epoch.
+    return CSVLogger(folder, name="csv", version="")
 
 
 def log_figure(logger: Logger | None, name: str, figure: Figure, epoch: int) -> None:
     """Give a picture to a logger; those without pictures leave it out."""
-    writer: Any = getattr(logger, "experiment", None)
-    kind = type(logger).__name__
-    if kind == "TensorBoardLogger":
-        writer.add_figure(name, figure, epoch)
-    elif kind == "WandbLogger":
-        logger.log_image(name, [figure])  # type: ignore[union-attr]
-    elif kind == "MLFlowLogger":
-        run: Any = logger
-        writer.log_figure(run.run_id, figure, f"{name}/{epoch:04d}.png")
+    if isinstance(logger, TensorBoardLogger):
+        logger.experiment.add_figure(name, figure, epoch)
+    elif isinstance(logger, WandbLogger):
+        logger.log_image(name, [figure])
+    elif isinstance(logger, MLFlowLogger):
+        path = f"{name}/{epoch:04d}.png"
+        logger.experiment.log_figure(logger.run_id, figure, path)
