@@ -188,6 +188,7 @@ def labels_by_method(
     """
     batch = segmenter.batch([scan])
     scores = segmenter.run(batch)
+
     labels = {}
     for name in methods:
         values: Tensor | None = scores.merged
@@ -207,6 +208,7 @@ def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatc
     f = scores.rv
     g = scores.bev
     ensemble = METHODS[name].ensemble
+
     if name == "rv":
         return f
     if name == "bev":

@@ -162,11 +162,16 @@ def fuse_files(
             checked = check_scan(scan)
             f, g = pair.read(scan_input.scores_path, checked, taxonomy.size)
             results.append(fusion(checked, f, g))
+
         return results
 
     pipeline = Pipeline(scans, segment, output, taxonomy)
     entries, faults = pipeline.run({"fused": pair.to_dict()}, progress)
     check_faults(faults, len(scans))
-    points = sum(entry.points for entry in entries)
-    uncertain = sum(entry.uncertain for entry in entries)
+
+    points = 0
+    uncertain = 0
+    for entry in entries:
+        points += entry.points
+        uncertain += entry.uncertain
     return len(scans), uncertain / max(points, 1)

@@ -102,7 +102,8 @@ class Journal:
         self.processes.wait()
         entries: dict[str, Entry] = {}
         for path in self.folder.glob(PATTERN):
-            entries.update({entry.scan: entry for entry in _read(path)[1]})
+            for entry in _read(path)[1]:
+                entries[entry.scan] = entry
         self.processes.wait()  # until all have read
 
         if self.processes.first:
@@ -132,7 +133,8 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
                 f"{folder}: expected the settings of the earlier run, found another {names}; "
                 "resume it with the same, or leave --resume out to start over"
             )
-        done.update({entry.scan: entry for entry in entries})
+        for entry in entries:
+            done[entry.scan] = entry
     return done
 
 

@@ -259,6 +259,7 @@ def _say_left_out(text: str, scans: Sequence[NamedScan], say: Say) -> None:
         is_written = path.name.endswith((".label", ".uncertain.npy")) or path.suffix == ".npz"
         if path.is_file() and not path.name.startswith(".") and not is_written:
             endings[path.suffix] += path not in paths
+
     count = endings.total()
     if count:
         names = [ending or "without an ending" for ending, found in endings.items() if found]

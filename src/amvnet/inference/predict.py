@@ -87,6 +87,7 @@ def predict(
             if isinstance(scan, DatasetScan):
                 scan.written = classes.target
         taxonomy = classes.target
+
     execution = replace(execution, at_once=segmenter.at_once)
     segment = segment_by(segmenter, classes)
     entries, faults = Pipeline(scans, segment, output, taxonomy, execution).run(settings, progress)
@@ -151,6 +152,7 @@ def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment
         for is_normalised, group in groupby(pairs, key=lambda pair: pair[0].is_normalised):
             fitting = by_ring if is_normalised else segmenter
             results += fitting.many([scan for _, scan in group])
+
         if table is None:
             return results
         return [replace(result, labels=table[result.labels]) for result in results]

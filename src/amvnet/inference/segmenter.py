@@ -94,6 +94,7 @@ class Segmenter:
         self.tau = tau
         self.device = check_device(choose_device(device))
         self.precision = choose_precision(precision, self.device)
+
         self.engine = "torch"
         self.at_once = 1
         if self.device == "cpu":
@@ -177,6 +178,7 @@ class Segmenter:
         """
         checked = [check_scan(points, self.intensity) for points in scans]
         uses_team = self.device == "cpu" and self.engine not in ONNX_ENGINES
+
         is_large = sum(map(len, checked)) >= LARGE
         memory = return_freed_memory() if is_large else nullcontext()
         with self._machine.watch(uses_team), memory:
@@ -255,6 +257,7 @@ class Segmenter:
         if self.method == "bev":
             g = model.score_polar_view(batch)
             return Scores(g, _nowhere(g), rv=None, bev=g)
+
         f = model.score_range_view(batch)
         y = self.vote(f, batch) if self.method == "rv-knn" else f
         return Scores(y, _nowhere(y), rv=f, bev=None)
@@ -271,10 +274,12 @@ class Segmenter:
         Raises:
             InputError: if more than a few intensities are out of range.
         """
-        if self._are_fractions:
-            scans = [check_intensity(scan) for scan in scans]
-        scans = [match_scan(scan, self.intensity) for scan in scans]
-        return PointBatch.of(scans, self.device)
+        matched = []
+        for scan in scans:
+            if self._are_fractions:
+                scan = check_intensity(scan)
+            matched.append(match_scan(scan, self.intensity))
+        return PointBatch.of(matched, self.device)
 
 
 def _is_gpu(device: str) -> bool:

@@ -257,6 +257,7 @@ class PointGatherer:
         most = -(-limit // len(keys))  # points of a scan, rounded up
         scorer = self._scorer()
         tenths = Tenths()
+
         with (folder / str(processes.rank)).open("wb") as file:
             for number, key in enumerate(share, start=1):
                 points, scan_matrices = self._gather_scan(scans, key, scorer, assertion, most)
@@ -269,6 +270,7 @@ class PointGatherer:
         counts_by_rank = processes.gather(counts)
         certain, uncertain = np.sum(processes.gather(matrices), axis=0)
         labelled = certain[1:].sum() + uncertain.sum()
+
         return HeadPoints(
             path=_join(folder, counts_by_rank, self._dtype.itemsize, processes),
             dtype=self._dtype,

@@ -207,6 +207,7 @@ def train_network(plan: Plan, name: str, weights: Weights, steps: int | None = N
     model = plan.build(weights)
     intensity = _intensity(plan, weights)
     loaders = make_loaders(plan, config, intensity)
+
     if steps is not None:
         # To compute class weights would need every scan; their values do not change the speed.
         uniform = class_weights(np.ones(weights.taxonomy.size)) if config.class_weights else None

@@ -217,9 +217,8 @@ def _frame(recipe: Recipe, taxonomy: Taxonomy, earlier: Weights | None) -> Weigh
 
 def _earlier_weights(out: Path) -> Weights | None:
     """Return weights that an earlier call has written into the folder of a run; None if none."""
-    paths = [out / "weights.safetensors"]
-    paths += [out / stage / "last.safetensors" for stage in ("rv", "bev")]
-    for path in paths:
+    for name in ("weights", "rv/last", "bev/last"):
+        path = out / f"{name}.safetensors"
         if path.is_file():
             return load(path)
     return None

@@ -167,8 +167,8 @@ def try_out(plan: Plan, stage: StageName | Literal["all"]) -> Iterator[str]:
     Raises:
         InputError: if the stage trains none of the networks, or a GPU's memory does not suffice.
     """
-    names = [name for name in ("rv", "bev") if stage in (name, "all")]
-    if not names:
+    names = ("rv", "bev") if stage == "all" else (stage,)
+    if stage == "head":
         raise InputError(
             f"expected --stage rv, bev or all for a dry run, found {stage}; give one of these"
         )

@@ -102,7 +102,7 @@ class Stage(L.LightningModule):
         """
         if isinstance(batch, InputError):
             raise batch
-        return tuple(self._in_precision(values) for values in batch)
+        return tuple(map(self._in_precision, batch))
 
     def check_finite(self, loss: Tensor, where: str) -> None:
         """Check a loss before it spoils the weights; raise InputError if it is infinite or NaN."""
