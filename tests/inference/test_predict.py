@@ -201,13 +201,13 @@ def test_a_killed_run_goes_on_where_it_stopped(
         process = subprocess.Popen(
             [sys.executable, "-c", SLOW_CLI, *command.split()], stdout=subprocess.DEVNULL
         )
-        while len(list(out.glob("*.label"))) < 3 * kill and process.poll() is None:
+        while len(list(out.glob("0*.label"))) < 3 * kill and process.poll() is None:
             time.sleep(0.005)
         process.kill()
         process.wait()
         assert list(out.glob(".unfinished-*")), "the run was over before it was killed"
         check_kept(out, times)
-        times = {path.name: path.stat().st_mtime_ns for path in out.glob("*.label")}
+        times = {path.name: path.stat().st_mtime_ns for path in out.glob("0*.label")}
 
     assert run_cli(*command.split()) == (0, "")
     check_same(out, whole)
@@ -250,7 +250,7 @@ def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_p
 
 def times_of(folder: Path) -> dict[str, int]:
     """Return when each label file was written."""
-    return {path.name: path.stat().st_mtime_ns for path in folder.glob("*.label")}
+    return {path.name: path.stat().st_mtime_ns for path in folder.glob("0*.label")}
 
 
 def said_by(command: str, capsys: pytest.CaptureFixture[str]) -> str:
