@@ -20,6 +20,7 @@ from typing import Any
 import laspy
 import numpy as np
 import pytest
+import torch
 from pypcd4 import Encoding, PointCloud
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from rosbags.typesys import Stores, get_typestore
@@ -31,6 +32,7 @@ from amvnet.data.formats.pcd import unpack_lzf
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.data.formats.registry import read_cloud
 from amvnet.scan import Scan
+from amvnet.sensors.lidars import Sensor
 
 from fixtures.scan_writers import (
     FLOATS,
@@ -346,6 +348,49 @@ def test_arrays_with_named_columns_and_of_either_order_are_read(tmp_path: Path) 
 def test_an_archive_with_no_clear_array_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", left=some_points(), right=some_points())
     fails(lambda: read_scan(tmp_path / "a.npz"), "left", "points")
+
+
+def test_an_archive_that_open3d_writes_is_read(tmp_path: Path) -> None:
+    points = some_points()
+    np.savez(tmp_path / "a.npz", positions=points[:, :3], intensity=points[:, 3:])
+    np.testing.assert_array_equal(read_scan(tmp_path / "a.npz").points, points)
+
+
+def test_a_ring_that_is_the_same_for_all_points_is_none(tmp_path: Path) -> None:
+    """Some drivers fill the column with zeros: it would be one row of the range image."""
+    x, y, z, intensity = some_points().T
+    for ring in (0, 5):
+        columns = {"x": x, "y": y, "z": z, "intensity": intensity, "ring": np.full(60, ring)}
+        np.savez(tmp_path / "a.npz", **columns)
+        assert read_scan(tmp_path / "a.npz").ring is None
+
+
+def test_a_file_of_pytorch_is_told_from_packed_scans(tmp_path: Path) -> None:
+    torch.save(torch.from_numpy(some_points()), tmp_path / "a.pt")
+    fails(lambda: read_scan(tmp_path / "a.pt"), "a pickle of PyTorch", "numpy.save")
+
+
+def test_an_mcap_file_without_messages_of_ros_2_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    for profile in (b"", b"ros1"):
+        strings = len(profile).to_bytes(4, "little") + profile + bytes(4)
+        header = b"\x01" + len(strings).to_bytes(8, "little") + strings
+        path.write_bytes(b"\x89MCAP0\r\n" + header + bytes(100))
+        fails(
+            lambda: open_bag(path, ".mcap"),
+            f"profile ros2, found '{profile.decode()}'",
+            "PointCloud2",
+        )
+
+
+def test_the_offset_that_the_error_for_map_coordinates_names_helps(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    points = some_points().astype(float)
+    points[:, :3] += (500_000, 5_400_000, 100)
+    np.save(path, points)
+    fails(lambda: read_scan(path), "--offset -x,-y,-z")
+    moved = Sensor(offset=(-500_000, -5_400_000, -100)).to_level(read_cloud(path).xyz)
+    np.testing.assert_allclose(moved, some_points()[:, :3], atol=1e-3)
 
 
 def test_intensities_and_rings_in_arrays_of_their_own_are_read(tmp_path: Path) -> None:

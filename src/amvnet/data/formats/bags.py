@@ -39,6 +39,8 @@ LISTED = 10  # topics in a message
 
 CHUNK = 1 << 20  # bytes that are unpacked at a time
 MIN_MESSAGE = 16  # bytes of a bag for each message, compressed ones too
+PROFILE = 17  # bytes of an MCAP file before its profile, a text after its length
+LONGEST_PROFILE = 20
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
@@ -94,11 +96,26 @@ def _open_reader(path: Path, ending: str) -> Any:
         ".db3": open_database,
         FOLDER: DirectoryReader,
     }
+    if ending == ".mcap":
+        _check_profile(path)
     reader = readers[ending](path)
     if ending == FOLDER:
         reader.STORAGE_PLUGINS = {"mcap": McapReader, "sqlite3": open_database}
     reader.open()
     return reader
+
+
+def _check_profile(path: Path) -> None:
+    """Raise InputError if the messages of an MCAP file are not those of ROS 2."""
+    with path.open("rb") as file:
+        file.seek(PROFILE)
+        length = int.from_bytes(file.read(4), "little")
+        profile = file.read(min(length, LONGEST_PROFILE)).decode("latin-1")
+    if profile != "ros2":
+        raise InputError(
+            f"{path}: expected an MCAP file with the profile ros2, found {profile!a}; write the "
+            "scans as PointCloud2 messages of ROS 2, or as .pcd"
+        )
 
 
 def _check_unpacked(folder: Path) -> None:

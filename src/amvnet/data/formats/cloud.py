@@ -179,7 +179,7 @@ def _why_unusable(xyz: np.ndarray) -> str:
         )
     return (
         f"expected metres from the sensor, found every point farther than {FARTHEST / 1000:g} km, "
-        "as in map coordinates; give the sensor's position with --offset"
+        "as in map coordinates; subtract the sensor's position x,y,z with --offset -x,-y,-z"
     )
 
 
@@ -319,14 +319,14 @@ def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
     """Return (N,) values as int64 ring indices, 0 for those that are not finite.
 
     Returns:
-        (N,) int64; None if there are no values, or one is negative, too large or not a whole
-        number.
+        (N,) int64; None if there are no values, all are the same, or one is negative, too large or
+        not a whole number.
     """
     if values is None or not len(values):
         return None
 
     finite = np.where(np.isfinite(values), values, 0)
     is_whole = np.array_equal(finite, np.round(finite))
-    if not is_whole or finite.min() < 0 or finite.max() >= MOST_RINGS:
+    if not is_whole or not 0 <= finite.min() < finite.max() < MOST_RINGS:
         return None
     return finite.astype(np.int64)

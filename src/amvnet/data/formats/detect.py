@@ -37,8 +37,8 @@ UNREADABLE = {
         "MMDetection3D",
     ),
     ".parquet": (
-        "Parquet, the format of Waymo's version 2",
-        "convert it to KITTI's .bin, for example with OpenPCDet or MMDetection3D",
+        "Parquet, such as Waymo's version 2",
+        "save the points of each scan as .feather, for example with pandas' to_feather",
     ),
     ".lvx": ("a recording of Livox Viewer", "convert it to a bag with Livox's lvx_to_rosbag"),
     ".lvx2": ("a recording of Livox Viewer", "convert it to .pcd or .las in Livox Viewer"),
@@ -47,6 +47,9 @@ UNREADABLE = {
     ".ptx": ("a scan of Leica's Cyclone", "export it as .e57, or as .ply with CloudCompare"),
     ".obj": ("a mesh", "export its points as .ply, for example with CloudCompare"),
     ".stl": ("a mesh", "export its points as .ply, for example with CloudCompare"),
+    ".vtk": ("a file of VTK", "save its points as .ply, for example with ParaView"),
+    ".vtp": ("a file of VTK", "save its points as .ply, for example with ParaView"),
+    ".osf": ("a recording of Ouster", "convert it with ouster-cli source FILE save out.csv"),
     ".mat": ("variables of MATLAB", "write the cloud with pcwrite as .pcd"),
     ".pkl": ("a pickle, which can run any program", "save the points with numpy.save"),
     ".pickle": ("a pickle, which can run any program", "save the points with numpy.save"),
@@ -100,8 +103,10 @@ def ending_of(path: Path) -> str:
             f"{path}: expected a file that can be read, found {error.strerror}; check it"
         ) from None
     ending = _begins_as(head[:BEGINNING])
+    if ending == ".zip":
+        return _ending_of_zip(path)
     if ending is not None:
-        return ".npz" if ending == ".zip" and _has_arrays(path) else ending
+        return ending
 
     named = named_ending(path)
     if find_table(head) is not None:
@@ -125,6 +130,18 @@ def _begins_as(beginning: bytes) -> str | None:
     return None
 
 
+def _ending_of_zip(path: Path) -> str:
+    """Return ".npz" for the arrays of NumPy in a zip file, else ".zip".
+
+    Raises:
+        InputError: if its name is that of files that are not read, such as PyTorch's.
+    """
+    if _has_arrays(path):
+        return ".npz"
+    _check_name(path)
+    return ".zip"
+
+
 def _has_arrays(path: Path) -> bool:
     """Return whether a zip file is one of NumPy's; a broken one is, if its name says so."""
     try:
@@ -140,16 +157,20 @@ def _guess_ending(path: Path) -> str:
     Raises:
         InputError: if they do not, or files of this kind are not read.
     """
-    for ending, (content, advice) in UNREADABLE.items():
-        if path.name.lower().endswith(ending):
-            raise InputError(f"{path}: expected a scan file, found {content}; {advice}")
-
+    _check_name(path)
     if guess_rows(path) is not None:
         return ".bin"
     raise InputError(
         f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; "
         "convert it to one"
     )
+
+
+def _check_name(path: Path) -> None:
+    """Raise InputError if files with this name are known, but not read."""
+    for ending, (content, advice) in UNREADABLE.items():
+        if path.name.lower().endswith(ending):
+            raise InputError(f"{path}: expected a scan file, found {content}; {advice}")
 
 
 def named_ending(path: Path) -> str | None:

@@ -28,7 +28,8 @@ from amvnet.data.formats.fields import Arrays, Choose
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
-KEYS = ("points", "xyz", "scan", "arr_0")  # names of the array to read, if there are several
+# Names of the array to read, if there are several.
+KEYS = ("points", "positions", "xyz", "scan", "arr_0")
 FEW = 10  # an array with as few rows and more columns is transposed
 BLOCK = 1 << 20  # bytes read at once
 MOST_COLUMNS = 200  # of an array without names, of which one can be chosen
@@ -53,8 +54,9 @@ def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
 def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     """Read the points of an archive.
 
-    They are its only array, or the one named `points`, `xyz`, `scan` or `arr_0`, with arrays named
-    `intensity` and `ring` next to it; or arrays named `x`, `y`, `z` and so on.
+    They are its only array, or the one named `points`, `positions` (Open3D), `xyz`, `scan` or
+    `arr_0`, with arrays named `intensity` and `ring` next to it; or arrays named `x`, `y`, `z` and
+    so on.
 
     Raises:
         InputError: as `read_npy`, or if there are no such arrays.

@@ -203,7 +203,7 @@ def are_rings(xyz: np.ndarray, values: np.ndarray) -> bool:
     A laser has about as many points as any other, or one elevation: classes have neither.
     """
     ring = ring_indices(values)
-    if ring is None or ring.min() == ring.max():
+    if ring is None:
         return False
 
     points = np.bincount(ring)
