@@ -86,6 +86,15 @@ def test_values_that_fit_nothing_are_refused_and_both_options_named(tmp_path: Pa
     fails(lambda: read_cloud(path), path, "--columns x,y,z,intensity,ring", "--dtype float32")
 
 
+def test_a_table_that_was_written_column_by_column_is_refused(
+    table: np.ndarray, tmp_path: Path
+) -> None:
+    """As the scans of Oxford RobotCar are: all x, then all y and so on."""
+    path = tmp_path / "a.bin"
+    path.write_bytes(row_bytes(table[:, :4].T, "float32"))
+    fails(lambda: read_cloud(path), path, "found values that fit none")
+
+
 def test_the_user_s_columns_count(table: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(row_bytes(table[:, [5, 4, 2, 1, 0, 3]], "float64"))
