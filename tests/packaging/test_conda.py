@@ -16,7 +16,7 @@ PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = PYPROJECT["project"]
 
 # Names on conda-forge, if they differ, and what an extra of a package stands for there.
-CONDA_NAMES = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+CONDA_NAMES = {"torch": "pytorch", "matplotlib": "matplotlib-base", "ray": "ray-data"}
 EXTRAS_OF_OTHERS = {"jsonargparse[signatures]": {"docstring_parser", "typeshed_client"}}
 
 
