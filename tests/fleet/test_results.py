@@ -10,8 +10,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from pyarrow import fs
 
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.errors import InputError
 from amvnet.fleet import results as results_module
 from amvnet.fleet.actors import results_schema
 from amvnet.fleet.drives import Drives, describe_drive, parse_estimates
@@ -129,6 +131,20 @@ def test_a_place_that_cannot_be_written_is_refused_in_one_line(
     (tmp_path / "file").touch()
     fails(lambda: Results(Place.of(f"{tmp_path}/file/out"), SETTINGS), f"{tmp_path}/file")
     fails(lambda: Results(Place.of("s3://none/out"), SETTINGS), "s3://none", "credentials")
+
+
+def test_a_storage_that_does_not_answer_is_refused_in_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Unreachable(fs.FileSystem):
+        @staticmethod
+        def from_uri(uri: str) -> tuple[fs.FileSystem, str]:
+            raise OSError(f"cannot resolve the host of {uri}")
+
+    monkeypatch.setattr("amvnet.fleet.storage.fs.FileSystem", Unreachable)
+    with pytest.raises(InputError, match=r"s3://no-such-bucket: .* check the URL") as error:
+        Place.of("s3://no-such-bucket/scans")
+    assert "\n" not in str(error.value)
 
 
 def test_drives_are_read_as_they_were_measured(out: Place) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import fs
 
-from amvnet.errors import InputError, one_line_errors
+from amvnet.errors import InputError
 from amvnet.files import atomic_write
 
 # Without it, pyarrow uploads even a small file in three requests.
@@ -131,14 +131,18 @@ def reaching(url: str) -> Iterator[None]:
     Raises:
         InputError: if the block cannot reach the storage.
     """
-    with one_line_errors(
-        lambda error: (
-            f"{url}: expected a file or a folder that can be read, found {_first_line(error)}; "
-            "check the URL and the credentials"
-        ),
-        only=(OSError, pa.ArrowException),
-    ):
+    try:
         yield
+    except (OSError, pa.ArrowException) as error:
+        raise _unreachable(url, error) from None
+
+
+def _unreachable(url: str, error: Exception) -> InputError:
+    """Return the error about a storage that cannot be reached."""
+    return InputError(
+        f"{url}: expected a file or a folder that can be read, found {_first_line(error)}; "
+        "check the URL and the credentials"
+    )
 
 
 @cache
@@ -151,7 +155,9 @@ def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
     try:
         return fs.FileSystem.from_uri(f"{root}{OPTIONS.get(scheme, '/')}")
     except pa.ArrowInvalid:
-        pass
+        pass  # not a scheme of pyarrow
+    except OSError as error:
+        raise _unreachable(root, error) from None
     try:
         from fsspec.core import url_to_fs
 
