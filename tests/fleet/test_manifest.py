@@ -195,7 +195,8 @@ def test_the_memory_of_planning_does_not_grow_with_the_names(
         return size
 
     few = peak(20)
-    many = peak(100)
+    # Python may enlarge its table of interned strings meanwhile, but not twice.
+    many = min(peak(100), peak(100))
     assert (many - few) / (80 * DRIVE) < 40
 
 

@@ -142,8 +142,8 @@ def test_a_storage_that_does_not_answer_is_refused_in_one_line(
             raise OSError(f"cannot resolve the host of {uri}")
 
     monkeypatch.setattr("amvnet.fleet.storage.fs.FileSystem", Unreachable)
-    with pytest.raises(InputError, match=r"s3://no-such-bucket: .* check the URL") as error:
-        Place.of("s3://no-such-bucket/scans")
+    with pytest.raises(InputError, match=r"s3://a-bucket-of-no-host: .* check the URL") as error:
+        Place.of("s3://a-bucket-of-no-host/scans")
     assert "\n" not in str(error.value)
 
 
