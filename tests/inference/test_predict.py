@@ -21,6 +21,7 @@ from amvnet.files import atomic_write
 from amvnet.inference.journal import JOURNAL, PATTERN, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan
 from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
+from amvnet.inference.predict import predict as predict_scans
 from amvnet.inference.predict import segment_by
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
@@ -484,3 +485,24 @@ def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
     first, second = pipeline.stream(scans)
     assert isinstance(first, Entry)
     assert isinstance(second, Entry)
+
+
+def test_the_scans_at_a_time_are_those_that_the_caller_asks_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    segmenter = Segmenter(fresh_weights())
+    segmenter.at_once = 1
+    points, _ = street(0)
+    points.tofile(tmp_path / "scan.bin")
+    seen = []
+
+    def note(self: Pipeline, *arguments: object) -> tuple[list[Entry], list[str]]:
+        seen.append(self.execution.at_once)
+        return [], []
+
+    monkeypatch.setattr(Pipeline, "run", note)
+    for execution in (ExecutionOptions(at_once=3), ExecutionOptions()):
+        predict_scans(
+            [str(tmp_path / "scan.bin")], segmenter, OutputOptions(tmp_path), execution=execution
+        )
+    assert seen == [3, 1]

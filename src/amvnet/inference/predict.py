@@ -88,7 +88,7 @@ def predict(
                 scan.written = classes.target
         taxonomy = classes.target
 
-    execution = replace(execution, at_once=segmenter.at_once)
+    execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
     segment = segment_by(segmenter, classes)
     entries, faults = Pipeline(scans, segment, output, taxonomy, execution).run(settings, progress)
 

@@ -61,9 +61,9 @@ def receive(
         (N, 4) float32 x, y, z, intensity; (N,) uint32 class ids with the instance in the upper
         half; (N,) uint8 rings.
     """
-    _, _, _, _, drop, relief, ghost = REFLECTIONS[hits.surface].T
+    base, _, shade, _, drop, relief, ghost = REFLECTIONS[hits.surface].T
     count = len(hits.distance)
-    reflectivity = _reflectivity(hits)
+    reflectivity = base * np.exp(shade * hits.tint)
 
     # The received power falls with the square of the range; a return is lost if noise covers it.
     reach = sensor.reach * np.sqrt(reflectivity * np.maximum(hits.cosine, 1e-3))
@@ -75,7 +75,7 @@ def receive(
     distance[is_ghost] += beyond.astype(np.float32)
     chance[(distance < sensor.min_range) | (distance > sensor.max_range)] = 0
 
-    intensity = _intensity(hits, sensor, lasers, rng)
+    intensity = _intensity(hits, reflectivity, sensor, lasers, rng)
 
     # Parts of the car itself are too near and too glossy to be bright.
     is_own = _hits_own_car(hits, sensor, rng)
@@ -108,16 +108,14 @@ def receive(
     )
 
 
-def _reflectivity(hits: Hits) -> np.ndarray:
-    """Return the (N,) reflectivities of the surfaces that were hit."""
-    base, _, shade, *_ = REFLECTIONS[hits.surface].T
-    return base * np.exp(shade * hits.tint)
-
-
 def _intensity(
-    hits: Hits, sensor: LidarModel, lasers: Lasers, rng: np.random.Generator
+    hits: Hits,
+    reflectivity: np.ndarray,
+    sensor: LidarModel,
+    lasers: Lasers,
+    rng: np.random.Generator,
 ) -> np.ndarray:
-    """Return the (N,) intensities that the device reports, most of them in [0, 1]."""
+    """Return the (N,) intensities in [0, 0.99] that the device reports."""
     _, spread, _, dark, *_ = REFLECTIONS[hits.surface].T
     count = len(hits.distance)
 
@@ -126,7 +124,7 @@ def _intensity(
     is_near = np.exp(-((hits.distance / NEAR) ** 4))
     noise = np.maximum(1 + spread * rng.standard_normal(count, np.float32), 0) ** (1 / sensor.gamma)
 
-    brightness = _reflectivity(hits) * noise * power / (power + sensor.half_power)
+    brightness = reflectivity * noise * power / (power + sensor.half_power)
     brightness /= 1 + (hits.distance / sensor.half_range) ** FADING
     brightness *= 1 - lasers.near_loss[hits.ring] * is_near
 
