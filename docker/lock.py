@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-# All but the Rerun viewer, the tests, and the loggers of other services.
+# All but the tests, the loggers of other services, and the fleet.
 EXTRAS = ("simulate", "formats", "datasets", "e57", "packets", "export", "hub")
 
 # constraints.txt pins torch, which pins these itself, and not all of them are on every machine.

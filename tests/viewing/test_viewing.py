@@ -1,4 +1,4 @@
-"""A page or a recording holds what the scans, labels and networks say, and a browser draws it."""
+"""A page holds what the scans, labels and networks say, and a browser draws it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ import base64
 import hashlib
 import os
 import re
-import sys
+import tempfile
+import webbrowser
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +23,6 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.evaluation.scoring import labels_by_method
 from amvnet.inference.segmenter import Segmenter
 from amvnet.viewing import page as pages
-from amvnet.viewing import rerun_log
 from amvnet.viewing.frames import RIGHT, Frame
 from amvnet.weights.file import save
 
@@ -409,18 +407,17 @@ def test_a_mistake_gets_one_line(line: str, world: Path, tmp_path: Path) -> None
     assert not files(tmp_path)
 
 
-def test_without_rerun_the_line_says_what_to_install(
+def test_without_a_file_a_temporary_page_opens_in_the_browser(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    for options in ((), ("--save", tmp_path / "r.rrd")):
-        code, message = run_cli("view", world / "data", *options)
-        assert code == 2
-        assert message.count("\n") == 1
-        assert 'pip install "amvnet[view]"' in message
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    assert run_cli("view", world / "data") == (0, "")
 
-    assert run_cli("view", world / "data", "--html", tmp_path / "p.html")[0] == 0
-    assert files(tmp_path) == {"p.html"}
+    (page,) = tmp_path.glob("*/scan.html")
+    assert opened == [page.as_uri()]
+    assert len(scan_names(read_page(page))) == 5
 
 
 # ---- what a browser draws
@@ -515,59 +512,6 @@ def test_a_hostile_name_is_shown_and_not_run(tmp_path: Path, browser: Browser) -
     assert "img" not in tags(state["dom"])
 
 
-# ---- Rerun
-
-
-class Recording:
-    """The values in a recording, by entity, step of the timeline and component."""
-
-    def __init__(self, path: Path) -> None:
-        reader = pytest.importorskip("rerun.chunk").RrdReader
-        self.batches: dict[str, list[Any]] = {}
-        for chunk in reader(path).stream():
-            self.batches.setdefault(chunk.entity_path, []).append(chunk.to_record_batch())
-
-    def values(self, entity: str, step: int, component: str) -> list[object]:
-        for batch in self.batches[entity]:
-            for name in batch.schema.names:
-                if not name.endswith(f":{component}"):
-                    continue
-                steps = batch.column("scan").to_pylist()
-                if step in steps:
-                    values = batch.column(name)[steps.index(step)].as_py()
-                    assert isinstance(values, list)
-                    return values
-        raise AssertionError(f"expected {component} of {entity} at step {step}, found none")
-
-
-def test_a_recording_reads_back(world: Path, tmp_path: Path, dataset: SemanticKitti) -> None:
-    pytest.importorskip("rerun.chunk")
-    options = ("--sequences", "08", "--save", tmp_path / "r.rrd")
-    weights = world / "w.safetensors"
-    assert run_cli("view", world / "data", "--weights", weights, *options)[0] == 0
-
-    recording = Recording(tmp_path / "r.rrd")
-    segmenter = Segmenter(world / "w.safetensors")
-    for step, record in enumerate(dataset.records(["08"])):
-        scan = dataset.read(record)
-        assert scan.labels is not None
-        assert recording.values("/truth", step, "class_ids") == scan.labels.tolist()
-
-        labels, uncertain = labels_by_method(segmenter, scan)
-        assert uncertain is not None
-        for method, ids in labels.items():
-            assert recording.values(f"/labels/{method}", step, "class_ids") == ids.tolist()
-        positions = recording.values("/uncertain", step, "positions")
-        np.testing.assert_array_equal(positions, scan.points[uncertain, :3])
-
-        wrong = (scan.labels > 0) & (labels["rv"] != scan.labels)
-        positions = recording.values("/errors/rv", step, "positions")
-        np.testing.assert_array_equal(positions, scan.points[wrong, :3])
-        percent = 100 * wrong.sum() / (scan.labels > 0).sum()
-        shares = recording.values("/percent/wrong/rv", step, "scalars")
-        assert shares == pytest.approx([percent])
-
-
 # ---- real scans, and the page of the documentation
 
 
@@ -585,18 +529,14 @@ def test_the_commands_of_the_documentation_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("embreex")
-    windows: list[int] = []
-    monkeypatch.setattr(rerun_log, "check_window", lambda: None)
-    monkeypatch.setattr(rerun_log, "open_window", lambda frames, taxonomy: windows.append(1))
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
     monkeypatch.chdir(tmp_path)
 
     for program, *command in commands_of("docs/viewing.md"):
-        if program != "amvnet" or ("--save" in command and find_spec("rerun") is None):
-            continue
+        assert program == "amvnet"
         assert run_cli(*command) == (0, ""), command
-        for option in ("--html", "--save"):
-            if option in command:
-                path = tmp_path / command[command.index(option) + 1]
-                assert path.stat().st_size > 0
-
-    assert windows
+        if "--html" in command:
+            path = tmp_path / command[command.index("--html") + 1]
+            assert path.stat().st_size > 0
+    assert len(opened) == 1

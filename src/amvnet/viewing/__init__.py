@@ -1,1 +1,1 @@
-"""Scans in 3D: a page for the browser, or Rerun."""
+"""Scans in 3D, on a page for the browser."""

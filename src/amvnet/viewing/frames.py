@@ -55,15 +55,6 @@ class Frame:
     uncertain: np.ndarray | None = None
     disagreement: np.ndarray | None = None
 
-    def errors(self, method: str) -> np.ndarray | None:
-        """Return the points that a method gets wrong, (N,) bool; None without ground truth.
-
-        Points without a true class are never wrong.
-        """
-        if self.truth is None:
-            return None
-        return (self.truth > 0) & (self.labels[method] != self.truth)
-
 
 @dataclass(frozen=True)
 class LabelSource:

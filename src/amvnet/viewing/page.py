@@ -89,14 +89,22 @@ def show(result: Segmentation, path: Path | str | None = None, open_browser: boo
         InputError: if the file cannot be written.
     """
     origin = result.require_origin()
-    if path is None:
-        path = Path(tempfile.mkdtemp(prefix="amvnet-")) / "scan.html"
-
     title = Path(origin.scan.name).name or "scan"
-    page = write_page(path, [frame_of(result, origin)], origin.taxonomy, title)
+    frame = frame_of(result, origin)
+    page = write_page(path or temporary_page(), [frame], origin.taxonomy, title)
     if open_browser:
-        webbrowser.open(page.resolve().as_uri())
+        open_page(page)
     return page
+
+
+def temporary_page() -> Path:
+    """Return the path of a page in a new temporary folder."""
+    return Path(tempfile.mkdtemp(prefix="amvnet-")) / "scan.html"
+
+
+def open_page(path: Path) -> None:
+    """Open a page in the browser of this machine, if it has one."""
+    webbrowser.open(path.resolve().as_uri())
 
 
 def write_page(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy, title: str) -> Path:
