@@ -147,7 +147,7 @@ def test_names_colours_and_raw_ids_are_aligned_with_ids(result: Segmentation) ->
     assert result.raw_ids.dtype == np.uint32
 
 
-@pytest.mark.parametrize("kind", ["label", "npy", "ply", "pcd", "las"])
+@pytest.mark.parametrize("kind", ["label", "npy", "ply", "pcd"])
 def test_a_result_is_saved_in_the_format_of_the_ending(
     kind: str, result: Segmentation, tmp_path: Path
 ) -> None:

@@ -367,7 +367,7 @@ def test_a_ring_that_is_the_same_for_all_points_is_none(tmp_path: Path) -> None:
 
 def test_a_file_of_pytorch_is_told_from_packed_scans(tmp_path: Path) -> None:
     torch.save(torch.from_numpy(some_points()), tmp_path / "a.pt")
-    fails(lambda: read_scan(tmp_path / "a.pt"), "a pickle of PyTorch", "numpy.save")
+    fails(lambda: read_scan(tmp_path / "a.pt"), "variables of a program", "numpy.save")
 
 
 def test_an_mcap_file_without_messages_of_ros_2_is_refused(tmp_path: Path) -> None:

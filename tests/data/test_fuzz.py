@@ -20,12 +20,12 @@ from amvnet.data.formats.find import list_scans
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
-from fixtures.extra_writers import vlp16_packet, write_capture, write_e57, write_sweep
+from fixtures.extra_writers import write_e57, write_sweep
 from fixtures.scan_writers import WRITERS, some_points, write_bag2
 
 CASES = 200  # of each format
 METADATA = "drive/metadata.yaml"
-EXTRA = {"scan.feather": "pyarrow", "scan.e57": "pye57", "drive.pcap": "velodyne_decoder"}
+EXTRA = {"scan.feather": "pyarrow", "scan.e57": "pye57"}
 PACKED = ("kitti.bin.gz", "kitti.zip")
 FORMATS = [*WRITERS, *PACKED, METADATA, *EXTRA]
 HEADER = 400  # bytes: most headers are within them
@@ -108,8 +108,6 @@ def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     if find_spec("pye57"):
         axes = {f"cartesian{axis}": some_points()[:, i] for i, axis in enumerate("XYZ")}
         write_e57(folder / "scan.e57", [{key: xyz.astype(float) for key, xyz in axes.items()}])
-    packets = [vlp16_packet(480 * index % 36000, index * 1327) for index in range(100)]
-    write_capture(folder / "drive.pcap", packets)
     return {name: (folder / name).read_bytes() for name in FORMATS if (folder / name).exists()}
 
 

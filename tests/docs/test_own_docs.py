@@ -127,9 +127,11 @@ def test_the_tables_of_formats_are_those_of_the_code() -> None:
             extras[ending] = needs.strip("`[] ")
     packages = {ending: extra for ending, (extra, *_) in PACKAGES.items() if ending}
     assert list(extras) == list(ENDINGS)
-    assert extras == dict.fromkeys(ENDINGS, "") | packages | {".pcap": "packets"}
+    assert extras == dict.fromkeys(ENDINGS, "") | packages
 
-    rows = [f"| `{ending}`, {found} | {advice} |" for ending, (found, advice) in UNREADABLE.items()]
+    rows = []
+    for endings, content, advice in UNREADABLE:
+        rows.append(f"| `{'`, `'.join(endings)}` | {content} | {advice} |")
     assert unread.splitlines()[2:] == rows
 
 

@@ -3,24 +3,18 @@
 from __future__ import annotations
 
 import os
-import signal
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
-import laspy
 import numpy as np
 import plyfile
 import pytest
 from pypcd4 import PointCloud
-from rosbags.highlevel import AnyReader
 
 from amvnet.cli.commands import predict as verbs
-from amvnet.data.formats.find import list_scans
 from amvnet.data.formats.registry import read_cloud
-from amvnet.data.labels import label_bags
 from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
@@ -31,7 +25,7 @@ from fixtures.worlds import fails, files, fresh_weights, make_streets, run_cli
 
 COUNT = 60
 LOST = 7  # the index of a point with NaN
-WITH_POINTS = ("ply", "pcd", "las")  # kinds of files with coordinates
+WITH_POINTS = ("ply", "pcd")  # kinds of files with coordinates
 
 
 @dataclass(frozen=True)
@@ -66,16 +60,6 @@ def read_pcd(path: Path) -> LabelFile:
     return LabelFile(cloud.pc_data["label"], cloud.numpy(("x", "y", "z")), colors, uncertain)
 
 
-def read_las(path: Path) -> LabelFile:
-    las = laspy.read(path)
-    colors = np.stack([las.red, las.green, las.blue], axis=1) >> 8
-
-    extra = set(las.point_format.extra_dimension_names)
-    assert extra <= {"class", "uncertain"}
-    uncertain = np.asarray(las["uncertain"]) if "uncertain" in extra else None
-    return LabelFile(np.asarray(las["class"]), np.asarray(las.xyz), colors, uncertain)
-
-
 def read_npy(path: Path) -> LabelFile:
     raw = np.load(path, allow_pickle=False)
     assert raw.dtype == np.uint32
@@ -87,7 +71,6 @@ READERS: dict[str, Callable[[Path], LabelFile]] = {
     "npy": read_npy,
     "ply": read_ply,
     "pcd": read_pcd,
-    "las": read_las,
 }
 
 
@@ -107,12 +90,9 @@ def make_scan(
     return xyz, ids.astype(np.uint8), uncertain
 
 
-def check_coordinates(kind: str, xyz: np.ndarray | None, expected: np.ndarray) -> None:
-    """Check the coordinates of a file against the scan's. LAS rounds, and cannot hold NaN."""
+def check_coordinates(xyz: np.ndarray | None, expected: np.ndarray) -> None:
     assert xyz is not None
-    if kind == "las":
-        expected = np.where(np.isfinite(expected), expected, 0)
-    np.testing.assert_allclose(xyz, expected, rtol=0, atol=1e-4 if kind == "las" else 0)
+    np.testing.assert_array_equal(xyz, expected)
 
 
 # --- the files ---
@@ -120,7 +100,7 @@ def check_coordinates(kind: str, xyz: np.ndarray | None, expected: np.ndarray) -
 
 def test_every_kind_has_a_reader_here_and_is_offered_by_the_command_line() -> None:
     assert set(READERS) == set(KINDS)
-    assert {*KINDS, *label_bags.KINDS} == set(get_args(verbs.FormatName))
+    assert set(KINDS) == set(get_args(verbs.FormatName))
 
 
 @pytest.mark.parametrize("with_uncertain", [True, False])
@@ -140,7 +120,7 @@ def test_other_libraries_read_the_files(kind: str, with_uncertain: bool, tmp_pat
     if kind not in WITH_POINTS:
         return
 
-    check_coordinates(kind, content.xyz, xyz)
+    check_coordinates(content.xyz, xyz)
     np.testing.assert_array_equal(content.colors, np.array(SEMANTICKITTI.colors)[ids])
     if with_uncertain:
         np.testing.assert_array_equal(content.uncertain, uncertain)
@@ -169,19 +149,6 @@ def test_float64_takes_no_space_if_float32_is_exact_enough(kind: str, tmp_path: 
     assert path_32.read_bytes() == path_64.read_bytes()
 
 
-def test_points_that_las_cannot_hold_keep_their_rows_and_move_no_others(tmp_path: Path) -> None:
-    xyz, ids, _ = make_scan()
-    xyz[[3, 4, 5]] = [[1e30, 0, 0], [0, -np.inf, 0], [0, 0, 3e5]]
-    fits = ~np.isin(np.arange(COUNT), [3, 4, 5, LOST])
-
-    content = read_las(write_scan_labels(tmp_path / "a", "las", xyz, ids, SEMANTICKITTI))
-    assert content.xyz is not None
-    assert not content.xyz[~fits].any()
-    assert not content.raw[~fits].any()
-    np.testing.assert_allclose(content.xyz[fits], xyz[fits], rtol=0, atol=1e-4)
-    np.testing.assert_array_equal(content.raw[fits], SEMANTICKITTI.to_raw(ids)[fits])
-
-
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("raw", [256, 260, 65535])
 def test_raw_ids_of_more_than_a_byte_survive(kind: str, raw: int, tmp_path: Path) -> None:
@@ -206,7 +173,7 @@ def test_the_files_can_be_read_as_scans_again(kind: str, tmp_path: Path) -> None
     path = write_scan_labels(
         tmp_path / "a", kind, xyz, ids, taxonomy=SEMANTICKITTI, uncertain=uncertain
     )
-    check_coordinates(kind, read_cloud(path).xyz, xyz)
+    check_coordinates(read_cloud(path).xyz, xyz)
 
 
 # --- errors ---
@@ -239,15 +206,6 @@ def test_an_unknown_format_is_named() -> None:
     xyz = np.zeros((1, 3))
     ids = np.zeros(1)
     fails(lambda: write_scan_labels(Path("a"), "xyz", xyz, ids, SEMANTICKITTI), "xyz", "ply")
-
-
-def test_a_missing_extra_is_named(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "laspy", None)
-    message = failure(world, tmp_path, world / "scans/a.bin", "--format", "las")
-    assert 'pip install "amvnet[formats]"' in message
-    assert not files(tmp_path)
 
 
 # --- predict ---
@@ -303,7 +261,7 @@ def test_predict_writes_the_points_of_the_file_though_the_network_gets_others(
         np.testing.assert_array_equal(content.raw, raw)
         if kind in WITH_POINTS:
             assert content.uncertain is not None
-            check_coordinates(kind, content.xyz, xyz)
+            check_coordinates(content.xyz, xyz)
 
 
 def test_uncertain_points_are_those_of_the_segmenter(world: Path, tmp_path: Path) -> None:
@@ -374,127 +332,3 @@ def test_uncertain_points_next_to_scans_are_not_scans(world: Path, tmp_path: Pat
 def test_an_unknown_format_gives_an_error_of_one_line(world: Path, tmp_path: Path) -> None:
     message = failure(world, tmp_path, world / "scans/a.bin", "--format", "xyz")
     assert "ply" in message
-
-
-# --- bags ---
-
-
-@pytest.mark.parametrize("kind", label_bags.KINDS)
-def test_labels_of_a_bag_become_a_bag_with_its_stamps(
-    kind: str, world: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    bag = write_bag1(tmp_path / "drive.bag", {"/top": [some_points(60, seed) for seed in (1, 2)]})
-    options = ("--weights", world / "w.safetensors", "--out", out)
-    assert run_cli("predict", bag, *options, "--format", kind) == (0, "")
-    assert {name for name in files(out) if not name.startswith(".")} == {f"drive.{kind}"}
-    assert not list(out.glob(".drive*"))
-
-    assert run_cli("predict", bag, *options[:2], "--out", tmp_path / "ids")[0] == 0
-    scans = list(zip(list_scans(bag), list_scans(out / f"drive.{kind}"), strict=True))
-    assert len(scans) == 2
-    for index, (scan, labelled) in enumerate(scans):
-        first = scan.read()
-        second = labelled.read()
-        np.testing.assert_array_equal(second.xyz, first.xyz)
-        assert first.message is not None
-        assert second.message == replace(first.message, topic="/top/labels")
-
-        raw = np.fromfile(tmp_path / f"ids/drive/{index:06d}.label", np.uint32)
-        np.testing.assert_array_equal(labels_in(out / f"drive.{kind}", index), raw)
-
-
-def labels_in(path: Path, index: int) -> np.ndarray:
-    """Return the field `label` of a message of a bag."""
-    with AnyReader([path]) as reader:
-        messages = [
-            reader.deserialize(data, connection.msgtype)
-            for connection, _, data in reader.messages()
-        ]
-    message: Any = messages[index]
-    (offset,) = [field.offset for field in message.fields if field.name == "label"]
-    rows = message.data.reshape(-1, message.point_step)
-    return np.ascontiguousarray(rows[:, offset : offset + 4]).view("<u4").ravel()
-
-
-def test_only_bags_become_bags_and_none_is_overwritten(world: Path, tmp_path: Path) -> None:
-    bag = write_bag1(tmp_path / "drive.bag", {"/top": [some_points()]})
-    content = bag.read_bytes()
-    options = ("--weights", world / "w.safetensors", "--format", "bag", "--out")
-    code, message = run_cli("predict", bag, *options, tmp_path)
-    assert (code, message.count("\n")) == (2, 1)
-    assert bag.read_bytes() == content
-
-    code, message = run_cli("predict", world / "scans", *options, tmp_path / "out")
-    assert (code, message.count("\n")) == (2, 1)
-    assert "--format bag" in message
-
-
-def test_parts_of_a_killed_run_on_other_scans_stay_out_of_a_bag(
-    world: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    clouds = [some_points(60, seed) for seed in (1, 2, 3)]
-    bag = write_bag1(tmp_path / "drive.bag", {"/front": clouds, "/top": clouds[:2]})
-    options = ("--weights", world / "w.safetensors", "--format", "bag", "--out", out)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(label_bags, "_write_bag", interrupt)
-        assert run_cli("predict", bag, "--topic", "/front", *options)[0] == 130
-
-    assert run_cli("predict", bag, "--topic", "/top", *options) == (0, "")
-    assert len(list(list_scans(out / "drive.bag"))) == 2
-
-
-def test_bags_that_were_written_before_a_run_was_killed_are_its_own(
-    world: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    (tmp_path / "bags").mkdir()
-    for name in ("a", "b"):
-        write_bag1(tmp_path / f"bags/{name}.bag", {"/top": [some_points()]})
-
-    write_bag = label_bags._write_bag
-
-    def write_first(path: Path, parts: Sequence[Path], kind: str) -> None:
-        if path.name == "b.bag":
-            interrupt()
-        write_bag(path, parts, kind)
-
-    options = ("--weights", world / "w.safetensors", "--format", "bag", "--out", out)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(label_bags, "_write_bag", write_first)
-        assert run_cli("predict", tmp_path / "bags", *options)[0] == 130
-    assert run_cli("predict", tmp_path / "bags", *options) == (0, "")
-    assert {name for name in files(out) if not name.startswith(".")} == {"a.bag", "b.bag"}
-
-
-def interrupt(*_: object) -> None:
-    """Do as Ctrl-C does."""
-    signal.raise_signal(signal.SIGINT)
-
-
-def test_a_bag_of_labels_is_replaced_but_no_other_bag(world: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    bag = write_bag1(tmp_path / "drive.bag", {"/top": [some_points()]})
-    command = (
-        "predict",
-        bag,
-        "--weights",
-        world / "w.safetensors",
-        "--format",
-        "bag",
-        "--out",
-        out,
-    )
-    for _ in range(2):
-        assert run_cli(*command) == (0, "")
-
-    (out / "drive.bag").write_bytes(b"of the user")
-    code, message = run_cli(*command)
-    assert (code, message.count("\n")) == (2, 1)
-    assert "--overwrite" in message
-    assert (out / "drive.bag").read_bytes() == b"of the user"
-    assert not list(out.glob(".drive*"))
-
-    assert run_cli(*command, "--overwrite") == (0, "")
-    assert labels_in(out / "drive.bag", 0).shape == (len(some_points()),)

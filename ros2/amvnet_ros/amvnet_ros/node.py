@@ -22,12 +22,17 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header, String
 
-from amvnet.data.formats.cloud import NANOSECONDS
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE
-from amvnet.data.labels.messages import FIELD_TYPE, HEADER_TYPE, TIME_TYPE, encode_labels
 from amvnet.errors import InputError
 from amvnet.threads import wait_passively
 from amvnet_ros.health import Health, Labelled
+from amvnet_ros.messages import (
+    FIELD_TYPE,
+    HEADER_TYPE,
+    NANOSECONDS,
+    TIME_TYPE,
+    encode_labels,
+)
 from amvnet_ros.newest import NewestOnly
 from amvnet_ros.segmentation import CloudSegmenter, LabelledCloud, Settings
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Message, reading
+from amvnet.data.formats.cloud import reading
 from amvnet.data.formats.pointcloud2 import read_message
 from amvnet.data.labels.writers import LabelledPoints
+from amvnet_ros.messages import Message
 
 
 def _parameter(default: Any, description: str) -> Any:

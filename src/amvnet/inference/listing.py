@@ -16,9 +16,8 @@ from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.labels import label_bags
 from amvnet.data.labels.readers import read_scan_labels
-from amvnet.data.labels.writers import KINDS, label_points, write_scan_labels
+from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
@@ -72,8 +71,7 @@ class InputScan(Protocol):
         """Return the path of the file of its labels, relative to a folder of predictions.
 
         Args:
-            kind: the format for scan files; datasets have their own. Of bags, the file is a part of
-                the bag.
+            kind: the format for scan files; datasets have their own.
         """
 
     def load(self, labels: bool = False) -> LoadedScan:
@@ -164,8 +162,6 @@ class FileScan:
         self.is_normalised = reader.is_normalising
 
     def labels_path(self, kind: str) -> Path:
-        if kind in label_bags.KINDS:
-            return label_bags.part_path(self.name, kind)
         return Path(f"{self.name}.{kind}")
 
     def load(self, labels: bool = False) -> LoadedScan:
@@ -181,17 +177,15 @@ class FileScan:
     def write_labels(
         self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
     ) -> Path:
-        ids = result.labels
-        uncertain = result.uncertain if result.has_two_networks else None
-        xyz = loaded.file_xyz
-        assert xyz is not None
-
-        if kind in label_bags.KINDS:
-            assert loaded.message is not None  # predict checks that the scan is from a bag
-            points = label_points(xyz, ids, taxonomy, uncertain)
-            return label_bags.write_part(folder, self.name, kind, loaded.message, points)
-        path = inside(folder, self.name)
-        return write_scan_labels(path, kind, xyz, ids, taxonomy, uncertain=uncertain)
+        assert loaded.file_xyz is not None
+        return write_scan_labels(
+            inside(folder, self.name),
+            kind,
+            loaded.file_xyz,
+            result.labels,
+            taxonomy,
+            uncertain=result.uncertain if result.has_two_networks else None,
+        )
 
 
 def list_inputs(

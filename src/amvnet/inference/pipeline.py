@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.formats.registry import COLUMN_READERS
-from amvnet.data.labels.label_bags import KINDS as BAG_KINDS
 from amvnet.data.labels.writers import check_kind, write_uncertain
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
@@ -43,15 +42,14 @@ class OutputOptions:
 
     Attributes:
         folder: the folder of predictions.
-        kind: the format of scan files' labels, one of `writers.KINDS` or `label_bags.KINDS`;
-            datasets have their own.
+        kind: the format of scan files' labels, one of `writers.KINDS`; datasets have their own.
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.
         uncertain: also write (N,) bool, the uncertain points, as `.uncertain.npy`.
         overwrite: replace files that this package did not write, too.
 
     Raises:
-        InputError: if the format is unknown, or a library for it is missing.
+        InputError: if the format is unknown.
     """
 
     folder: Path
@@ -61,8 +59,7 @@ class OutputOptions:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.kind not in BAG_KINDS:
-            check_kind(self.kind)
+        check_kind(self.kind)
 
     def paths_of(self, scan: InputScan) -> list[Path]:
         """Return the paths of a scan's files, relative to the folder."""

@@ -9,12 +9,9 @@ from itertools import groupby
 from typing import Any
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.data.formats.cloud import require
-from amvnet.data.formats.detect import BAGS, FOLDER
-from amvnet.data.labels import label_bags
 from amvnet.errors import InputError
 from amvnet.inference.journal import Entry
-from amvnet.inference.listing import DatasetScan, FileScan, InputScan, ScanOptions, list_inputs
+from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import (
     ExecutionOptions,
     OutputOptions,
@@ -29,7 +26,6 @@ from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
-from amvnet.written import WrittenFiles
 
 NAMED = 10  # recordings with doubtful labels, each in a line
 # What to try if the labels are doubtful.
@@ -77,10 +73,6 @@ def predict(
 
     normaliser = normaliser_for(segmenter.weights, sensor, say)
     scans, taxonomy = list_inputs(inputs, options, segmenter.taxonomy, normaliser, say)
-    writes_bags = output.kind in label_bags.KINDS
-    if writes_bags:
-        _check_bags(scans, output)
-
     settings = _settings(segmenter, output, normaliser.sensor, options, classes)
     if classes is not None:
         for scan in scans:
@@ -92,49 +84,10 @@ def predict(
     segment = segment_by(segmenter, classes)
     entries, faults = Pipeline(scans, segment, output, taxonomy, execution).run(settings, progress)
 
-    if writes_bags and execution.processes.first:
-        _write_bags(scans, output)
     if method.has_two_networks:
         report(entries, segmenter.usual_uncertain, say)
     check_faults(faults, len(scans))
     return len(scans)
-
-
-def _check_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
-    """Check that labels can become bags.
-
-    Raises:
-        InputError: if scans are in other files, or in these bags, or a bag of the user would be
-            replaced.
-    """
-    require("bags", "formats", "rosbags")
-    bags = set()
-    for scan in scans:
-        if not isinstance(scan, FileScan):
-            continue
-        if scan.scan.ending not in (FOLDER, *BAGS):
-            raise InputError(
-                f"{scan.path}: expected a bag for --format {output.kind}, found another file; "
-                "choose another format, such as ply"
-            )
-        bag = label_bags.bag_path(scan.name, output.kind)
-        bags.add(bag)
-        if (output.folder / bag).resolve() == scan.path.resolve():
-            raise InputError(
-                f"{scan.path}: expected another folder for the labels, found the bag's own; "
-                "change --out"
-            )
-
-    if not output.overwrite:
-        WrittenFiles(output.folder).check(sorted(bags))
-
-
-def _write_bags(scans: Sequence[InputScan], output: OutputOptions) -> None:
-    """Join the labels of the scans to bags."""
-    names = [scan.name for scan in scans if isinstance(scan, FileScan)]
-    written = WrittenFiles(output.folder)
-    written.claim({label_bags.bag_path(name, output.kind) for name in names})
-    written.finish(label_bags.join_parts(output.folder, names, output.kind))
 
 
 def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment:

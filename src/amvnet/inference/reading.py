@@ -11,7 +11,7 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_with_classes
 from amvnet.data.datasets.own import OwnScans
-from amvnet.data.formats.cloud import Cloud, Message
+from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError
@@ -36,13 +36,11 @@ class LoadedScan:
             first scan.
         file_xyz: (N, 3) the coordinates as they are in the scan's file; None for a scan of a
             dataset.
-        message: of a bag, where the scan is from.
     """
 
     scan: Scan
     sensor: str = ""
     file_xyz: np.ndarray | None = None
-    message: Message | None = None
 
 
 class FileReader:
@@ -83,7 +81,7 @@ class FileReader:
             normalised, title = self.normaliser.assign(cloud, scan.source)
 
         file_xyz = cloud.xyz if cloud.file_xyz is None else cloud.file_xyz
-        return LoadedScan(normalised, title, file_xyz, cloud.message)
+        return LoadedScan(normalised, title, file_xyz)
 
     def _read_and_keep(self, scan: NamedScan) -> Cloud:
         """Read one of the first scans of a source, and forget those of others."""

@@ -168,15 +168,15 @@ class Segmentation:
     def save(self, path: Path | str) -> Path:
         """Write the labels, in the format of the path's ending; an existing file is replaced.
 
-        `.label` and `.npy` hold the raw ids; `.ply`, `.pcd` and `.las` the points too, coloured by
-        class, with the coordinates of the scan's file (`write_scan_labels` describes them).
+        `.label` and `.npy` hold the raw ids; `.ply` and `.pcd` the points too, coloured by class,
+        with the coordinates of the scan's file (`write_scan_labels` describes them).
 
         Returns:
             The path.
 
         Raises:
-            InputError: if the ending is another one, the path is that of the scan itself, a library
-                for the format is missing, or the file cannot be written.
+            InputError: if the ending is another one, the path is that of the scan itself, or
+                the file cannot be written.
         """
         origin = self.require_origin()
         path = Path(path)

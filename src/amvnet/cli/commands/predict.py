@@ -23,7 +23,7 @@ from amvnet.progress import counted
 if TYPE_CHECKING:
     from amvnet.data.formats.rows import RowLayout
 
-FormatName = Literal["label", "npy", "ply", "pcd", "las", "bag", "mcap"]
+FormatName = Literal["label", "npy", "ply", "pcd"]
 
 
 def predict(
@@ -61,8 +61,7 @@ def predict(
         scores: also write the probabilities of both networks.
         resume: continue an earlier run into the folder: segment only the scans that are new or were
             not done, with the same weights and options.
-        format: of scan files' labels: raw ids alone (label, npy), coloured points (ply, pcd, las),
-            or, of bags, a bag of coloured points with the stamps of the scans (bag, mcap).
+        format: of scan files' labels: raw ids alone (label, npy), or coloured points (ply, pcd).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         classes: write the ids of these classes, to which those of the weights are mapped: coarse,
             or a YAML file.

@@ -4,27 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from amvnet.data.formats.cloud import Cloud, Message, reading
+from amvnet.data.formats.cloud import Cloud, reading
 from amvnet.data.formats.detect import FOLDER
-from amvnet.data.formats.livox import TYPES as LIVOX
-from amvnet.data.formats.livox import read_custom_message, read_header
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
 from amvnet.data.formats.recording import Decode, Recording
 from amvnet.errors import InputError
 
-TYPES = (CLOUD_TYPE, *LIVOX)
-KINDS = "PointCloud2 or Livox CustomMsg"
-
-# Messages with the packets of a sensor, by the beginning of their type, and what turns them into
-# PointCloud2 while the bag is played.
-PACKETS = {
+# Other messages of sensors, by the beginning of their type, and what turns them into PointCloud2
+# while the bag is played.
+DRIVERS = {
     "velodyne_msgs/": "velodyne_pointcloud (ros2 launch velodyne_pointcloud "
     "velodyne_transform_node-VLP16-launch.py)",
     "ouster_ros/": "ouster_ros (ros2 launch ouster_ros replay.launch.xml bag_file:=BAG)",
@@ -34,6 +28,7 @@ PACKETS = {
     "rslidar_msg": "rslidar_sdk with msg_source 2",
     "robosense": "rslidar_sdk with msg_source 2",
     "nebula_msgs/": "nebula_ros with launch_hw:=false",
+    "livox_ros_driver": "livox_to_pointcloud2",
 }
 LISTED = 10  # topics in a message
 
@@ -51,7 +46,7 @@ def open_bag(path: Path, ending: str, topic: str | None = None) -> Recording:
     Args:
         path: the file, or the folder of a ROS 2 bag.
         ending: the storage format: `.bag`, `.mcap`, `.db3`, or empty for a folder.
-        topic: the topic of the scans; None for the only one with PointCloud2 or Livox CustomMsg.
+        topic: the topic of the scans; None for the only one with PointCloud2.
 
     Raises:
         InputError: if the bag cannot be read, or has no such topic, or more than one.
@@ -73,10 +68,9 @@ def _read_messages(path: Path, ending: str, topic: str) -> Iterator[Decode]:
     # A ROS 2 bag serialises in the same way in every storage format.
     is_ros1 = ending == ".bag"
     with closing(_open_reader(path, ending)) as reader:
-        connections = [c for c in reader.connections if c.topic == topic and c.msgtype in TYPES]
-        for connection, time, data in reader.messages(connections=connections):
-            read = _read_pointcloud2 if connection.msgtype == CLOUD_TYPE else _read_livox
-            yield partial(read, data, is_ros1, topic, time)
+        connections = [c for c in _with_scans(reader) if c.topic == topic]
+        for _, _, data in reader.messages(connections=connections):
+            yield partial(_read_message, data, is_ros1)
 
 
 def _open_reader(path: Path, ending: str) -> Any:
@@ -146,42 +140,38 @@ def types_of(is_ros1: bool) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
-def _read_pointcloud2(data: bytes, is_ros1: bool, topic: str, time: int, name: str) -> Cloud:
+def _read_message(data: bytes, is_ros1: bool, name: str) -> Cloud:
     types = types_of(is_ros1)
     deserialise = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-    values = deserialise(data, CLOUD_TYPE)
-    message = replace(Message.of(values), topic=topic, time=time)
-    return replace(read_message(values, name), message=message)
-
-
-def _read_livox(data: bytes, is_ros1: bool, topic: str, time: int, name: str) -> Cloud:
-    stamp, frame = read_header(data, is_ros1)
-    cloud = read_custom_message(data, is_ros1, name)
-    return replace(cloud, message=Message(stamp, frame, topic=topic, time=time))
+    return read_message(deserialise(data, CLOUD_TYPE), name)
 
 
 def _count_messages(reader: Any) -> dict[str, int]:
     """Return the number of messages of each topic with scans."""
     counts: dict[str, int] = {}
-    for connection in reader.connections:
-        if connection.msgtype in TYPES:
-            counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+    for connection in _with_scans(reader):
+        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
     return counts
 
 
+def _with_scans(reader: Any) -> list[Any]:
+    """Return the connections of a bag whose messages are scans."""
+    return [each for each in reader.connections if each.msgtype == CLOUD_TYPE]
+
+
 def _describe_others(reader: Any) -> str:
-    """Return what is in a bag without scans, and what turns packets into scans."""
+    """Return what else is in a bag, and what turns messages of sensors into scans."""
     topics = []
     advice = "give a bag with scans"
     for connection in reader.connections:
-        if connection.msgtype in TYPES:
+        if connection.msgtype == CLOUD_TYPE:
             continue
         topics.append(f"{connection.topic} ({connection.msgtype}, {connection.msgcount})")
-        for beginning, driver in PACKETS.items():
+        for beginning, driver in DRIVERS.items():
             if connection.msgtype.startswith(beginning):
                 advice = (
-                    f"{connection.topic} has the packets of a sensor: play the bag with {driver} "
-                    "running, and record the PointCloud2 topic that it publishes"
+                    f"{connection.topic} has other messages of a sensor: play the bag with "
+                    f"{driver} running, and record the PointCloud2 topic that it publishes"
                 )
 
     listing = ", ".join(topics[:LISTED]) or "no topic"
@@ -204,15 +194,15 @@ def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, without
 
     if not counts:
         expected = "a topic" if topic is None else topic
-        raise InputError(f"{path}: expected {expected} with {KINDS}, {without_scans}")
+        raise InputError(f"{path}: expected {expected} with PointCloud2, {without_scans}")
     if topic is not None:
         if topic in counts:
             return topic
         raise InputError(
-            f"{path}: expected {KINDS} under {topic}, found {listing}; give another --topic"
+            f"{path}: expected PointCloud2 under {topic}, found {listing}; give another --topic"
         )
     if len(counts) > 1:
         raise InputError(
-            f"{path}: expected one topic with {KINDS}, found {listing}; choose one with --topic"
+            f"{path}: expected one topic with PointCloud2, found {listing}; choose one with --topic"
         )
     return next(iter(counts))

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from amvnet.scan import FARTHEST, Scan
 # broken.
 MAX_POINTS = 10_000_000
 MAX_BYTES = 32 * MAX_POINTS  # of the points of a packed file
-NANOSECONDS = 1_000_000_000  # of a second
 MOST_RINGS = 256  # a column with larger values does not hold ring indices
 
 # The largest intensities that sensors write: fractions, 8 bits, 16 bits.
@@ -45,32 +43,6 @@ COLUMN_NAMES = {
 
 
 @dataclass(frozen=True)
-class Message:
-    """The ROS message that a cloud is from.
-
-    Attributes:
-        stamp: when the points were measured, nanoseconds since the epoch.
-        frame_id: name of the frame of the coordinates.
-        height: number of rows of an organised cloud, else 1.
-        topic: its topic in a bag.
-        time: when it was recorded, nanoseconds.
-    """
-
-    stamp: int
-    frame_id: str
-    height: int = 1
-    topic: str = ""
-    time: int = 0
-
-    @classmethod
-    def of(cls, message: Any) -> Message:
-        """Return what the header of a deserialised PointCloud2 says."""
-        stamp = message.header.stamp
-        nanoseconds = stamp.sec * NANOSECONDS + stamp.nanosec
-        return cls(nanoseconds, message.header.frame_id, message.height)
-
-
-@dataclass(frozen=True)
 class Cloud:
     """The points of one scan file, in the file's own units and frame.
 
@@ -82,7 +54,6 @@ class Cloud:
         full: the largest possible intensity, or None if the format does not define it.
         note: what the reader had to assume about the file; empty if nothing.
         file_xyz: (N, 3) the coordinates as they are in the file; None if `xyz` are these.
-        message: of a bag, where the cloud is from.
     """
 
     xyz: np.ndarray
@@ -92,7 +63,6 @@ class Cloud:
     full: float | None = None
     note: str = ""
     file_xyz: np.ndarray | None = None
-    message: Message | None = None
 
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.

@@ -6,7 +6,6 @@ import re
 import zipfile
 from pathlib import Path
 
-from amvnet.data.formats.packets import PCAPNG
 from amvnet.data.formats.raw import NUSCENES_ENDING, columns_of
 from amvnet.data.formats.rows import guess_rows
 from amvnet.data.formats.text import ADVICE as TEXT_ADVICE
@@ -25,37 +24,34 @@ ENDINGS = (
     *PACKED,
     *(".las", ".laz"),
     *BAGS,
-    *(".feather", ".e57", ".pcap"),
+    *(".feather", ".e57"),
 )
 
-# Kinds of files that are known, but not read: what they are, and what to do.
-UNREADABLE = {
-    ".pcapng": ("a capture in the newer format", "run Wireshark's editcap -F pcap OLD NEW.pcap"),
-    ".tfrecord": (
-        "Waymo's records",
-        "they need TensorFlow; convert them to KITTI's .bin, for example with OpenPCDet or "
-        "MMDetection3D",
+# Kinds of files that are known, but not read: their endings, what they are, and what to do.
+UNREADABLE = (
+    (
+        (".pcap", ".pcapng", ".lvx", ".lvx2", ".osf"),
+        "the packets of a sensor",
+        "convert them with its maker's software: VeloView writes .csv, PandarView 2 .pcd, Livox "
+        "Viewer .las, ouster-cli source FILE save FILE.csv; or record PointCloud2 with its driver",
     ),
-    ".parquet": (
-        "Parquet, such as Waymo's version 2",
-        "save the points of each scan as .feather, for example with pandas' to_feather",
+    (
+        (".tfrecord", ".parquet"),
+        "records such as Waymo's",
+        "save the points of each scan with numpy.save, or as .feather with pandas' to_feather",
     ),
-    ".lvx": ("a recording of Livox Viewer", "convert it to a bag with Livox's lvx_to_rosbag"),
-    ".lvx2": ("a recording of Livox Viewer", "convert it to .pcd or .las in Livox Viewer"),
-    ".rcp": ("a project of ReCap", "export it as .e57 or .pts"),
-    ".rcs": ("a scan of ReCap", "export it as .e57 or .pts"),
-    ".ptx": ("a scan of Leica's Cyclone", "export it as .e57, or as .ply with CloudCompare"),
-    ".obj": ("a mesh", "export its points as .ply, for example with CloudCompare"),
-    ".stl": ("a mesh", "export its points as .ply, for example with CloudCompare"),
-    ".vtk": ("a file of VTK", "save its points as .ply, for example with ParaView"),
-    ".vtp": ("a file of VTK", "save its points as .ply, for example with ParaView"),
-    ".osf": ("a recording of Ouster", "convert it with ouster-cli source FILE save out.csv"),
-    ".mat": ("variables of MATLAB", "write the cloud with pcwrite as .pcd"),
-    ".pkl": ("a pickle, which can run any program", "save the points with numpy.save"),
-    ".pickle": ("a pickle, which can run any program", "save the points with numpy.save"),
-    ".pt": ("a pickle of PyTorch", "save the points with numpy.save"),
-    ".h5": ("HDF5", "save the points of each scan with numpy.save"),
-}
+    ((".rcp", ".rcs", ".ptx"), "scans of surveying software", "export them as .e57"),
+    (
+        (".obj", ".stl", ".vtk", ".vtp"),
+        "a mesh",
+        "save its points as .ply, for example with CloudCompare",
+    ),
+    (
+        (".pkl", ".pickle", ".pt", ".mat", ".h5"),
+        "variables of a program",
+        "save the points with numpy.save",
+    ),
+)
 
 
 # The first bytes of files.
@@ -74,11 +70,6 @@ BEGINNINGS = {
     b"ARROW1": ".feather",
     b"FEA1": ".feather",
     b"ASTM-E57": ".e57",
-    b"\xd4\xc3\xb2\xa1": ".pcap",
-    b"\xa1\xb2\xc3\xd4": ".pcap",
-    b"\x4d\x3c\xb2\xa1": ".pcap",
-    b"\xa1\xb2\x3c\x4d": ".pcap",
-    PCAPNG: ".pcap",
 }
 BEGINNING = 4096  # bytes in which they must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
@@ -168,8 +159,8 @@ def _guess_ending(path: Path) -> str:
 
 def _check_name(path: Path) -> None:
     """Raise InputError if files with this name are known, but not read."""
-    for ending, (content, advice) in UNREADABLE.items():
-        if path.name.lower().endswith(ending):
+    for endings, content, advice in UNREADABLE:
+        if path.name.lower().endswith(endings):
             raise InputError(f"{path}: expected a scan file, found {content}; {advice}")
 
 

@@ -13,12 +13,11 @@ import numpy as np
 
 from amvnet.data.formats import arrow, las, numpy_files, pcd, ply, text
 from amvnet.data.formats.bags import open_bag
-from amvnet.data.formats.cloud import Cloud, Message, make_cloud, require, require_columns
+from amvnet.data.formats.cloud import Cloud, make_cloud, require, require_columns
 from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, PACKED, TEXT, ending_of
 from amvnet.data.formats.e57 import open_e57
 from amvnet.data.formats.fields import Arrays, Choose
 from amvnet.data.formats.packed import unpacked
-from amvnet.data.formats.packets import open_capture
 from amvnet.data.formats.raw import read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.recording import Recording
@@ -50,7 +49,6 @@ COLUMN_READERS: dict[str, Callable[[Path, Choose], Arrays]] = {
 RECORDINGS: dict[str, Callable[[Path, str, str | None], Recording]] = {
     **dict.fromkeys((FOLDER, *BAGS), open_bag),
     ".e57": lambda path, *_: open_e57(path),
-    ".pcap": lambda path, *_: open_capture(path),
 }
 
 # The extra of this package that reads a file, and the packages that it installs.
@@ -98,7 +96,7 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     if ending not in WITH_LIMITS:
         return _read(path, ending, layout)
     what = (layout.columns, layout.dtypes)
-    return _to_cloud(_with_limits("read_with_limits", path, ending, *what))
+    return Cloud(**_with_limits("read_with_limits", path, ending, *what))
 
 
 def read_column(path: Path, ending: str, names: Sequence[str]) -> np.ndarray:
@@ -167,7 +165,7 @@ class RecordedScans:
         Raises:
             InputError: if it is broken.
         """
-        return _to_cloud(_with_limits("recorded_with_limits", self.path, *self._what, index))
+        return Cloud(**_with_limits("recorded_with_limits", self.path, *self._what, index))
 
 
 def _with_limits(function: str, path: Path, ending: str, *arguments: Any) -> dict[str, Any]:
@@ -210,13 +208,6 @@ def _ending_of_one(path: Path) -> str:
     return ending
 
 
-def _to_cloud(values: dict[str, Any]) -> Cloud:
-    """Return the cloud that came from the process with limits."""
-    if values["message"] is not None:
-        values["message"] = Message(**values["message"])
-    return Cloud(**values)
-
-
 # --- within the process with limits ---
 
 
@@ -238,10 +229,9 @@ def count_with_limits(path: str, *what: str) -> dict[str, int]:
 
 
 def recorded_with_limits(path: str, *what: Any) -> dict[str, Any]:
-    """Return the attributes of a cloud in a file of several, and of its message."""
+    """Return the attributes of a cloud in a file of several."""
     *which, index = what
-    cloud = _open(path, *which).read(index)
-    return {**vars(cloud), "message": cloud.message and vars(cloud.message)}
+    return vars(_open(path, *which).read(index))
 
 
 @lru_cache(OPEN_FILES)

@@ -9,19 +9,16 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from amvnet.data.formats.cloud import require, split_records
+from amvnet.data.formats.cloud import split_records
 from amvnet.data.labels.ids import check_count, write_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 
-Kind = Literal["label", "npy", "ply", "pcd", "las"]
+Kind = Literal["label", "npy", "ply", "pcd"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 
 MAX_ERROR = 0.0005  # metres: if float32 is off by more, coordinates are written as float64
-LAS_STEP = 0.0001  # metres: the unit of LAS coordinates
-LAS_REACH = 200_000.0  # metres from the offset, either way: a little less than 32 bits can hold
-LAS_POINT_FORMAT = 7  # of LAS 1.4, with colours
 
 PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 PCD_HEADER = """\
@@ -67,15 +64,12 @@ def check_kind(kind: str) -> None:
     """Check that a format can be written; call this before the work starts.
 
     Raises:
-        InputError: if the format is unknown, or needs laspy, which is not installed.
+        InputError: if the format is unknown.
     """
     if kind not in KINDS:
         raise InputError(
             f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them"
         )
-
-    if kind == "las":
-        require("LAS", "formats", "laspy")
 
 
 def write_scan_labels(
@@ -95,10 +89,6 @@ def write_scan_labels(
     - `ply` (binary): x, y, z, red, green, blue, class (raw id), uncertain (0 or 1).
     - `pcd` (binary): x, y, z, rgb (packed as in PCL), label (raw id), uncertain. NaN stays NaN, as
       in `ply`.
-    - `las`: coordinates to 0.1 mm, colours, and the extra dimensions class (raw id) and uncertain.
-      LAS cannot hold NaN, nor points 200 km from the others. Such points keep their row, with
-      class 0 and the file's offset as coordinates. The offset is 0, 0, 0 unless the scan is far
-      from the origin, as in map coordinates.
 
     Coordinates of `ply` and `pcd` are float32, or float64 if float32 would be off by more than half
     a millimetre.
@@ -189,68 +179,10 @@ def _write_pcd(path: Path, points: LabelledPoints) -> None:
     path.write_bytes(header.encode("ascii") + table.tobytes())
 
 
-def _write_las(path: Path, points: LabelledPoints) -> None:
-    """Write LAS 1.4.
-
-    The raw ids are an extra dimension, because the classification that LAS defines is one byte and
-    its numbers have fixed meanings.
-    """
-    import laspy
-
-    steps, offset, fits = _las_coordinates(points.xyz)
-    raw_ids = np.where(fits, points.raw, 0).astype(np.uint16)
-    extra = {"class": raw_ids} | _uncertain_column(points.uncertain)
-
-    header = laspy.LasHeader(point_format=LAS_POINT_FORMAT, version="1.4")
-    header.scales = np.full(3, LAS_STEP)
-    header.offsets = offset
-    dimensions = []
-    for name, values in extra.items():
-        dimensions.append(laspy.ExtraBytesParams(name, values.dtype))
-    header.add_extra_dims(dimensions)
-
-    record = laspy.ScaleAwarePointRecord.zeros(len(points.xyz), header=header)
-    las = laspy.LasData(header, record)
-    las.X, las.Y, las.Z = steps.T
-
-    # LAS has 16 bits per colour; its specification says to multiply 8-bit colours by 256.
-    las.red, las.green, las.blue = points.colors.T.astype(np.uint16) * 256
-
-    for name, values in extra.items():
-        las[name] = values
-    las.write(str(path))
-
-
 POINT_WRITERS: dict[str, Callable[[Path, LabelledPoints], None]] = {
     "ply": _write_ply,
     "pcd": _write_pcd,
-    "las": _write_las,
 }
-
-
-@np.errstate(invalid="ignore", over="ignore")
-def _las_coordinates(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Convert (N, 3) coordinates, metres, to the integers of LAS.
-
-    Returns:
-        (N, 3) int32 multiples of `LAS_STEP` from the offset, 0 for points that do not fit; the
-        (3,) offset, metres, 0 unless the scan is far from the origin; and (N,) bool, whether each
-        point fits.
-    """
-    xyz64 = xyz.astype(np.float64)
-    is_finite = np.isfinite(xyz).all(axis=1)
-
-    # The median, because a few broken points, however far away, do not move it.
-    offset = np.zeros(3)
-    if is_finite.any():
-        median = np.round(np.median(xyz64[is_finite], axis=0))
-        if (np.abs(median) > LAS_REACH / 2).any():
-            offset = median
-
-    distances = xyz64 - offset
-    fits = is_finite & (np.abs(distances) < LAS_REACH).all(axis=1)
-    steps = np.round(np.where(fits[:, None], distances, 0) / LAS_STEP).astype(np.int32)
-    return steps, offset, fits
 
 
 @np.errstate(invalid="ignore", over="ignore")

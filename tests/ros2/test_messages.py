@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from amvnet.data.formats.cloud import Message
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
-from amvnet.data.labels import label_bags
-from amvnet.data.labels.messages import encode_labels
 from amvnet.data.labels.writers import LabelledPoints
+from amvnet_ros.messages import Message, encode_labels
 
 from fixtures.scan_writers import cloud_message, some_points
 
@@ -123,25 +119,3 @@ def test_lost_points_stay_and_the_message_says_that_there_are_some() -> None:
     message = through_ros2(ORIGIN, labelled(np.arange(5), xyz))
     assert not message.is_dense
     assert np.isnan(column(message, "x")).tolist() == [False, False, True, False, False]
-
-
-@pytest.mark.parametrize("kind", label_bags.KINDS)
-def test_a_run_that_is_killed_while_it_joins_leaves_nothing_to_the_next(
-    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    names = ["drive/000000", "drive/000001"]
-    points = labelled(np.arange(5))
-    for time, name in enumerate(names):
-        message = Message(time, "lidar", topic="/lidar", time=time)
-        label_bags.write_part(tmp_path, name, kind, message, points)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(label_bags, "publish", lambda part, path: os._exit(7))
-        process = os.fork()
-        if not process:
-            label_bags.join_parts(tmp_path, names, kind)
-        assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 7
-    assert list(tmp_path.rglob("*labels*"))
-
-    label_bags.join_parts(tmp_path, names, kind)
-    assert [path.name for path in tmp_path.rglob("*")] == [f"drive.{kind}"]

@@ -3,18 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import NANOSECONDS, Message, record_dtype
+from amvnet.data.formats.cloud import record_dtype
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, TYPES
 from amvnet.data.labels.writers import LabelledPoints
 
 FIELD_TYPE = "sensor_msgs/msg/PointField"
 HEADER_TYPE = "std_msgs/msg/Header"
 TIME_TYPE = "builtin_interfaces/msg/Time"
+NANOSECONDS = 1_000_000_000  # of a second
 ALIGNMENT = 4  # bytes: every field of an encoded point starts at a multiple, as in PCL
+
+
+@dataclass(frozen=True)
+class Message:
+    """The message that a cloud is from.
+
+    Attributes:
+        stamp: when the points were measured, nanoseconds since the epoch.
+        frame_id: name of the frame of the coordinates.
+        height: number of rows of an organised cloud, else 1.
+    """
+
+    stamp: int
+    frame_id: str
+    height: int = 1
+
+    @classmethod
+    def of(cls, message: Any) -> Message:
+        """Return what the header of a deserialised PointCloud2 says."""
+        stamp = message.header.stamp
+        nanoseconds = stamp.sec * NANOSECONDS + stamp.nanosec
+        return cls(nanoseconds, message.header.frame_id, message.height)
 
 
 def encode_labels(
