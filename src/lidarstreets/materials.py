@@ -100,7 +100,7 @@ class Surface(IntEnum):
 
     ASPHALT = Reflection(0.28, spread=0.11, shade=0.14, dark=0.004)
     PAVING = Reflection(0.32, spread=0.09, shade=0.12, dark=0.003)
-    GRASS = Reflection(0.39, spread=0.12, shade=0.10, dark=0.001, rough=0.018)
+    GRASS = Reflection(0.375, spread=0.12, shade=0.06, dark=0.001, rough=0.018)
     GRAVEL = Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004)
     ROAD_PAINT = Reflection(0.55, spread=0.20, shade=0.15)
     PLASTER = Reflection(0.43, spread=0.10, shade=0.20, drop=0.01)
@@ -119,7 +119,7 @@ class Surface(IntEnum):
     # Load boxes, caravans and machines.
     COATING = Reflection(0.42, spread=0.25, shade=0.25, dark=0.05, drop=0.03, rough=0.002)
     # Tubes, rims and spokes of a bicycle.
-    CYCLE = Reflection(0.40, spread=0.30, shade=0.25, dark=0.05, drop=0.05)
+    CYCLE = Reflection(0.34, spread=0.55, shade=0.25, dark=0.08, drop=0.05)
     RUBBER = Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.10)
     PLATE = Reflection(0.95, spread=0.10, shade=0.10, dark=0.0)
     PLASTIC = Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03)

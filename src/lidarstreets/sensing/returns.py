@@ -124,7 +124,7 @@ def _intensity(
     is_near = np.exp(-((hits.distance / NEAR) ** 4))
     noise = np.maximum(1 + spread * rng.standard_normal(count, np.float32), 0) ** (1 / sensor.gamma)
 
-    brightness = reflectivity * noise * power / (power + sensor.half_power)
+    brightness = reflectivity * noise * power**2 / (power**2 + sensor.half_power**2)
     brightness /= 1 + (hits.distance / sensor.half_range) ** FADING
     brightness *= 1 - lasers.near_loss[hits.ring] * is_near
 

@@ -9,7 +9,7 @@ from lidarstreets.streets.places import Places
 from lidarstreets.streets.plans import Plan
 
 # Median reflectivities of asphalt and of other pavements, measured on KITTI's scans.
-ASPHALT = 0.255
+ASPHALT = 0.275
 PAVEMENT = 0.315
 # Metres along and across the street: cells within which the surface has been repaired or not.
 CELL = (7.0, 1.6)
@@ -22,7 +22,7 @@ class GroundBrightness:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._tints = 0.9 * rng.standard_normal(256)  # by class id
-        wanted = {Label.ROAD: rng.lognormal(np.log(ASPHALT), 0.13)}
+        wanted = {Label.ROAD: rng.lognormal(np.log(ASPHALT), 0.10)}
         if rng.random() < 0.12:
             wanted[Label.ROAD] = rng.uniform(0.33, 0.44)  # concrete or cobbles
 
@@ -31,7 +31,7 @@ class GroundBrightness:
             if rng.random() < 1 / 3:
                 wanted[label] = wanted[Label.ROAD] * rng.lognormal(0, 0.06)
             else:
-                wanted[label] = rng.lognormal(np.log(PAVEMENT), 0.15)
+                wanted[label] = rng.lognormal(np.log(PAVEMENT), 0.08)
 
         for label, reflectivity in wanted.items():
             reflection = GROUND_SURFACES[label].reflection
