@@ -6,7 +6,7 @@ import re
 import zipfile
 from pathlib import Path
 
-from amvnet.data.formats.raw import NUSCENES_ENDING, columns_of
+from amvnet.data.formats.raw import NUSCENES_ENDING, load, usual_layout
 from amvnet.data.formats.rows import guess_rows
 from amvnet.data.formats.text import ADVICE as TEXT_ADVICE
 from amvnet.data.formats.text import find_table, is_text, read_head
@@ -106,9 +106,7 @@ def ending_of(path: Path) -> str:
         if is_text(head):
             raise InputError(f"{path}: expected rows of numbers, found other text; {TEXT_ADVICE}")
         return named
-    if columns_of(path) is not None:
-        return ".bin"
-    return named or _guess_ending(path)
+    return _guess_ending(path, named)
 
 
 def _begins_as(beginning: bytes) -> str | None:
@@ -142,14 +140,20 @@ def _has_arrays(path: Path) -> bool:
         return not path.name.lower().endswith(".zip")
 
 
-def _guess_ending(path: Path) -> str:
-    """Return the ending that the values in a file tell, if its name does not.
+def _guess_ending(path: Path, named: str | None) -> str:
+    """Return the ending that the values in a file tell, or else its name.
 
     Raises:
-        InputError: if they do not, or files of this kind are not read.
+        InputError: if neither tells, or files of this kind are not read.
     """
+    data = load(path)
+    if usual_layout(data) is not None:
+        return ".bin"
+    if named is not None:
+        return named
+
     _check_name(path)
-    if guess_rows(path) is not None:
+    if guess_rows(data) is not None:
         return ".bin"
     raise InputError(
         f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; "

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from amvnet.data.formats.cloud import (
-    MAX_POINTS,
     MOST_RINGS,
     Cloud,
     check_point_count,
@@ -37,7 +36,10 @@ NUSCENES_ENDING = ".pcd.bin"
 FULL_INTENSITY = 255.0
 MAX_INTENSITY = 65535  # of any device
 NEAR = 500.0  # metres: coordinates of usual scans are smaller
-SAMPLE_VALUES = 100_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # whole rows of either layout
+KITTI_ROWS = RowLayout(NAMES[:KITTI_COLUMNS], DTYPES[:1])
+NUSCENES_ROWS = RowLayout(NAMES, DTYPES[:1])
+WIDEST = 8  # bytes of a number
+SAMPLE = 400_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # bytes: whole rows of either layout
 
 
 def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
@@ -52,42 +54,45 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     Raises:
         InputError: if the file is not a whole number of rows, or the values fit no layout.
     """
+    data = load(path, max(len(layout.columns), COUNTS[-1]))
     if layout != UNKNOWN:
-        return _read_rows(path, _complete(path, layout))
+        return _to_cloud(data, path, _complete(data, path, layout))
 
-    count = columns_of(path)
-    guess = guess_rows(path) if count is None else None
-    if guess is not None:
-        return _read_rows(path, guess)
+    is_named = path.name.lower().endswith(NUSCENES_ENDING)
+    usual = usual_layout(data, is_named)
+    if usual is None:
+        guess = guess_rows(data)
+        if guess is not None:
+            return _to_cloud(data, path, guess)
+        if len(data) >= ENOUGH:
+            raise InputError(
+                f"{path}: expected rows of {COUNTS[0]} to {COUNTS[-1]} {' or '.join(DTYPES)}, "
+                f"found values that fit none; {ADVICE}"
+            )
+        usual = NUSCENES_ROWS if is_named else KITTI_ROWS
 
-    usual = RowLayout(NAMES[: count or _usual_count(path)], DTYPES[:1])
-    is_nuscenes = _has_nuscenes_name(path) and len(usual.columns) == NUSCENES_COLUMNS
-    full = FULL_INTENSITY if is_nuscenes else None
-    return replace(_read_rows(path, usual), full=full, note="")
+    full = FULL_INTENSITY if is_named and usual == NUSCENES_ROWS else None
+    return replace(_to_cloud(data, path, usual), full=full, note="")
 
 
-def _usual_count(path: Path) -> int:
-    """Return the number of columns of a file whose values do not tell.
+def load(path: Path, columns: int = COUNTS[-1]) -> np.ndarray:
+    """Return the (B,) bytes of a file.
 
     Raises:
-        InputError: if there are so many values that they would tell.
+        InputError: if they are more than those of `MAX_POINTS` rows of so many columns.
     """
-    if path.stat().st_size >= ENOUGH:
-        raise InputError(
-            f"{path}: expected rows of {COUNTS[0]} to {COUNTS[-1]} {' or '.join(DTYPES)}, "
-            f"found values that fit none; {ADVICE}"
-        )
-    return NUSCENES_COLUMNS if _has_nuscenes_name(path) else KITTI_COLUMNS
+    check_point_count(path.stat().st_size // (WIDEST * columns), path)
+    return np.fromfile(path, np.uint8)
 
 
-def _complete(path: Path, layout: RowLayout) -> RowLayout:
+def _complete(data: np.ndarray, path: Path, layout: RowLayout) -> RowLayout:
     """Return a layout with what the user did not say taken from the values.
 
     Raises:
         InputError: if the columns cannot be inferred.
     """
-    dtypes = layout.dtypes or (guess_dtype(path) or DTYPES[0],)
-    columns = layout.columns or guess_columns(path, dtypes[0])
+    dtypes = layout.dtypes or (guess_dtype(data) or DTYPES[0],)
+    columns = layout.columns or guess_columns(data, dtypes[0])
     if columns is None:
         raise InputError(
             f"{path}: expected rows of {dtypes[0]}, found values that fit none; {ADVICE}"
@@ -95,18 +100,16 @@ def _complete(path: Path, layout: RowLayout) -> RowLayout:
     return RowLayout(columns, dtypes)
 
 
-def _read_rows(path: Path, layout: RowLayout) -> Cloud:
-    record = layout.record
-    size = path.stat().st_size
-    if size % record.itemsize:
+def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
+    size = layout.record.itemsize
+    if len(data) % size:
         raise InputError(
-            f"{path}: expected {layout.describe()}, found {size} bytes, which is no multiple of "
-            f"{record.itemsize}; {ADVICE}, or copy the file again"
+            f"{path}: expected {layout.describe()}, found {len(data)} bytes, which is no multiple "
+            f"of {size}; {ADVICE}, or copy the file again"
         )
 
-    check_point_count(size // record.itemsize, path)
-    records = np.fromfile(path, dtype=record)
-    columns = list(split_records(records).values())
+    check_point_count(len(data) // size, path)
+    columns = list(split_records(data.view(layout.record)).values())
     return named_cloud(columns, layout.columns, str(path), layout.describe())
 
 
@@ -145,24 +148,23 @@ def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def columns_of(path: Path) -> int | None:
-    """Return the number of columns, 4 or 5, that the values of a file fit; None if neither."""
-    size = path.stat().st_size
-    if not size or size % 4 or size > MAX_POINTS * 4 * NUSCENES_COLUMNS:
+def usual_layout(data: np.ndarray, is_named: bool = False) -> RowLayout | None:
+    """Return the layout of KITTI or nuScenes if the values of a file fit it.
+
+    Args:
+        data: (B,) the bytes of the file.
+        is_named: whether the name says that the columns are those of nuScenes.
+    """
+    if not len(data):
         return None
-
-    values = np.fromfile(path, dtype=np.float32, count=SAMPLE_VALUES)
-    if size % (4 * NUSCENES_COLUMNS) == 0:
-        table = values.reshape(-1, NUSCENES_COLUMNS)
-        if _is_nuscenes(table, _has_nuscenes_name(path)):
-            return NUSCENES_COLUMNS
-    if size % (4 * KITTI_COLUMNS) == 0 and _is_kitti(values.reshape(-1, KITTI_COLUMNS)):
-        return KITTI_COLUMNS
-    return None
-
-
-def _has_nuscenes_name(path: Path) -> bool:
-    return path.name.lower().endswith(NUSCENES_ENDING)
+    if len(data) % NUSCENES_ROWS.record.itemsize == 0:
+        table = data[:SAMPLE].view(np.float32).reshape(-1, NUSCENES_COLUMNS)
+        if _is_nuscenes(table, is_named):
+            return NUSCENES_ROWS
+    if len(data) % KITTI_ROWS.record.itemsize:
+        return None
+    table = data[:SAMPLE].view(np.float32).reshape(-1, KITTI_COLUMNS)
+    return KITTI_ROWS if _is_kitti(table) else None
 
 
 def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:

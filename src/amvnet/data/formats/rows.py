@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -146,23 +145,23 @@ def named_cloud(
     return Cloud(cloud.xyz, cloud.intensity, cloud.ring, name, note=note)
 
 
-def guess_dtype(path: Path) -> str | None:
-    """Infer the type of the numbers in a file: with it, their magnitudes are usual.
+def guess_dtype(data: np.ndarray) -> str | None:
+    """Infer the type of the numbers in the (B,) bytes of a file: their magnitudes are usual.
 
     Returns:
         One of `DTYPES`; None if the values are too few or of no magnitude that is measured.
     """
     shares = {}
     for dtype in DTYPES:
-        values = _sample(path, np.dtype(dtype))
+        values = _sample(data, np.dtype(dtype))
         shares[dtype] = _usual_share(values) if len(values) >= FEWEST else 0.0
 
     dtype = max(shares, key=lambda name: shares[name])
     return dtype if shares[dtype] >= USUAL else None
 
 
-def guess_columns(path: Path, dtype: str) -> tuple[str, ...] | None:
-    """Infer the columns of a file of nothing but rows from the values.
+def guess_columns(data: np.ndarray, dtype: str) -> tuple[str, ...] | None:
+    """Infer the columns of rows from the values in the (B,) bytes of a file.
 
     The number of columns is the one that separates the values best: columns that hold one quantity
     each are less varied than mixtures of several.
@@ -171,7 +170,7 @@ def guess_columns(path: Path, dtype: str) -> tuple[str, ...] | None:
         The names of 3 to 6 columns; the size of the file may be another than that of whole rows.
         None if the values are too few, cannot be coordinates, or are not a row for each point.
     """
-    values = _sample(path, np.dtype(dtype))
+    values = _sample(data, np.dtype(dtype))
     if len(values) < FEWEST:
         return None
 
@@ -181,10 +180,10 @@ def guess_columns(path: Path, dtype: str) -> tuple[str, ...] | None:
     return name_columns(table) if _are_positions(xyz) and not _are_alike(xyz) else None
 
 
-def guess_rows(path: Path) -> RowLayout | None:
-    """Infer the columns and their type from the values of a file; None if they fit no layout."""
-    dtype = guess_dtype(path)
-    columns = None if dtype is None else guess_columns(path, dtype)
+def guess_rows(data: np.ndarray) -> RowLayout | None:
+    """Infer the columns and their type from the (B,) bytes of a file; None if they fit none."""
+    dtype = guess_dtype(data)
+    columns = None if dtype is None else guess_columns(data, dtype)
     if dtype is None or columns is None:
         return None
     return RowLayout(columns, (dtype,))
@@ -237,18 +236,15 @@ def _is_number(dtype: str) -> bool:
         return False
 
 
-def _sample(path: Path, dtype: np.dtype) -> np.ndarray:
-    """Return values of blocks that are spread evenly over a file, as float64."""
-    count = path.stat().st_size // dtype.itemsize
-    starts = np.unique(np.linspace(0, max(count - BLOCK, 0), BLOCKS).astype(int) // 60 * 60)
+def _sample(data: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Return values of blocks that are spread evenly over the bytes of a file, as float64."""
+    values = data[: len(data) // dtype.itemsize * dtype.itemsize].view(dtype)
+    starts = np.unique(np.linspace(0, max(len(values) - BLOCK, 0), BLOCKS).astype(int) // 60 * 60)
 
     blocks = []
-    with path.open("rb") as file:
-        for start in starts.tolist():
-            file.seek(start * dtype.itemsize)
-            data = file.read(BLOCK * dtype.itemsize)
-            whole = len(data) // (60 * dtype.itemsize) * 60
-            blocks.append(np.frombuffer(data, dtype, whole))
+    for start in starts.tolist():
+        block = values[start : start + BLOCK]
+        blocks.append(block[: len(block) // 60 * 60])
     with np.errstate(invalid="ignore", over="ignore"):  # of signalling NaN
         return np.concatenate(blocks).astype(np.float64)
 
