@@ -64,11 +64,6 @@ def filled(*raw_ids: int) -> Callable[[Case], Entries]:
     return changed(lambda data: np.resize(np.array(raw_ids, "<u4"), len(data) // 4).tobytes())
 
 
-def off_disk(content: bytes) -> Callable[[Case], Entries]:
-    """The good files and a prediction for a scan that is not on disk."""
-    return lambda case: {**case.good, "sequences/11/predictions/000900.label": content}
-
-
 BOTH = {
     "no entries": Fault(nothing, "found no", official=True),
     "a prediction missing": Fault(without_the_first, "found no", official=True),
@@ -83,9 +78,6 @@ SEMANTICKITTI = {
     "big-endian": Fault(as_type(">u4"), "endian", official=False),
     "train ids": Fault(filled(*range(20)), "train ids", official=False),
     "unknown id": Fault(filled(40, 400), "400", official=False),
-    "scan off disk, empty": Fault(off_disk(b""), "found 0 bytes", official=False),
-    "scan off disk, odd size": Fault(off_disk(b"12345"), "found 5 bytes", official=False),
-    "scan off disk, huge": Fault(off_disk(bytes(8_000_000)), "8000000", official=False),
 }
 NUSCENES = {
     "no class": Fault(changed(lambda data: b"\0" + data[1:]), "found 0 for 1 of", official=True),

@@ -13,7 +13,7 @@ import pytest
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.submission import pack as submission
-from amvnet.submission.rules import TEST_SCANS, rules_for
+from amvnet.submission.rules import rules_for
 from amvnet.weights.file import save
 
 from fixtures.datasets import make_nuscenes
@@ -204,41 +204,24 @@ def test_the_scenes_of_an_archive_are_of_one_split(tmp_path: Path) -> None:
             assert name.startswith(f"lidarseg/mini_{split}/")
 
 
-def test_scans_that_are_not_on_disk_are_required_nonetheless(tmp_path: Path) -> None:
-    dataset = open_dataset(make_nuscenes(tmp_path).spec)
-    required = set(rules_for(dataset, "val").required)
-    for path in tmp_path.glob("samples/LIDAR_TOP/*"):
+def test_scans_of_the_test_split_must_be_on_disk(tmp_path: Path) -> None:
+    dataset = make_nuscenes(tmp_path / "nuscenes")
+    for path in tmp_path.glob("nuscenes/samples/LIDAR_TOP/*"):
         path.unlink()
+    fails(lambda: rules_for(open_dataset(dataset.spec), "val"), "complete the dataset")
 
-    rules = rules_for(dataset, "val")
-    assert set(rules.required) == required
-    assert set(rules.points.values()) == {None}
-
-
-# --- test sequences that are not all on disk ---
-
-
-def test_predictions_of_absent_sequences_are_required_nonetheless(tmp_path: Path) -> None:
     for sequence in TEST[:-1]:
-        write_scan(tmp_path, sequence, "000000", np.ones((5, 4)), None)
-    out = tmp_path / "s.zip"
+        write_scan(tmp_path / "kitti", sequence, "000000", np.ones((5, 4)), None)
+    fails(lambda: rules_for(open_dataset(f"{tmp_path}/kitti"), "test"), TEST[-1])
 
-    rules = rules_for(open_dataset(str(tmp_path)), "test")
-    required = 10 + TEST_SCANS["21"]
-    assert len(rules.required) == required
-    assert rules.official == len(rules.points) == 20351
-    fails(
-        lambda: submission.write(rules, tmp_path, out),
-        f"{required} scans",
-        f"{required - 1} more",
-    )
 
-    prediction = np.full(5, 40, "<u4").tobytes()
-    write_files(tmp_path, dict.fromkeys(rules.required, prediction))
-    packed = submission.write(rules, tmp_path, out)
-    assert packed.predictions == required
-    assert packed.unmatched == TEST_SCANS["21"]
-    assert len(packed.notes) == 2
+def test_an_archive_of_fewer_scans_than_the_benchmark_has_is_noted(
+    cases: dict[str, Case], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    case = cases["semantickitti"]
+    options = ("--predictions", case.predictions, "--out", tmp_path / "s.zip")
+    assert submit(case.spec, *options) == (0, "")
+    assert "20351" in capsys.readouterr().out
 
 
 def test_from_scans_without_labels_to_an_archive(tmp_path: Path) -> None:

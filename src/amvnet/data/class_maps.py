@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -11,37 +12,9 @@ import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
-from amvnet.files import read_yaml
+from amvnet.files import parse_yaml, read_yaml
 
 COARSE_NAME = "coarse"
-
-# Each coarse class with its colour, and the classes of SemanticKITTI and nuScenes that belong to
-# it. nuScenes has no class of poles: they are manmade, as buildings and fences are.
-_COARSE: dict[str, dict[str, Any]] = {
-    "ground": {
-        "color": [160, 130, 160],
-        "from": [
-            *("road", "parking", "sidewalk", "other-ground", "terrain"),
-            *("driveable_surface", "other_flat"),
-        ],
-    },
-    "vegetation": {"color": [0, 175, 0], "from": ["vegetation", "trunk"]},
-    "building": {"color": [255, 200, 0], "from": ["building", "fence", "manmade"]},
-    "vehicle": {
-        "color": [100, 150, 245],
-        "from": [
-            *("car", "truck", "other-vehicle"),
-            *("bus", "construction_vehicle", "trailer"),
-        ],
-    },
-    "two-wheeler": {
-        "color": [100, 230, 245],
-        "from": ["bicycle", "motorcycle", "bicyclist", "motorcyclist"],
-    },
-    "person": {"color": [255, 30, 30], "from": ["person", "pedestrian"]},
-    "pole": {"color": [255, 240, 150], "from": ["pole", "traffic-sign"]},
-    "other": {"color": [112, 128, 144], "from": ["barrier", "traffic_cone"]},
-}
 
 
 @dataclass(frozen=True)
@@ -84,7 +57,8 @@ def class_map(name: str) -> ClassMap:
         InputError: if there is neither, or the file is no map.
     """
     if name == COARSE_NAME:
-        return _parse(name, {"classes": _COARSE})
+        text = (resources.files("amvnet.data") / "coarse.yaml").read_text(encoding="utf-8")
+        return _parse(name, parse_yaml(text, name))
 
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):

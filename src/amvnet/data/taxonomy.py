@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import colorsys
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
+from importlib import resources
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -13,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.config.bounds import check_text
-from amvnet.errors import InputError, errors_of, shown
+from amvnet.errors import InputError, errors_of, one_line_errors, shown
 from amvnet.files import read_yaml
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
@@ -197,7 +200,8 @@ class Taxonomy:
         Raises:
             InputError: if a field is missing or has the wrong type.
         """
-        try:
+        expected = "taxonomy: expected its fields as this package writes them"
+        with _one_line(expected, "use a weights file of this package"):
             return cls(
                 name=values["name"],
                 classes=tuple(values["classes"]),
@@ -207,13 +211,6 @@ class Taxonomy:
                 splits={split: tuple(sequences) for split, sequences in values["splits"].items()},
                 counts_absent=bool(values["counts_absent"]),
             )
-        except InputError:  # a ValueError, too
-            raise
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise InputError(
-                "taxonomy: expected its fields as this package writes them, "
-                f"found {shown(error)}; use a weights file of this package"
-            ) from None
 
 
 def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
@@ -229,25 +226,20 @@ def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
     """
     path = Path(path)
     config = read_yaml(path, "a label map")
-    if not isinstance(config, Mapping):
-        raise InputError(f"{path}: expected the tables {_YAML_TABLES}, found none; add them")
+    expected = f"{path}: expected the tables {_YAML_TABLES} that fit each other, of whole numbers"
+    with errors_of(path), _one_line(expected, "correct them"):
+        return _from_config(path.stem, config)
 
-    try:
-        with errors_of(path):
-            return _from_config(path.stem, config)
-    except InputError:  # a ValueError, too
-        raise
-    except KeyError as error:
-        raise InputError(
-            f"{path}: expected the tables {_YAML_TABLES} that fit each other, found no entry "
-            f"{error}; add it"
-        ) from None
+
+def _one_line(expected: str, advice: str) -> AbstractContextManager[None]:
+    """Turn what tables of other keys and types raise into an InputError of one line."""
+
+    def message(error: BaseException) -> str:
+        return f"{expected}, found {shown(error)}; {advice}"
+
     # AttributeError: a table that is none; OverflowError: .inf as an id.
-    except (TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise InputError(
-            f"{path}: expected tables of whole numbers as ids and colours, found {shown(error)}; "
-            "correct them"
-        ) from None
+    faults = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+    return one_line_errors(message, only=faults)
 
 
 def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
@@ -357,123 +349,36 @@ def _rgb(values: Iterable[Any]) -> Color:
     return int(red), int(green), int(blue)
 
 
-# (train id, name, RGB colour, raw id in predictions, further raw ids of the class)
-_SEMANTICKITTI = (
-    (0, "unlabeled", (0, 0, 0), 0, (1, 52, 99)),
-    (1, "car", (100, 150, 245), 10, (252,)),
-    (2, "bicycle", (100, 230, 245), 11, ()),
-    (3, "motorcycle", (30, 60, 150), 15, ()),
-    (4, "truck", (80, 30, 180), 18, (258,)),
-    (5, "other-vehicle", (0, 0, 255), 20, (13, 16, 256, 257, 259)),
-    (6, "person", (255, 30, 30), 30, (254,)),
-    (7, "bicyclist", (255, 40, 200), 31, (253,)),
-    (8, "motorcyclist", (150, 30, 90), 32, (255,)),
-    (9, "road", (255, 0, 255), 40, (60,)),
-    (10, "parking", (255, 150, 255), 44, ()),
-    (11, "sidewalk", (75, 0, 75), 48, ()),
-    (12, "other-ground", (175, 0, 75), 49, ()),
-    (13, "building", (255, 200, 0), 50, ()),
-    (14, "fence", (255, 120, 50), 51, ()),
-    (15, "vegetation", (0, 175, 0), 70, ()),
-    (16, "trunk", (135, 60, 0), 71, ()),
-    (17, "terrain", (150, 240, 80), 72, ()),
-    (18, "pole", (255, 240, 150), 80, ()),
-    (19, "traffic-sign", (255, 0, 0), 81, ()),
-)
+def _built_in() -> dict[str, Taxonomy]:
+    """Return the classes of the benchmarks by name."""
+    text = (resources.files("amvnet.data") / "benchmarks.toml").read_text(encoding="utf-8")
 
-# Categories of category.json that the lidarseg challenge ignores.
-_IGNORED = (
-    "noise",
-    "animal",
-    "human.pedestrian.personal_mobility",
-    "human.pedestrian.stroller",
-    "human.pedestrian.wheelchair",
-    "movable_object.debris",
-    "movable_object.pushable_pullable",
-    "static.other",
-    "static_object.bicycle_rack",
-    "vehicle.ego",
-    "vehicle.emergency.ambulance",
-    "vehicle.emergency.police",
-)
+    taxonomies = {}
+    for name, table in tomllib.loads(text).items():
+        names = table["classes"]
+        colors = []
+        raw_to_train: dict[int | str, int] = {}
+        train_to_raw = []
+        for train_id, entry in enumerate(names.values()):
+            colors.append(_rgb(entry["color"]))
+            raw_to_train.update(dict.fromkeys(entry["raw"], train_id))
+            train_to_raw.append(entry["id"])
 
-# Categories of category.json that are pedestrians in the lidarseg challenge.
-_PEDESTRIANS = (
-    "human.pedestrian.adult",
-    "human.pedestrian.child",
-    "human.pedestrian.construction_worker",
-    "human.pedestrian.police_officer",
-)
-
-# (train id, name, RGB colour, categories of category.json)
-_NUSCENES = (
-    (0, "ignore", (0, 0, 0), _IGNORED),
-    (1, "barrier", (112, 128, 144), ("movable_object.barrier",)),
-    (2, "bicycle", (220, 20, 60), ("vehicle.bicycle",)),
-    (3, "bus", (255, 127, 80), ("vehicle.bus.bendy", "vehicle.bus.rigid")),
-    (4, "car", (255, 158, 0), ("vehicle.car",)),
-    (5, "construction_vehicle", (233, 150, 70), ("vehicle.construction",)),
-    (6, "motorcycle", (255, 61, 99), ("vehicle.motorcycle",)),
-    (7, "pedestrian", (0, 0, 230), _PEDESTRIANS),
-    (8, "traffic_cone", (47, 79, 79), ("movable_object.trafficcone",)),
-    (9, "trailer", (255, 140, 0), ("vehicle.trailer",)),
-    (10, "truck", (255, 99, 71), ("vehicle.truck",)),
-    (11, "driveable_surface", (0, 207, 191), ("flat.driveable_surface",)),
-    (12, "other_flat", (175, 0, 75), ("flat.other",)),
-    (13, "sidewalk", (75, 0, 75), ("flat.sidewalk",)),
-    (14, "terrain", (112, 180, 60), ("flat.terrain",)),
-    (15, "manmade", (222, 184, 135), ("static.manmade",)),
-    (16, "vegetation", (0, 175, 0), ("static.vegetation",)),
-)
+        taxonomies[name] = Taxonomy(
+            name=name,
+            classes=tuple(names)[1:],
+            colors=tuple(colors),
+            raw_to_train=raw_to_train,
+            train_to_raw=tuple(train_to_raw),
+            splits={split: tuple(sequences) for split, sequences in table["splits"].items()},
+            counts_absent=table["counts_absent"],
+        )
+    return taxonomies
 
 
-def _semantickitti() -> Taxonomy:
-    _, names, colors, raw_ids, _ = zip(*_SEMANTICKITTI, strict=True)
-
-    raw_to_train: dict[int | str, int] = {}
-    for train_id, _, _, raw_id, further_raw_ids in _SEMANTICKITTI:
-        raw_to_train[raw_id] = train_id
-        raw_to_train.update(dict.fromkeys(further_raw_ids, train_id))
-
-    return Taxonomy(
-        name="semantickitti",
-        classes=names[1:],
-        colors=colors,
-        raw_to_train=raw_to_train,
-        train_to_raw=raw_ids,
-        splits={
-            "train": ("00", "01", "02", "03", "04", "05", "06", "07", "09", "10"),
-            "val": ("08",),
-            "test": ("11", "12", "13", "14", "15", "16", "17", "18", "19", "20", "21"),
-        },
-        counts_absent=True,
-    )
-
-
-def _nuscenes() -> Taxonomy:
-    train_ids, names, colors, _ = zip(*_NUSCENES, strict=True)
-
-    raw_to_train: dict[int | str, int] = {}
-    for train_id, _, _, categories in _NUSCENES:
-        raw_to_train.update(dict.fromkeys(categories, train_id))
-
-    return Taxonomy(
-        name="nuscenes",
-        classes=names[1:],
-        colors=colors,
-        raw_to_train=raw_to_train,
-        train_to_raw=train_ids,  # prediction files of the challenge hold train ids
-        splits={},
-        counts_absent=False,
-    )
-
-
-SEMANTICKITTI = _semantickitti()
-NUSCENES = _nuscenes()
-TAXONOMIES: Mapping[str, Taxonomy] = {
-    SEMANTICKITTI.name: SEMANTICKITTI,
-    NUSCENES.name: NUSCENES,
-}
+TAXONOMIES: Mapping[str, Taxonomy] = _built_in()
+SEMANTICKITTI = TAXONOMIES["semantickitti"]
+NUSCENES = TAXONOMIES["nuscenes"]
 
 
 def taxonomy_named(text: str) -> Taxonomy:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import stat
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 
+from amvnet.data.labels.ids import check_size
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.progress import Progress, no_progress
@@ -20,47 +20,13 @@ UNIX = 3  # code of the system that wrote an entry
 FOLDER_BIT = 0x10  # of an entry's MS-DOS attributes
 
 
-@dataclass(frozen=True)
-class Submission:
-    """An archive that keeps to the rules.
-
-    Attributes:
-        predictions: number of predictions in it.
-        unmatched: number of predictions whose scan is not on disk, so that its number of points
-            is unknown.
-        official: how many predictions the server expects, or None if it has no fixed number.
-    """
-
-    predictions: int
-    unmatched: int
-    official: int | None
-
-    @property
-    def notes(self) -> list[str]:
-        """Remarks that a user should read, although the archive keeps to the rules."""
-        notes = []
-        if self.unmatched:
-            notes.append(
-                f"{self.unmatched} predictions are of scans that are not on disk; "
-                "their length is not checked"
-            )
-
-        if self.official is not None and self.predictions < self.official:
-            notes.append(
-                f"the benchmark has {self.official} scans in this split; "
-                "its server refuses an archive with fewer"
-            )
-
-        return notes
-
-
 def write(
     rules: Rules,
     folder: Path,
     out: Path,
     sources: Sources | None = None,
     progress: Progress = no_progress,
-) -> Submission:
+) -> int:
     """Check a folder of predictions and pack it; the same predictions give the same bytes.
 
     Files that have no place in the archive (scores, other splits) are left out. One scan is in
@@ -73,7 +39,7 @@ def write(
         progress: called before each file and at the end.
 
     Returns:
-        A summary of the archive.
+        The number of predictions in it.
 
     Raises:
         InputError: if a prediction is missing or breaks the rules, or the archive cannot be
@@ -87,11 +53,11 @@ def write(
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 
-    names = [name for name in sorted(rules.points) if (folder / name).is_file()]
-    _check_missing(rules, names, folder)
-
+    names = sorted(rules.points)
+    _check_missing(names, folder)
     for name in names:
-        rules.check_size(name, (folder / name).stat().st_size, folder / name)
+        size = (folder / name).stat().st_size
+        check_size(folder / name, size, rules.points[name], rules.dtype)
 
     with atomic_write(out) as part, zipfile.ZipFile(part, "w") as archive:
         for name in rules.folders:
@@ -102,25 +68,23 @@ def write(
             if (folder / name).is_file():
                 _add(archive, name, (folder / name).read_bytes())
 
-        unmatched = 0
         for done, name in enumerate(names):
             progress(done, len(names))
-            unmatched += rules.points[name] is None
             data = (folder / name).read_bytes()
             rules.check_ids(data, folder / name)
             _add(archive, name, data)
 
     progress(len(names), len(names))
-    return Submission(len(names), unmatched, rules.official)
+    return len(names)
 
 
-def _check_missing(rules: Rules, names: list[str], folder: Path) -> None:
-    """Check that no required prediction is missing, given the names of the present ones."""
-    missing = sorted(set(rules.required) - set(names))
+def _check_missing(names: list[str], folder: Path) -> None:
+    """Raise InputError if a prediction with one of these names is missing."""
+    missing = [name for name in names if not (folder / name).is_file()]
     if missing:
         others = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise InputError(
-            f"{folder}: expected a prediction for each of {len(rules.required)} scans, "
+            f"{folder}: expected a prediction for each of {len(names)} scans, "
             f"found no {missing[0]}{others}; predict these scans too, "
             "or select predicted ones with --sequences or --split"
         )

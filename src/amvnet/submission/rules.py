@@ -8,7 +8,7 @@ The rules are those of the official checkers: `validate_submission.py` (task "se
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -17,27 +17,11 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.semantickitti import SemanticKitti
-from amvnet.data.labels.ids import check_size, train_ids
+from amvnet.data.labels.ids import train_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
-# Number of scans in each test sequence of SemanticKITTI (KITTI odometry 11 to 21). Its server
-# requires all of them.
-TEST_SCANS = {
-    "11": 921,
-    "12": 1061,
-    "13": 3281,
-    "14": 631,
-    "15": 1901,
-    "16": 1731,
-    "17": 491,
-    "18": 1801,
-    "19": 4981,
-    "20": 831,
-    "21": 2721,
-}
-# Most points accepted of a scan that is not on disk. A full turn of the sensor has 130,000.
-MOST_POINTS = 1_000_000
+TEST_SCANS = 20_351  # of SemanticKITTI (KITTI odometry 11 to 21); its server requires all of them
 
 
 @dataclass(frozen=True)
@@ -62,9 +46,7 @@ class Rules:
     Attributes:
         taxonomy: the classes.
         description: of the scans, in words.
-        points: by name, each prediction that the archive may contain, with the number of points
-            of its scan; None if the scan is not on disk.
-        required: names of the predictions that it must contain.
+        points: the predictions that it must contain, by name, with the number of points of each.
         dtype: number type of the ids.
         unlabelled: whether points may have no class (train id 0).
         folders: names of the folders' entries, outer ones first, each with a trailing slash.
@@ -75,32 +57,13 @@ class Rules:
 
     taxonomy: Taxonomy
     description: str
-    points: Mapping[str, int | None]
-    required: Collection[str]
+    points: Mapping[str, int]
     dtype: type[np.unsignedinteger]
     unlabelled: bool
     folders: tuple[str, ...]
     meta: str | None = None
     texts: tuple[str, ...] = ()
     official: int | None = None
-
-    def check_size(self, name: str, size: int, path: Path) -> None:
-        """Check the size of a prediction before it is read.
-
-        Raises:
-            InputError: if it does not have one id per point.
-        """
-        count = self.points[name]
-        if count is not None:
-            check_size(path, size, count, self.dtype)
-            return
-
-        width = np.dtype(self.dtype).itemsize
-        if not 0 < size <= MOST_POINTS * width or size % width:
-            raise InputError(
-                f"{path}: expected 1 to {MOST_POINTS} ids of {width} bytes, found {size} bytes; "
-                "write one id per point"
-            )
 
     def check_ids(self, data: bytes, path: Path) -> None:
         """Check the ids of a prediction whose size has been checked.
@@ -121,7 +84,7 @@ def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = No
     """Return the rules for the archive of one split, or of some sequences.
 
     Args:
-        dataset: its scans determine which predictions are required, and their sizes.
+        dataset: its scans decide which predictions are required, and their sizes.
         split: "test" is what the servers score; the others are for trials.
         sequences: only these sequences or scenes, instead of a split.
 
@@ -148,42 +111,21 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
     ids are errors. A point may be unlabelled (it counts as missed) and the upper 16 bits are free.
     The file description.txt is optional.
     """
-    present = dataset.sequences("all")
-    absent: list[str] = []  # test sequences that are not on disk
-    if sequences is None:
-        wanted = dataset.taxonomy.splits[split]
-        absent = [name for name in wanted if name in TEST_SCANS and name not in present]
-    else:
-        wanted = tuple(sorted(set(sequences)))
-
-    records = dataset.records([name for name in wanted if name not in absent])
-
+    wanted = dataset.taxonomy.splits[split] if sequences is None else sorted(set(sequences))
     folders = ["sequences/"]
-    points: dict[str, int | None] = {}
-    required: set[str] = set()
     for sequence in wanted:
         folders += [f"sequences/{sequence}/", f"sequences/{sequence}/predictions/"]
-        for index in range(TEST_SCANS.get(sequence, 0)):
-            name = f"sequences/{sequence}/predictions/{index:06d}.label"
-            points[name] = None
-            if sequence in absent:
-                required.add(name)
-
-    for record in records:
-        points[record.prediction] = _count_points(dataset, record)
-        required.add(record.prediction)
 
     is_whole_test = split == "test" and sequences is None
     return Rules(
         taxonomy=dataset.taxonomy,
         description=_describe(split, sequences),
-        points=points,
-        required=required,
+        points=_count_points(dataset, dataset.records(wanted)),
         dtype=np.uint32,
         unlabelled=True,
         folders=tuple(folders),
         texts=("description.txt", "sequences/description.txt"),
-        official=sum(TEST_SCANS.values()) if is_whole_test else None,
+        official=TEST_SCANS if is_whole_test else None,
     )
 
 
@@ -208,12 +150,8 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
             "or name another one with --split"
         )
 
-    points: dict[str, int | None] = {}
-    splits: set[str] = set()
-    for record in dataset.records(scenes):
-        points[record.prediction] = _count_points(dataset, record)
-        splits.add(record.prediction.split("/")[1])
-
+    records = dataset.records(scenes)
+    splits = {record.prediction.split("/")[1] for record in records}
     if len(splits) != 1:
         raise InputError(
             f"{dataset.root}: expected scenes of one split, found {', '.join(sorted(splits))}; "
@@ -224,8 +162,7 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     return Rules(
         taxonomy=dataset.taxonomy,
         description=_describe(split, sequences),
-        points=points,
-        required=points.keys(),
+        points=_count_points(dataset, records),
         dtype=np.uint8,
         unlabelled=False,
         folders=("lidarseg/", f"lidarseg/{only_split}/", f"{only_split}/"),
@@ -236,9 +173,12 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
 RULES: Mapping[type, Callable[..., Rules]] = {SemanticKitti: _semantickitti, NuScenes: _nuscenes}
 
 
-def _count_points(dataset: Dataset, record: ScanRecord) -> int | None:
-    """Return the number of points of a scan, or None if it is not on disk."""
-    return dataset.count_points(record) if record.points_path.is_file() else None
+def _count_points(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, int]:
+    """Return the number of points of each scan, by the name of its prediction."""
+    points = {}
+    for record in records:
+        points[record.prediction] = dataset.count_points(record)
+    return points
 
 
 def _describe(split: str, sequences: Sequence[str] | None) -> str:

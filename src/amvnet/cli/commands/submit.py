@@ -51,9 +51,12 @@ def submit(
         )
 
     with protecting([out], overwrite), progress("packing") as step:
-        submission = pack.write(rules, predictions, out, sources, step)
-    packed = counted(submission.predictions, "prediction")
-    fit = "keeps" if submission.predictions == 1 else "keep"
+        count = pack.write(rules, predictions, out, sources, step)
+    packed = counted(count, "prediction")
+    fit = "keeps" if count == 1 else "keep"
     say(f"{out}: {packed} of {rules.description} {fit} to the rules of {rules.taxonomy.name}")
-    for note in submission.notes:
-        say(f"note: {note}")
+    if rules.official is not None and count < rules.official:
+        say(
+            f"note: the benchmark has {rules.official} scans in this split; "
+            "its server refuses an archive with fewer"
+        )
