@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from amvnet.data.formats.find import list_scans
 from amvnet.data.formats.registry import read_cloud
-from amvnet.inference.reading import FileReader
 
 from fixtures.extra_writers import write_e57, write_sweep
 from fixtures.scan_writers import some_points
@@ -56,39 +54,15 @@ def test_a_bag_of_other_messages_says_what_turns_them_into_clouds(
 # --- Feather ---
 
 
-def test_a_sweep_of_argoverse_is_moved_to_its_lidars(tmp_path: Path) -> None:
+def test_a_table_is_read_by_the_names_of_its_columns(tmp_path: Path) -> None:
     points = some_points()
-    expected = points[:, :3].astype("f2").astype("f4")
-
-    cloud = read_cloud(write_sweep(tmp_path / "alone", points, {}))
-    np.testing.assert_array_equal(cloud.xyz, expected)
+    cloud = read_cloud(write_sweep(tmp_path / "a.feather", points))
+    np.testing.assert_array_equal(cloud.xyz, points[:, :3].astype("f2").astype("f4"))
     assert cloud.intensity_scale() == 255
-
-    lidars = {"ring_camera": (9.0, 9, 9), "up_lidar": (1.0, 0, 1.5), "down_lidar": (2.0, 0, 1.5)}
-    path = write_sweep(tmp_path / "log", points, lidars)
-    cloud = read_cloud(path)
-    np.testing.assert_allclose(cloud.xyz, expected - np.array([1.5, 0, 1.5], "f4"), atol=1e-5)
-    assert "Argoverse" in cloud.note
-
-    # Labels are written with the coordinates of the file.
-    (scan,) = list_scans(path)
-    np.testing.assert_array_equal(FileReader(None).read(scan).file_xyz, expected)
-
-
-def test_logs_of_argoverse_are_their_sweeps(tmp_path: Path) -> None:
-    lidars = {"up_lidar": (1.0, 0.0, 1.5)}
-    for log in ("a", "b"):
-        path = write_sweep(tmp_path / log, some_points(), lidars)
-        # A log has other tables, too.
-        shutil.copy(tmp_path / log / "calibration/egovehicle_SE3_sensor.feather", tmp_path / log)
-
-    assert [scan.name for scan in list_scans(tmp_path / "a")] == [path.stem]
-    names = [scan.name for scan in list_scans(tmp_path)]
-    assert names == [f"a/{path.stem}", f"b/{path.stem}"]
 
 
 def test_broken_feather_is_refused(tmp_path: Path) -> None:
-    content = write_sweep(tmp_path / "log", some_points(), {}).read_bytes()
+    content = write_sweep(tmp_path / "log.feather", some_points()).read_bytes()
     path = tmp_path / "a.feather"
     for size in (7, 100, len(content) // 2, len(content) - 9):
         path.write_bytes(content[:size])

@@ -104,7 +104,7 @@ def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
         archive.writestr("kitti.bin", kitti)
 
     if find_spec("pyarrow"):
-        write_sweep(folder / "log", some_points(), {}).rename(folder / "scan.feather")
+        write_sweep(folder / "scan.feather", some_points())
     if find_spec("pye57"):
         axes = {f"cartesian{axis}": some_points()[:, i] for i, axis in enumerate("XYZ")}
         write_e57(folder / "scan.e57", [{key: xyz.astype(float) for key, xyz in axes.items()}])

@@ -80,8 +80,7 @@ class FileReader:
             cloud = scan.read() if kept is None else kept
             normalised, title = self.normaliser.assign(cloud, scan.source)
 
-        file_xyz = cloud.xyz if cloud.file_xyz is None else cloud.file_xyz
-        return LoadedScan(normalised, title, file_xyz)
+        return LoadedScan(normalised, title, cloud.xyz)
 
     def _read_and_keep(self, scan: NamedScan) -> Cloud:
         """Read one of the first scans of a source, and forget those of others."""

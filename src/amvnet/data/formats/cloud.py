@@ -53,7 +53,6 @@ class Cloud:
         name: where the scan comes from, for messages.
         full: the largest possible intensity, or None if the format does not define it.
         note: what the reader had to assume about the file; empty if nothing.
-        file_xyz: (N, 3) the coordinates as they are in the file; None if `xyz` are these.
     """
 
     xyz: np.ndarray
@@ -62,7 +61,6 @@ class Cloud:
     name: str = ""
     full: float | None = None
     note: str = ""
-    file_xyz: np.ndarray | None = None
 
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.

@@ -7,7 +7,6 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from pathlib import Path
 
 from amvnet.data.formats.cloud import Cloud
@@ -26,9 +25,6 @@ from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
 
 POSE_COLUMNS = 12  # of poses as in KITTI: a 3 x 4 matrix in each line of a text file
-KITTI_RAW = "velodyne_points/data"  # the folder of the scans of a drive of KITTI's raw data
-ARGOVERSE = "sensors/lidar"  # the folder of the scans of a log of Argoverse 2
-DEPTHS = ("", "*/", "*/*/")  # of recordings in a folder: itself, drives, and days of drives
 
 
 @dataclass(frozen=True)
@@ -55,9 +51,8 @@ def find_scans(path: Path | str) -> list[Path]:
     """Return the scan files and bags that a text names, sorted by name.
 
     Args:
-        path: a file, a folder of them, a folder of drives of KITTI's raw data or of logs of
-            Argoverse 2, or a pattern such as `drive/*.bin` or `drives/**/*.pcd`. Hidden files are
-            left out, and text files too if a folder has other scans.
+        path: a file, a folder of them, or a pattern such as `drive/*.bin` or `drives/**/*.pcd`.
+            Hidden files are left out, and text files too if a folder has other scans.
 
     Raises:
         InputError: if nothing has this name, or there is no scan.
@@ -66,7 +61,7 @@ def find_scans(path: Path | str) -> list[Path]:
     if path.is_file() or is_bag_folder(path) or is_dead_link(path):
         return [path]
     if path.is_dir():
-        paths = _scans_of_folder(path)
+        paths = _scans_in(path)
     elif glob.has_magic(str(path)):
         paths = _matches(str(path))
     else:
@@ -107,8 +102,6 @@ def list_scans(
     for file in files:
         # Files of several folders can have the same names.
         name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
-        name = name.replace(f"/{KITTI_RAW}/", "/").replace(f"/{ARGOVERSE}/", "/")
-
         try:
             scans = _scans_of(file, name, topic, layout)
         except InputError as error:
@@ -137,14 +130,6 @@ def _refuse(message: str) -> Cloud:
     raise InputError(message)
 
 
-def _scans_of_folder(folder: Path) -> list[Path]:
-    """Return the scans that a folder stands for."""
-    # The other files of a log are tables, too.
-    if (folder / ARGOVERSE).is_dir():
-        return _scans_in(folder / ARGOVERSE)
-    return _scans_in(folder) or _drives_in(folder)
-
-
 def _scans_in(folder: Path) -> list[Path]:
     """Return the scans of a folder; its text files only if there are no others."""
     paths = sorted(filter(is_scan_file, folder.iterdir()))
@@ -152,15 +137,6 @@ def _scans_in(folder: Path) -> list[Path]:
         return paths
     texts = [path for path in sorted(folder.iterdir()) if path.name.lower().endswith(TEXT)]
     return [path for path in texts if _is_text_scan(path)]
-
-
-def _drives_in(folder: Path) -> list[Path]:
-    """Return the scans of the recordings in a folder: drives of KITTI, logs of Argoverse 2."""
-    paths: list[Path] = []
-    for depth, scans in product(DEPTHS, (KITTI_RAW, ARGOVERSE)):
-        for data in sorted(folder.glob(depth + scans)):
-            paths += _scans_in(data)
-    return paths
 
 
 def _matches(pattern: str) -> list[Path]:
@@ -172,7 +148,7 @@ def _matches(pattern: str) -> list[Path]:
         if is_scan_file(path) or _is_text_scan(path):
             paths.append(path)
         elif path.is_dir() and "**" not in pattern:
-            paths += _scans_of_folder(path)
+            paths += _scans_in(path)
         elif path.is_file():
             unnamed.append(path)
     return paths or unnamed

@@ -184,8 +184,6 @@ def _read(path: Path, ending: str, layout: RowLayout) -> Cloud:
 
     if ending in ROW_READERS:
         return ROW_READERS[ending](path, layout)
-    if ending == ".feather":
-        return arrow.read_feather(path)
     columns = COLUMN_READERS[ending](path, partial(require_columns, path=path))
     return make_cloud(columns, str(path))
 
