@@ -150,4 +150,5 @@ GROUND_SURFACES = {
     Label.OTHER_GROUND: Surface.GRAVEL,
     Label.LANE_MARKING: Surface.ROAD_PAINT,
     Label.TERRAIN: Surface.GRASS,
+    Label.VEGETATION: Surface.LEAF,
 }

@@ -165,6 +165,12 @@ def turf(
     return part([blades], Surface.GRASS, Label.TERRAIN, rng.uniform(0.3, 1.6), tint=tint)
 
 
+def ground_cover(rng: np.random.Generator, width: float, height: float) -> Mesh:
+    """Return a patch of low plants, which is labelled vegetation."""
+    leaves = bank(rng, width + 0.4, "dome", (1.2 * width, height), 0.3 * height, step=0.8)
+    return foliage([leaves], rng.uniform(0.02, 0.4), rng.normal(scale=0.5))
+
+
 @dataclass(frozen=True)
 class Thicket:
     """A kind of undergrowth or wood edge; lengths are in metres.

@@ -251,7 +251,7 @@ def trace(
         surface[bare[label[bare] == ground_label]] = ground_surface
     tint[bare] = ground.tint(x, y, label[bare])
 
-    has_leaves = (nearest.depth[hit] > 0) | (surface == Surface.GRASS)
+    has_leaves = (nearest.depth[hit] > 0) | np.isin(surface, (Surface.GRASS, Surface.LEAF))
 
     return Hits(
         direction=rays.direction[hit],

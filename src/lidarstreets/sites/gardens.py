@@ -8,7 +8,7 @@ from lidarstreets.bodies import buildings, clutter, furniture, plants, trees
 from lidarstreets.bodies.vehicles import cars, two_wheelers
 from lidarstreets.materials import Label
 from lidarstreets.sites.boundaries import DRIVE_WIDTH, draw_boundary, enclose, line_up
-from lidarstreets.sites.land import plant_bushes, plant_thickets
+from lidarstreets.sites.land import grow_cover, plant_bushes, plant_thickets
 from lidarstreets.sites.site import Plot
 
 
@@ -54,6 +54,9 @@ def _plant_garden(plot: Plot, depth: float) -> None:
     if rng.random() < 0.25 * green:
         overgrown = replace(plot, width=plot.width * 0.7)
         plant_thickets(overgrown, plot.front + rng.uniform(1.8, 3.0))
+    if rng.random() < 0.3 * green:
+        near = plot.front + rng.uniform(0.1, 1.5)
+        grow_cover(plot, near, near + rng.uniform(0.8, 4))
     if rng.random() < 0.25:
         bed = plants.flower_bed(rng, plot.width * rng.uniform(0.2, 0.5))
         plot.put(bed, plot.middle, plot.front + rng.uniform(0.8, 3), margin=plot.width * 0.3)

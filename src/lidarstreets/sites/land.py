@@ -12,6 +12,7 @@ from lidarstreets.sites.boundaries import draw_boundary, line_up
 from lidarstreets.sites.site import Plot
 
 MEADOW_TILE = 5.0  # metres: side of a patch of uncut grass, which lies flat on the ground
+COVER_TILE = 3.0  # metres: side of a patch of low plants
 # Functions that fill a plot, and their shares.
 _Fillers = dict[Callable[[Plot], None], float]
 
@@ -48,6 +49,8 @@ def _wood(plot: Plot) -> None:
         plot.put(trees.stump(rng), plot.random_x(), front + rng.uniform(1, 8))
 
     plant_bushes(plot, rng.poisson(density * plot.width * 14), depth)
+    if rng.random() < 0.9:
+        grow_cover(plot, front + rng.uniform(0.1, 4), front + depth)
     if rng.random() < 0.75:
         plant_thickets(plot, front + rng.uniform(1.5, 10))
     if rng.random() < 0.4:
@@ -68,6 +71,8 @@ def _wood_edge(plot: Plot) -> None:
     for x in np.arange(plot.x, plot.end, rng.uniform(4, 9)):
         tree = trees.tree(rng, rng.uniform(7, 14))
         plot.put(tree, x, edge + rng.uniform(-1.5, 1.5))
+    if rng.random() < 0.6:
+        grow_cover(plot, front + rng.uniform(0.1, edge - front), edge + 8)
     if rng.random() < 0.5:
         plant_bushes(plot, rng.poisson(4), edge - front + 0.5)
     if rng.random() < 0.5:
@@ -127,6 +132,9 @@ def _meadow(plot: Plot) -> None:
         _fence_off(plot, front + rng.choice([0.4, 1.5, 4.0, 10.0]))
 
     plant_bushes(plot, rng.poisson(2), 12)
+    if rng.random() < 0.4:
+        near = front + rng.uniform(0.1, 6)
+        grow_cover(plot, near, near + rng.uniform(1.5, 10))
     if rng.random() < 0.75:
         plant_thickets(plot, front + rng.uniform(7, 26))
     if rng.random() < 0.25:
@@ -252,6 +260,20 @@ def _lay_turf(plot: Plot, near: float, far: float) -> None:
                 plot.put_as_is(tile, x, distance, margin=3.0)
 
 
+def grow_cover(plot: Plot, near: float, far: float) -> None:
+    """Cover a plot with ivy, brambles or fern between two distances from the middle line."""
+    rng = plot.rng
+    plot.overgrow(near, far)
+
+    height = rng.uniform(0.03, 0.4)
+    filled = rng.uniform(0.0, 0.9)
+    for x in np.arange(plot.x, plot.end, COVER_TILE) + COVER_TILE / 2:
+        for distance in np.arange(near, min(far, near + 15), COVER_TILE) + COVER_TILE / 2:
+            if rng.random() < filled:
+                tile = plants.ground_cover(rng, COVER_TILE, height * rng.uniform(0.5, 1.5))
+                plot.put_as_is(tile, x, distance, margin=2.0)
+
+
 def _ground_tint(plot: Plot, x: float, distance: float) -> float:
     ground = plot.site.ground
     px, py, _ = ground.pose_at(x, plot.side * distance)
@@ -264,6 +286,10 @@ def plant_thickets(plot: Plot, distance: float, height: float | None = None) -> 
     thicket = plants.draw_thicket(rng)
     change = rng.choice([0.1, 0.5])
     filled = rng.choice([0.85, 1.0])
+
+    # What lies under and behind undergrowth is called vegetation, too.
+    if rng.random() < 0.7:
+        plot.overgrow(distance - rng.uniform(0.2, 1.5), distance + rng.uniform(1, 10))
 
     height = float(rng.uniform(1.2, 5.0)) if height is None else height
     highest = max(6.0, 1.3 * height)

@@ -204,6 +204,15 @@ class Plot:
         near, far = sorted((self.side * distance[0], self.side * distance[1]))
         self.site.ground.patches.append(Patch(x, (near, far), label))
 
+    def overgrow(self, near: float, far: float) -> None:
+        """Make the ground between two distances from the middle line vegetation.
+
+        It is drawn as the ground of the plot, so what is paved earlier or later lies on it.
+        """
+        t = sorted((self.side * near, self.side * far))
+        patch = Patch((self.x, self.end), (t[0], t[1]), Label.VEGETATION)
+        self.site.ground.patches.insert(0, patch)
+
 
 def covers(
     mesh: Mesh, pose: tuple[float, float, float], places: np.ndarray, clearance: float
