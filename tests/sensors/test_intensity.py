@@ -16,7 +16,6 @@ from amvnet.data.formats.cloud import Cloud
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
-from amvnet.sensors.ground import ground_height
 from amvnet.sensors.intensity import (
     KEY,
     MATCHED,
@@ -30,7 +29,7 @@ from amvnet.sensors.lidars import Sensor
 from amvnet.training.loaders import sensor_record
 from amvnet.weights.file import Weights
 
-from fixtures.sensors import LASERS, place
+from fixtures.sensors import LASERS, ground_height, place
 from fixtures.worlds import fails, fresh_weights, make_streets, street, write_scan
 
 TRAINED = np.array(QUANTILES["hdl64e"])
@@ -148,7 +147,7 @@ def test_another_range_later_in_a_source_is_that_of_another_sensor() -> None:
         points = scan_points(height)
         scan = normaliser(Cloud(points[:, :3], 255 * points[:, 3], name="b"), "a")
         np.testing.assert_allclose(scan.points[:, 3], points[:, 3], atol=1e-6)
-        assert ground_height(scan.points[:, :3].astype(float)) == pytest.approx(1.73, abs=0.05)
+        assert ground_height(scan.points) == pytest.approx(1.73, abs=0.05)
 
     points = scan_points()
     scan = normaliser(Cloud(points[:, :3], points[:, 3], name="c"), "a")

@@ -130,7 +130,7 @@ def test_disagreement_is_one_minus_the_cosine(world: Path, dataset: SemanticKitt
 def test_the_page_names_classes_and_colours_officially(world: Path) -> None:
     about = read_page(world / "p.html").about
     assert about["classes"][1:] == list(SEMANTICKITTI.classes)
-    np.testing.assert_array_equal(about["colors"][1:], class_colors(SEMANTICKITTI.colors)[1:])
+    np.testing.assert_array_equal(about["colors"][1:], class_colors(SEMANTICKITTI)[1:])
 
     keys = [source["key"] for source in about["sources"]]
     assert keys == ["truth", "rv", "bev", "ensemble", "amvnet"]

@@ -104,7 +104,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     With truth, its column is the first, and each prediction has a column of its own. Without
     truth there is one row, and the uncertain points are its last panel.
     """
-    palette = np.asarray(class_colors(view.taxonomy.colors)) / 255.0
+    palette = np.asarray(class_colors(view.taxonomy)) / 255.0
     palette[0] = IGNORED
     truth = view.truth
 
@@ -157,7 +157,7 @@ def _class_entries(view: TopView) -> list[tuple[str, Color]]:
     entries: list[tuple[str, Color]] = []
     for class_id in class_ids:
         if class_id > 0:
-            color = _shares(class_colors(taxonomy.colors)[class_id])
+            color = _shares(class_colors(taxonomy)[class_id])
             entries.append((taxonomy.classes[class_id - 1], color))
     if 0 in class_ids:
         entries.append(("ignored", IGNORED))

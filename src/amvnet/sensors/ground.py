@@ -51,16 +51,6 @@ class Ground:
         return float(np.degrees(np.arccos(np.clip(self.up[2], -1, 1))))
 
 
-def ground_height(xyz: np.ndarray) -> float | None:
-    """Return how many metres the origin is above the ground; None if no ground is found.
-
-    Args:
-        xyz: (N, 3) points in the sensor's frame.
-    """
-    ground = find_ground(xyz)
-    return None if ground is None else ground.height
-
-
 def find_ground(xyz: np.ndarray) -> Ground | None:
     """Find the ground of a scan whose z axis points more or less up; None if there is none.
 

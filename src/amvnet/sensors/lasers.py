@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from amvnet.sensors.ground import MIN_DISTANCE, ground_height
+from amvnet.sensors.ground import MIN_DISTANCE, find_ground
 from amvnet.sensors.lidars import Sensor
 
 MIN_POINTS = 100  # fewer say nothing about the sensor
@@ -112,8 +112,8 @@ def measure(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometr
     lasers = measure_lasers(points, ring)
     if lasers.fov_up is None:
         return lasers
-    height = ground_height(points[:, :3].astype(np.float64))
-    return dataclasses.replace(lasers, height=height)
+    ground = find_ground(points[:, :3].astype(np.float64))
+    return lasers if ground is None else dataclasses.replace(lasers, height=ground.height)
 
 
 def measure_lasers(points: np.ndarray, ring: np.ndarray | None = None) -> SensorGeometry:

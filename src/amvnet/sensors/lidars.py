@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -128,31 +130,8 @@ def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> np.ndarray:
     return about_z @ about_y @ about_x
 
 
-# Number of lasers and both ends of the field of view, degrees, from the makers' data sheets. How a
-# sensor is mounted on a vehicle is in none of them.
-_DATA_SHEETS: dict[str, tuple[int, float, float]] = {
-    "hdl64e": (64, 2.6, -24.0),
-    "hdl32e": (32, 10.67, -30.67),
-    "vlp16": (16, 15, -15),
-    "vlp32c": (32, 15, -25),
-    "vls128": (128, 15, -25),
-    "os0-32": (32, 45, -45),
-    "os0-64": (64, 45, -45),
-    "os0-128": (128, 45, -45),
-    "os1-32": (32, 22.5, -22.5),
-    "os1-64": (64, 22.5, -22.5),
-    "os1-128": (128, 22.5, -22.5),
-    "os2-64": (64, 11.25, -11.25),
-    "os2-128": (128, 11.25, -11.25),
-    "pandar40p": (40, 15, -25),
-    "pandar64": (64, 15, -25),
-    "pandar128": (128, 15, -25),
-    "xt32": (32, 15, -16),
-    "rs16": (16, 15, -15),
-    "rs32": (32, 15, -25),
-    "rs128": (128, 15, -25),
-}
-SENSORS = {name: Sensor(name, *sheet) for name, sheet in _DATA_SHEETS.items()}
+_SHEETS = tomllib.loads((files("amvnet.sensors") / "lidars.toml").read_text(encoding="utf-8"))
+SENSORS = {name: Sensor(name, *sheet) for name, sheet in _SHEETS.items()}
 
 
 def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -> Sensor:

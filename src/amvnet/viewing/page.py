@@ -216,7 +216,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     return {
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
-        "colors": [UNLABELLED, *class_colors(taxonomy.colors)[1:]],
+        "colors": [UNLABELLED, *class_colors(taxonomy)[1:]],
         "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
         "present": sorted(present),
         "sources": sources,
