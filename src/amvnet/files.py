@@ -58,12 +58,14 @@ def atomic_write(path: Path | str) -> Iterator[Path]:
         yield part
         if part.stat().st_mode != mode:
             part.chmod(mode)
+
         publish(part, path)
     except OSError as error:
         if error.errno in REFUSALS:
             raise InputError(
                 f"{path}: expected a file that can be written, found {error.strerror}; give another"
             ) from None
+
         if error.filename == str(part):
             error.filename = str(path)
         raise

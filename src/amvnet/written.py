@@ -146,8 +146,10 @@ def protecting(paths: Sequence[Path], overwrite: bool = False) -> Iterator[None]
     if not overwrite:
         for folder, names in names_by_folder.items():
             WrittenFiles(folder).check(names)
+
     earlier_stamps = {path: _stamp_of(path) for path in paths}
     yield
+
     for folder, names in names_by_folder.items():
         changed = []
         for name in names:

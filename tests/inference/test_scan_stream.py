@@ -17,11 +17,12 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.errors import InputError
 from amvnet.evaluation.analysis import analyze
 from amvnet.evaluation.scoring import evaluate, label_by_weights
+from amvnet.inference.listing import list_inputs
 from amvnet.inference.scan_stream import AHEAD, stream_scans
 from amvnet.inference.segmenter import Segmenter
 from amvnet.memory import available_memory
 from amvnet.ranking.label_errors import rank
-from amvnet.viewing.frames import LabelSource, choose_frames
+from amvnet.viewing.frames import Frames
 from amvnet.weights.file import save
 
 from fixtures.worlds import fresh_weights, make_streets, refusal, run_cli
@@ -149,7 +150,8 @@ def _ranked(dataset: Dataset, segmenter: Segmenter) -> Any:
 
 
 def _viewed(dataset: Dataset, segmenter: Segmenter) -> Any:
-    frames = choose_frames([dataset.spec], 10, LabelSource(segmenter))
+    scans, taxonomy = list_inputs([dataset.spec])
+    frames = Frames(taxonomy, scans, segmenter)
     return [[frame.name, frame.labels["amvnet"].tolist()] for frame in frames.each()]
 
 

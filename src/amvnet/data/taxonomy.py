@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
 from itertools import chain
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ MOST_CLASSES = 255  # train ids are uint8
 SATURATION = 0.65
 VALUE = 0.95
 GOLDEN_ANGLE = 0.381966  # of the circle of hues
+SHOWN = 5  # unknown ids in a message
 UNKNOWN = -1  # in lookup tables: no train id belongs to this raw id
 
 # A YAML label map has these tables, and its own name for each split.
@@ -147,14 +149,19 @@ class Taxonomy:
         raw_ids = np.asarray(raw).astype(np.uint32) & np.uint32(INSTANCE_MASK)
         train_ids = self._raw_id_lookup[raw_ids]
 
-        if (train_ids == UNKNOWN).any():
-            unknown = np.unique(raw_ids[train_ids == UNKNOWN])
-            raise InputError(
-                f"taxonomy {self.name}: expected only raw ids of its table, "
-                f"found {unknown[:5].tolist()}; check that the file holds labels, "
-                "or give the label map (YAML) that it was written with"
-            )
+        unknown = np.unique(raw_ids[train_ids == UNKNOWN]).tolist()
+        if unknown:
+            listed = ", ".join(map(str, unknown[:SHOWN]))
+            if len(unknown) > SHOWN:
+                listed += f" and {len(unknown) - SHOWN} more"
 
+            if raw_ids.max() <= self.size:
+                listed += " (train ids, it seems)"
+            raise InputError(
+                f"expected the raw ids of {self.name} "
+                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; write its raw "
+                "ids, or give the label map (YAML) that they are of"
+            )
         return train_ids.astype(np.uint8)
 
     def to_raw(self, ids: np.ndarray) -> np.ndarray:
@@ -355,24 +362,20 @@ def _built_in() -> dict[str, Taxonomy]:
 
     taxonomies = {}
     for name, table in tomllib.loads(text).items():
-        names = table["classes"]
-        colors = []
-        raw_to_train: dict[int | str, int] = {}
-        train_to_raw = []
-        for train_id, entry in enumerate(names.values()):
-            colors.append(_rgb(entry["color"]))
-            raw_to_train.update(dict.fromkeys(entry["raw"], train_id))
-            train_to_raw.append(entry["id"])
+        entries = table["classes"].values()
+        raw_to_train = []
+        for train_id, entry in enumerate(entries):
+            for raw in entry["raw"]:
+                raw_to_train.append((raw, train_id))
 
-        taxonomies[name] = Taxonomy(
-            name=name,
-            classes=tuple(names)[1:],
-            colors=tuple(colors),
-            raw_to_train=raw_to_train,
-            train_to_raw=tuple(train_to_raw),
-            splits={split: tuple(sequences) for split, sequences in table["splits"].items()},
-            counts_absent=table["counts_absent"],
-        )
+        fields = {
+            "name": name,
+            "classes": list(table["classes"])[1:],
+            "colors": map(itemgetter("color"), entries),
+            "raw_to_train": raw_to_train,
+            "train_to_raw": map(itemgetter("id"), entries),
+        }
+        taxonomies[name] = Taxonomy.from_dict({**table, **fields})
     return taxonomies
 
 

@@ -153,13 +153,15 @@ def median_frame(frames: Sequence[Frame]) -> Frame:
     unit = mode(frame.unit for frame in frames)
     axes = mode(frame.axes for frame in frames)
     alike = [frame for frame in frames if (frame.unit, frame.axes) == (unit, axes)] or list(frames)
+    turns = [(frame.pitch, frame.roll, frame.tilt) for frame in alike]
+    pitch, roll, tilt = np.median(turns, axis=0).tolist()
     heights = [frame.height for frame in frames if frame.height is not None]
 
     return Frame(
         unit,
         axes,
-        pitch=float(np.median([frame.pitch for frame in alike])),
-        roll=float(np.median([frame.roll for frame in alike])),
+        pitch=pitch,
+        roll=roll,
         height=float(np.median(heights)) if heights else None,
-        tilt=float(np.median([frame.tilt for frame in alike])),
+        tilt=tilt,
     )

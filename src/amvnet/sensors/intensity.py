@@ -90,6 +90,7 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
             quantiles = NO_INTENSITY
         elif carried:
             quantiles = check_quantiles(carried, f"the training record of {part}")
+
         augment = record.get("augment")
         share = augment.get("no_intensity") if isinstance(augment, Mapping) else None
         shares.append(share if isinstance(share, (int, float)) else 0)

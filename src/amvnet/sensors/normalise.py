@@ -342,8 +342,10 @@ def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
     texts = []
     if sensor.unit is None and frame.unit != "m":
         texts.append(f"--unit {frame.unit}")
+
     if sensor.axes is None and frame.axes != "x-forward":
         texts.append(f"--axes {frame.axes}")
+
     if frame.pitch or frame.roll:
         texts.append(
             f"a tilt of {frame.tilt:.0f} degrees (levelled, --rotate "

@@ -10,19 +10,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from amvnet.data.spacing import evenly_spaced
-from amvnet.data.taxonomy import Taxonomy, taxonomy_named
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import LoadedScan, check_scan, normaliser_for
+from amvnet.inference.listing import InputScan
+from amvnet.inference.reading import LoadedScan, check_scan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Origin, Segmentation, expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import cosine_similarity
 from amvnet.models.methods import geometric_mean
-from amvnet.progress import Progress, Say, no_progress, say_nothing
-from amvnet.sensors.lidars import Sensor
-from amvnet.sensors.normalise import Normaliser
+from amvnet.progress import Progress, no_progress
 
 # Colours for a dark background, RGB in 0..255. The official colour of points without a class is
 # black, which would hide them.
@@ -57,51 +54,39 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class LabelSource:
-    """Where the labels of the frames come from.
-
-    Attributes:
-        segmenter: labels the scans by every method, or None.
-        path: a folder of predictions as `predict` writes them, or the label file of one scan, or
-            None.
-        taxonomy: the name of a benchmark, or a YAML file; None means the classes of the weights or
-            of the inputs.
-    """
-
-    segmenter: Segmenter | None = None
-    path: Path | None = None
-    taxonomy: str | None = None
-
-    def named_taxonomy(self) -> Taxonomy | None:
-        """Return the classes of the weights, or those that the user named, or None.
-
-        Raises:
-            InputError: if there are both, or the named classes cannot be read.
-        """
-        if self.segmenter is not None:
-            if self.taxonomy is not None:
-                raise InputError(
-                    "expected no --taxonomy together with --weights, which define their classes; "
-                    "leave it out"
-                )
-            return self.segmenter.taxonomy
-
-        return None if self.taxonomy is None else taxonomy_named(self.taxonomy)
-
-
-@dataclass(frozen=True)
 class Frames:
     """The frames of some scans; each is read and labelled when it is needed.
 
     Attributes:
         taxonomy: the classes of the ids.
         scans: the scans, in the order of the frames.
-        source: where their labels come from.
+        segmenter: labels the scans by every method, or None.
+        labels: a folder of predictions as `predict` writes them, or the label file of one scan, or
+            None.
+
+    Raises:
+        InputError: if the labels do not exist, or one file is named for several scans.
     """
 
     taxonomy: Taxonomy
     scans: Sequence[InputScan]
-    source: LabelSource
+    segmenter: Segmenter | None = None
+    labels: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.labels is None:
+            return
+
+        if not self.labels.exists():
+            raise InputError(
+                f"{self.labels}: expected a file or a folder of labels, found none; check the path"
+            )
+
+        if self.labels.is_file() and len(self.scans) > 1:
+            raise InputError(
+                f"{self.labels}: expected a folder of labels for {len(self.scans)} scans, found a "
+                "file; give a folder"
+            )
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -112,8 +97,7 @@ class Frames:
         Raises:
             InputError: if a file is broken or missing.
         """
-        segmenter = self.source.segmenter
-        at_once = 1 if segmenter is None else segmenter.at_once
+        at_once = 1 if self.segmenter is None else self.segmenter.at_once
 
         progress(0, len(self))
         frames = stream_scans(self.scans, _load_with_labels, self._frame, at_once)
@@ -126,12 +110,11 @@ class Frames:
         scan = check_scan(loaded.scan)
         frame = Frame(scan_input.title, scan.points, scan.valid, scan.labels)
 
-        path = self.source.path
-        if path is not None:
-            ids = scan_input.read_labels(path, len(scan), self.taxonomy)
+        if self.labels is not None:
+            ids = scan_input.read_labels(self.labels, len(scan), self.taxonomy)
             frame = replace(frame, labels={"labels": ids})
 
-        segmenter = self.source.segmenter
+        segmenter = self.segmenter
         if segmenter is not None:
             if scan_input.is_normalised:
                 segmenter = segmenter.by_ring()
@@ -143,45 +126,6 @@ class Frames:
 
 def _load_with_labels(scan: InputScan) -> LoadedScan:
     return scan.load(labels=True)
-
-
-def choose_frames(
-    inputs: Sequence[str],
-    count: int,
-    source: LabelSource,
-    options: ScanOptions = ScanOptions(),
-    sensor: Sensor | None = None,
-    say: Say = say_nothing,
-) -> Frames:
-    """Choose up to `count` scans of the inputs, evenly spaced, to look at.
-
-    Args:
-        sensor: what is known of the sensor of scan files; the rest is measured for the weights.
-        say: called with what was assumed of the sensor.
-
-    Raises:
-        InputError: if an input or the labels are missing, one label file is named for several
-            scans, the inputs do not have the same classes, or `count` is below 1.
-    """
-    if count < 1:
-        raise InputError(f"expected a number of scans from 1, found {count}; say --scans 5")
-    labels_path = source.path
-    if labels_path is not None and not labels_path.exists():
-        raise InputError(
-            f"{labels_path}: expected a file or a folder of labels, found none; check the path"
-        )
-
-    normaliser = Normaliser(None, sensor, say)
-    if source.segmenter is not None:
-        normaliser = normaliser_for(source.segmenter.weights, sensor, say)
-    scans, taxonomy = list_inputs(inputs, options, source.named_taxonomy(), normaliser, say)
-    if labels_path is not None and labels_path.is_file() and len(scans) > 1:
-        raise InputError(
-            f"{labels_path}: expected a folder of labels for {len(scans)} scans, found a file; "
-            "give a folder"
-        )
-
-    return Frames(taxonomy, evenly_spaced(scans, count), source)
 
 
 def frame_of(result: Segmentation, origin: Origin) -> Frame:

@@ -37,25 +37,42 @@ def view(
         scans: at most this many, evenly spaced.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
     """
+    from amvnet.data.spacing import evenly_spaced
+    from amvnet.data.taxonomy import taxonomy_named
     from amvnet.files import make_folder
-    from amvnet.viewing.frames import LabelSource, choose_frames
+    from amvnet.inference.listing import list_inputs
+    from amvnet.inference.reading import normaliser_for
+    from amvnet.sensors.normalise import Normaliser
+    from amvnet.viewing.frames import Frames
     from amvnet.viewing.page import open_page, temporary_page, write_page
     from amvnet.weights.file import load
 
     if labels is not None and weights is not None:
         raise InputError("expected --labels or --weights, found both; give one of them")
+    if taxonomy is not None and weights is not None:
+        raise InputError(
+            "expected no --taxonomy together with --weights, which define their classes; "
+            "leave it out"
+        )
+    if scans < 1:
+        raise InputError(f"expected a number of scans from 1, found {scans}; say --scans 5")
     sensor = known.parse()
     # Before any scan is segmented, so that no time is wasted if a folder cannot be made.
-    page = html or temporary_page()
-    make_folder(page.parent)
+    if html is not None:
+        make_folder(html.parent)
 
     segmenter = None
+    classes = None if taxonomy is None else taxonomy_named(taxonomy)
+    normaliser = Normaliser(None, sensor, say)
     if weights is not None:
         loaded = load(weights)
         segmenter = compute.segmenter(loaded, widest_method(loaded.parts))
-    source = LabelSource(segmenter, labels, taxonomy)
-    frames = choose_frames(inputs, scans, source, choice.parse(), sensor=sensor, say=say)
+        classes = segmenter.taxonomy
+        normaliser = normaliser_for(loaded, sensor, say)
 
+    listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser, say)
+    frames = Frames(classes, evenly_spaced(listed, scans), segmenter, labels)
+    page = html or temporary_page()
     with progress("looking") as step:
         write_page(page, frames.each(step), frames.taxonomy, _title(inputs, weights))
     say(f"{counted(len(frames), 'scan')} in {page}; open it in a browser")

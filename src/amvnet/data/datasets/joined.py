@@ -199,6 +199,7 @@ def split_share(spec: str) -> tuple[str, float | None]:
         share = float(text)
     except ValueError:
         return spec, None  # such as PATH@v1.0-mini
+
     if not 0 < share < 1:
         raise InputError(
             f"{spec}: expected a share of an epoch above 0 and below 1, found {text}; correct it"

@@ -69,6 +69,7 @@ class NuScenes(Dataset):
     ) -> None:
         super().__init__(root, taxonomy)
         self.version = self._find_version(version)
+
         try:
             label_rows = self._table("lidarseg", required=False)
             self._label_files = _lookup(label_rows, "sample_data_token", "filename")

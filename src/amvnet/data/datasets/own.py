@@ -229,6 +229,7 @@ class OwnScans(Dataset):
 
             place = self.description.labels
             labels_path = None if place is None else place.path_of(scan.path, scan.name)
+
             record = ScanRecord(
                 name=name,
                 sequence=sequence,
@@ -257,7 +258,7 @@ class OwnScans(Dataset):
         texts = {name, path.relative_to(self.root).as_posix(), self._folder_of(name), *folders}
         splits = []
         for split, names in self._names.items():
-            if texts & names or any(fnmatchcase(name, pattern) for pattern in _patterns(names)):
+            if texts & names or any(fnmatchcase(name, pattern) for pattern in names):
                 splits.append(split)
 
         if len(splits) > 1:
@@ -273,6 +274,7 @@ class OwnScans(Dataset):
         names = {}
         for split, entries in self.description.split.items():
             texts: set[str] = set()
+
             for entry in entries:
                 path = self.root / entry
                 if path.suffix in (".txt", ".lst") and path.is_file():
@@ -289,10 +291,6 @@ class OwnScans(Dataset):
             return None
         layout = self.description.layout
         return read_scan_labels(path, count, self.taxonomy, place.field, layout)
-
-
-def _patterns(names: frozenset[str]) -> list[str]:
-    return [name for name in names if set(name) & set("*?[")]
 
 
 def _fixed_part(pattern: str) -> Path:
@@ -334,6 +332,7 @@ def _parse(path: Path, tree: Any) -> Description:
     """Return what the YAML file says."""
     _check_keys("the file", tree, KEYS, required=("classes", "scans"))
     root = (path.parent / Path(_text(tree, "root", ".")).expanduser()).absolute()
+
     scans = _text(tree, "scans")
     if Path(scans).is_absolute() or ".." in Path(scans).parts:
         raise InputError(
@@ -347,6 +346,7 @@ def _parse(path: Path, tree: Any) -> Description:
             f"sensor: expected a name or attributes such as height: 0.9, found {shown(sensor)}; "
             "correct it"
         )
+
     return Description(
         path,
         root,
@@ -370,6 +370,7 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
     for train_id, (title, values) in enumerate(entries.items(), start=1):
         _check_keys(f"classes: {title}", values, ("ids", "color"), required=("ids",))
         ids = _ids(f"classes: {title}", values["ids"])
+
         if not ids:
             raise InputError(f"classes: {title}: expected ids, found none; name one or more")
         train_to_raw.append(ids[0])
@@ -379,6 +380,7 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
     ignored = _ids("ignored", tree.get("ignored", []))
     for raw_id in ignored:
         _add(raw_to_train, raw_id, 0)
+
     if not ignored:  # points without a label have to get some id
         ignored = [next(raw for raw in range(INSTANCE_MASK) if raw not in raw_to_train)]
         raw_to_train[ignored[0]] = 0
@@ -393,14 +395,15 @@ def _add(raw_to_train: dict[int | str, int], raw_id: int, train_id: int) -> None
 
 def _ids(title: str, values: Any) -> list[int]:
     """Return raw ids; -1, which many tools write for no label, becomes the largest id."""
-    ids = values if isinstance(values, list) else [values]
-    for raw_id in ids:
+    ids = []
+    for raw_id in values if isinstance(values, list) else [values]:
         if type(raw_id) is not int or not -1 <= raw_id <= INSTANCE_MASK:
             raise InputError(
                 f"{title}: expected whole numbers from -1 to {INSTANCE_MASK} as ids, "
                 f"found {shown(raw_id)}; correct them"
             )
-    return [raw_id & INSTANCE_MASK for raw_id in ids]
+        ids.append(raw_id & INSTANCE_MASK)
+    return ids
 
 
 def _parse_labels(entry: Any) -> LabelPlace | None:

@@ -64,13 +64,13 @@ def split_records(
 
     # A sequence that the user named for one purpose is not used for the other by default.
     if not val:
-        val = [name for name in official_val if name not in (train or ())]
+        val = _without(official_val, train or ())
     if not train:
-        train = [name for name in official_train if name not in val]
+        train = _without(official_train, val)
 
     if with_val:
-        added = [name for name in val if name not in train]
-        return TrainingScans(dataset, dataset.labelled(dataset.records([*train, *added])), [])
+        names = [*train, *_without(val, train)]
+        return TrainingScans(dataset, dataset.labelled(dataset.records(names)), [])
 
     if not train or not val:
         raise InputError(
@@ -82,6 +82,10 @@ def split_records(
         dataset.labelled(dataset.records(train)),
         dataset.labelled(dataset.records(val)),
     )
+
+
+def _without(names: Sequence[str], others: Sequence[str]) -> list[str]:
+    return [name for name in names if name not in others]
 
 
 def training_records(dataset: Dataset) -> list[ScanRecord]:

@@ -90,6 +90,7 @@ def _open_reader(path: Path, ending: str) -> Any:
         ".db3": open_database,
         FOLDER: DirectoryReader,
     }
+
     if ending == ".mcap":
         _check_profile(path)
     reader = readers[ending](path)
@@ -120,6 +121,7 @@ def _check_unpacked(folder: Path) -> None:
     from rosbags.rosbag2.reader import zstd
 
     most = DISK + DISK_PER_BYTE * size_of(folder)
+
     unpacked = 0
     for path in sorted(folder.glob("*.zstd")):
         with zstd.open(path, "rb") as file:
@@ -195,12 +197,14 @@ def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, without
     if not counts:
         expected = "a topic" if topic is None else topic
         raise InputError(f"{path}: expected {expected} with PointCloud2, {without_scans}")
+
     if topic is not None:
         if topic in counts:
             return topic
         raise InputError(
             f"{path}: expected PointCloud2 under {topic}, found {listing}; give another --topic"
         )
+
     if len(counts) > 1:
         raise InputError(
             f"{path}: expected one topic with PointCloud2, found {listing}; choose one with --topic"

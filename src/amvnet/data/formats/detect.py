@@ -93,6 +93,7 @@ def ending_of(path: Path) -> str:
         raise InputError(
             f"{path}: expected a file that can be read, found {error.strerror}; check it"
         ) from None
+
     ending = _begins_as(head[:BEGINNING])
     if ending == ".zip":
         return _ending_of_zip(path)
@@ -102,6 +103,7 @@ def ending_of(path: Path) -> str:
     named = named_ending(path)
     if find_table(head) is not None:
         return named if named in TEXT else TEXT[0]
+
     if named in (NUSCENES_ENDING, ".bin"):
         if is_text(head):
             raise InputError(f"{path}: expected rows of numbers, found other text; {TEXT_ADVICE}")

@@ -60,6 +60,7 @@ def find_scans(path: Path | str) -> list[Path]:
     path = Path(path)
     if path.is_file() or is_bag_folder(path) or is_dead_link(path):
         return [path]
+
     if path.is_dir():
         paths = _scans_in(path)
     elif glob.has_magic(str(path)):
@@ -102,6 +103,7 @@ def list_scans(
     for file in files:
         # Files of several folders can have the same names.
         name = (file.parent.relative_to(folder) / scan_stem(file)).as_posix()
+
         try:
             scans = _scans_of(file, name, topic, layout)
         except InputError as error:
@@ -135,8 +137,7 @@ def _scans_in(folder: Path) -> list[Path]:
     paths = sorted(filter(is_scan_file, folder.iterdir()))
     if paths:
         return paths
-    texts = [path for path in sorted(folder.iterdir()) if path.name.lower().endswith(TEXT)]
-    return [path for path in texts if _is_text_scan(path)]
+    return sorted(filter(_is_text_scan, folder.iterdir()))
 
 
 def _matches(pattern: str) -> list[Path]:

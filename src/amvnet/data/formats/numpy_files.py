@@ -67,6 +67,7 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         if {"x", "y", "z"} <= set(arrays):
             columns = {key: read_array(path, names[index]).ravel() for key, index in arrays.items()}
             lengths = {names[arrays[key]]: len(values) for key, values in columns.items()}
+
             if len(set(lengths.values())) > 1:
                 raise InputError(
                     f"{path}: expected columns of one length, found {lengths}; {ARCHIVE_ADVICE}"
@@ -81,6 +82,7 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
             # An array of another size describes something else, such as the lasers.
             if len(values) == len(cloud.xyz):
                 extra[key] = values
+
         intensity = extra.get("intensity") if cloud.intensity is None else cloud.intensity
         ring = ring_indices(extra.get("ring")) if cloud.ring is None else cloud.ring
         return replace(cloud, intensity=intensity, ring=ring)
@@ -193,6 +195,7 @@ def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
             f"{path}: expected numbers of shape (N, 3), (N, 4), (N, 5) or (H, W, C), "
             f"found shape {array.shape}; save such an array"
         )
+
     if array.shape[0] <= FEW < array.shape[-1]:
         raise InputError(
             f"{path}: expected a row per point, found shape {array.shape}, which is transposed; "

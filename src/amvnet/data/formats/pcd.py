@@ -54,6 +54,7 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
             # Each value takes at least one digit, and each but the last a separator.
             check_point_count(points, path, 2 * fields.values * points - 1)
             return fields.read_text(file, points, chosen, path)
+
         if encoding == "binary":
             check_point_count(points, path, file.tell() + points * fields.record.itemsize)
             return fields.read_binary(file, points, chosen)

@@ -72,6 +72,7 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
         index = [element.name for element in elements].index("vertex")
         before = elements[:index]
         vertex = elements[index]
+
         if any("list" in element.types for element in elements[: index + 1]):
             raise InputError(
                 f"{path}: expected vertices without lists, found a list; write the points alone"

@@ -64,6 +64,7 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         guess = guess_rows(data)
         if guess is not None:
             return _to_cloud(data, path, guess)
+
         if len(data) >= ENOUGH:
             raise InputError(
                 f"{path}: expected rows of {COUNTS[0]} to {COUNTS[-1]} {' or '.join(DTYPES)}, "

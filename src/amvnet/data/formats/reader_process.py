@@ -64,9 +64,11 @@ def call(function: str, path: Path, *arguments: Any) -> dict[str, Any]:
         "folder": os.sep if path.is_absolute() else os.getcwd(),
         "size": size_of(path),
     }
+
     with _lock:
         if _process is None:
             _process = _Process()
+
         try:
             values = _process.exchange(request)
         except BaseException as error:  # an interruption, too: the reply would be that of the next
@@ -183,6 +185,7 @@ def serve() -> None:
         request = json.loads(line)
         os.chdir(request["folder"])  # of the other process, which may have changed since the last
         _set_limits(request["size"])
+
         module, _, function = request["function"].partition(":")
         try:
             with reading(request["arguments"][0], "a file that can be read", ADVICE):

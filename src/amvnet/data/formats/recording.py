@@ -59,6 +59,7 @@ class Recording:
                     if self._next == self._count:
                         self._rest = iter(())  # closes the file
                     return decode(name)
+
         raise InputError(
             f"{name}: expected {self._count} scans, found {self._next}; {self._advice}"
         )

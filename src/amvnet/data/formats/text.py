@@ -80,6 +80,7 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     with reading(path, EXPECTED, ADVICE):
         table = _require_table(path)
         names = layout.columns or table.names
+
         if names:
             indices = sorted(find_columns(names).values())
             if max(indices) >= table.count:

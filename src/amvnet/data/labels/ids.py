@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy
-from amvnet.errors import InputError
+from amvnet.errors import InputError, errors_of
 from amvnet.files import atomic_write
 
 WIDTHS = (1, 2, 4, 8)  # bytes of the number types that labels are written in by mistake
-SHOWN = 5  # unknown ids in a message
 
 
 def read_ids(path: Path, dtype: DTypeLike, count: int) -> np.ndarray:
@@ -108,23 +107,5 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
             f"as float32 and big-endian ids read; write the ids as little-endian {raw.dtype}"
         )
 
-    try:
+    with errors_of(name):
         return taxonomy.to_train(raw)
-    except InputError:
-        raise InputError(f"{name}: {_describe_unknown(classes, taxonomy)}") from None
-
-
-def _describe_unknown(classes: np.ndarray, taxonomy: Taxonomy) -> str:
-    """Return the message for (N,) raw ids that are not all in the taxonomy."""
-    unknown = sorted(set(np.unique(classes).tolist()) - set(taxonomy.raw_ids))
-    listed = ", ".join(map(str, unknown[:SHOWN]))
-    if len(unknown) > SHOWN:
-        listed += f" and {len(unknown) - SHOWN} more"
-    if classes.max() <= taxonomy.size:
-        listed += " (train ids, it seems)"
-
-    expected = ", ".join(map(str, taxonomy.train_to_raw[1:]))
-    return (
-        f"expected the raw ids of {taxonomy.name} ({expected}), found {listed}; write its raw ids, "
-        "or give the label map (YAML) that they are of"
-    )

@@ -63,8 +63,10 @@ def _read_field(path: Path, field: str, layout: RowLayout) -> np.ndarray:
     ending = ending_of(path)
     if ending.endswith(".bin"):
         return _read_raw_column(path, layout, field)
+
     if ending == ".npz" and field in member_names(path):
         return read_array(path, field)
+
     if ending in COLUMN_READERS:
         return read_column(path, ending, (field,))
     raise InputError(
@@ -78,6 +80,7 @@ def _read_usual(path: Path, count: int) -> np.ndarray:
     ending = path.suffix.lower()
     if ending in TEXT:
         return _read_numbers(path)
+
     if ending == ".npy":
         return read_array(path)
     if ending == ".npz":
