@@ -17,7 +17,7 @@ from amvnet.models.sync_batch_norm import SyncedBatchNorm, synchronise_batch_nor
 from amvnet.training.loaders import EpochSampler
 from amvnet.weights.file import Weights, load, save
 
-from fixtures.worlds import NO_PICTURES, files, make_streets, run_cli, without, write_recipe
+from fixtures.worlds import files, make_streets, run_cli, without, write_recipe
 
 # No DropBlock, as each process draws its own blocks. Double precision, as AdamW divides each
 # gradient by its size, which turns the rounding of a tiny gradient into a full step.
@@ -70,7 +70,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("world")
     data = make_streets(root / "data", scans=4)
     recipe = write_recipe(root / "recipe.yaml", model=MODEL, training=TRAINING)
-    assert run_cli("train", recipe, "--data", data, "--out", root / "run", *NO_PICTURES) == (0, "")
+    assert run_cli("train", recipe, "--data", data, "--out", root / "run") == (0, "")
 
     save(without(load(root / "run"), "point_head"), root / "networks.safetensors")
     return root
@@ -79,7 +79,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def train_arguments(world: Path, out: Path, stage: str) -> list[object]:
     recipe = world / "recipe.yaml"
     arguments = ["train", recipe, "--data", world / "data", "--out", out, "--stage", stage]
-    arguments += NO_PICTURES
     if stage == "head":
         arguments += ["--init", world / "networks.safetensors"]
     return arguments

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import threading
-import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -19,7 +18,7 @@ from torch import Tensor
 
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models import point_head, polar_net
-from amvnet.threads import BUSY, WAITING, BusyMachine, run_parts
+from amvnet.threads import WAITING, run_parts
 from amvnet.weights.file import save
 
 from fixtures.worlds import fresh_weights, street
@@ -87,44 +86,6 @@ def test_what_the_user_has_set_stays(name: str, value: str) -> None:
     expected = [value if variable == name else "None" for variable in WAITING]
     output = run_python(PRINTING, *WAITING, environment={name: value})
     assert output.split() == ["False", *expected]
-
-
-@pytest.fixture
-def machine(monkeypatch: pytest.MonkeyPatch) -> BusyMachine:
-    for name in WAITING:
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    return BusyMachine()
-
-
-def test_calls_that_wait_for_a_processor_are_warned_of_once(machine: BusyMachine) -> None:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        machine.note(9, 1)  # the first call waits for memory and files, too
-        machine.note(0.9 * BUSY, 1)
-        machine.note(9, 1)
-        machine.note(1, 1)
-        machine.note(9, 1)
-
-    with pytest.warns(RuntimeWarning, match="OMP_WAIT_POLICY=passive"):
-        machine.note(9, 1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        machine.note(9, 1)
-
-
-@pytest.mark.parametrize("setting", ["passive threads", "one thread"])
-def test_threads_that_do_not_spin_are_not_warned_of(
-    machine: BusyMachine, setting: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if setting == "one thread":
-        monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
-    else:
-        monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for _ in range(5):
-            machine.note(9, 1)
 
 
 @pytest.fixture

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import os
 import sys
-import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -20,12 +18,6 @@ from typing import TypeVar
 # Threads sleep while they wait. GNU's and LLVM's OpenMP read the first, LLVM's and Intel's the last
 # one; GNU's reads the second instead of the first.
 WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": None, "KMP_BLOCKTIME": "0"}
-
-# Ratio of a call's time to its thread's processor time. A thread that spins is never idle, so the
-# ratio is 1.0 on an idle machine; one busy process on two processors makes it 1.5, two make it 2.
-BUSY = 1.4
-SLOW_CALLS = 2  # in succession: one may have waited for a disk
-SHORTEST = 0.05  # seconds; shorter calls are not judged, as a single time slice decides their ratio
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
@@ -37,16 +29,11 @@ def wait_passively() -> None:
     Nothing changes if the user has set one of the variables, or torch is already imported: OpenMP
     reads the environment only once.
     """
-    if is_waiting_set() or "torch" in sys.modules:
+    if any(name in os.environ for name in WAITING) or "torch" in sys.modules:
         return
     for name, value in WAITING.items():
         if value is not None:
             os.environ[name] = value
-
-
-def is_waiting_set() -> bool:
-    """Return whether the environment says how threads wait."""
-    return any(name in os.environ for name in WAITING)
 
 
 def do_threads_sleep() -> bool:
@@ -116,50 +103,3 @@ def _use_one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
-
-
-class BusyMachine:
-    """Notices calls that wait for processors which other programs use, and warns once."""
-
-    def __init__(self) -> None:
-        self._calls = 0
-        self._slow_calls = 0
-        self._has_warned = False
-
-    @contextmanager
-    def watch(self, uses_team: bool) -> Iterator[None]:
-        """Time the block, if it computes in this thread with torch's team of threads."""
-        start = time.perf_counter()
-        thread_start = time.thread_time()
-        yield
-        if uses_team:
-            self.note(time.perf_counter() - start, time.thread_time() - thread_start)
-
-    def note(self, seconds: float, thread_seconds: float) -> None:
-        """Take note of a call, and warn if it and the one before waited for a processor.
-
-        The first call, which also waits for memory and files, does not count.
-        """
-        self._calls += 1
-        is_slow = seconds > SHORTEST and seconds > BUSY * thread_seconds
-        if self._calls == 1 or not is_slow:
-            self._slow_calls = 0
-            return
-
-        self._slow_calls += 1
-        if self._slow_calls < SLOW_CALLS or self._has_warned or not self._spins():
-            return
-        self._has_warned = True
-        warnings.warn(
-            f"a call took {seconds:.2f} s, and its thread ran for {thread_seconds:.2f} s of them: "
-            "other programs use the processors, and torch's threads wait by spinning; set "
-            "OMP_WAIT_POLICY=passive before Python starts, or call torch.set_num_threads(1)",
-            RuntimeWarning,
-            stacklevel=6,  # whoever calls the segmenter
-        )
-
-    def _spins(self) -> bool:
-        """Return whether this thread has a team of threads that spin while they wait."""
-        import torch
-
-        return torch.get_num_threads() > 1 and not is_waiting_set()

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import subprocess
 import sys
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
-from amvnet.cli.completion import SHELLS
 from amvnet.cli.main import VERBS, main
 from amvnet.cli.options import ScanChoice
 from amvnet.cli.parser import Command, field_texts, join_negative_values, make_parser, run_with
 from amvnet.cli.recipe_options import OFTEN_SET, add_recipe, with_options
 from amvnet.config.schema import ModelConfig, Recipe
-from amvnet.models.methods import EngineName
 
 from fixtures.worlds import refusal, run_cli
 
@@ -106,33 +102,6 @@ def test_help_shows_what_people_set(verb: str, capsys: pytest.CaptureFixture[str
         assert len(flags) <= 30
         assert set(OFTEN_SET) <= set(flags)
         assert "--help-all" in flags
-
-
-@pytest.mark.parametrize("shell", SHELLS)
-def test_a_shell_completes_verbs_options_and_values(
-    shell: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("shtab")
-    assert main(["--completion", shell]) == 0
-    script = capsys.readouterr().out
-    for verb in VERBS:
-        assert verb in script
-    for word in ("save", "training.rv.epochs", "int8", "nuscenes-compact"):
-        assert word in script
-
-
-def test_bash_completes_an_option_and_its_values(tmp_path: Path) -> None:
-    pytest.importorskip("shtab")
-    run = f"source <({sys.executable} -m amvnet --completion bash); "
-    run += "COMP_WORDS=(amvnet predict --engine ''); COMP_CWORD=3; "
-    run += "_shtab_amvnet amvnet '' --engine; echo ${COMPREPLY[@]}"
-    done = subprocess.run(["bash", "-c", run], capture_output=True, text=True, timeout=60)
-    assert done.stdout.split() == list(get_args(EngineName))
-
-
-def test_completion_for_another_shell_is_refused() -> None:
-    assert "bash, zsh" in refusal("--completion dosshell")
-    assert "bash, zsh" in refusal("--completion")
 
 
 def test_values_of_the_command_line_replace_those_of_the_recipe() -> None:

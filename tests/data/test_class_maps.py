@@ -26,7 +26,6 @@ from fixtures.worlds import (
     make_streets,
     refusal,
     run_cli,
-    succeed,
 )
 
 EQUAL = {  # classes of SemanticKITTI and of nuScenes that are the same coarse class
@@ -150,31 +149,6 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
     assert iou["vehicle"] == 1
     assert iou["ground"] == pytest.approx(matrix[0] / (matrix[0] + matrix[1]))
     assert iou["building"] == pytest.approx(matrix[2] / (matrix[2] + matrix[3]))
-
-
-def test_mapped_predictions_score_as_their_own_ids_do(tmp_path: Path) -> None:
-    weights = save(fresh_weights(), tmp_path / "w.safetensors")
-    data = make_streets(tmp_path / "data")
-    reports = []
-    for out, options, mapped in (
-        ("fine", [], []),
-        ("coarse", ["--classes", "coarse"], ["--mapped"]),
-    ):
-        succeed(f"predict {data} --weights {weights} --out {tmp_path / out} {' '.join(options)}")
-        figures = tmp_path / f"{out}.json"
-        code, error = run_cli(
-            *("evaluate", data, "--predictions", tmp_path / out, "--classes", "coarse"),
-            *("--json", figures, *mapped),
-        )
-        assert code == 0, error
-        reports.append(json.loads(figures.read_text())["methods"])
-    assert reports[0] == reports[1]
-
-    coarse = f"evaluate {data} --predictions {tmp_path / 'coarse'}"
-    assert "--mapped" in refusal(f"{coarse} --classes coarse")
-    missing = f"evaluate {data} --predictions {tmp_path / 'missing'} --classes coarse"
-    assert "--mapped" not in refusal(missing)
-    assert "--classes" in refusal(f"{coarse} --mapped")
 
 
 def test_two_classes_of_one_name_are_refused(tmp_path: Path) -> None:

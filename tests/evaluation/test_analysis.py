@@ -31,7 +31,6 @@ from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.worlds import (
-    NO_PICTURES,
     files,
     fresh_weights,
     make_streets,
@@ -54,7 +53,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_recipe(root / "recipe.yaml")
     save(fresh_weights(), root / "weights.safetensors")
     options = f"--data {root}/data --out {root}/run --training.head.epochs 4"
-    succeed(f"train {root}/recipe.yaml {options} {' '.join(NO_PICTURES)}")
+    succeed(f"train {root}/recipe.yaml {options}")
     return root
 
 
@@ -270,22 +269,6 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
     assert "networks" in refusal(command.replace("weights.safetensors", "other.safetensors"))
 
 
-def test_taus_are_swept_with_heads_of_their_own(world: Path) -> None:
-    out = world / "taus"
-    options = f"--out {out} --taus 1,0.9 --recipe {world}/recipe.yaml"
-    succeed(f"analyze {world}/data --weights {world}/weights.safetensors {options}")
-
-    assert column(out / "taus.csv", "tau, a head for each") == ["0.9", "1.0"]
-    fewer, all_points = map(float, column(out / "taus.csv", "uncertain %"))
-    assert fewer < all_points == 100
-    few = load(out / "taus/0.9/weights.safetensors")
-    many = load(out / "taus/1.0/weights.safetensors")
-    assert few.model.assertion.threshold == 0.9
-    assert many.model.assertion.threshold == 1.0
-    assert few.digest("point_head") != many.digest("point_head")
-    assert few.digest("range_net") == many.digest("range_net")
-
-
 def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     save(without(fresh_weights(), "point_head"), world / "headless.safetensors")
 
@@ -293,9 +276,6 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     cases = [
         ("headless", "", "point_head"),
         ("weights", "--neighbours 3", "--recipe"),
-        ("weights", "--taus 0.5", "--recipe"),
-        ("weights", f"--taus 0.5,2 {recipe}", "0.5,2"),
-        ("weights", f"--taus nan {recipe}", "nan"),
         ("weights", f"--neighbours 3,x {recipe}", "3,x"),
         ("weights", f"--neighbours ² {recipe}", "²"),
         ("weights", "--neighbours 3 --recipe nonsense", "nonsense"),

@@ -19,7 +19,6 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import load, save
 
 from fixtures.worlds import (
-    NO_PICTURES,
     commands_of,
     files,
     fresh_weights,
@@ -255,7 +254,7 @@ def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) ->
 def train_head_arguments(world: Path, out: Path) -> list[Any]:
     recipe = world / "recipe.yaml"
     arguments = ["train", recipe, "--data", world / "data", "--stage", "head", "--out", out]
-    return [*arguments, *NO_PICTURES]
+    return arguments
 
 
 def score_options(world: Path) -> list[Any]:

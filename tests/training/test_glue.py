@@ -28,7 +28,7 @@ from amvnet.training.plan import Plan
 from amvnet.training.stage import Stage
 from amvnet.weights.file import save
 
-from fixtures.worlds import NO_PICTURES, fresh_weights, make_streets, run_cli, write_recipe
+from fixtures.worlds import fresh_weights, make_streets, run_cli, write_recipe
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def arguments(world: Path, out: Path, stage: str, *options: object) -> list[object]:
-    shared = ["--data", world / "data", "--out", out, "--stage", stage, *NO_PICTURES, "--with-val"]
+    shared = ["--data", world / "data", "--out", out, "--stage", stage, "--with-val"]
     shared += ["--train-sequences", "00,01,02,03,04", "--init", world / "start.safetensors"]
     return ["train", world / "recipe.yaml", *shared, *options]
 
@@ -202,6 +202,6 @@ def test_every_part_of_a_training_takes_normalised_scans_by_their_rings(
     plan.build = lambda weights: Plan.build(plan, weights)
     gatherer: Any = SimpleNamespace(plan=plan, weights=weights, _device="cpu")
 
-    Plan.build(plan, weights)  # of all stages and their pictures
+    Plan.build(plan, weights)  # of all stages
     PointGatherer._scorer(gatherer)  # of the points of the head
     assert len(views) == 2 * is_normalised

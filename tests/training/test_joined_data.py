@@ -26,7 +26,6 @@ from amvnet.weights.file import load, save
 from fixtures.own_scans import make_own_scans
 from fixtures.worlds import (
     GOLDEN,
-    NO_PICTURES,
     fresh_weights,
     make_streets,
     refusal,
@@ -154,7 +153,6 @@ def arguments(world: Path, out: Path, b: str) -> list[object]:
     return [
         *("train", world / "recipe.yaml", "--init", world / "start.safetensors", "--out", out),
         *("--data", world / "a", "--data", b, "--train-sequences", "00", "--val-sequences", "08"),
-        *NO_PICTURES,
     ]
 
 

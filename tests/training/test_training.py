@@ -36,7 +36,6 @@ from fixtures.worlds import (
     BUILDING,
     CAR,
     GOLDEN,
-    NO_PICTURES,
     ROAD,
     SIDEWALK,
     fake_drive,
@@ -72,7 +71,7 @@ def train(world: Path, out: Path, *options: object) -> Weights:
 
 def train_arguments(world: Path, out: Path) -> list[object]:
     arguments = ["train", world / "recipe.yaml", "--data", world / "data", "--out", out]
-    return [*arguments, *NO_PICTURES]
+    return arguments
 
 
 def fail(*arguments: object) -> str:
@@ -111,7 +110,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(world: Path) -> Path:
     """Train all stages without interruption."""
-    train(world, world / "run", "--logger", "tensorboard")
+    train(world, world / "run")
     return world / "run"
 
 
@@ -818,15 +817,6 @@ def test_a_stage_can_be_followed_in_tensorboard(run: Path, stage: str) -> None:
     assert {"train/loss", "val/miou", "iou/road"} <= scalars
     assert any(name.startswith("lr-") for name in scalars)
     assert ("points/s" if stage == "head" else "scans/s") in scalars
-
-    assert sorted(events.Tags()["images"]) == ["08/000000", "08/000001"]
-    first = events.Images("08/000000")
-    second = events.Images("08/000001")
-    epochs = 2 if stage == "head" else 3
-    assert len(first) == epochs
-    assert len(second) == epochs
-    assert first[0].encoded_image_string.startswith(b"\x89PNG")
-    assert first[0].encoded_image_string != second[0].encoded_image_string
 
 
 def test_the_share_of_uncertain_points_is_that_of_the_networks(

@@ -77,8 +77,7 @@ USAGE = f"""usage: amvnet VERB ...
   bench      time per stage on this machine
   info       what a weights file is, or what is installed
 
-`amvnet VERB --help` says more. `amvnet --completion bash` prints what completes all of it
-(also for zsh, fish and tcsh; pip install "amvnet[completion]"). Version {__version__}."""
+`amvnet VERB --help` says more. Version {__version__}."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -128,11 +127,6 @@ def _run_in_one_line(arguments: Sequence[str]) -> int:
         return DONE
 
     try:
-        if arguments[0] == "--completion":
-            from amvnet.cli.completion import completion
-
-            stdout.write(completion(VERBS, " ".join(arguments[1:])))
-            return DONE
         with memory_for(f"amvnet {arguments[0]}"):
             run(arguments[0], arguments[1:])
     except InputError as error:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import say, silence
 from amvnet.config.bounds import Range
@@ -28,8 +28,6 @@ Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]  # the 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 SHOWN = 20  # names of sequences in a line
 NEIGHBOURS = Range(1, 1000)
-
-Number = TypeVar("Number", int, float)
 
 
 @dataclass(frozen=True)
@@ -262,27 +260,18 @@ def parse_methods(text: str) -> list[str]:
     return names
 
 
-def parse_numbers(
-    text: str, kind: Callable[[str], Number], allowed: Range, example: str
-) -> list[Number]:
-    """Parse numbers separated by commas; return them sorted, each once.
-
-    Args:
-        kind: int or float.
-        example: for the message.
+def parse_counts(text: str) -> list[int]:
+    """Parse numbers of neighbours separated by commas; return them sorted, each once.
 
     Raises:
-        InputError: if one is no number in the range.
+        InputError: if one is no number, or out of range.
     """
-    values = set()
+    counts = set()
     for name in parse_names(text) or []:
-        try:
-            value = kind(name)
-        except ValueError:
-            value = kind("-1")
-        if value not in allowed:  # nor NaN
+        count = int(name) if name.isdecimal() and len(name) < 9 else -1
+        if count not in NEIGHBOURS:
             raise InputError(
-                f"expected numbers {allowed} with commas, found {shown(text)}; say {example}"
+                f"expected numbers {NEIGHBOURS} with commas, found {shown(text)}; say 5,10,15"
             )
-        values.add(value)
-    return sorted(values)
+        counts.add(count)
+    return sorted(counts)

@@ -17,7 +17,6 @@ from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import check_classes
 from amvnet.data.spacing import evenly_spaced
-from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
@@ -220,48 +219,21 @@ def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatc
     return None
 
 
-def label_from_files(
-    dataset: Dataset, folder: Path, classes: ClassMap | None = None, is_mapped: bool = False
-) -> Labeller:
+def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = None) -> Labeller:
     """Return what reads the labels of scans from a folder of predictions.
 
     Args:
         classes: maps the classes of the dataset to those that are scored; None scores these.
-        is_mapped: whether the predictions have the ids of the map; else those of the dataset.
 
     Raises:
         InputError: if there is no such folder.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
-
-    def read(record: ScanRecord) -> np.ndarray:
-        if classes is None:
-            return dataset.read_prediction(record, folder)
-        if is_mapped:
-            return dataset.read_prediction(record, folder, classes.target)
-
-        try:
-            ids = dataset.read_prediction(record, folder)
-        except InputError:
-            if _has_ids_of(classes.target, dataset, record, folder):
-                raise InputError(
-                    f"{folder / record.prediction}: expected the ids of {dataset.taxonomy.name}, "
-                    f"found those of {classes.target.name}; say --mapped"
-                ) from None
-            raise
-        return classes.table(dataset.taxonomy)[ids]
+    table = None if classes is None else classes.table(dataset.taxonomy)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
-        return {"predictions": read(record)}, None
+        ids = dataset.read_prediction(record, folder)
+        return {"predictions": ids if table is None else table[ids]}, None
 
     return Labeller(label)
-
-
-def _has_ids_of(taxonomy: Taxonomy, dataset: Dataset, record: ScanRecord, folder: Path) -> bool:
-    """Return whether the prediction of a scan can be read with the ids of some classes."""
-    try:
-        dataset.read_prediction(record, folder, taxonomy)
-    except InputError:
-        return False
-    return True

@@ -30,7 +30,6 @@ from amvnet.models.graphs import Captured
 from amvnet.models.layers import freeze
 from amvnet.models.methods import (
     METHODS,
-    ONNX_ENGINES,
     MethodName,
     Precision,
     check_method,
@@ -42,7 +41,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import Voting
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
-from amvnet.threads import BusyMachine, survive_forks
+from amvnet.threads import survive_forks
 from amvnet.weights.file import Weights, load
 
 EACH = 2**30  # bytes that a scan may take; one of 120,000 points takes half, at the paper's size
@@ -105,7 +104,6 @@ class Segmenter:
         self._are_fractions = self.intensity is None or self.intensity.quantiles[-1] <= 1
 
         survive_forks()
-        self._machine = BusyMachine()
 
         self.model: AMVNet = self.weights.build().to(self.device)
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -177,11 +175,9 @@ class Segmenter:
             InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
         checked = [check_scan(points, self.intensity) for points in scans]
-        uses_team = self.device == "cpu" and self.engine not in ONNX_ENGINES
-
         is_large = sum(map(len, checked)) >= LARGE
         memory = return_freed_memory() if is_large else nullcontext()
-        with self._machine.watch(uses_team), memory:
+        with memory:
             batch = self.batch(checked)
             labels, scores = fetch(self.run(batch))
 

@@ -1,88 +1,56 @@
-"""Studies that train: heads by tau and by neighbours, and the range-view network's ablation."""
+"""Studies that train: heads by number of neighbours, and the range-view network's ablation."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from amvnet.config.schema import AssertionConfig, Recipe
-from amvnet.data.datasets.select import TrainingScans
+from amvnet.config.schema import Recipe
 from amvnet.evaluation.analysis import Swept
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.precision import choose_device
-from amvnet.progress import Say, say_nothing
 from amvnet.training.plan import Plan
 from amvnet.training.run import train
 from amvnet.weights.file import Weights
 
 
-@dataclass(frozen=True)
-class HeadStudy:
-    """Heads for different values of tau or numbers of neighbours (Fig. 8 of the paper).
+def sweep_neighbours(
+    plan: Plan, counts: Sequence[int], weights: Weights, device: str = "cpu"
+) -> Iterator[Swept]:
+    """Train a head for each number of neighbours, and yield its figures (Fig. 8 of the paper).
 
-    Each is kept in OUT/NAME/VALUE; those that are finished are not trained again.
+    Args:
+        plan: how the heads are trained; each is kept in a folder of the plan's, and not trained
+            again if it is finished.
+        weights: whose networks the heads are trained for.
 
-    Attributes:
-        name: of the parameter, and of the folder.
-        recipe: how the heads are trained.
-        weights: whose networks they are trained for.
-        scans: to train on, and to score.
-        out: the folder of the analysis.
+    Raises:
+        InputError: if a folder holds a head for other networks, other scans or another recipe.
     """
+    dataset = plan.scans.dataset
+    for count in counts:
+        networks = _with_neighbours(weights, count)
+        recipe = dataclasses.replace(plan.recipe, model=networks.model)
+        head_plan = dataclasses.replace(plan, recipe=recipe, out=plan.out / str(count))
 
-    name: Literal["neighbours", "taus"]
-    recipe: Recipe
-    weights: Weights
-    scans: TrainingScans
-    out: Path
-
-    def check(self) -> None:
-        """Raise InputError if the recipe does not fit the scans."""
-        Plan(self.recipe, self.scans, self.out)
-
-    def sweep(
-        self, values: Sequence[float], say: Say = say_nothing, device: str = "cpu"
-    ) -> Iterator[Swept]:
-        """Train a head for each value, and yield its figures.
-
-        Raises:
-            InputError: if OUT holds heads for other networks, other scans or another recipe.
-        """
-        for value in values:
-            yield self._score(value, say, device)
-
-    def _score(self, value: float, say: Say, device: str) -> Swept:
-        networks = self._networks(value)
-        recipe = dataclasses.replace(self.recipe, model=networks.model)
-        out = self.out / self.name / str(value)
-        plan = Plan(recipe, self.scans, out, resume=True, say=say)
-
-        segmenter = Segmenter(train(plan, "head", networks), device)
-        dataset = self.scans.dataset
-        evaluation = evaluate(dataset, self.scans.val, label_by_weights(dataset, segmenter))
+        segmenter = Segmenter(train(head_plan, "head", networks), device)
+        evaluation = evaluate(dataset, plan.scans.val, label_by_weights(dataset, segmenter))
         uncertain = evaluation.uncertain / max(evaluation.asked, 1)
-        matrix = evaluation.matrices["amvnet"][0]
-        return Swept.of(value, uncertain, matrix, dataset.taxonomy)
+        yield Swept.of(count, uncertain, evaluation.matrices["amvnet"][0], dataset.taxonomy)
 
-    def _networks(self, value: float) -> Weights:
-        """Return the weights without their head, for a head with a value of the parameter."""
-        model = self.weights.model
-        if self.name == "neighbours":
-            head = dataclasses.replace(model.point_head, neighbours=int(value))
-            model = dataclasses.replace(model, point_head=head)
-        else:
-            model = dataclasses.replace(model, assertion=AssertionConfig(value))
 
-        networks = Weights(model, self.weights.taxonomy, self.weights.sensor)
-        for part in ("range_net", "polar_net"):
-            networks = networks.replace_part(part, self.weights)
-
-        return networks
+def _with_neighbours(weights: Weights, count: int) -> Weights:
+    """Return the networks of some weights, for a head with another number of neighbours."""
+    head = dataclasses.replace(weights.model.point_head, neighbours=count)
+    model = dataclasses.replace(weights.model, point_head=head)
+    networks = Weights(model, weights.taxonomy, weights.sensor)
+    for part in BOTH_NETWORKS:
+        networks = networks.replace_part(part, weights)
+    return networks
 
 
 def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[str, Any]]]:

@@ -1,11 +1,11 @@
-"""Lightning callbacks and loggers of a training: weights, curves, seeds, speed, pictures."""
+"""Lightning callbacks of a training: weights, curves, seeds, speed."""
 
 from __future__ import annotations
 
 import csv
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -16,34 +16,16 @@ import numpy as np
 import torch
 import yaml
 from lightning.pytorch.callbacks import Callback, RichProgressBar
-from lightning.pytorch.loggers import (
-    CSVLogger,
-    Logger,
-    MLFlowLogger,
-    TensorBoardLogger,
-    WandbLogger,
-)
-from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from amvnet.data.spacing import evenly_spaced
-from amvnet.evaluation.top_view import TopView, scan_figure
 from amvnet.files import atomic_write
 from amvnet.memory import peak_memory
-from amvnet.models.views.points import PointBatch
-from amvnet.scan import Scan
-from amvnet.sensors.intensity import TrainedIntensity, match_scan
+from amvnet.progress import Say
+from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.loaders import sensor_record
-from amvnet.training.plan import LoggerName, Plan, check_logger
+from amvnet.training.plan import Plan
 from amvnet.training.run_folder import PART_OF, SETTINGS, description, stage_settings
 from amvnet.weights.file import Weights, part_state, save
-
-PICTURED_SCANS = 2
-PICTURE_ROUNDS = 10  # about how many times in a training pictures are drawn
-PICTURE_DPI = 60
-
-PROJECT = "amvnet"  # the project of Weights & Biases, and the experiment of MLflow
-WITH_PICTURES = ("tensorboard", "wandb", "mlflow")
 
 
 class AverageWeights(Callback):
@@ -308,16 +290,21 @@ class Speed(Callback):
 class Bar(RichProgressBar):
     """Progress bar of an epoch with loss, mIoU, speed and the time left of the whole training."""
 
+    def __init__(self, speed: Speed) -> None:
+        super().__init__()
+        self.speed = speed
+
     def get_metrics(self, trainer: L.Trainer, pl_module: L.LightningModule) -> dict[str, Any]:
         metrics = super().get_metrics(trainer, pl_module)
         metrics.pop("v_num", None)
-        return {**metrics, "left": _speed_of(trainer).time_left(trainer)}
+        return {**metrics, "left": self.speed.time_left(trainer)}
 
 
 class EpochLines(Callback):
     """Prints one line per epoch; used if there is no terminal for a progress bar."""
 
-    def __init__(self, say: Callable[[str], None], name: str) -> None:
+    def __init__(self, speed: Speed, say: Say, name: str) -> None:
+        self.speed = speed
         self.say = say
         self.name = name
 
@@ -331,69 +318,15 @@ class EpochLines(Callback):
             miou_present = metrics["val/miou_present"]
             results += f", val mIoU {miou:.4f} (classes present {miou_present:.4f})"
 
-        speed = _speed_of(trainer)
-        pace = f"{speed.rate:.3g} {pl_module.unit}/s"
-        times = f"epoch in {speed.elapsed}, {speed.time_left(trainer)} left"
+        pace = f"{self.speed.rate:.3g} {pl_module.unit}/s"
+        times = f"epoch in {self.speed.elapsed}, {self.speed.time_left(trainer)} left"
         epoch = f"{self.name} epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"
         self.say(f"{epoch}: {results}; {pace}, {times}")
-
-
-class Pictures(Callback):
-    """Draws predictions of some validation scans, seen from above, for the logger.
-
-    Args:
-        score: returns the (P, K) scores of a batch of one scan.
-    """
-
-    def __init__(
-        self,
-        plan: Plan,
-        intensity: TrainedIntensity | None,
-        score: Callable[[PointBatch], Tensor],
-    ) -> None:
-        dataset = plan.scans.dataset
-        is_drawn = plan.processes.first and plan.logger in WITH_PICTURES
-        records = evenly_spaced(plan.scans.val, PICTURED_SCANS) if is_drawn else []
-        self.scans = [match_scan(dataset.read(record), intensity) for record in records]
-        self.taxonomy = dataset.taxonomy
-        self.score = score
-
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
-        interval = max((trainer.max_epochs or 1) // PICTURE_ROUNDS, 1)
-        is_due = (trainer.current_epoch + 1) % interval == 0
-        if not (self.scans and is_due):
-            return
-
-        with _weights_to_keep(trainer, pl_module.trained) as part:
-            parameter = next(part.parameters())
-            part.eval()
-            for scan in self.scans:
-                batch = PointBatch.of([scan]).to(parameter.device).to(parameter.dtype)
-                self._draw(scan, batch, trainer)
-            part.train()
-
-    @torch.no_grad()
-    def _draw(self, scan: Scan, batch: PointBatch, trainer: L.Trainer) -> None:
-        ids = np.zeros(len(scan), dtype=np.uint8)  # 0 for invalid points
-        ids[scan.valid] = self.score(batch).argmax(dim=1).cpu().numpy() + 1
-
-        predictions = {"prediction": ids}
-        view = TopView(scan.points, self.taxonomy, predictions, scan.labels, title=scan.name)
-        figure = scan_figure(view)
-        figure.set_dpi(PICTURE_DPI)
-
-        log_figure(trainer.logger, scan.name, figure, trainer.current_epoch)
 
 
 def _metrics(trainer: L.Trainer) -> dict[str, float]:
     """Return the logged metrics of the epoch as plain numbers."""
     return {name: float(value) for name, value in trainer.callback_metrics.items()}
-
-
-def _speed_of(trainer: L.Trainer) -> Speed:
-    """Return the callback that measures the speed of this training."""
-    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    return next(callback for callback in callbacks if isinstance(callback, Speed))
 
 
 @contextmanager
@@ -409,36 +342,3 @@ def _weights_to_keep(trainer: L.Trainer, part: nn.Module) -> Iterator[nn.Module]
 
 def _copies(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor.clone() for name, tensor in tensors.items()}
-
-
-def make_logger(name: LoggerName, folder: Path) -> Logger:
-    """Return the logger of a stage.
-
-    Args:
-        folder: of the stage, in the folder of its run; what the logger writes goes there.
-
-    Raises:
-        InputError: if its library is missing.
-    """
-    check_logger(name)
-    title = f"{folder.parent.name}/{folder.name}"
-    if name == "tensorboard":
-        return TensorBoardLogger(folder, name="", version="")
-    if name == "wandb":
-        return WandbLogger(name=title, project=PROJECT, save_dir=folder)
-    if name == "mlflow":
-        # The variable MLFLOW_TRACKING_URI of the user counts more than the folder.
-        return MLFlowLogger(PROJECT, run_name=title, save_dir=str(folder / "mlruns"))
-    # In a folder of its own, as metrics.csv in the stage's folder has a row per epoch.
-    return CSVLogger(folder, name="csv", version="")
-
-
-def log_figure(logger: Logger | None, name: str, figure: Figure, epoch: int) -> None:
-    """Give a picture to a logger; those without pictures leave it out."""
-    if isinstance(logger, TensorBoardLogger):
-        logger.experiment.add_figure(name, figure, epoch)
-    elif isinstance(logger, WandbLogger):
-        logger.log_image(name, [figure])
-    elif isinstance(logger, MLFlowLogger):
-        path = f"{name}/{epoch:04d}.png"
-        logger.experiment.log_figure(logger.run_id, figure, path)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 from torch.nn import functional as F
 from torch.utils.data import DataLoader
@@ -16,9 +15,8 @@ from amvnet.config.schema import HeadTraining
 from amvnet.errors import InputError
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.point_head import PointHead
-from amvnet.models.views.points import PointBatch
 from amvnet.sensors.intensity import trained_intensity
-from amvnet.training.callbacks import KeepWeights, Pictures
+from amvnet.training.callbacks import KeepWeights
 from amvnet.training.head_points import (
     HeadBatch,
     HeadPoints,
@@ -149,15 +147,8 @@ def train_head(plan: Plan, weights: Weights) -> None:
         weights=class_weights_of(plan) if config.class_weights else None,
         processes=plan.processes,
     )
-    callbacks: list[Callback] = [KeepWeights(plan, "head", weights, intensity)]
-    # Pictures show batches of points, which do not say whose scores to read from files.
-    if plan.scores is None:
-
-        def score(batch: PointBatch) -> Tensor:
-            return model.to(batch.points.device)(batch).merged
-
-        callbacks.append(Pictures(plan, intensity, score))
-    fit(stage, plan, _make_loaders(plan, train, val), callbacks)
+    keep_weights = KeepWeights(plan, "head", weights, intensity)
+    fit(stage, plan, _make_loaders(plan, train, val), keep_weights)
 
     # The gathered points take much space, and no process needs them any more.
     plan.processes.wait()

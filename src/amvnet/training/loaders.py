@@ -184,38 +184,6 @@ class EpochSampler(EpochOrder):
         return self.processes.share(order.tolist())
 
 
-class ErrorsAsItems(data.Dataset[Scan | InputError]):
-    """The same scans, with an error in place of each that cannot be read.
-
-    A worker process can raise an error only as text, with its traceback. As an item it reaches the
-    main process whole, and `Stage` raises it there.
-    """
-
-    def __init__(self, scans: ScanSet) -> None:
-        self.scans = scans
-
-    def __len__(self) -> int:
-        return len(self.scans)
-
-    def __getitem__(self, key: Key) -> Scan | InputError:
-        try:
-            return self.scans[key]
-        except InputError as error:
-            return error
-
-
-def collate_or_error(
-    items: Sequence[Scan | InputError],
-) -> tuple[PointBatch, Tensor] | InputError:
-    """Return the batch of some scans, or the first error among them."""
-    scans = []
-    for item in items:
-        if isinstance(item, InputError):
-            return item
-        scans.append(item)
-    return collate(scans)
-
-
 def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
     """Return the valid points of labelled scans, and their (P,) int64 train ids."""
     labels = [scan.labels[scan.valid] for scan in scans if scan.labels is not None]
@@ -224,21 +192,19 @@ def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
 
 def make_loader(
     scans: ScanSet, batch: int, workers: int, shuffle: bool, processes: Processes = ALONE
-) -> data.DataLoader[tuple[PointBatch, Tensor] | InputError]:
+) -> data.DataLoader[tuple[PointBatch, Tensor]]:
     """Make a loader of this process's batches; the last one of an epoch may be smaller.
-
-    A batch with a scan that cannot be read is an error instead.
 
     Args:
         batch: scans in a batch of one process.
         workers: processes that read scans; 0 to read in this one.
     """
     return data.DataLoader(
-        ErrorsAsItems(scans),  # type: ignore[arg-type]  # the sampler gives keys, not indices
+        scans,  # type: ignore[arg-type]  # the sampler gives keys, not indices
         batch_size=batch,
         sampler=EpochSampler(len(scans), scans.seed, shuffle, processes),
         num_workers=workers,
-        collate_fn=collate_or_error,
+        collate_fn=collate,
         persistent_workers=workers > 0,
         pin_memory=torch.cuda.is_available(),  # so that batches go to a GPU while it computes
     )

@@ -18,7 +18,7 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
-from amvnet.training.callbacks import KeepWeights, Pictures, Speed
+from amvnet.training.callbacks import KeepWeights, Speed
 from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
@@ -214,9 +214,7 @@ def train_network(plan: Plan, name: str, weights: Weights, steps: int | None = N
         return fit(make_stage(plan, name, model, uniform), plan, loaders, steps=steps)
 
     stage = make_stage(plan, name, model, class_weights_of(plan) if config.class_weights else None)
-    score = model.score_range_view if name == "rv" else model.score_polar_view
-    callbacks = [KeepWeights(plan, name, weights, intensity), Pictures(plan, intensity, score)]
-    return fit(stage, plan, loaders, callbacks)
+    return fit(stage, plan, loaders, KeepWeights(plan, name, weights, intensity))
 
 
 def make_stage(

@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
 
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
@@ -23,9 +21,6 @@ from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Say, say_nothing
 from amvnet.weights.file import Weights, load
 
-LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
-LIBRARIES = ("wandb", "mlflow")  # loggers that need a library of the same name
-
 
 @dataclass(frozen=True)
 class Plan:
@@ -40,13 +35,12 @@ class Plan:
         say: prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
         processes: those that share the run; all must see its folder.
-        logger: where the curves and pictures go.
         scores: two other models' scores of the scans; the head is trained on them instead of on
             those of the networks. None without other models.
 
     Raises:
-        InputError: if the processes cannot share the scans or the batches, the recipe is for other
-            classes than the dataset's, or the logger lacks its library.
+        InputError: if the processes cannot share the scans or the batches, or the recipe is for
+            other classes than the dataset's.
     """
 
     recipe: Recipe
@@ -56,12 +50,9 @@ class Plan:
     say: Say = say_nothing
     bars: bool = False
     processes: Processes = ALONE
-    logger: LoggerName = "tensorboard"
     scores: ScorePair | None = None
 
     def __post_init__(self) -> None:
-        check_logger(self.logger)
-
         size = self.processes.size
         val = self.scans.val
         if 0 < len(val) < size:  # a process without a scan would keep the others waiting
@@ -102,14 +93,6 @@ class Plan:
         if self.scans.dataset.is_normalised:
             model.range_view = model.range_view.by_ring()
         return model
-
-
-def check_logger(name: LoggerName) -> None:
-    """Raise InputError if the library of a logger is not installed."""
-    if name in LIBRARIES and find_spec(name) is None:
-        raise InputError(
-            f"expected {name} for --logger {name}, found none; pip install 'amvnet[{name}]'"
-        )
 
 
 def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:

@@ -7,7 +7,6 @@ import math
 import pickle
 import signal
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -15,6 +14,7 @@ import lightning as L
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
@@ -34,7 +34,6 @@ from amvnet.training.callbacks import (
     EpochLines,
     SeedBatches,
     Speed,
-    make_logger,
 )
 from amvnet.training.loaders import count_classes
 from amvnet.training.losses import class_weights
@@ -95,13 +94,7 @@ class Stage(L.LightningModule):
         raise NotImplementedError
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
-        """Convert floating-point values of a batch to the precision of the weights.
-
-        Raises:
-            InputError: if the batch is one, because a scan cannot be read.
-        """
-        if isinstance(batch, InputError):
-            raise batch
+        """Convert floating-point values of a batch to the precision of the weights."""
         return tuple(map(self._in_precision, batch))
 
     def check_finite(self, loss: Tensor, where: str) -> None:
@@ -202,14 +195,14 @@ def fit(
     stage: Stage,
     plan: Plan,
     loaders: Loaders,
-    callbacks: Sequence[Callback] = (),
+    keep_weights: Callback | None = None,
     steps: int | None = None,
 ) -> Speed:
     """Train a stage in its folder of the run; return how fast it was.
 
     Args:
-        callbacks: write at the end of each epoch, before the checkpoint, which therefore never
-            claims more than they have written.
+        keep_weights: writes weights at the end of each epoch, before the checkpoint, which
+            therefore never claims more than has been written.
         steps: end after this many, for a trial; then nothing is validated or written.
 
     Raises:
@@ -236,6 +229,9 @@ def fit(
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
 
     speed = Speed()
+    callbacks: list[Callback] = [speed]
+    if keep_weights is not None:
+        callbacks.append(keep_weights)
     is_trial = steps is not None
     folder = plan.out / stage.name
     has_bar = plan.bars and plan.processes.first
@@ -255,9 +251,9 @@ def fit(
         limit_val_batches=0 if val is None else None,
         accumulate_grad_batches=stage.accumulate,
         gradient_clip_val=stage.clip,
-        callbacks=[speed, *callbacks, *_shared_callbacks(stage, plan, is_trial)],
+        callbacks=[*callbacks, *_shared_callbacks(stage, plan, speed, is_trial)],
         default_root_dir=folder,
-        logger=False if is_trial else make_logger(plan.logger, folder),
+        logger=False if is_trial else TensorBoardLogger(folder, name="", version=""),
         enable_checkpointing=not is_trial,
         enable_progress_bar=has_bar,
         enable_model_summary=False,
@@ -265,11 +261,16 @@ def fit(
         num_sanity_val_steps=0,
         use_distributed_sampler=False,
     )
-    trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
+    try:
+        trainer.fit(stage, train, val, ckpt_path=begun, weights_only=begun is not None)
+    except InputError as error:
+        # A worker process raises an error with its traceback, whose last line is the message.
+        line = str(error).strip().splitlines()[-1]
+        raise InputError(line.removeprefix(f"{InputError.__module__}.InputError: ")) from None
     return speed
 
 
-def _shared_callbacks(stage: Stage, plan: Plan, is_trial: bool) -> list[Callback]:
+def _shared_callbacks(stage: Stage, plan: Plan, speed: Speed, is_trial: bool) -> list[Callback]:
     """Return the callbacks that every stage has."""
     folder = plan.out / stage.name
     callbacks: list[Callback] = [
@@ -284,7 +285,7 @@ def _shared_callbacks(stage: Stage, plan: Plan, is_trial: bool) -> list[Callback
         )
         callbacks += [Curves(folder / "metrics.csv"), checkpoint, LearningRateMonitor()]
     has_bar = plan.bars and plan.processes.first
-    callbacks.append(Bar() if has_bar else EpochLines(plan.say, stage.name))
+    callbacks.append(Bar(speed) if has_bar else EpochLines(speed, plan.say, stage.name))
     return callbacks
 
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
-    NEIGHBOURS,
     ComputeChoice,
     Split,
     labelled_scans,
+    parse_counts,
     parse_names,
-    parse_numbers,
 )
-from amvnet.config.bounds import Range
 from amvnet.errors import InputError
 from amvnet.progress import counted
 
@@ -27,7 +24,6 @@ def analyze(
     split: Split = "val",
     sequences: str | None = None,
     neighbours: str | None = None,
-    taus: str | None = None,
     recipe: str | None = None,
     train_sequences: str | None = None,
 ) -> None:
@@ -40,10 +36,8 @@ def analyze(
         compute: where and how the networks are computed.
         split: the official split to score.
         sequences: sequences or scenes, separated by commas, to score instead.
-        neighbours: also train a head for each of these numbers of neighbours, separated by commas;
-            needs a recipe.
-        taus: also train a head for each of these values of tau, separated by commas (Fig. 8a; 1
-            makes all points uncertain); needs a recipe.
+        neighbours: also train a head for each of these numbers of neighbours, separated by commas
+            (Fig. 8b); needs a recipe.
         recipe: how these heads are trained: a built-in recipe's name or a YAML file.
         train_sequences: sequences or scenes, separated by commas, that these heads learn from;
             default: the official split.
@@ -54,12 +48,13 @@ def analyze(
     from amvnet.evaluation.analysis import analyze as analyze_records
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
-    from amvnet.training.ablation import HeadStudy
+    from amvnet.training.ablation import sweep_neighbours
+    from amvnet.training.plan import Plan
     from amvnet.weights.file import load
 
-    if (neighbours is None and taus is None) != (recipe is None):
+    if (neighbours is None) != (recipe is None):
         raise InputError(
-            "expected --neighbours or --taus together with --recipe, found only one of them; "
+            "expected --neighbours together with --recipe, found only one of them; "
             "give both or neither"
         )
     loaded = load(weights)
@@ -68,28 +63,22 @@ def analyze(
     records = labelled_scans(dataset, sequences, split)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
-    studies: list[tuple[HeadStudy, Sequence[float]]] = []
-    if recipe is not None:
-        loaded_recipe = load_recipe(recipe)
+    counts: list[int] = []
+    plan = None
+    if neighbours is not None and recipe is not None:
+        counts = parse_counts(neighbours)
         names = parse_names(train_sequences) or dataset.sequences("train")
         scans = TrainingScans(dataset, dataset.labelled(dataset.records(names)), records)
-        if taus is not None:
-            study = HeadStudy("taus", loaded_recipe, loaded, scans, out)
-            studies.append((study, parse_numbers(taus, float, Range(0, 1), "0.7,0.85,1")))
-        if neighbours is not None:
-            study = HeadStudy("neighbours", loaded_recipe, loaded, scans, out)
-            studies.append((study, parse_numbers(neighbours, int, NEIGHBOURS, "5,10,15")))
-        for study, _ in studies:
-            study.check()
+        folder = out / "neighbours"
+        plan = Plan(load_recipe(recipe), scans, folder, resume=True, say=say)
 
     make_folder(out)
     with progress("scoring") as step:
         analysis = analyze_records(dataset, records, segmenter, step)
     written = charts.write_all(analysis, data, out)
 
-    for study, values in studies:
-        sweep = list(study.sweep(values, say, segmenter.device))
-        used = analysis.tau if study.name == "taus" else loaded.model.point_head.neighbours
-        title = "tau, a head for each" if study.name == "taus" else "neighbours"
-        written += charts.write_sweep(sweep, title, used, data, out / study.name)
+    if plan is not None:
+        sweep = list(sweep_neighbours(plan, counts, loaded, segmenter.device))
+        used = loaded.model.point_head.neighbours
+        written += charts.write_sweep(sweep, "neighbours", used, data, out / "neighbours")
     say(f"{counted(len(written), 'file')} in {out}")

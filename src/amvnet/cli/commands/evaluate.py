@@ -36,7 +36,6 @@ def evaluate(
     pictures: Path | None = None,
     taxonomy: Path | None = None,
     classes: str | None = None,
-    mapped: bool = False,
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
 
@@ -56,7 +55,6 @@ def evaluate(
         taxonomy: a semantic-kitti.yaml with other classes.
         classes: score these classes instead, to which those of the data and of the weights are
             mapped: coarse, or a YAML file.
-        mapped: the predictions have the ids of --classes, as predict --classes writes them.
     """
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
@@ -66,10 +64,6 @@ def evaluate(
 
     processes = join_processes()
     class_map = parse_classes(classes)
-    if mapped and (class_map is None or predictions is None):
-        raise InputError(
-            "--mapped: expected --predictions and --classes, found not both; leave --mapped out"
-        )
     if weights is not None and predictions is None:
         loaded = load(weights)
         has_own = taxonomy is not None or class_map is not None
@@ -86,7 +80,7 @@ def evaluate(
             raise InputError("--tau: expected --weights, found --predictions; leave --tau out")
         dataset = open_data(data, taxonomy)
         records = labelled_scans(dataset, sequences, split)
-        labeller = label_from_files(dataset, predictions, class_map, mapped)
+        labeller = label_from_files(dataset, predictions, class_map)
     else:
         raise InputError(
             "expected either --weights or --predictions, found both or neither; give one of them"

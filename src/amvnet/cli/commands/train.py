@@ -21,7 +21,6 @@ def train(
     val_sequences: str | None = None,
     with_val: bool = False,
     dry_run: bool = False,
-    logger: Literal["tensorboard", "csv", "wandb", "mlflow"] = "tensorboard",
     taxonomy: Path | None = None,
 ) -> None:
     """Train the two networks and the point head.
@@ -46,7 +45,6 @@ def train(
             official split.
         with_val: train on these too, as for a benchmark's server; then nothing is validated.
         dry_run: only take two steps of each network, and say what these and the training cost.
-        logger: where the curves go; wandb and mlflow need their library.
         taxonomy: a semantic-kitti.yaml with other classes.
     """
     from amvnet.data.datasets.joined import join
@@ -76,7 +74,6 @@ def train(
         say=say,
         bars=on_terminal(),
         processes=processes,
-        logger=logger,
         scores=models.parse(),
     )
     if dry_run:
