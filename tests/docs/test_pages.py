@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from amvnet.cli.main import VERBS
-from amvnet.cli.parser import join_negative_values, make_parser
+from amvnet.cli.parser import make_parser
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
 
@@ -29,7 +29,7 @@ def test_every_command_can_be_parsed(page: str) -> None:
         parser = make_parser(verb, VERBS[verb])
         if VERBS[verb].takes_recipe:
             add_recipe(parser, Recipe())
-        parser.parse_args(join_negative_values(arguments))
+        parser.values(arguments)
 
 
 def test_the_readme_names_every_extra() -> None:

@@ -15,9 +15,8 @@ ROOT = Path(__file__).parents[2]
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PROJECT = PYPROJECT["project"]
 
-# Names on conda-forge, if they differ, and what an extra of a package stands for there.
+# Names on conda-forge, if they differ.
 CONDA_NAMES = {"torch": "pytorch", "matplotlib": "matplotlib-base", "ray": "ray-data"}
-EXTRAS_OF_OTHERS = {"jsonargparse[signatures]": {"docstring_parser", "typeshed_client"}}
 
 
 def read_recipe() -> dict[str, Any]:
@@ -55,11 +54,7 @@ def test_the_package_requires_what_pip_would_install() -> None:
     run = from_conda(RECIPE["requirements"]["run"])
     assert run.pop("python") == SpecifierSet(PROJECT["requires-python"])
 
-    expected = from_pip(PROJECT["dependencies"])
-    for extra, names in EXTRAS_OF_OTHERS.items():
-        assert any(line.startswith(extra) for line in PROJECT["dependencies"])
-        expected |= dict.fromkeys(names, SpecifierSet())
-    assert run == expected
+    assert run == from_pip(PROJECT["dependencies"])
 
 
 def test_the_versions_of_optional_packages_are_those_of_the_extras() -> None:

@@ -789,25 +789,6 @@ def test_the_validation_scans_can_be_learnt_too(world: Path, tmp_path: Path) -> 
     assert not differing(load(f"{run}-again"), weights)
 
 
-def test_a_dry_run_estimates_the_cost_of_a_training_and_leaves_nothing(
-    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "run"
-    batches = ("--training.rv.batch", 6, "--training.bev.accumulate", 2)  # for four scans
-    assert run_cli(*train_arguments(world, out), *batches, "--dry-run") == (0, "")
-
-    output = capsys.readouterr().out
-    rv, bev = (line for line in output.splitlines() if "would take" in line)
-    assert rv.startswith("rv:")
-    assert bev.startswith("bev:")
-    assert "step of 6 scans" in rv
-    assert "step of 2 scans" in bev
-    for line in (rv, bev):
-        assert "3 epochs of 4 scans" in line
-        assert "GiB" in line
-    assert not out.exists()
-
-
 @STAGES
 def test_a_stage_can_be_followed_in_tensorboard(run: Path, stage: str) -> None:
     events = EventAccumulator(str(run / stage), size_guidance={"images": 0})

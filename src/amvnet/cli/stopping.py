@@ -93,8 +93,8 @@ def stoppable(line: str, exits: bool) -> Iterator[Stop]:
     """Yield what says whether a signal has asked the block to stop, by a KeyboardInterrupt in it.
 
     Args:
-        line: as of `Stop`.
-        exits: as of `Stop`.
+        line: what is said when the verb has stopped.
+        exits: whether the process ends with the verb.
     """
     stop = Stop(line, exits)
     earlier = {}

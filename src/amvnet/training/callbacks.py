@@ -19,7 +19,6 @@ from lightning.pytorch.callbacks import Callback, RichProgressBar
 from torch import Tensor, nn
 
 from amvnet.files import atomic_write
-from amvnet.memory import peak_memory
 from amvnet.progress import Say
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.loaders import sensor_record
@@ -225,46 +224,32 @@ class SeedBatches(Callback):
 
 
 class Speed(Callback):
-    """Measures the speed of the current epoch so far, and the peak memory of the training.
+    """Measures the speed of the current epoch so far.
 
     Attributes:
-        seconds: duration of each optimizer step.
         rate: scans (or points, for the head) per second, over all processes.
     """
 
     def __init__(self) -> None:
-        self.seconds: list[float] = []
         self.rate = 0.0
         self._units = 0  # scans or points so far
-        self._step = 0  # the last optimizer step that was timed
-        self._epoch_start = 0.0
-        self._step_start = 0.0
+        self._start = 0.0
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self.seconds = []
         self._units = 0
-        self._step = trainer.global_step
-        self._epoch_start = time.perf_counter()
-        self._step_start = self._epoch_start
+        self._start = time.perf_counter()
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        now = time.perf_counter()
         self._units += pl_module.size_of(batch) * trainer.world_size
-        self.rate = self._units / (now - self._epoch_start)
+        self.rate = self._units / (time.perf_counter() - self._start)
         pl_module.log(f"{pl_module.unit}/s", self.rate, prog_bar=True, batch_size=1)
-
-        # A step may take several batches, whose gradients are accumulated.
-        if trainer.global_step > self._step:
-            self.seconds.append(now - self._step_start)
-            self._step = trainer.global_step
-            self._step_start = now
 
     @property
     def elapsed(self) -> str:
         """How long the current epoch has taken so far, with its validation, as h:mm:ss."""
-        return str(timedelta(seconds=round(time.perf_counter() - self._epoch_start)))
+        return str(timedelta(seconds=round(time.perf_counter() - self._start)))
 
     def time_left(self, trainer: L.Trainer) -> str:
         """Return how long the rest of the training takes at this rate, as h:mm:ss."""
@@ -273,18 +258,10 @@ class Speed(Callback):
         if not done:
             return "?"
 
-        elapsed = time.perf_counter() - self._epoch_start
+        elapsed = time.perf_counter() - self._start
         epochs = trainer.max_epochs or trainer.current_epoch
         ahead = epochs - trainer.current_epoch - done
         return str(timedelta(seconds=round(ahead * elapsed / done)))
-
-    @property
-    def memory(self) -> int:
-        """Peak memory in bytes: of the CUDA device if one is in use, else of this process."""
-        if torch.cuda.is_available() and torch.cuda.max_memory_allocated():
-            return torch.cuda.max_memory_allocated()
-
-        return peak_memory()
 
 
 class Bar(RichProgressBar):

@@ -18,12 +18,11 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
-from amvnet.training.callbacks import KeepWeights, Speed
+from amvnet.training.callbacks import KeepWeights
 from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
     Scored,
-    class_weights,
     dice,
     lovasz_softmax,
     majority_labels,
@@ -187,18 +186,15 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
     return Scored(voxel_logits, voxel_labels, scan, scans)
 
 
-def train_network(plan: Plan, name: str, weights: Weights, steps: int | None = None) -> Speed:
+def train_network(plan: Plan, name: str, weights: Weights) -> None:
     """Train a network in the stage rv or bev, and write its weights after each epoch.
-
-    With a number of `steps`, take only so many and write nothing. Return how fast it was, and the
-    memory that it took.
 
     Raises:
         InputError: if the weights do not fit the recipe, or a scan is broken.
     """
     config = getattr(plan.recipe.training, name)
     # Before the scans are read for the class weights.
-    if steps is None and config.initial and PART_OF[name] not in weights.parts:
+    if config.initial and PART_OF[name] not in weights.parts:
         raise InputError(
             f"training.{name}.initial: expected weights to begin with, found none; give "
             "--init, or set it to 0"
@@ -207,14 +203,8 @@ def train_network(plan: Plan, name: str, weights: Weights, steps: int | None = N
     model = plan.build(weights)
     intensity = _intensity(plan, weights)
     loaders = make_loaders(plan, config, intensity)
-
-    if steps is not None:
-        # To compute class weights would need every scan; their values do not change the speed.
-        uniform = class_weights(np.ones(weights.taxonomy.size)) if config.class_weights else None
-        return fit(make_stage(plan, name, model, uniform), plan, loaders, steps=steps)
-
     stage = make_stage(plan, name, model, class_weights_of(plan) if config.class_weights else None)
-    return fit(stage, plan, loaders, KeepWeights(plan, name, weights, intensity))
+    fit(stage, plan, loaders, KeepWeights(plan, name, weights, intensity))
 
 
 def make_stage(

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Literal
 
 import lightning as L
-import torch
 
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
@@ -25,8 +22,6 @@ from amvnet.training.run_folder import (
     write_record,
 )
 from amvnet.weights.file import Weights, save
-
-TRIAL_STEPS = 2  # the second of them is timed
 
 
 def train(
@@ -88,7 +83,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
     return trained
 
 
-def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str] = ()) -> Weights:
+def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> Weights:
     """Return fresh weights with the parts of `init`, and of this folder's finished stages.
 
     If `init` has other classes, its parts are only taken for the stages that are to be trained.
@@ -159,48 +154,3 @@ def _check_init(plan: Plan, init: Weights, names: Sequence[str]) -> None:
                 f"{folder.path}: expected no earlier run of the stage {name} for other "
                 f"weights with {part}, found one; leave out --init, or give another folder"
             )
-
-
-def try_out(plan: Plan, stage: StageName | Literal["all"]) -> Iterator[str]:
-    """Take some steps of each network; yield a line on the memory and time of each. Write nothing.
-
-    Raises:
-        InputError: if the stage trains none of the networks, or a GPU's memory does not suffice.
-    """
-    names = ("rv", "bev") if stage == "all" else (stage,)
-    if stage == "head":
-        raise InputError(
-            f"expected --stage rv, bev or all for a dry run, found {stage}; give one of these"
-        )
-    for name in names:
-        with TemporaryDirectory() as folder:
-            yield _try_out(plan, name, Path(folder))
-
-
-def _try_out(plan: Plan, name: str, folder: Path) -> str:
-    train = plan.scans.train
-    config = getattr(plan.recipe.training, name)
-
-    # Whole steps, even if there are fewer scans.
-    scans = [train[index % len(train)] for index in range(TRIAL_STEPS * config.batch)]
-    trial = dataclasses.replace(
-        plan, scans=dataclasses.replace(plan.scans, train=scans, val=()), out=folder, resume=False
-    )
-    try:
-        speed = train_network(trial, name, _first_weights(plan, None), TRIAL_STEPS)
-    except torch.OutOfMemoryError:
-        raise InputError(
-            f"{name}: expected steps that fit into the GPU's memory, found {config.batch} scans "
-            f"in {config.accumulate} parts; set --training.{name}.accumulate to more parts, or "
-            "take a compact recipe"
-        ) from None
-
-    step_seconds = speed.seconds[-1]
-    steps_per_epoch = -(-len(train) // config.batch)  # rounded up
-    hours = steps_per_epoch * config.epochs * step_seconds / 3600
-    return (
-        f"{name}: {step_seconds:.3g} s for a step of {config.batch} scans "
-        f"({config.batch / step_seconds:.3g} scans/s), "
-        f"memory so far {speed.memory / 2**30:.1f} GiB; "
-        f"{config.epochs} epochs of {len(train)} scans would take {hours:.3g} h"
-    )

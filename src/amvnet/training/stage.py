@@ -191,19 +191,12 @@ def class_weights_of(plan: Plan) -> np.ndarray:
     return class_weights(count_classes(scans.dataset, scans.train, path, plan.processes, plan.say))
 
 
-def fit(
-    stage: Stage,
-    plan: Plan,
-    loaders: Loaders,
-    keep_weights: Callback | None = None,
-    steps: int | None = None,
-) -> Speed:
-    """Train a stage in its folder of the run; return how fast it was.
+def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: Callback) -> None:
+    """Train a stage in its folder of the run.
 
     Args:
         keep_weights: writes weights at the end of each epoch, before the checkpoint, which
             therefore never claims more than has been written.
-        steps: end after this many, for a trial; then nothing is validated or written.
 
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
@@ -228,11 +221,6 @@ def fit(
         # Lightning sets the sampler's epoch only after the reading processes have begun to draw.
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
 
-    speed = Speed()
-    callbacks: list[Callback] = [speed]
-    if keep_weights is not None:
-        callbacks.append(keep_weights)
-    is_trial = steps is not None
     folder = plan.out / stage.name
     has_bar = plan.bars and plan.processes.first
     # The statistics of synchronised batch norms are the same everywhere, and processes may validate
@@ -247,14 +235,12 @@ def fit(
         strategy=ddp if plan.processes.size > 1 else "auto",
         plugins=[environment()],
         max_epochs=stage.config.epochs,
-        max_steps=-1 if steps is None else steps,
         limit_val_batches=0 if val is None else None,
         accumulate_grad_batches=stage.accumulate,
         gradient_clip_val=stage.clip,
-        callbacks=[*callbacks, *_shared_callbacks(stage, plan, speed, is_trial)],
+        callbacks=_callbacks(stage, plan, keep_weights, has_bar),
         default_root_dir=folder,
-        logger=False if is_trial else TensorBoardLogger(folder, name="", version=""),
-        enable_checkpointing=not is_trial,
+        logger=TensorBoardLogger(folder, name="", version=""),
         enable_progress_bar=has_bar,
         enable_model_summary=False,
         log_every_n_steps=min(LOGGED_EVERY, len(train)),
@@ -267,25 +253,26 @@ def fit(
         # A worker process raises an error with its traceback, whose last line is the message.
         line = str(error).strip().splitlines()[-1]
         raise InputError(line.removeprefix(f"{InputError.__module__}.InputError: ")) from None
-    return speed
 
 
-def _shared_callbacks(stage: Stage, plan: Plan, speed: Speed, is_trial: bool) -> list[Callback]:
-    """Return the callbacks that every stage has."""
+def _callbacks(stage: Stage, plan: Plan, keep_weights: Callback, has_bar: bool) -> list[Callback]:
+    """Return the callbacks of a stage, those that write before the checkpoint."""
     folder = plan.out / stage.name
+    speed = Speed()
     callbacks: list[Callback] = [
+        speed,
+        keep_weights,
         KeepSignals(),
         SeedBatches(plan.recipe.training.seed, plan.processes.rank),
+        Curves(folder / "metrics.csv"),
+        ModelCheckpoint(
+            folder, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
+        ),
+        LearningRateMonitor(),
+        Bar(speed) if has_bar else EpochLines(speed, plan.say, stage.name),
     ]
     if stage.ema or stage.initial:
         callbacks.append(AverageWeights(stage.ema, stage.initial))
-    if not is_trial:
-        checkpoint = ModelCheckpoint(
-            folder, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
-        )
-        callbacks += [Curves(folder / "metrics.csv"), checkpoint, LearningRateMonitor()]
-    has_bar = plan.bars and plan.processes.first
-    callbacks.append(Bar(speed) if has_bar else EpochLines(speed, plan.say, stage.name))
     return callbacks
 
 

@@ -36,8 +36,6 @@ SIZES = {
     "point_head": ("assertion", "point_head"),
 }
 PARTS = tuple(SIZES)
-LENGTH_BYTES = 8  # at the beginning of safetensors: the length of the header
-LONGEST_HEADER = 100_000_000  # bytes, as safetensors has it
 UNCERTAIN = "val/uncertain"  # metric of the point head: the share of uncertain points
 # The share for weights without this metric: that of the paper on nuScenes, and of `sim-hdl64e` on
 # simulated streets.
@@ -300,23 +298,14 @@ def load(name_or_path: str | Path) -> Weights:
             weights = _from_description((file.metadata() or {}).get(KEY, ""))
             tensors = _read_tensors(file, weights)
     except (SafetensorError, OSError):
-        found = "something else; give AMVNet weights"
-        if _begins_as_safetensors(path):
-            found = f"a truncated one of {path.stat().st_size} bytes; copy or download it again"
-        raise InputError(f"{path}: expected a safetensors file, found {found}") from None
+        raise InputError(
+            f"{path}: expected AMVNet weights in safetensors, found a truncated or another file of "
+            f"{path.stat().st_size} bytes; copy it again, or give weights"
+        ) from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
     return dataclasses.replace(weights, tensors=tensors)
-
-
-def _begins_as_safetensors(path: Path) -> bool:
-    """Return whether a file begins with the length of a header, and a header in JSON."""
-    with suppress(OSError), path.open("rb") as file:
-        beginning = file.read(LENGTH_BYTES + 1)
-        length = int.from_bytes(beginning[:LENGTH_BYTES], "little")
-        return length <= LONGEST_HEADER and beginning[LENGTH_BYTES:] == b"{"
-    return False
 
 
 def _from_description(text: str) -> Weights:

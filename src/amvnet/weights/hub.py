@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import socket
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit
-from urllib.request import getproxies
 
 from amvnet.errors import InputError, one_line_errors
 
 PREFIX = "hf-hub:"
 FILE = "model.safetensors"
-CONNECTING = 4  # seconds to wait for a connection to the hub
-PORTS = {"http": 80, "https": 443}
 
 
 def fetch(name: str) -> Path:
@@ -34,35 +29,9 @@ def fetch(name: str) -> Path:
     check_name(repository, name)
     hub = client()
 
-    # Without a network the client tries again and again, for half a minute.
-    options: dict[str, Any] = {}
-    advice = f"check the name and the network, and that {FILE} is there"
-    if not can_be_reached(hub.constants.ENDPOINT):
-        options["local_files_only"] = True
-        advice = f"{hub.constants.ENDPOINT} cannot be reached: check the network, or name a file"
-
-    with hub_errors(name, advice):
-        path = hub.hf_hub_download(
-            repo_id=repository, filename=FILE, revision=revision or None, **options
-        )
+    with hub_errors(name, f"check the name and the network, and that {FILE} is there"):
+        path = hub.hf_hub_download(repo_id=repository, filename=FILE, revision=revision or None)
         return Path(path)
-
-
-def can_be_reached(address: str) -> bool:
-    """Return whether the server of an address accepts a connection within some seconds.
-
-    Behind a proxy, only the proxy could tell; then this is True.
-    """
-    parts = urlsplit(address)
-    proxies = getproxies()
-    if parts.hostname is None or parts.scheme in proxies or "all" in proxies:
-        return True
-    try:
-        port = parts.port or PORTS.get(parts.scheme, 443)
-        socket.create_connection((parts.hostname, port), timeout=CONNECTING).close()
-    except OSError:
-        return False
-    return True
 
 
 def check_name(repository: str, name: str) -> None:

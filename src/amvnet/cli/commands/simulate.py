@@ -18,7 +18,7 @@ def simulate(
     first_sequence: int = 0,
     processes: int | None = None,
 ) -> None:
-    """Write labelled scans of simulated streets; scans of an earlier call stay and are not redone.
+    """Write labelled scans of simulated streets; scans of an earlier call stay.
 
     Args:
         out: folder to write to.
