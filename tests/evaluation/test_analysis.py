@@ -213,13 +213,13 @@ def test_every_method_is_scored_as_by_the_segmenter(
 # ---- the verb `analyze`
 
 
-def test_analyze_writes_each_figure_as_picture_table_and_text(world: Path) -> None:
+def test_analyze_writes_each_figure_as_picture_and_table(world: Path) -> None:
     out = world / "figures"
     succeed(f"analyze {world}/data --weights {world}/weights.safetensors --out {out}")
 
-    names = {"classes.csv", "classes.md", "methods.csv", "methods.md"}
+    names = {"classes.csv", "methods.csv"}
     for figure in ("similarity", "distance", "tau"):
-        names |= {f"{figure}.png", f"{figure}.csv", f"{figure}.md"}
+        names |= {f"{figure}.png", f"{figure}.csv"}
         picture = imread(out / f"{figure}.png")
         assert picture.shape[1] == 960
         assert picture[..., :3].std() > 0.05  # something is drawn
@@ -335,11 +335,11 @@ def test_ablate_trains_four_networks_and_goes_on_where_it_stopped(world: Path) -
     ends = {}
     for path in (out / "rv/rv/last.safetensors", out / "rv-gru/rv/last.safetensors"):
         ends[path] = path.read_bytes()[-1000:]
-    text = (out / "ablation.md").read_text()
+    text = (out / "ablation.csv").read_text()
     (out / "rv-gru/rv/done").unlink()
-    (out / "ablation.md").unlink()
+    (out / "ablation.csv").unlink()
     succeed(command)
-    assert (out / "ablation.md").read_text() == text
+    assert (out / "ablation.csv").read_text() == text
 
     make_streets(world / "data2", ("02", "03", "08"))
     assert "scans" in refusal(command.replace(f"{world}/data", f"{world}/data2"))

@@ -186,21 +186,6 @@ def test_a_dead_link_is_a_broken_scan(tmp_path: Path) -> None:
     assert "leads nowhere" in line
 
 
-def test_files_of_a_folder_that_are_no_scans_are_counted_in_one_line(tmp_path: Path) -> None:
-    street(0, 300)[0].tofile(tmp_path / "a.bin")
-    (tmp_path / "a.label").write_bytes(b"1234")
-    (tmp_path / ".hidden").write_text("")
-    lines: list[str] = []
-    list_inputs([str(tmp_path)], say=lines.append)
-    assert lines == []
-
-    for name in ("readme.md", "a.jpg", "b.jpg"):
-        (tmp_path / name).write_text("no scan")
-    inputs, _ = list_inputs([str(tmp_path)], say=lines.append)
-    assert [scan.name for scan in inputs] == ["a"]
-    assert lines == [f"{tmp_path}: 3 other files are left out (.jpg, .md)"]
-
-
 def test_each_file_is_read_once_and_its_format_detected_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,17 +67,13 @@ class Analysis:
     ensemble: np.ndarray
     head: np.ndarray
 
-    @property
-    def taxonomy(self) -> Taxonomy:
-        return self.evaluation.taxonomy
-
     def sweep(self) -> list[Swept]:
         """Return AMVNet's figures for each tau from 0 to 0.98, with the head as it is."""
         sweep = []
         for bins in range(SWEPT + 1):
             matrix = self.head[:bins].sum(axis=0) + self.ensemble[bins:].sum(axis=0)
             share = float(self.points[:bins].sum() / max(self.points.sum(), 1))
-            sweep.append(Swept.of(bins / BINS, share, matrix, self.taxonomy))
+            sweep.append(Swept.of(bins / BINS, share, matrix, self.evaluation.taxonomy))
         return sweep
 
 

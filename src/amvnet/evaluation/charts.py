@@ -1,4 +1,4 @@
-"""The figures (PNG) and tables of the paper's section 4.4, with all numbers as CSV and Markdown."""
+"""The figures (PNG) and tables of the paper's section 4.4, with all numbers as CSV."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from amvnet.models.methods import title_of
 SIZE = (6.0, 3.6)  # inches
 DOTS_PER_INCH = 160
 MOST_MARKED = 20  # longer sweeps are drawn without markers, which would overlap
-Cell = str | float | int | None  # None: no such number, written as a dash
+Cell = str | float | int | None  # None: no such number
 
 
 # Of the curves of the methods, in Matplotlib.
@@ -150,11 +150,13 @@ def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
 
 def _write_classes(analysis: Analysis, path: Path) -> list[Path]:
     """Write Table 3 of the paper: IoU by class."""
-    rows: list[list[Cell]] = [[name] for name in (*analysis.taxonomy.classes, "mIoU", "fwIoU")]
+    rows: list[list[Cell]] = [
+        [name] for name in (*analysis.evaluation.taxonomy.classes, "mIoU", "fwIoU")
+    ]
     columns = ["IoU %"]
     for method in STYLES:
         columns.append(title_of(method))
-        figures = metrics(analysis.evaluation.matrices[method][0], analysis.taxonomy)
+        figures = metrics(analysis.evaluation.matrices[method][0], analysis.evaluation.taxonomy)
         values = (*figures["iou"].values(), figures["miou"], figures["fwiou"])
         for row, value in zip(rows, values, strict=True):
             row.append(_percent(value))
@@ -166,7 +168,7 @@ def _write_methods(analysis: Analysis, path: Path) -> list[Path]:
     """Write Table 4 of the paper: the networks, the ensembles and AMVNet."""
     rows: list[Sequence[Cell]] = []
     for method, matrices in analysis.evaluation.matrices.items():
-        figures = metrics(matrices[0], analysis.taxonomy)
+        figures = metrics(matrices[0], analysis.evaluation.taxonomy)
         row: list[Cell] = ["geometric mean" if method == "ensemble" else title_of(method)]
         for key in ("miou", "miou_present", "accuracy", "fwiou"):
             row.append(_percent(figures[key]))
@@ -200,31 +202,14 @@ def _figure(title: str) -> tuple[Any, Any]:
 def _write(
     path: Path, columns: Sequence[str], rows: Sequence[Sequence[Cell]], figure: Any = None
 ) -> list[Path]:
-    """Write the rows as CSV and as Markdown, and the figure as PNG if there is one."""
+    """Write the rows as CSV, and the figure as PNG if there is one."""
     csv_path = path.with_suffix(".csv")
     with atomic_write(csv_path) as part, part.open("w", newline="") as file:
         csv.writer(file).writerows([columns, *rows])
-
-    lines = [_markdown_row(columns), _markdown_row(["---"] * len(columns))]
-    for row in rows:
-        lines.append(_markdown_row(row))
-    markdown_path = path.with_suffix(".md")
-    with atomic_write(markdown_path) as part:
-        part.write_text("".join(lines))
-
     if figure is None:
-        return [csv_path, markdown_path]
+        return [csv_path]
+
     png_path = path.with_suffix(".png")
     with atomic_write(png_path) as part:
         figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor="white")
-    return [csv_path, markdown_path, png_path]
-
-
-def _markdown_row(cells: Sequence[Cell]) -> str:
-    return f"| {' | '.join(map(_cell_text, cells))} |\n"
-
-
-def _cell_text(cell: Cell) -> str:
-    if cell is None:
-        return "–"
-    return f"{cell:.2f}" if isinstance(cell, float) else str(cell)
+    return [csv_path, png_path]

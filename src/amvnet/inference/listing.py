@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,11 +22,8 @@ from amvnet.errors import InputError
 from amvnet.files import inside
 from amvnet.inference.reading import FileReader, LoadedScan, normalised_by
 from amvnet.inference.segmentation import Segmentation
-from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Normaliser
-
-SHOWN = 8  # endings of files that are left out
 
 
 @dataclass(frozen=True)
@@ -193,7 +189,6 @@ def list_inputs(
     options: ScanOptions = ScanOptions(),
     taxonomy: Taxonomy | None = None,
     normaliser: Normaliser | None = None,
-    say: Say = say_nothing,
 ) -> tuple[list[InputScan], Taxonomy]:
     """List the scans of all inputs, in their order.
 
@@ -203,7 +198,6 @@ def list_inputs(
         taxonomy: the classes, of weights or as the user names them. If None, they are those of the
             datasets; scan files have nuScenes' if they end in `.pcd.bin`, else SemanticKITTI's.
         normaliser: normalises scan files to weights; None reads them as they are.
-        say: is told which files of folders are left out.
 
     Returns:
         The scans, and the classes of their labels.
@@ -231,7 +225,6 @@ def list_inputs(
             scans.append(FileScan(scan, reader))
         is_nuscenes = files[0].ending == NUSCENES_ENDING
         taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
-        _say_left_out(text, files, say)
 
     if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:
         raise InputError(
@@ -239,26 +232,6 @@ def list_inputs(
             "take them one after the other"
         )
     return scans, taxonomies[0]
-
-
-def _say_left_out(text: str, scans: Sequence[NamedScan], say: Say) -> None:
-    """Say how many files of a folder of scans are no scans, without what `predict` writes."""
-    folder = Path(text)
-    paths = {scan.path for scan in scans}
-    if not folder.is_dir() or not any(path.parent == folder for path in paths):
-        return
-
-    endings: Counter[str] = Counter()
-    for path in folder.iterdir():
-        is_written = path.name.endswith((".label", ".uncertain.npy")) or path.suffix == ".npz"
-        if path.is_file() and not path.name.startswith(".") and not is_written:
-            endings[path.suffix] += path not in paths
-
-    count = endings.total()
-    if count:
-        names = [ending or "without an ending" for ending, found in endings.items() if found]
-        files = "1 other file is" if count == 1 else f"{count} other files are"
-        say(f"{text}: {files} left out ({', '.join(sorted(names)[:SHOWN])})")
 
 
 class Scans(Sequence[Scan]):

@@ -72,7 +72,7 @@ def predict(
         )
 
     normaliser = normaliser_for(segmenter.weights, sensor, say)
-    scans, taxonomy = list_inputs(inputs, options, segmenter.taxonomy, normaliser, say)
+    scans, taxonomy = list_inputs(inputs, options, segmenter.taxonomy, normaliser)
     settings = _settings(segmenter, output, normaliser.sensor, options, classes)
     if classes is not None:
         for scan in scans:

@@ -32,7 +32,7 @@ def analyze(
     Args:
         data: the dataset, with labels.
         weights: a weights file, or the name of a built-in one.
-        out: folder for the figures (PNG), and the same figures as CSV and Markdown.
+        out: folder for the figures (PNG), and the same figures as CSV.
         compute: where and how the networks are computed.
         split: the official split to score.
         sequences: sequences or scenes, separated by commas, to score instead.

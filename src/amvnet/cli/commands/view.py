@@ -70,7 +70,7 @@ def view(
         classes = segmenter.taxonomy
         normaliser = normaliser_for(loaded, sensor, say)
 
-    listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser, say)
+    listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser)
     frames = Frames(classes, evenly_spaced(listed, scans), segmenter, labels)
     page = html or temporary_page()
     with progress("looking") as step:
