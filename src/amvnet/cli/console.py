@@ -90,7 +90,13 @@ def say_lines(text: str) -> None:
 
 def show(table: RenderableType) -> None:
     """Print a table, without styles."""
-    plain = Console(file=stdout, width=console.width, color_system=None, emoji=False, markup=False)  # type: ignore[arg-type]
+    plain = Console(
+        file=stdout,  # type: ignore[arg-type]
+        width=console.width,
+        color_system=None,
+        emoji=False,
+        markup=False,
+    )
     with plain.capture() as captured:
         plain.print(table)
     say_lines(captured.get().rstrip("\n"))

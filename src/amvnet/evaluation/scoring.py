@@ -47,10 +47,12 @@ class Labeller:
     Attributes:
         label: labels a scan by one or several methods.
         at_once: scans that it labels at the same time, each in a thread.
+        classes: maps the classes of the data to those of the labels; None if they are the same.
     """
 
     label: Callable[[ScanRecord, Scan], MethodLabels]
     at_once: int = 1
+    classes: ClassMap | None = None
 
 
 def evaluate(
@@ -58,16 +60,14 @@ def evaluate(
     records: Sequence[ScanRecord],
     labeller: Labeller,
     pictures: Path | None = None,
-    classes: ClassMap | None = None,
     progress: Progress = no_progress,
     processes: Processes = ALONE,
 ) -> Evaluation:
     """Score the labels of some scans.
 
     Args:
-        labeller: labels the scans, in the classes of the map if there is one.
+        labeller: labels the scans, in the classes that are scored.
         pictures: folder for pictures of a few of the scans from above; None draws none.
-        classes: maps the classes of the dataset to those that are scored; None scores these.
         progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans; each returns the evaluation of all scans.
 
@@ -76,6 +76,7 @@ def evaluate(
             points.
     """
     own = dataset.taxonomy
+    classes = labeller.classes
     taxonomy = own if classes is None else classes.target
     table = np.arange(own.size + 1, dtype=np.uint8) if classes is None else classes.table(own)
     evaluation = Evaluation(taxonomy)
@@ -174,7 +175,7 @@ def label_by_weights(
         labels, uncertain = labels_by_method(segmenter, check_scan(scan), methods)
         return {name: table[ids] for name, ids in labels.items()}, uncertain
 
-    return Labeller(label, segmenter.at_once)
+    return Labeller(label, segmenter.at_once, classes)
 
 
 def labels_by_method(
@@ -236,4 +237,4 @@ def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = 
         ids = dataset.read_prediction(record, folder)
         return {"predictions": ids if table is None else table[ids]}, None
 
-    return Labeller(label)
+    return Labeller(label, classes=classes)

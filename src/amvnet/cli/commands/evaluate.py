@@ -96,7 +96,6 @@ def evaluate(
             records,
             labeller,
             pictures,
-            classes=class_map,
             progress=step,
             processes=processes,
         )
