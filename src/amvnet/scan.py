@@ -68,7 +68,10 @@ class Scan:
     @property
     def valid(self) -> np.ndarray:
         """(N,) bool: points with four finite values, nearer than `FARTHEST` along each axis."""
-        # Column by column: a reduction over rows of four takes ten times as long. Comparisons with
-        # NaN are false.
+        # Comparisons with NaN are false.
+        if np.abs(self.points).max(initial=0) < FARTHEST:
+            return np.ones(len(self.points), dtype=bool)
+
+        # Column by column: a reduction over rows of four takes ten times as long.
         x, y, z, intensity = np.abs(self.points.T)
         return (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST) & (intensity < np.inf)

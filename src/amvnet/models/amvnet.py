@@ -191,7 +191,8 @@ class AMVNet(LateFusion):
 
     @step("RV")
     def score_range(self, image: RangeImage) -> Tensor:  # (P, K)
-        return image.to_points(self.range_net(image.image)).float().softmax(dim=1)
+        logits = self.range_net(image.image).float().permute(0, 2, 3, 1)  # (B, H, W, K)
+        return image.to_points(logits.softmax(dim=3).permute(0, 3, 1, 2))
 
     @step("BEV")
     def score_polar(self, grid: PolarGrid) -> Tensor:  # (P, K)

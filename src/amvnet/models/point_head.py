@@ -17,7 +17,7 @@ from amvnet.threads import run_parts
 
 POINT_VALUES = 4  # x, y, z, intensity
 LEAST = 1e-24  # product of two probabilities whose logarithm is still taken
-PART = 2048  # uncertain points scored at a time, so that they fit into a CPU's cache
+PART = 1024  # uncertain points encoded at a time, so that they fit into a CPU's cache
 PART_ON_GPU = 2**16  # the same for a GPU: enough to keep it busy
 AT_ONCE = 2**17  # uncertain points whose table is in memory: a scan may have millions of them
 
@@ -65,23 +65,21 @@ class PointHead(nn.Module):
         assert isinstance(first, nn.Linear)
 
         encoded = first(table)  # (P, hidden[0]): W [f_k, g_k, x_k] of every point
+        point = table.index_select(0, uncertain)
+        shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
 
-        def score_part(part: tuple[Tensor, Tensor]) -> Tensor:
-            i, k = part
-            point = table.index_select(0, i)
-            shift = F.linear(point[:, -POINT_VALUES:], first.weight[:, -POINT_VALUES:])
+        def pool_part(part: tuple[Tensor, Tensor]) -> Tensor:
+            k, shift = part
             rows = encoded.index_select(0, k.flatten()).unflatten(0, k.shape)
             rows = rows.sub_(shift[:, None])  # (part, n, hidden[0])
-
-            point[:, -POINT_VALUES:-1] *= self.config.position_scale
-            encoded_rows = rest(rows.flatten(0, 1)).unflatten(0, k.shape)
-            return self._classify(_pool(encoded_rows), point)
+            return _pool(rest(rows.flatten(0, 1)).unflatten(0, k.shape))
 
         size = PART if table.is_cpu else PART_ON_GPU
-        parts = list(zip(uncertain.split(size), near.split(size), strict=True))
-        if not table.is_cpu:
-            return torch.cat([score_part(part) for part in parts])
-        return torch.cat(run_parts(score_part, parts))
+        parts = list(zip(near.split(size), shift.split(size), strict=True))
+        pooled = run_parts(pool_part, parts) if table.is_cpu else list(map(pool_part, parts))
+
+        point[:, -POINT_VALUES:-1] *= self.config.position_scale
+        return self._classify(torch.cat(pooled), point)
 
     def _classify(self, pooled: Tensor, point: Tensor) -> Tensor:
         """Return the (U, K) logits."""

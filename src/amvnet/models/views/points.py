@@ -22,14 +22,15 @@ def occurring(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     Returns:
         The indices that occur (M,), ascending, and the tensors `indices` as indices into these.
     """
-    device = indices[0].device
-    occurs = torch.zeros(count, dtype=torch.bool, device=device)
-    true = torch.ones((), dtype=torch.bool, device=device)  # Python's True would be copied there
+    # One place before the first index: the sum up to there is the number of smaller indices.
+    padded = torch.zeros(count + 1, dtype=torch.bool, device=indices[0].device)
+    occurs = padded[1:]
     for index in indices:
-        occurs[index.flatten()] = true
+        occurs.index_fill_(0, index.flatten().long(), True)
 
-    rank = occurs.cumsum(0) - 1  # position of an index among those that occur
-    return occurs.nonzero()[:, 0], [rank[index] for index in indices]
+    rank = padded.cumsum(0)  # position of an index among those that occur
+    ranks = [rank.index_select(0, index.flatten()).view(index.shape) for index in indices]
+    return occurs.nonzero()[:, 0], ranks
 
 
 @dataclass(frozen=True)

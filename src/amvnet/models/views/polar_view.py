@@ -139,18 +139,20 @@ class PolarView:
 
     def __init__(self, config: PolarViewConfig) -> None:
         self.config = config
-        self._axes_on: dict[torch.device, Tensor] = {}
+        self._axes_on: dict[torch.device, tuple[Tensor, ...]] = {}
 
-    def _axes(self, device: torch.device) -> Tensor:
-        """Return (3, 3) float64: start, end and number of the cells along radius, angle, height."""
+    def _axes(self, device: torch.device) -> tuple[Tensor, ...]:
+        """Return the start, length, number and last of the cells along radius, angle and height.
+
+        Each is (3, 1) float64.
+        """
         if device not in self._axes_on:
             c = self.config
-            axes = [
-                [c.radius_min, -math.pi, c.z_min],
-                [c.radius_max, math.pi, c.z_max],
-                [c.radial, c.angular, c.vertical],
-            ]
-            self._axes_on[device] = torch.tensor(axes, dtype=torch.float64, device=device)
+            low = torch.tensor([[c.radius_min], [-math.pi], [c.z_min]], dtype=torch.float64)
+            high = torch.tensor([[c.radius_max], [math.pi], [c.z_max]], dtype=torch.float64)
+            cells = torch.tensor([[c.radial], [c.angular], [c.vertical]], dtype=torch.float64)
+            axes = (low, high - low, cells, cells - 1)
+            self._axes_on[device] = tuple(axis.to(device) for axis in axes)
         return self._axes_on[device]
 
     def project(self, batch: PointBatch) -> PolarGrid:
@@ -162,10 +164,10 @@ class PolarView:
         c = self.config
 
         # Python's numbers would be copied to a GPU.
-        low, high, cells = (column[:, None] for column in self._axes(batch.points.device))
+        low, length, cells, last = self._axes(batch.points.device)
         polar = batch.cylindrical
-        cell = ((polar - low) / (high - low) * cells).floor().clamp_min(0).minimum(cells - 1)
-        offset = polar - (low + (cell + 0.5) * (high - low) / cells)
+        cell = (polar - low).div_(length).mul_(cells).floor_().clamp_min_(0).minimum(last)
+        offset = polar - (cell + 0.5).mul_(length).div_(cells).add_(low)
         radial_cell, angular_cell, voxel = cell.long()
 
         # Not by a list of columns, which would have to be copied to a GPU.
@@ -173,7 +175,8 @@ class PolarView:
         intensity = batch.points[:, 3:]
         features = torch.cat([offset.T.to(xy.dtype), polar.T.to(xy.dtype), xy, intensity], dim=1)
 
-        pillar = (batch.scan * c.radial + radial_cell) * c.angular + angular_cell
+        row = radial_cell.add(batch.scan, alpha=c.radial)
+        pillar = angular_cell.add(row, alpha=c.angular)
         pillars = batch.count * c.radial * c.angular
         occupied, (slot,) = occurring(pillars, pillar)
         seen = occupied

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from amvnet.config.schema import RangeViewConfig
 from amvnet.errors import InputError
@@ -24,7 +25,7 @@ class RangeImage:
         image: (B, 6, H, W) float32: x, y, z, intensity, range, and a mask that is 1 if the pixel
             has a point. All values of a pixel without a point are 0.
         pixel: (P,) int64: each point's pixel, an index into the B * H * W pixels of the batch.
-        nearest: (B * H * W,) int64: the point that represents each pixel, -1 if it has none.
+        nearest: (B * H * W,) int32: the point that represents each pixel, -1 if it has none.
     """
 
     image: Tensor
@@ -64,14 +65,15 @@ class RangeView:
         """
         c = self.config
         distance = batch.points[:, :3].norm(dim=1)
-        pixel = (batch.scan * c.height + self.rows(batch)) * c.width + self.columns(batch)
+        row = self.rows(batch).add(batch.scan, alpha=c.height)
+        pixel = self.columns(batch).add(row, alpha=c.width)
         nearest = _nearest(distance, pixel, batch.count * c.height * c.width, c.nearest)
 
         # The row of zeros at the end is for pixels without a point.
-        mask = torch.ones_like(distance)
-        values = torch.cat([batch.points, distance[:, None], mask[:, None]], dim=1)
-        padded = torch.cat([values, values.new_zeros(1, CHANNELS)])
-        image = padded.index_select(0, nearest % len(padded))  # -1 selects the last row
+        values = F.pad(batch.points, (0, 2, 0, 1))  # (P + 1, 6)
+        values[:-1, 4] = distance
+        values[:-1, 5] = 1
+        image = values.index_select(0, nearest % len(values))  # -1 selects the last row
         image = image.view(batch.count, c.height, c.width, CHANNELS).permute(0, 3, 1, 2)
         return RangeImage(image, pixel, nearest)
 
@@ -112,11 +114,11 @@ def _cells(fractions: Tensor, cells: int) -> Tensor:
 
     Numbers outside [0, 1] go to the nearest cell.
     """
-    return (fractions * cells).floor().long().clamp_(0, cells - 1)
+    return (fractions * cells).long().clamp_(0, cells - 1)
 
 
 def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tensor:
-    """Return the (pixels,) index of the nearest point in each pixel, -1 if it has none.
+    """Return the (pixels,) int32 index of the nearest point in each pixel, -1 if it has none.
 
     Args:
         distance: (P,) metres from the sensor.
@@ -127,10 +129,10 @@ def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tens
     # The bits of floats >= 0 sort as the floats do, so one integer minimum finds both the least
     # distance and its point.
     index = torch.arange(len(distance), device=distance.device)
-    key = (distance.float().view(torch.int32).long() << _INDEX_BITS) | index
+    key = index.add(distance.float().view(torch.int32), alpha=1 << _INDEX_BITS)
 
-    empty = torch.iinfo(torch.int64).max
+    empty = torch.iinfo(torch.int64).max  # its lower half is -1
     if least > 0:
         key = torch.where(distance < least, empty, key)
     first = torch.full((pixels,), empty, device=key.device).scatter_reduce_(0, pixel, key, "amin")
-    return torch.where(first == empty, -1, first & ((1 << _INDEX_BITS) - 1))
+    return first.view(torch.int32)[::2]
