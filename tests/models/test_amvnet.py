@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from amvnet.config.schema import PointHeadConfig
-from amvnet.models import amvnet as amvnet_module
 from amvnet.models import point_head as point_head_module
 from amvnet.models.amvnet import LateFusion
 from amvnet.models.assertion import Disagreement
@@ -26,7 +25,7 @@ from amvnet.models.point_head import (
     head_features,
     nearest_neighbours,
     point_table,
-    select_used_points,
+    used_points_table,
 )
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.polar_view import PolarGrid
@@ -309,11 +308,13 @@ def test_scoring_points_from_the_table_equals_scoring_their_features(
 def test_only_the_points_that_occur_are_selected() -> None:
     uncertain = torch.tensor([7, 3])
     near = torch.tensor([[3, 9, 9], [0, 7, 3]])
-    selected, (uncertain_index, near_index) = select_used_points(12, uncertain, near)
+    points, f, g = torch.rand(12, 4), torch.rand(12, K), torch.rand(12, K)
+    table, (i, k) = used_points_table(points, f, g, uncertain, near)
 
-    assert selected.tolist() == [0, 3, 7, 9]
-    assert torch.equal(selected[uncertain_index], uncertain)
-    assert torch.equal(selected[near_index], near)
+    whole = point_table(points, f, g)
+    assert torch.equal(table, whole[[0, 3, 7, 9]])
+    assert torch.equal(table[i], whole[uncertain])
+    assert torch.equal(table[k], whole[near])
 
 
 def test_a_scan_of_many_uncertain_points_is_settled_by_sectors_with_the_same_result(
@@ -328,13 +329,13 @@ def test_a_scan_of_many_uncertain_points_is_settled_by_sectors_with_the_same_res
         expected = model.refine(batch, f, g, uncertain)
 
         settled: list[int] = []
-        select = amvnet_module.select_used_points
+        score = model.point_head.score
 
-        def selected(count: int, index: Tensor, near: Tensor) -> tuple[Tensor, list[Tensor]]:
-            settled.append(len(index))
-            return select(count, index, near)
+        def counted(table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
+            settled.append(len(uncertain))
+            return score(table, uncertain, near)
 
-        monkeypatch.setattr(amvnet_module, "select_used_points", selected)
+        monkeypatch.setattr(model.point_head, "score", counted)
         monkeypatch.setattr(point_head_module, "AT_ONCE", 64)
         h = model.refine(batch, f, g, uncertain)
 

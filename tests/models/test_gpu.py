@@ -398,8 +398,8 @@ def test_a_gpu_is_told_few_times_what_to_do_around_the_networks(
         with Launches() as fuse:
             h = model.refine(batch, f, g, uncertain)
             model.merge(f, g, model.compare(batch, f, g) & uncertain, h)
-    assert project.count <= 75
-    assert project.count + fuse.count <= 230
+    assert project.count <= 55
+    assert project.count + fuse.count <= 155
 
 
 def street_scans(*counts: int) -> list[Scan]:

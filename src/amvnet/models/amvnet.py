@@ -8,7 +8,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
 from amvnet.config.schema import ModelConfig
@@ -17,14 +16,13 @@ from amvnet.models.methods import Ensemble, geometric_mean
 from amvnet.models.point_head import (
     PointHead,
     nearest_neighbours,
-    point_table,
     sectors,
-    select_used_points,
+    used_points_table,
 )
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.streams import Arrangement, one_after_the_other
-from amvnet.models.views.points import PointBatch
+from amvnet.models.views.points import PointBatch, concatenate
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeImage, RangeView
 
@@ -111,7 +109,7 @@ class LateFusion(nn.Module):
             index = uncertain[scan].nonzero()[:, 0]  # (U,)
             near = self.find_neighbours(points, index)  # (U, n)
             parts.append(self.settle(points, f[scan], g[scan], index, near))
-        return parts[0] if len(parts) == 1 else torch.cat(parts)
+        return concatenate(parts)
 
     @step("neighbours")
     def find_neighbours(self, points: Tensor, index: Tensor) -> Tensor:
@@ -134,10 +132,7 @@ class LateFusion(nn.Module):
 
         h = f.new_empty(len(index), f.shape[1])
         for part in sectors(points, index):
-            used, (i, k) = select_used_points(len(points), index[part], near[part])
-            table = point_table(
-                points.index_select(0, used), f.index_select(0, used), g.index_select(0, used)
-            )
+            table, (i, k) = used_points_table(points, f, g, index[part], near[part])
             h[part] = self.point_head.score(table, i, k).softmax(dim=1)
         return h
 

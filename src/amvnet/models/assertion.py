@@ -44,7 +44,6 @@ class Disagreement:
 
 def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
     """Return the (P,) similarity of class probabilities (P, K): 0 if disjoint, 1 if the same."""
-    product = torch.linalg.vecdot(f, g)
-    squared_lengths = torch.linalg.vecdot(f, f) * torch.linalg.vecdot(g, g)
-    similarity = product / squared_lengths.clamp_min(TINY).sqrt()
+    lengths = f.norm(dim=1) * g.norm(dim=1)
+    similarity = torch.linalg.vecdot(f, g) / lengths.clamp_min(TINY)
     return similarity.clamp_max(1)  # rounding must not put a point beyond tau = 1

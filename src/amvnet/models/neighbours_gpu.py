@@ -12,6 +12,9 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
+
+from amvnet.models.views.points import concatenate
 
 BLOCK = 128  # points of a block, at most
 NEAREST = 8  # blocks searched for a point's neighbours; for most points 2 hold them all
@@ -28,12 +31,14 @@ class Blocks:
     """The P points of a scan in M blocks of B points that lie close together.
 
     Attributes:
-        index: (M, B) int64 indices of the points; P in an unused slot.
+        xyz: (M * B, 3) metres, the P points of the scan; infinity after these.
+        index: (M, B) int64 indices into these; at least P in an unused slot.
         points: (M, 3, B) metres; infinity in an unused slot.
         low: (M, 3) lower corner of the box around each block.
         high: (M, 3) upper corner of the box around each block.
     """
 
+    xyz: Tensor
     index: Tensor
     points: Tensor
     low: Tensor
@@ -55,13 +60,16 @@ def nearest_others_by_blocks(xyz: Tensor, own: Tensor, n: int) -> Tensor:
         return own[:, None].repeat(1, n)
 
     nearest = _nearest(xyz, own, others)
+    if others == n:
+        return nearest
     return torch.cat([nearest, nearest[:, -1:].expand(-1, n - others)], dim=1)
 
 
 def split_into_blocks(xyz: Tensor) -> Blocks:
     """Split points (P, 3) into blocks of at most `BLOCK`.
 
-    Each part is halved across the longest side of its box until it is small enough.
+    Parts are cut into quarters across x and y in turn, and in the end into halves. The last cut is
+    across the longest side of each part's box.
     """
     levels = max(0, math.ceil(math.log2(len(xyz) / BLOCK)))
     size = -(-len(xyz) >> levels)  # rounded up
@@ -70,30 +78,32 @@ def split_into_blocks(xyz: Tensor) -> Blocks:
     count = size << levels
     padded = torch.cat([xyz, xyz[-1:].expand(count - len(xyz), 3)])
     index = torch.arange(count, device=xyz.device)[None]
-    if levels % 2:
-        index = _split(padded, index, 2)
-    # Cutting into quarters takes half as many sorts, and the boxes are nearly as good.
-    for _ in range(levels // 2):
-        index = _split(padded, index, 4)
+    axis = 0
+    while levels > 1:
+        cuts = 2 if levels > 2 else 1
+        index = _cut(index, padded[:, axis][index], 2**cuts)
+        levels -= cuts
+        axis = 1 - axis
+    if levels:
+        index = _cut(index, _along_longest_side(padded, index), 2)
 
-    points = padded[index]  # (M, B, 3)
-    low, high = points.aminmax(dim=1)
-    is_copy = (index >= len(xyz))[..., None]
-    return Blocks(
-        index=index.clamp_max(len(xyz)),
-        points=points.masked_fill(is_copy, torch.inf).transpose(1, 2).contiguous(),
-        low=low,
-        high=high,
-    )
+    low, high = padded[index].aminmax(dim=1)
+    slots = F.pad(xyz, (0, 0, 0, count - len(xyz)), value=torch.inf)
+    points = slots[index].transpose(1, 2).contiguous()
+    return Blocks(slots, index, points, low, high)
 
 
-def _split(xyz: Tensor, index: Tensor, ways: int) -> Tensor:
-    """Cut each part across the longest side of its box: (M, B) -> (M * ways, B / ways)."""
+def _cut(index: Tensor, positions: Tensor, ways: int) -> Tensor:
+    """Cut each part (M, B) across an axis, given the positions along it: (M * ways, B / ways)."""
+    return index.gather(1, positions.argsort(dim=1)).view(len(index) * ways, -1)
+
+
+def _along_longest_side(xyz: Tensor, index: Tensor) -> Tensor:
+    """Return the positions (M, B) of points along the longest side of each part's box."""
     points = xyz[index]  # (M, B, 3)
     low, high = points.aminmax(dim=1)
     axis = (high - low).argmax(dim=1)
-    positions = points.gather(2, axis[:, None, None].expand(-1, points.shape[1], 1))[..., 0]
-    return index.gather(1, positions.argsort(dim=1)).view(len(index) * ways, -1)
+    return points.gather(2, axis[:, None, None].expand(-1, points.shape[1], 1))[..., 0]
 
 
 def _nearest(xyz: Tensor, own: Tensor, n: int) -> Tensor:
@@ -103,72 +113,61 @@ def _nearest(xyz: Tensor, own: Tensor, n: int) -> Tensor:
         return _nearest_of_all(xyz, own, n)
 
     blocks = split_into_blocks(xyz)
-    nearest_parts = []
-    sure_parts = []
+    parts = []
     for queries in _parts(own, _bytes_per_query(blocks)):
-        nearest, sure = _nearest_in_blocks(xyz, blocks, queries, n)
-        nearest_parts.append(nearest)
-        sure_parts.append(sure)
-
-    nearest = torch.cat(nearest_parts)
-    unsure = (~torch.cat(sure_parts)).nonzero()[:, 0]
-    if len(unsure):
-        nearest[unsure] = _nearest_of_all(xyz, own[unsure], n)
-    return nearest
+        nearest, is_unsure = _nearest_in_blocks(blocks, queries, n)
+        unsure = is_unsure.nonzero()[:, 0]
+        if len(unsure):
+            nearest[unsure] = _nearest_of_all(xyz, queries[unsure], n)
+        parts.append(nearest)
+    return concatenate(parts)
 
 
-def _nearest_in_blocks(xyz: Tensor, blocks: Blocks, own: Tensor, n: int) -> tuple[Tensor, Tensor]:
+def _nearest_in_blocks(blocks: Blocks, own: Tensor, n: int) -> tuple[Tensor, Tensor]:
     """Search the nearest blocks only.
 
     Returns:
-        (U, n) indices of the nearest others, and (U,) bool: True if no other point is nearer.
+        (U, n) indices of the nearest others, and (U,) bool: True if another point may be nearer.
     """
-    queries = xyz[own]  # (U, 3)
+    queries = blocks.xyz[own]  # (U, 3)
     gaps, near = _gaps(blocks, queries).topk(NEAREST + 1, dim=1, largest=False)
 
     # Squared distances in float32 to all points of the nearest blocks
     index = blocks.index[near[:, :-1]].flatten(1)  # (U, NEAREST * B)
     offsets = blocks.points[near[:, :-1]] - queries[:, None, :, None]  # (U, NEAREST, 3, B)
     distance = offsets.square_().sum(dim=2).flatten(1)
-    distance.masked_fill_(index == own[:, None], torch.inf)
 
-    # The best of them ranked again in double precision
+    # The best of them ranked again in double precision, and without the point itself
     rough, column = distance.topk(n + SPARE, dim=1, largest=False)
     index = index.gather(1, column)
-    offset = xyz[index.clamp_max(len(xyz) - 1)].double() - queries[:, None].double()
-    exact, order = offset.square().sum(dim=2).masked_fill(rough.isinf(), torch.inf).sort(dim=1)
+    exact = (blocks.xyz[index] - queries[:, None].double()).square_().sum(dim=2)
+    exact, order = exact.masked_fill_(index == own[:, None], torch.inf).sort(dim=1)
 
     # All other points are at least as far as the next block's box or the farthest candidate.
-    bound = torch.minimum(gaps[:, -1], rough[:, -1]).double() * (1 - ROUNDING) - UNDERFLOW
-    return index.gather(1, order[:, :n]), exact[:, n - 1] <= bound.clamp_min(0)
+    bound = torch.minimum(gaps[:, -1], rough[:, -1]) * (1 - ROUNDING)
+    return index.gather(1, order[:, :n]), exact[:, n - 1] > F.threshold(bound, UNDERFLOW, 0)
 
 
 def _gaps(blocks: Blocks, queries: Tensor) -> Tensor:
     """Return (U, M) squared distances of points (U, 3) to the blocks' boxes; 0 inside a box."""
-    total = queries.new_zeros(len(queries), len(blocks.low))
-    for axis in range(3):
-        values = queries[:, axis, None]
-        outside = values - values.clamp(blocks.low[:, axis], blocks.high[:, axis])
-        total.addcmul_(outside, outside)
-    return total
+    values = queries[:, :, None]
+    return values.clamp(blocks.low.T, blocks.high.T).sub_(values).square_().sum(dim=1)
 
 
 def _nearest_of_all(xyz: Tensor, own: Tensor, n: int) -> Tensor:
     """Return (U, n) indices of the nearest others by the distances to all points, in float64."""
-    nearest = []
-    for queries in _parts(own, len(xyz) * 4 * 8):  # sums, differences, and two copies to rank them
-        distance = torch.zeros(len(queries), len(xyz), dtype=torch.float64, device=xyz.device)
-        for axis in xyz.double().unbind(1):
-            distance += (axis - axis[queries][:, None]).square_()
-
-        distance.scatter_(1, queries[:, None], torch.inf)
-        nearest.append(distance.topk(n, dim=1, largest=False).indices)
-    return torch.cat(nearest)
+    points = xyz.T.double()
+    parts = []
+    for queries in _parts(own, len(xyz) * 6 * 8):  # offsets, distances, two copies to rank them
+        offsets = points - points.T[queries][:, :, None]  # (U, 3, P)
+        distance = offsets.square_().sum(dim=1).scatter_(1, queries[:, None], torch.inf)
+        parts.append(distance.topk(n, dim=1, largest=False).indices)
+    return concatenate(parts)
 
 
 def _bytes_per_query(blocks: Blocks) -> int:
     """Return the memory that the search for one point's neighbours in the blocks takes."""
-    to_boxes = 4 * 4 * len(blocks.low)  # distances
+    to_boxes = 4 * 4 * len(blocks.low)  # offsets and distances
     per_point = 2 * 3 * 4 + 2 * 8 + 2 * 4  # coordinates, indices, distances
     return to_boxes + per_point * NEAREST * blocks.index.shape[1]
 

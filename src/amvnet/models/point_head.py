@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -12,7 +13,7 @@ from amvnet.config.schema import PointHeadConfig
 from amvnet.models.layers import PointLinear
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
-from amvnet.models.views.points import occurring
+from amvnet.models.views.points import concatenate, occurring
 from amvnet.threads import run_parts
 
 POINT_VALUES = 4  # x, y, z, intensity
@@ -78,8 +79,8 @@ class PointHead(nn.Module):
         parts = list(zip(near.split(size), shift.split(size), strict=True))
         pooled = run_parts(pool_part, parts) if table.is_cpu else list(map(pool_part, parts))
 
-        point[:, -POINT_VALUES:-1] *= self.config.position_scale
-        return self._classify(torch.cat(pooled), point)
+        point[:, -POINT_VALUES:-1].mul_(self.config.position_scale)
+        return self._classify(concatenate(pooled), point)
 
     def _classify(self, pooled: Tensor, point: Tensor) -> Tensor:
         """Return the (U, K) logits."""
@@ -89,8 +90,8 @@ class PointHead(nn.Module):
             return logits
 
         f, g, _ = point.split([self.classes, self.classes, POINT_VALUES], dim=1)
-        ensemble = (f * g).clamp_min(LEAST).log() / 2
-        return share * logits + (1 - share) * ensemble
+        squared_ensemble = (f * g).clamp_min(LEAST)
+        return torch.add(share * logits, squared_ensemble.log(), alpha=(1 - share) / 2)
 
 
 def _pool(rows: Tensor) -> Tensor:
@@ -127,20 +128,23 @@ def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
     return list(azimuth.argsort().split(AT_ONCE))
 
 
-def select_used_points(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Select those of `count` points whose indices occur in any of the tensors `indices`.
+def used_points_table(
+    points: Tensor, f: Tensor, g: Tensor, *indices: Tensor
+) -> tuple[Tensor, Sequence[Tensor]]:
+    """Return `point_table` for the points whose indices occur in any of the tensors `indices`.
 
-    On a GPU all points are selected, because the CPU would have to wait for the number of those
-    that occur.
+    On a GPU it has all points, because the CPU would have to wait for the number of those that
+    occur.
 
     Returns:
-        (M,) indices of the selected points, ascending, and the tensors `indices` as indices into
-        these.
+        The table, and the tensors `indices` as indices into it.
     """
-    if not indices[0].is_cpu:
-        return torch.arange(count, device=indices[0].device), list(indices)
+    if not points.is_cpu:
+        return point_table(points, f, g), indices
 
-    return occurring(count, *indices)
+    used, places = occurring(len(points), *indices)
+    points, f, g = (values.index_select(0, used) for values in (points, f, g))
+    return point_table(points, f, g), places
 
 
 def head_features(

@@ -33,6 +33,11 @@ def occurring(count: int, *indices: Tensor) -> tuple[Tensor, list[Tensor]]:
     return occurs.nonzero()[:, 0], ranks
 
 
+def concatenate(parts: Sequence[Tensor]) -> Tensor:
+    """Concatenate tensors along their first axis; a single one is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
+
+
 @dataclass(frozen=True)
 class PointBatch:
     """The points of B scans, one scan after the other.
@@ -85,8 +90,10 @@ class PointBatch:
         In double precision, so that a point at a cell's border falls the same way on any device.
         """
         # Contiguous, for which some functions take a fraction of the time.
-        x, y, z = self.points.T[:3].contiguous().double()
-        return torch.stack([torch.sqrt(x * x + y * y), torch.atan2(y, x), z])
+        xyz = self.points.T[:3].to(torch.float64, memory_format=torch.contiguous_format)
+        x, y, z = xyz
+        x_squared, y_squared = xyz[:2].square()
+        return torch.stack([(x_squared + y_squared).sqrt_(), torch.atan2(y, x), z])
 
     def slices(self) -> list[slice]:
         """Return the slice of each scan's points."""

@@ -142,9 +142,9 @@ class PolarView:
         self._axes_on: dict[torch.device, tuple[Tensor, ...]] = {}
 
     def _axes(self, device: torch.device) -> tuple[Tensor, ...]:
-        """Return the start, length, number and last of the cells along radius, angle and height.
+        """Return the start, the length, the number and the last of the cells.
 
-        Each is (3, 1) float64.
+        Each is (3, 1) float64, along radius, angle and height.
         """
         if device not in self._axes_on:
             c = self.config
@@ -167,7 +167,7 @@ class PolarView:
         low, length, cells, last = self._axes(batch.points.device)
         polar = batch.cylindrical
         cell = (polar - low).div_(length).mul_(cells).floor_().clamp_min_(0).minimum(last)
-        offset = polar - (cell + 0.5).mul_(length).div_(cells).add_(low)
+        offset = polar - torch.addcdiv(low, (cell + 0.5).mul_(length), cells)
         radial_cell, angular_cell, voxel = cell.long()
 
         # Not by a list of columns, which would have to be copied to a GPU.

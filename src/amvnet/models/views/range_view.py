@@ -64,16 +64,17 @@ class RangeView:
                 range.
         """
         c = self.config
-        distance = batch.points[:, :3].norm(dim=1)
+
+        # The row of zeros at the end is for pixels without a point.
+        values = F.pad(batch.points, (0, 2, 0, 1))  # (P + 1, 6)
+        values[:-1, 5] = 1
+        distance = torch.linalg.vector_norm(batch.points[:, :3], dim=1, out=values[:-1, 4])
+
         row = self.rows(batch).add(batch.scan, alpha=c.height)
         pixel = self.columns(batch).add(row, alpha=c.width)
         nearest = _nearest(distance, pixel, batch.count * c.height * c.width, c.nearest)
 
-        # The row of zeros at the end is for pixels without a point.
-        values = F.pad(batch.points, (0, 2, 0, 1))  # (P + 1, 6)
-        values[:-1, 4] = distance
-        values[:-1, 5] = 1
-        image = values.index_select(0, nearest % len(values))  # -1 selects the last row
+        image = values[nearest]  # -1 selects the last row
         image = image.view(batch.count, c.height, c.width, CHANNELS).permute(0, 3, 1, 2)
         return RangeImage(image, pixel, nearest)
 
