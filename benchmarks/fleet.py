@@ -3,7 +3,8 @@
 python benchmarks/fleet.py [--scans 400] [--workers 2]
 python benchmarks/fleet.py --names 10000000
 
-The first compares the labels with those of `predict`, also after a worker and the driver are
+The first prints what `predict` and `--ray` take to start and for each scan, from files; then it
+compares the labels in a bucket with those of `predict`, also after a worker and the driver are
 killed. The second lists and plans made-up names, and prints the memory that it takes. Needs
 the packages of `make test-slow`.
 """
@@ -13,12 +14,14 @@ from __future__ import annotations
 import argparse
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from io import BytesIO
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -31,7 +34,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from fixtures.s3_server import Bucket, s3_server
 
 WEIGHTS = "sim-hdl64e"
+TO = ("--weights", WEIGHTS, "--out")
 DRIVES = 4
+FEW = 5  # scans of each drive, to tell the time of the start
 DRIVE = 1000  # names of each made-up drive
 
 
@@ -50,30 +55,60 @@ def main() -> None:
 
 def compare(root: Path, bucket: Bucket, scans: int, workers: int) -> None:
     """Label the same scans by `predict`, and on Ray undisturbed and with kills; print both."""
-    amvnet("simulate", root / "streets", "--sequences", DRIVES, "--scans", scans // DRIVES)
-    bucket.upload(root / "streets/sequences", "scans")
+    simulated = root / "streets"
+    amvnet("simulate", simulated, "--sequences", DRIVES, "--scans", scans // DRIVES)
+    for folder in sorted(simulated.glob("sequences/*/velodyne")):
+        drive = folder.parent.name
+        shutil.copytree(folder, root / "scans" / drive)
+        (root / "few" / drive).mkdir(parents=True)
+        for path in sorted(folder.iterdir())[:FEW]:
+            shutil.copy(path, root / "few" / drive)
+    bucket.upload(root / "scans", "scans")
 
+    for name in ("few", "scans"):
+        alone = amvnet("predict", f"{root / name}/*/*.bin", *TO, root / f"{name}-alone")
+        on_ray = amvnet(
+            *("predict", root / name, *TO, root / f"{name}-ray"), "--workers", workers, "--ray"
+        )
+        count = len(list((root / name).rglob("*.bin")))
+        print(f"{count} files: predict {alone:.1f} s, --ray {on_ray:.1f} s", flush=True)
+        if name == "few":
+            few = (count, alone, on_ray)
+    print_costs(few, (count, alone, on_ray))
+
+    expected = root / "scans-alone"
+    print(f"from the S3 server on the same cores: {in_bucket(bucket, 'whole', workers):.1f} s")
+    check(expected, bucket, "whole")
+    in_bucket(bucket, "worker", workers, kill_worker)
+    check(expected, bucket, "worker")
+    in_bucket(bucket, "driver", workers, subprocess.Popen.kill)
+    in_bucket(bucket, "driver", workers, None, "--resume")
+    check(expected, bucket, "driver")
+
+
+def print_costs(few: tuple[int, float, float], many: tuple[int, float, float]) -> None:
+    """Print what a run takes at its start, and what each scan takes.
+
+    Args:
+        few, many: the number of scans, and the seconds of `predict` and of `--ray`.
+    """
+    slopes = []
+    for name, column in (("predict", 1), ("--ray", 2)):
+        slope = (many[column] - few[column]) / (many[0] - few[0])
+        start = few[column] - slope * few[0]
+        print(f"{name}: {start:.1f} s + {slope:.4f} s a scan")
+        slopes.append(slope)
+    print(f"--ray: {slopes[1] / slopes[0] - 1:+.1%} a scan, {many[2] / many[1] - 1:+.1%} in all")
+
+
+def amvnet(*words: object) -> float:
+    """Run a command; return the seconds."""
     start = time.perf_counter()
-    pattern = f"{root}/streets/sequences/*/velodyne/*.bin"
-    amvnet("predict", pattern, "--weights", WEIGHTS, "--out", root / "labels")
-    alone = time.perf_counter() - start
-
-    whole = on_ray(bucket, "whole", workers)
-    print(f"predict {alone:.0f} s, --ray {whole:.0f} s, {whole / alone - 1:+.1%} with its start")
-    check(root / "labels", bucket, "whole")
-
-    on_ray(bucket, "worker", workers, kill_worker)
-    check(root / "labels", bucket, "worker")
-    on_ray(bucket, "driver", workers, subprocess.Popen.kill)
-    on_ray(bucket, "driver", workers, None, "--resume")
-    check(root / "labels", bucket, "driver")
-
-
-def amvnet(*words: object) -> None:
     subprocess.run([sys.executable, "-m", "amvnet", *map(str, words)], check=True)
+    return time.perf_counter() - start
 
 
-def on_ray(
+def in_bucket(
     bucket: Bucket,
     out: str,
     workers: int,
@@ -85,7 +120,7 @@ def on_ray(
     Args:
         kill: kills something when a quarter of the labels is there.
     """
-    words = ["s3://fleet/scans", "--weights", WEIGHTS, "--out", f"s3://fleet/{out}", *more]
+    words = ["s3://fleet/scans", *TO, f"s3://fleet/{out}", *more]
     words += ["--workers", str(workers), "--ray"]
     command = [sys.executable, "-m", "amvnet", "predict", *words]
     start = time.perf_counter()
@@ -136,10 +171,17 @@ def plan(names: int) -> None:
     from amvnet.fleet.actors import Labelling
     from amvnet.fleet.cluster import FleetRun
     from amvnet.fleet.drives import describe_drive
-    from amvnet.fleet.manifest import list_blocks, windows
+    from amvnet.fleet.manifest import list_blocks
     from amvnet.fleet.results import Results
     from amvnet.fleet.storage import Place
     from amvnet.weights.file import load
+
+    class Measuring:
+        """Workers that find nothing to measure."""
+
+        def run(self, method: str, tables: list[pa.Table]) -> Iterator[tuple[pa.Table, Any]]:
+            for table in tables:
+                yield table, describe_drive(table["drive"][0].as_py(), "", "", [])
 
     class MadeUp(Place):
         def kind(self) -> FileType:
@@ -155,16 +197,15 @@ def plan(names: int) -> None:
 
     with TemporaryDirectory() as folder:
         labelling = Labelling(load(WEIGHTS), folder)
-        run = FleetRun(labelling, Results(Place.of(folder), {}), (1, 1), {})
+        run = FleetRun(labelling, Results(Place.of(folder), {}), Measuring())  # type: ignore[arg-type]
         Place.of = classmethod(lambda cls, url: MadeUp(url, None, ""))  # type: ignore[method-assign, assignment]
         before = peak()
         start = time.perf_counter()
         total = 0
-        for window in windows(run.plan(list_blocks(["s3://fleet"])), cluster.WINDOW):
-            run.results.drives.add([describe_drive(drive, "", "", []) for drive in run.first])
-            run.first.clear()
-            tables = [run.to_table(block) for block in window]
-            total += sum(map(len, tables))
+        blocks = list_blocks(["s3://fleet"])
+        while window := list(islice(blocks, cluster.WINDOW)):
+            total += sum(map(len, run.plan(window)))
+            run.measure()
         seconds = time.perf_counter() - start
     print(f"{total:,} names in {seconds:.0f} s; peak memory {peak():.2f} GB, {before:.2f} before")
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
+import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -97,7 +100,8 @@ def test_two_processes_train_the_weights_of_one(world: Path, tmp_path: Path, sta
     assert result.stdout.count("epoch 2/") == 1  # only one of them prints
 
 
-def test_processes_that_slurm_has_started_find_each_other(world: Path, tmp_path: Path) -> None:
+def slurm(command: Sequence[object]) -> list[tuple[int, str]]:
+    """Run a command in two processes as srun does; return exit codes and what is printed."""
     job = {
         "SLURM_JOB_ID": "4711",
         "SLURM_JOB_NAME": "amvnet",
@@ -110,22 +114,60 @@ def test_processes_that_slurm_has_started_find_each_other(world: Path, tmp_path:
         "MASTER_PORT": str(free_port()),
         "OMP_NUM_THREADS": "1",
     }
-    arguments = map(str, train_arguments(world, tmp_path / "two", "rv"))
-    command = [sys.executable, "-m", "amvnet", *arguments]
+    words = [sys.executable, *map(str, command)]
     processes = []
     for rank in ("0", "1"):
         environment = {**os.environ, **job, "SLURM_PROCID": rank, "SLURM_LOCALID": rank}
         process = subprocess.Popen(
-            command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
         processes.append(process)
-
     outputs = [process.communicate()[0] for process in processes]
-    assert [process.returncode for process in processes] == [0, 0], outputs
-    assert outputs[1] == ""
+    return [(process.returncode, text) for process, text in zip(processes, outputs, strict=True)]
+
+
+def test_processes_that_slurm_has_started_find_each_other(world: Path, tmp_path: Path) -> None:
+    results = slurm(["-m", "amvnet", *train_arguments(world, tmp_path / "two", "rv")])
+    assert [code for code, _ in results] == [0, 0], results
+    assert results[1][1] == ""
 
     weights = load(tmp_path / "two/rv/last.safetensors")
     assert largest_difference(weights, load(world / "run/rv/last.safetensors")) < 1e-5
+
+
+# The command line, whose second process is killed while it writes its second scan.
+MORTAL = """
+import itertools, os, signal, sys
+from amvnet.cli.main import main
+from amvnet.inference.pipeline import Pipeline
+
+write = Pipeline.write
+calls = itertools.count()
+
+def write_or_die(*values):
+    if os.environ["SLURM_PROCID"] == "1" and next(calls) == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return write(*values)
+
+Pipeline.write = write_or_die
+sys.exit(main())
+"""
+
+
+def test_if_a_process_dies_the_other_does_its_share_and_says_what_is_left(
+    world: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "labels"
+    words = ["predict", world / "data", "--weights", world / "run", "--sequences", "00,08"]
+    (code, output), (killed, _) = slurm(["-c", MORTAL, *words, "--out", out])
+    assert (code, killed) == (1, -signal.SIGKILL)
+    last = output.splitlines()[-1]
+    assert re.search(r"labels: a process has ended; [34] of the 4 scans of process 1 are", last)
+    assert "--resume" in last
+    assert 4 <= len(list(out.rglob("*.label"))) < 8
+
+    assert one_process(*words, "--out", out, "--resume") == 0
+    assert len(list(out.rglob("*.label"))) == 8
 
 
 def test_processes_share_the_scans_of_predict_and_evaluate(world: Path, tmp_path: Path) -> None:

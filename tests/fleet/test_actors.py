@@ -14,7 +14,7 @@ import pyarrow as pa
 import pytest
 
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.fleet.actors import Labelling, LabelScans, measure_drive, results_schema, statistics
+from amvnet.fleet.actors import Labelling, LabelScans, results_schema, statistics
 from amvnet.fleet.manifest import list_blocks
 from amvnet.fleet.storage import Place
 from amvnet.inference.segmentation import Segmentation
@@ -34,12 +34,15 @@ def label(labelling: Labelling, inputs: Sequence[str]) -> list[dict[str, Any]]:
     worker = LabelScans(labelling)
     rows = []
     for block in list_blocks(inputs):
-        drive = measure_drive(labelling, block.rows()[:5])
-        table = [row | {"estimates": drive["estimates"]} for row in block.rows()]
-        result = worker(pa.Table.from_pylist(table))
+        drive = worker.measure(block.slice(0, 5))
+        result = worker(with_estimates(block, drive["estimates"]))
         assert result.schema == results_schema(labelling.taxonomy)
         rows += result.to_pylist()
     return rows
+
+
+def with_estimates(block: pa.Table, estimates: str) -> pa.Table:
+    return block.append_column("estimates", pa.repeat(estimates, len(block)))
 
 
 def test_labels_in_a_bucket_are_those_of_predict(
@@ -75,14 +78,13 @@ def test_workers_normalise_by_what_was_measured_and_not_by_their_own_scans(
 ) -> None:
     """A worker that gets only the last scans of a drive gives them the labels of the whole."""
     (block,) = list(list_blocks([f"{fleet}/scans/drive4"]))
-    drive = measure_drive(labelling, block.rows())
+    worker = LabelScans(replace(labelling, out=str(tmp_path)))
+    drive = worker.measure(block)
     assert drive["height"] == pytest.approx(2.5, abs=0.05)
     other = json.dumps([json.loads(drive["estimates"])[0] | {"quantiles": None}])
 
-    worker = LabelScans(replace(labelling, out=str(tmp_path)))
     for estimates, is_same in ((drive["estimates"], True), (other, False)):
-        rows = [row | {"estimates": estimates} for row in block.rows()]
-        worker(pa.Table.from_pylist(rows[-1:]))
+        worker(with_estimates(block, estimates).slice(len(block) - 1))
         expected = (fleet / "labels/drive4/000003.label").read_bytes()
         assert ((tmp_path / "000003.label").read_bytes() == expected) == is_same
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from io import BytesIO
 from pathlib import Path
 
@@ -17,12 +18,13 @@ import pytest
 
 ray = pytest.importorskip("ray")
 
-from amvnet.fleet import cluster  # noqa: E402
+from amvnet.errors import InputError, SomeBroken  # noqa: E402
+from amvnet.fleet import workers as workers_module  # noqa: E402
 from amvnet.fleet.actors import Labelling, results_schema  # noqa: E402
-from amvnet.fleet.cluster import FleetRun, connect  # noqa: E402
-from amvnet.fleet.manifest import Block  # noqa: E402
+from amvnet.fleet.cluster import FleetRun  # noqa: E402
 from amvnet.fleet.results import Results  # noqa: E402
 from amvnet.fleet.storage import Place  # noqa: E402
+from amvnet.fleet.workers import Workers, connect  # noqa: E402
 from amvnet.weights.file import load, save  # noqa: E402
 
 from fixtures.s3_server import Bucket, slow_labels  # noqa: E402
@@ -35,7 +37,7 @@ import sys
 from amvnet.cli.main import main
 from amvnet.fleet import results
 
-results.PART_SECONDS = results.PART_SHARE = 0.0  # every block at once
+results.PART_SECONDS = 0.0  # every block at once
 sys.exit(main())
 """
 
@@ -191,15 +193,29 @@ def test_wrong_input_is_one_line_before_a_cluster_is_started(fleet: Path, bucket
             assert word in line, line
 
 
+def test_missing_credentials_are_one_line_and_exit_code_2(fleet: Path, locked_bucket: str) -> None:
+    weights = f"--weights {fleet}/w.safetensors"
+    line = refusal(f"predict {locked_bucket}/scans {weights} --out x --ray")
+    assert "credentials" in line
+
+
 def labelling_of(fleet: Path, out: str) -> Labelling:
     return Labelling(load(fleet / "w.safetensors"), out)
 
 
+def block_of(drive: str, *names: str) -> pa.Table:
+    rows = [{"path": f"{name}.bin", "name": name, "drive": drive, "sensor": ""} for name in names]
+    return pa.Table.from_pylist(rows)
+
+
+class Unused:
+    """Workers that are not needed."""
+
+
 def test_two_scans_of_one_name_are_refused(fleet: Path, tmp_path: Path) -> None:
     labelling = labelling_of(fleet, str(tmp_path))
-    run = FleetRun(labelling, Results(Place.of(str(tmp_path)), {}), (1, 1), {})
-    blocks = [Block("a", ["1", "2"], ["x/1.bin", "x/2.bin"]), Block("b", ["2"], ["y/2.bin"])]
-    fails(lambda: list(run.plan(blocks)), "found 2 twice")
+    run = FleetRun(labelling, Results(Place.of(str(tmp_path)), {}), Unused())  # type: ignore[arg-type]
+    fails(lambda: run.plan([block_of("a", "1", "2"), block_of("b", "2")]), "found 2 twice")
 
 
 class Mortal:
@@ -207,6 +223,9 @@ class Mortal:
 
     def __init__(self, labelling: Labelling) -> None:
         self.schema = results_schema(labelling.taxonomy)
+
+    def measure(self, scans: pa.Table) -> dict[str, object]:
+        return {"drive": scans["drive"][0].as_py(), "assumed": "", "estimates": "[]"}
 
     def __call__(self, batch: pa.Table) -> pa.Table:
         names = batch["name"].to_pylist()
@@ -221,38 +240,50 @@ class Mortal:
 @pytest.fixture
 def run_of(
     ray_here: None, fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[[], FleetRun]:
-    """Makes a run of one mortal worker, which is not started again for the same block."""
+) -> Iterator[FleetRun]:
+    """A run of one mortal worker, whose tables are not run again if it ends."""
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    monkeypatch.setattr(cluster, "LabelScans", Mortal)
-    monkeypatch.setattr(cluster, "RETRIES", 0)
-    monkeypatch.setattr(cluster, "measure_drive", _not_measured)
+    monkeypatch.setattr(workers_module, "LabelScans", Mortal)
+    monkeypatch.setattr(workers_module, "RETRIES", 0)
     labelling = labelling_of(fleet, str(tmp_path))
-    return lambda: FleetRun(
-        labelling, Results(Place.of(str(tmp_path)), {}), (1, 1), {"num_cpus": 1}
-    )
+    with closing(Workers(labelling, (1, 1))) as workers:
+        yield FleetRun(labelling, Results(Place.of(str(tmp_path)), {}), workers)
 
 
-def _not_measured(labelling: Labelling, drive: list[dict[str, str]]) -> dict[str, object]:
-    return {"drive": drive[0]["drive"], "sensor": "", "assumed": "", "estimates": "[]"}
+def label(run: FleetRun, *blocks: pa.Table) -> None:
+    remaining = run.plan(blocks)
+    run.measure()
+    run.label(remaining)
 
 
-def test_a_scan_that_ends_its_workers_is_a_broken_one(
-    run_of: Callable[[], FleetRun], tmp_path: Path
-) -> None:
-    run = run_of()
-    names = ["1", "poison", "2"]
-    run.label([Block("a", names, [f"{name}.bin" for name in names]), Block("b", ["3"], ["3.bin"])])
-    run.results.flush()
+def test_a_scan_that_ends_its_workers_is_a_broken_one(run_of: FleetRun, tmp_path: Path) -> None:
+    label(run_of, block_of("a", "1", "poison", "2"), block_of("b", "3"))
+    run_of.results.flush()
     rows = pa.parquet.read_table(sorted(tmp_path.glob("results/part-*"))).to_pylist()
     errors = {row["scan"]: row["error"] for row in rows}
     assert len(rows) == len(errors) == 4
     assert [name for name, error in errors.items() if error] == ["poison"]
-    with pytest.raises(Exception, match="3 of 4 scans segmented, 1 broken"):
-        run.finish()
+    with pytest.raises(SomeBroken, match="3 of 4 scans segmented, 1 broken"):
+        run_of.finish()
 
 
-def test_a_full_disk_ends_the_run_and_keeps_what_is_done(run_of: Callable[[], FleetRun]) -> None:
+def test_a_full_disk_ends_the_run_and_keeps_what_is_done(run_of: FleetRun) -> None:
     with pytest.raises(OSError, match="No space left") as caught:
-        run_of().label([Block("a", ["full"], ["full.bin"])])
+        label(run_of, block_of("a", "full"))
     assert caught.value.filename == "/full/disk"
+
+
+class Reluctant(Mortal):
+    """A worker that never starts."""
+
+    def __init__(self, labelling: Labelling) -> None:
+        raise InputError("expected a library on this machine, found none; install it")
+
+
+def test_workers_that_cannot_start_are_one_line(
+    ray_here: None, fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    monkeypatch.setattr(workers_module, "LabelScans", Reluctant)
+    with closing(Workers(labelling_of(fleet, "x"), (1, 1))) as workers:
+        fails(lambda: list(workers.run("measure", [block_of("a", "1")])), "install it")

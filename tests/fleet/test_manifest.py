@@ -5,6 +5,7 @@ from __future__ import annotations
 import tracemalloc
 from collections.abc import Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from pyarrow.fs import FileType
 
 from amvnet.data.formats.find import list_scans
 from amvnet.fleet import manifest
-from amvnet.fleet.manifest import BLOCK, Block, NameSet, list_blocks, windows
+from amvnet.fleet.manifest import BLOCK, NameSet, list_blocks
 from amvnet.fleet.storage import Place
 
 from fixtures.s3_server import Bucket
@@ -25,7 +26,7 @@ from fixtures.worlds import fails
 
 def scans_of(inputs: Sequence[str]) -> list[tuple[str, str, str]]:
     """Return the name, the drive and the URL of each scan."""
-    rows = [row for block in list_blocks(inputs) for row in block.rows()]
+    rows = [row for block in list_blocks(inputs) for row in block.to_pylist()]
     return [(row["name"], row["drive"], row["path"]) for row in rows]
 
 
@@ -66,10 +67,8 @@ def test_blocks_are_of_one_drive_and_keep_its_order(tmp_path: Path) -> None:
     names = [f"{index:03d}.bin" for index in range(2 * BLOCK + 1)]
     touch(tmp_path, *(f"{drive}/{name}" for drive in "ab" for name in names))
     blocks = list(list_blocks([str(tmp_path)]))
-    assert [len(block.names) for block in blocks] == 2 * [BLOCK, BLOCK, 1]
-    assert [name for block in blocks[:3] for name in block.names] == [
-        f"a/{name[:-4]}" for name in names
-    ]
+    assert [len(block) for block in blocks] == 2 * [BLOCK, BLOCK, 1]
+    assert pa.concat_tables(blocks[:3])["name"].to_pylist() == [f"a/{name[:-4]}" for name in names]
 
 
 def test_what_cannot_be_listed_is_refused_in_one_line(tmp_path: Path, bucket: Bucket) -> None:
@@ -107,24 +106,21 @@ def test_a_manifest_of_paths_gives_the_same_scans_as_the_folder(fleet: Path, end
     assert rows == [(f"scans/{name}", drive, url) for name, drive, url in expected]
 
 
-def test_rows_of_a_manifest_are_brought_together_by_drive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("ending", manifest.MANIFESTS)
+def test_rows_of_a_manifest_are_brought_together_by_drive(tmp_path: Path, ending: str) -> None:
     columns = {
         "path": [f"s3://b/x/{index}.bin" for index in range(6)],
         "drive": ["a", "b"] * 3,
         "sensor": ["vlp16", ""] * 3,
-        "name": [f"n{index}" for index in range(6)],
+        "name": [f"{index:06d}" for index in range(6)],  # digits, but no numbers
     }
-    path = write_manifest(tmp_path / "m.csv", columns)
-    a, b = list_blocks([path])
-    assert (a.drive, a.sensor, a.names) == ("a", "vlp16", ("n0", "n2", "n4"))
-    assert (b.drive, b.sensor, b.urls[0]) == ("b", "", "s3://b/x/1.bin")
-
-    monkeypatch.setattr(manifest, "MOST_PENDING", 2)
-    assert sorted(name for block in list_blocks([path]) for name in block.names) == sorted(
-        columns["name"]
-    )
+    a, b = list_blocks([write_manifest(tmp_path / f"m{ending}", columns)])
+    assert set(zip(a["drive"].to_pylist(), a["sensor"].to_pylist(), strict=True)) == {
+        ("a", "vlp16")
+    }
+    assert a["name"].to_pylist() == ["000000", "000002", "000004"]
+    assert b["drive"].to_pylist() == ["b"] * 3
+    assert b["path"][0].as_py() == "s3://b/x/1.bin"
 
 
 def test_a_manifest_without_paths_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -137,8 +133,7 @@ def test_a_manifest_without_paths_is_refused_in_one_line(tmp_path: Path) -> None
 # ---- many names
 
 
-def test_a_set_of_names_has_those_that_were_added(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(manifest, "MOST_RECENT", 10)
+def test_a_set_of_names_has_those_that_were_added() -> None:
     rng = np.random.default_rng(0)
     names = NameSet()
     reference: set[str] = set()
@@ -178,17 +173,16 @@ class MadeUp(Place):
 def test_the_memory_of_planning_does_not_grow_with_the_names(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Of each name stay 8 bytes, and of each drive its first scans until it is measured."""
+    """Of each name stay 8 bytes."""
     monkeypatch.setattr(Place, "of", lambda url: MadeUp(url, None, url))
-    monkeypatch.setattr(manifest, "MOST_RECENT", 1000)
 
     def peak(drives: int) -> int:
         monkeypatch.setattr(MadeUp, "drives", drives)
         names = NameSet()
         tracemalloc.start()
-        for window in windows(list_blocks(["/fleet"]), 20):
-            for block in window:
-                assert names.add(block.names).all()
+        blocks = list_blocks(["/fleet"])
+        while window := list(islice(blocks, 20)):
+            assert names.add(pa.concat_tables(window)["name"].to_pylist()).all()
         size = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         assert len(names) == drives * DRIVE
@@ -198,11 +192,3 @@ def test_the_memory_of_planning_does_not_grow_with_the_names(
     # Python may enlarge its table of interned strings meanwhile, but not twice.
     many = min(peak(100), peak(100))
     assert (many - few) / (80 * DRIVE) < 40
-
-
-def test_a_block_can_be_cut_down() -> None:
-    block = Block("drive", list("abc"), list("xyz"), "vlp16")
-    assert block.select(np.array([True, False, True])) == Block(
-        "drive", ["a", "c"], ["x", "z"], "vlp16"
-    )
-    assert [part.urls for part in block.singly()] == [["x"], ["y"], ["z"]]

@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 
 import amvnet
-from amvnet.fleet.actors import Labelling, LabelScans, measure_drive
+from amvnet.fleet.actors import Labelling, LabelScans
 from amvnet.fleet.manifest import list_blocks
 from amvnet.fleet.results import DRIVES, Results
 from amvnet.fleet.storage import Place
@@ -29,11 +29,10 @@ def world(fleet: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     results = Results(Place.of(labelling.out), labelling.settings)
     worker = LabelScans(labelling)
     for block in list_blocks([f"{fleet}/scans"]):
-        results.drives.add([measure_drive(labelling, block.rows())])
-        estimates = results.drives[block.drive]["estimates"]
-        rows = worker(
-            pa.Table.from_pylist([row | {"estimates": estimates} for row in block.rows()])
-        )
+        drive = worker.measure(block)
+        results.add_drives([drive])
+        estimates = pa.repeat(drive["estimates"], len(block))
+        rows = worker(block.append_column("estimates", estimates))
         results.add(rows.drop_columns(["is_fatal"]))
     results.flush()
 

@@ -16,7 +16,8 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.fleet import results as results_module
 from amvnet.fleet.actors import results_schema
-from amvnet.fleet.drives import Drives, describe_drive, parse_estimates
+from amvnet.fleet.drives import describe_drive, parse_estimates
+from amvnet.fleet.manifest import list_blocks
 from amvnet.fleet.results import Results
 from amvnet.fleet.storage import Place
 from amvnet.sensors.frame import Frame
@@ -96,7 +97,6 @@ def test_parts_are_written_by_size_and_time(
     results.add(rows("b"))
     monkeypatch.setattr(results_module, "PART_BYTES", 1 << 20)
     monkeypatch.setattr(results_module, "PART_SECONDS", 0.0)
-    monkeypatch.setattr(results_module, "PART_SHARE", 0.0)
     results.add(rows("c"))
     parts = [pa.parquet.read_table(path) for path in sorted(tmp_path.glob("results/part-*"))]
     assert [part["scan"].to_pylist() for part in parts] == [["a", "b"], ["c"]]
@@ -147,6 +147,14 @@ def test_a_storage_that_does_not_answer_is_refused_in_one_line(
     assert "\n" not in str(error.value)
 
 
+def test_missing_credentials_are_one_line(locked_bucket: str) -> None:
+    for action in (
+        lambda: next(list_blocks([f"{locked_bucket}/scans"])),
+        lambda: Results(Place.of(f"{locked_bucket}/out"), SETTINGS),
+    ):
+        fails(action, locked_bucket, "ACCESS_DENIED", "check the URL and the credentials")
+
+
 def test_drives_are_read_as_they_were_measured(out: Place) -> None:
     """To the last digit, so that all workers normalise alike."""
     rng = np.random.default_rng(0)
@@ -160,12 +168,10 @@ def test_drives_are_read_as_they_were_measured(out: Place) -> None:
         ),
         Estimate(Frame(), SensorGeometry(), quantiles=None, count=5),
     ]
-    place = out / "drives.parquet"
-    Drives(place).add([describe_drive("a", "vlp16", "line", estimates)])
-    Drives(place).add([describe_drive("b", "", "", [])])
-    drives = Drives(place)
-    assert "a" in drives
-    assert "c" not in drives
+    Results(out, SETTINGS).add_drives([describe_drive("a", "vlp16", "line", estimates)])
+    Results(out, SETTINGS, resume=True).add_drives([describe_drive("b", "", "", [])])
+    drives = Results(out, SETTINGS, resume=True).drives
+    assert set(drives) == {"a", "b"}
     assert parse_estimates(drives["b"]["estimates"]) == []
 
     for read_back, estimate in zip(

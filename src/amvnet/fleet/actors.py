@@ -7,9 +7,9 @@ import os
 import socket
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import groupby
@@ -34,10 +34,10 @@ from amvnet.export.engines import use_engine
 from amvnet.fleet.drives import describe_drive, parse_estimates
 from amvnet.fleet.manifest import split_name
 from amvnet.fleet.storage import Place
-from amvnet.inference.listing import FileScan, InputScan
-from amvnet.inference.pipeline import ExecutionOptions, OutputOptions, Pipeline
+from amvnet.inference.listing import FileScan
+from amvnet.inference.pipeline import ExecutionOptions, Outcome, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
-from amvnet.inference.reading import FileReader, LoadedScan, normaliser_for
+from amvnet.inference.reading import FileReader, normaliser_for
 from amvnet.inference.scan_stream import AHEAD
 from amvnet.inference.segmentation import Segmentation, uncertain_share
 from amvnet.inference.segmenter import Segmenter
@@ -198,8 +198,8 @@ class LabelScans:
 
     A batch has a row for each scan with the columns `path`, `name`, `drive`, `sensor` and
     `estimates`, of which only the first is needed. Scans of one drive should follow one another:
-    what is measured of its sensor is in `estimates` (`measure_drive`), or else it is measured on
-    the first scans of the drive in the batch.
+    what is measured of its sensor is in `estimates` (`measure`), or else it is measured on the
+    first scans of the drive in the batch.
     """
 
     def __init__(self, labelling: Labelling) -> None:
@@ -226,65 +226,88 @@ class LabelScans:
                 rows.append(self._row(drive[0], error=" ".join(line.split())))
         return pa.Table.from_pylist(rows, self._schema)
 
-    def _label(self, drive: Sequence[Row]) -> list[Row]:
-        """Label scans of one drive."""
-        start = time.perf_counter()
-        rows = []
+    def measure(self, scans: pa.Table) -> Row:
+        """Measure the sensor of a drive on its first scans; return its row in the table of drives.
+
+        Args:
+            scans: a row for each, with the columns `path`, `name`, `drive` and `sensor`.
+        """
+        rows = scans.to_pylist()
+        source, sensor = rows[0]["drive"], rows[0]["sensor"]
+        assumed: list[str] = []
+        reader = self.labelling.make_reader(sensor, assumed.append)
+        with self._fetch(rows, reader) as (files, _):
+            assert reader.normaliser is not None
+            estimates = reader.normaliser.measure(source).medians
+            for scan in files:
+                with suppress(InputError):  # the line about the first scan that can be read
+                    scan.load()
+                    break
+            line = assumed[0].replace(str(scan.path), scan.name) if assumed else ""
+        return describe_drive(source, sensor, line, estimates)
+
+    @contextmanager
+    def _fetch(
+        self, drive: Sequence[Row], reader: FileReader
+    ) -> Iterator[tuple[list[FileScan], Path]]:
+        """Yield the scans of a drive, whose files are fetched ahead of their reading.
+
+        Also yield a temporary folder.
+        """
         with (
             TemporaryDirectory(prefix="amvnet-") as temporary,
             ThreadPoolExecutor(TRANSFERS) as pool,
         ):
-            folder = Path(temporary)
-            reader = self._reader(drive[0])
-            layout = self.labelling.layout
-            scans = list_scans_of(drive, reader, layout, pool, folder / "scans")
-            pipeline = self._pipeline(scans, self._out.local or folder / "labels")
-            row_of = {scan.name: row for scan, row in zip(scans, drive, strict=True)}
+            scans = []
+            for index, row in enumerate(drive):
+                folder = Path(temporary, str(index))
+                fetching = pool.submit(_fetch_file, row["path"], folder)
+                read = partial(_read_fetched, fetching, self.labelling.layout)
+                path = folder / Path(row["path"]).name
+                scan = NamedScan(row["name"], row["drive"], path, "", read)
+                reader.expect(scan)
+                scans.append(FileScan(scan, reader))
+            yield scans, Path(temporary, "labels")
 
-            writing = deque[Future[Row]]()
-            with closing(pipeline.results(scans)) as results:
-                for scan, loaded, result in results:
-                    row = row_of[scan.name]
-                    if loaded is None or isinstance(result, InputError):
-                        line = str(result).replace(str(scan.path), row["path"])
-                        rows.append(self._row(row, error=line))
-                        continue
-                    job = pool.submit(self._write, pipeline, scan, loaded, result, row)
-                    writing.append(job)
-                    while len(writing) > AHEAD:
+    def _label(self, drive: Sequence[Row]) -> list[Row]:
+        """Label scans of one drive."""
+        start = time.perf_counter()
+        labelling = self.labelling
+        reader = labelling.make_reader(drive[0]["sensor"])
+        if drive[0]["estimates"]:
+            assert reader.normaliser is not None
+            reader.normaliser.recall(drive[0]["drive"], parse_estimates(drive[0]["estimates"]))
+
+        rows = []
+        writing = deque[Future[Row]]()
+        with self._fetch(drive, reader) as (scans, folder), ThreadPoolExecutor(AHEAD) as writer:
+            pipeline = Pipeline(
+                scans,
+                segment_by(self._segmenter, labelling.classes),
+                OutputOptions(
+                    self._out.local or folder, labelling.kind, labelling.scores, labelling.uncertain
+                ),
+                labelling.taxonomy,
+                ExecutionOptions(labelling.batch, self._segmenter.at_once),
+            )
+            row_of = {scan.name: row for scan, row in zip(scans, drive, strict=True)}
+            with closing(pipeline.results(scans)) as outcomes:
+                for outcome in outcomes:
+                    row = row_of[outcome[0].name]
+                    writing.append(writer.submit(self._write, pipeline, outcome, row))
+                    if len(writing) > AHEAD:
                         rows.append(writing.popleft().result())
             rows += [job.result() for job in writing]
 
         seconds = (time.perf_counter() - start) / len(drive)
         return [row | {"seconds": seconds} for row in rows]
 
-    def _reader(self, row: Row) -> FileReader:
-        """Return what reads the scans of a drive, given one of its rows."""
-        reader = self.labelling.make_reader(row["sensor"])
-        if row["estimates"]:
-            assert reader.normaliser is not None
-            reader.normaliser.recall(row["drive"], parse_estimates(row["estimates"]))
-        return reader
-
-    def _pipeline(self, scans: Sequence[InputScan], folder: Path) -> Pipeline:
-        labelling = self.labelling
-        return Pipeline(
-            scans,
-            segment_by(self._segmenter, labelling.classes),
-            OutputOptions(folder, labelling.kind, labelling.scores, labelling.uncertain),
-            labelling.taxonomy,
-            ExecutionOptions(labelling.batch, self._segmenter.at_once),
-        )
-
-    def _write(
-        self,
-        pipeline: Pipeline,
-        scan: InputScan,
-        loaded: LoadedScan,
-        result: Segmentation,
-        row: Row,
-    ) -> Row:
+    def _write(self, pipeline: Pipeline, outcome: Outcome, row: Row) -> Row:
         """Write the files of a scan, the labels last, and return its row of results."""
+        scan, loaded, result = outcome
+        if loaded is None or isinstance(result, InputError):
+            return self._row(row, error=str(result).replace(str(scan.path), row["path"]))
+
         paths = pipeline.output.paths_of(scan)
         try:
             entry = pipeline.write(scan, loaded, result)
@@ -340,59 +363,10 @@ def statistics(result: Segmentation, taxonomy: Taxonomy) -> Row:
     }
 
 
-def list_scans_of(
-    drive: Sequence[Row],
-    reader: FileReader,
-    layout: RowLayout,
-    pool: ThreadPoolExecutor,
-    folder: Path,
-) -> list[FileScan]:
-    """Return the scans of a drive, whose files are fetched ahead of their reading.
-
-    Args:
-        drive: rows with the columns `path`, `name` and `drive`.
-        reader: reads the scans.
-        layout: of rows of numbers without names, what they hold.
-        pool: fetches the files.
-        folder: for the files that are not on this machine.
-    """
-    scans = []
-    for index, row in enumerate(drive):
-        place = folder / str(index)
-        fetching = pool.submit(_fetch, row["path"], place)
-        read = partial(_read, fetching, layout)
-        path = place / Path(row["path"]).name
-        scan = NamedScan(row["name"], row["drive"], path, "", read)
-        reader.expect(scan)
-        scans.append(FileScan(scan, reader))
-    return scans
-
-
-def _fetch(url: str, folder: Path) -> Path:
+def _fetch_file(url: str, folder: Path) -> Path:
     return Place.of(url).fetch(folder)
 
 
-def _read(fetching: Future[Path], layout: RowLayout) -> Cloud:
+def _read_fetched(fetching: Future[Path], layout: RowLayout) -> Cloud:
     path = fetching.result()
     return read_file(path, ending_of(path), layout)
-
-
-def measure_drive(labelling: Labelling, drive: Sequence[Row]) -> Row:
-    """Measure the sensor of a drive on its first scans; return its row in the table of drives.
-
-    Args:
-        drive: rows of the first scans with the columns `path`, `name`, `drive` and `sensor`.
-    """
-    assumed: list[str] = []
-    source, sensor = drive[0]["drive"], drive[0]["sensor"]
-    reader = labelling.make_reader(sensor, assumed.append)
-    with TemporaryDirectory(prefix="amvnet-") as folder, ThreadPoolExecutor(TRANSFERS) as pool:
-        scans = list_scans_of(drive, reader, labelling.layout, pool, Path(folder))
-        assert reader.normaliser is not None
-        estimates = reader.normaliser.measure(source).medians
-        for scan in scans:
-            with suppress(InputError):  # the line about the first scan that can be read
-                scan.load()
-                break
-        line = assumed[0].replace(str(scan.path), scan.name) if assumed else ""
-    return describe_drive(source, sensor, line, estimates)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Any
 
@@ -14,7 +14,7 @@ import pyarrow.parquet
 from pyarrow.fs import FileType
 
 from amvnet.errors import InputError
-from amvnet.fleet.drives import Drives
+from amvnet.fleet.drives import SCHEMA
 from amvnet.fleet.manifest import NameSet
 from amvnet.fleet.storage import Place, reaching
 
@@ -22,8 +22,7 @@ FOLDER = "results"  # in the output folder
 SETTINGS = "run.json"
 DRIVES = "drives.parquet"
 PART_BYTES = 64 << 20
-PART_SECONDS = 10.0  # between two parts
-PART_SHARE = 0.02  # of the time of the run so far: long runs have fewer, larger parts
+PART_SECONDS = 60.0  # between two parts; what a killed driver loses
 
 
 class Results:
@@ -41,7 +40,7 @@ class Results:
 
     Attributes:
         done: the names of the scans that an earlier run has done.
-        drives: what was measured of each drive.
+        drives: what was measured of each drive, as of `describe_drive`.
 
     Raises:
         InputError: if the folder cannot be written, holds something else, or the earlier run had
@@ -54,45 +53,24 @@ class Results:
         self.folder = out / FOLDER
         self.done = NameSet()
         self._pending: list[pa.Table] = []
-        self._start = self._last = time.monotonic()
+        self._last = time.monotonic()
         self._number = 0
 
-        earlier = self._read_settings()
-        if earlier is None:
+        self.drives: dict[str, dict[str, Any]] = {}
+        place = self.folder / SETTINGS
+        if place.kind() == FileType.File:
+            if not resume:
+                raise InputError(
+                    f"{out.url}: expected a new folder, found the results of an earlier run; say "
+                    "--resume to go on with it, or change --out"
+                )
+            _check_same(place, settings)
+            self._read_parts()
+            self._read_drives()
+        else:
             if not overwrite:
                 _check_empty(out)
-            self._write_settings(settings)
-        elif not resume:
-            raise InputError(
-                f"{out.url}: expected a new folder, found the results of an earlier run; say "
-                "--resume to go on with it, or change --out"
-            )
-        else:
-            _check_same(out, earlier, settings)
-            self._read_parts()
-        self.drives = Drives(self.folder / DRIVES)
-
-    def _read_settings(self) -> Any:
-        """Return the settings of the earlier run; None if there is none."""
-        place = self.folder / SETTINGS
-        if place.kind() != FileType.File:
-            return None
-        try:
-            return json.loads(place.read())
-        except (ValueError, RecursionError):
-            return {}
-
-    def _write_settings(self, settings: Mapping[str, Any]) -> None:
-        place = self.folder / SETTINGS
-        try:
-            place.write(json.dumps(settings).encode())
-        except OSError as error:
-            if place.local is not None:
-                raise
-            raise InputError(
-                f"{place.url}: expected a place to write to, found {error.strerror}; check the URL "
-                "and the credentials"
-            ) from None
+            _write_settings(place, settings)
 
     def _read_parts(self) -> None:
         """Read which scans are done, and remove the rows of the others."""
@@ -101,22 +79,31 @@ class Results:
             if not file.startswith("part-"):
                 continue
             place = self.folder / file
-            with reaching(place.url):
-                table = pa.parquet.read_table(BytesIO(place.read()))
+            table = _read(place)
             is_done = pc.is_null(table["error"]).to_numpy()
             is_done[is_done] = self.done.add(table["scan"].filter(is_done).to_pylist())
             if not is_done.all():
                 _replace(place, table.filter(is_done))
             self._number = int(file[len("part-") : -len(".parquet")]) + 1
 
+    def _read_drives(self) -> None:
+        place = self.folder / DRIVES
+        if place.kind() == FileType.File:
+            self.drives = {row["drive"]: row for row in _read(place).to_pylist()}
+
+    def add_drives(self, rows: Sequence[dict[str, Any]]) -> None:
+        """Add rows of drives, and write the table of all."""
+        if not rows:
+            return
+        self.drives |= {row["drive"]: row for row in rows}
+        _replace(self.folder / DRIVES, pa.Table.from_pylist(list(self.drives.values()), SCHEMA))
+
     def add(self, rows: pa.Table) -> None:
         """Add rows, and write a part if it is time."""
         if len(rows):
             self._pending.append(rows)
-        now = time.monotonic()
-        patience = max(PART_SECONDS, PART_SHARE * (now - self._start))
         size = sum(table.nbytes for table in self._pending)
-        if size >= PART_BYTES or now - self._last >= patience:
+        if size >= PART_BYTES or time.monotonic() - self._last >= PART_SECONDS:
             self.flush()
 
     def flush(self) -> None:
@@ -127,6 +114,12 @@ class Results:
             self._number += 1
             self._pending.clear()
         self._last = time.monotonic()
+
+
+def _read(place: Place) -> pa.Table:
+    """Return a table; raise InputError if it cannot be read."""
+    with reaching(place.url):
+        return pa.parquet.read_table(BytesIO(place.read()))
 
 
 def _replace(place: Place, table: pa.Table) -> None:
@@ -151,12 +144,28 @@ def _check_empty(out: Place) -> None:
         )
 
 
-def _check_same(out: Place, earlier: Any, settings: Mapping[str, Any]) -> None:
-    """Raise InputError if an earlier run had other settings."""
+def _check_same(place: Place, settings: Mapping[str, Any]) -> None:
+    """Raise InputError if the settings in a file of an earlier run are others."""
+    try:
+        earlier = json.loads(place.read())
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
+        earlier = {}
     known = earlier if isinstance(earlier, dict) else {}
     changed = [key for key in settings if known.get(key) != settings[key]]
     if changed:
         raise InputError(
-            f"{out.url}: expected the settings of the earlier run, found another "
+            f"{place.url}: expected the settings of the earlier run, found another "
             f"{', '.join(changed)}; resume it with the same, or change --out"
         )
+
+
+def _write_settings(place: Place, settings: Mapping[str, Any]) -> None:
+    try:
+        place.write(json.dumps(settings).encode())
+    except OSError as error:
+        if place.local is not None:
+            raise
+        raise InputError(
+            f"{place.url}: expected a place to write to, found {error.strerror}; check the URL "
+            "and the credentials"
+        ) from None

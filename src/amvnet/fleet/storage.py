@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -134,15 +134,10 @@ def reaching(url: str) -> Iterator[None]:
     try:
         yield
     except (OSError, pa.ArrowException) as error:
-        raise _unreachable(url, error) from None
-
-
-def _unreachable(url: str, error: Exception) -> InputError:
-    """Return the error about a storage that cannot be reached."""
-    return InputError(
-        f"{url}: expected a file or a folder that can be read, found {_first_line(error)}; "
-        "check the URL and the credentials"
-    )
+        raise InputError(
+            f"{url}: expected a file or a folder that can be read, found {_first_line(error)}; "
+            "check the URL and the credentials"
+        ) from None
 
 
 @cache
@@ -152,22 +147,15 @@ def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
     pyarrow has some storages itself; fsspec has the others.
     """
     root = f"{scheme}://{bucket}"
-    try:
+    with reaching(root), suppress(pa.ArrowInvalid):  # not a scheme of pyarrow
         return fs.FileSystem.from_uri(f"{root}{OPTIONS.get(scheme, '/')}")
-    except pa.ArrowInvalid:
-        pass  # not a scheme of pyarrow
-    except OSError as error:
-        raise _unreachable(root, error) from None
     try:
-        from fsspec.core import url_to_fs
-
-        other, path = url_to_fs(root)
+        return fs.FileSystem.from_uri(f"fsspec+{root}")
     except (ImportError, ValueError) as error:
         raise InputError(
             f"{root}: expected a storage that can be opened, found {_first_line(error)}; "
             "install its package, or use s3://, gs:// or file://"
         ) from None
-    return fs.PyFileSystem(fs.FSSpecHandler(other)), path
 
 
 def _first_line(error: BaseException) -> str:

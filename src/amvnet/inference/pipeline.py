@@ -137,6 +137,7 @@ class Pipeline:
         Raises:
             InputError: if two scans would have the same files, an output folder is that of a scan,
                 a file of the user would be replaced, or another run is writing into the folder.
+            ConnectionResetError: if another process has ended before its share was done.
         """
         is_new = not self.output.folder.exists()
         written = self._check_output()
@@ -145,9 +146,13 @@ class Pipeline:
 
         journal = self._begin(settings, done, written, remaining)
         faults = self._process(remaining, journal, progress)
-        entries = self._finish(journal, written, remaining, is_new)
         processes = self.execution.processes
-        return entries, list(chain.from_iterable(processes.gather(faults)))
+        try:
+            entries = self._finish(journal, written, remaining, is_new)
+            return entries, list(chain.from_iterable(processes.gather(faults)))
+        except ConnectionResetError as error:
+            left = self._describe_left(settings, remaining)
+            raise ConnectionResetError(error.errno, left, str(self.output.folder)) from error
 
     def _check_output(self) -> WrittenFiles:
         """Check that the output replaces no file of the user; return the record of the folder's.
@@ -250,6 +255,18 @@ class Pipeline:
                 with suppress(OSError):  # stays unless all scans were broken
                     self.output.folder.rmdir()
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries]
+
+    def _describe_left(self, settings: Mapping[str, Any], remaining: Sequence[InputScan]) -> str:
+        """Return whose scans are not done after a process has ended."""
+        done = read_journals(self.output.folder, settings)
+        size = self.execution.processes.size
+        shares = []
+        for rank in range(size):
+            share = remaining[rank::size]
+            count = sum(_key(scan) not in done for scan in share)
+            if count:
+                shares.append(f"{count} of the {len(share)} scans of process {rank}")
+        return f"a process has ended; {' and '.join(shares)} are left for --resume"
 
     def _paths_of(self, scans: Sequence[InputScan]) -> list[Path]:
         """Return the paths of the files of scans, relative to the folder."""

@@ -95,7 +95,7 @@ def predict(
                 inputs,
                 labelling,
                 address=None if ray is True else ray,
-                workers=_parse_workers(workers),
+                limits=_parse_workers(workers),
                 resume=resume,
                 overwrite=overwrite,
                 progress=step,

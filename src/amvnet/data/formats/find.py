@@ -172,22 +172,25 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def is_scan_file(path: Path) -> bool:
-    """Return whether a name in a folder is that of a scan or a bag, and not of predictions.
-
-    Text files hold anything, so their names do not tell.
-    """
-    if path.name.startswith(".") or path.name.endswith(".uncertain.npy"):
-        return False
+    """Return whether a path in a folder is that of a scan or a bag, and not of predictions."""
     if path.suffix == ".npz" and path.with_suffix(".label").exists():
         return False
     if path.is_dir():
-        return is_bag_folder(path)
+        return is_bag_folder(path) and not path.name.startswith(".")
+    return is_scan_name(path.name)
 
+
+def is_scan_name(name: str) -> bool:
+    """Return whether the name of a file is that of a scan or a bag.
+
+    Text files hold anything, so their names do not tell.
+    """
+    if name.startswith(".") or name.endswith(".uncertain.npy"):
+        return False
     # A packed file counts if its name says that it is a scan, such as scan.bin.gz.
-    name = path.name.lower()
-    ending = named_ending(path)
+    ending = named_ending(Path(name))
     if ending in PACKED:
-        ending = named_ending(Path(name.removesuffix(ending)))
+        ending = named_ending(Path(name[: -len(ending)]))
         return ending is not None and ending not in (*PACKED, *TEXT)
     return ending is not None and ending not in TEXT
 
