@@ -16,7 +16,7 @@ import pytest
 
 import amvnet
 from amvnet import InputError, Scan, Segmentation, Segmenter
-from amvnet.data.formats.registry import read_cloud
+from amvnet.data.formats.find import read_cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.weights.file import save
 

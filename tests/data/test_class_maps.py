@@ -80,7 +80,7 @@ def fake_taxonomy() -> Taxonomy:
         ({"a": ["car"], "b": ["car"]}, "car twice"),
         ({"a": [1]}, "names of classes"),
         ({"a": {"from": "car", "id": 1.5}}, "whole number"),
-        ({"a": {"from": "car", "id": 2}, "b": {"id": 2}}, "different ids"),
+        ({"a": {"from": "car", "id": 2}, "b": {"id": 2}}, "no id twice"),
         ({"a": {"color": "red"}}, "color"),
     ],
 )
@@ -154,7 +154,7 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
 def test_two_classes_of_one_name_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "few.yaml"
     path.write_text("classes: {1: [road], '1': [car]}")
-    fails(lambda: class_map(str(path)), path, "'1' twice")
+    fails(lambda: class_map(str(path)), path, "no class twice, found ['1']")
 
 
 def score_with_map(tmp_path: Path, classes: dict[str, list[str]]) -> tuple[int, str, Path]:

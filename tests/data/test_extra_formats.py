@@ -11,8 +11,7 @@ import pytest
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from amvnet.data.formats.find import list_scans
-from amvnet.data.formats.registry import read_cloud
+from amvnet.data.formats.find import list_scans, read_cloud
 
 from fixtures.extra_writers import write_e57, write_sweep
 from fixtures.scan_writers import some_points

@@ -27,10 +27,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from amvnet.data.formats.bags import open_bag
 from amvnet.data.formats.cloud import MAX_POINTS
-from amvnet.data.formats.find import find_scans, list_scans, scan_stem
+from amvnet.data.formats.find import find_scans, list_scans, read_cloud, scan_stem
 from amvnet.data.formats.pcd import unpack_lzf
 from amvnet.data.formats.pointcloud2 import read_message
-from amvnet.data.formats.registry import read_cloud
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 

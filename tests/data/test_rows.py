@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amvnet.data.formats.find import find_scans, list_scans
-from amvnet.data.formats.registry import read_cloud
+from amvnet.data.formats.find import find_scans, list_scans, read_cloud
 from amvnet.data.formats.rows import RowLayout, parse_layout
 from amvnet.data.formats.text import find_table
 

@@ -21,7 +21,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.measure import MEASURED
-from amvnet.viewing.frames import Frames
+from amvnet.viewing.shown_scans import ShownScans
 from amvnet.weights.file import Weights, save
 
 from fixtures.sensors import LASERS, place
@@ -235,8 +235,8 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
     np.testing.assert_array_equal(raw, weights.taxonomy.to_raw(expected))
 
     scans, taxonomy = list_inputs([f"{tmp_path}/a.npy"], normaliser=normaliser_for(weights))
-    (frame,) = Frames(taxonomy, scans, segmenter).each()
-    np.testing.assert_array_equal(frame.labels["amvnet"], expected)
+    (shown,) = ShownScans(taxonomy, scans, segmenter).each()
+    np.testing.assert_array_equal(shown.labels["amvnet"], expected)
     np.testing.assert_array_equal(segmenter(tmp_path / "a.npy").labels, expected)
 
 

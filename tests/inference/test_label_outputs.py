@@ -14,7 +14,7 @@ import pytest
 from pypcd4 import PointCloud
 
 from amvnet.cli.commands import predict as verbs
-from amvnet.data.formats.registry import read_cloud
+from amvnet.data.formats.find import read_cloud
 from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter

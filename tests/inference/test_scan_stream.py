@@ -22,7 +22,7 @@ from amvnet.inference.scan_stream import AHEAD, stream_scans
 from amvnet.inference.segmenter import Segmenter
 from amvnet.memory import available_memory
 from amvnet.ranking.label_errors import rank
-from amvnet.viewing.frames import Frames
+from amvnet.viewing.shown_scans import ShownScans
 from amvnet.weights.file import save
 
 from fixtures.worlds import fresh_weights, make_streets, refusal, run_cli
@@ -151,8 +151,8 @@ def _ranked(dataset: Dataset, segmenter: Segmenter) -> Any:
 
 def _viewed(dataset: Dataset, segmenter: Segmenter) -> Any:
     scans, taxonomy = list_inputs([dataset.spec])
-    frames = Frames(taxonomy, scans, segmenter)
-    return [[frame.name, frame.labels["amvnet"].tolist()] for frame in frames.each()]
+    shown = ShownScans(taxonomy, scans, segmenter)
+    return [[each.name, each.labels["amvnet"].tolist()] for each in shown.each()]
 
 
 @pytest.mark.parametrize("command", [_evaluated, _analyzed, _ranked, _viewed])

@@ -23,7 +23,7 @@ from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.evaluation.scoring import labels_by_method
 from amvnet.inference.segmenter import Segmenter
 from amvnet.viewing import page as pages
-from amvnet.viewing.frames import RIGHT, Frame
+from amvnet.viewing.shown_scans import RIGHT, ShownScan
 from amvnet.weights.file import save
 
 from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page
@@ -63,14 +63,16 @@ def dataset(world: Path) -> SemanticKitti:
     return SemanticKitti(world / "data")
 
 
-def make_frame(points: np.ndarray, truth: np.ndarray | None = None, **labels: np.ndarray) -> Frame:
+def make_scan(
+    points: np.ndarray, truth: np.ndarray | None = None, **labels: np.ndarray
+) -> ShownScan:
     points = points.astype(np.float32)
     valid = np.isfinite(points).all(axis=1)
-    return Frame("scan", points, valid, truth, labels)
+    return ShownScan("scan", points, valid, truth, labels)
 
 
-def write_and_read(path: Path, *frames: Frame, title: str = "title") -> Page:
-    return read_page(pages.write_page(path, frames, SEMANTICKITTI, title))
+def write_and_read(path: Path, *scans: ShownScan, title: str = "title") -> Page:
+    return read_page(pages.write_page(path, scans, SEMANTICKITTI, title))
 
 
 def scan_names(page: Page) -> list[str]:
@@ -138,8 +140,8 @@ def test_the_page_names_classes_and_colours_officially(world: Path) -> None:
 
 def test_points_without_a_place_are_left_out_and_counted(tmp_path: Path) -> None:
     points = np.array([[1, 2, 3, 0.5], [np.nan, 0, 0, 0], [4, 5, 6, 2.0], [0, 0, 501, 0]])
-    frame = make_frame(points, labels=np.array([1, 2, 3, 4]))
-    page = write_and_read(tmp_path / "p.html", frame)
+    shown = make_scan(points, labels=np.array([1, 2, 3, 4]))
+    page = write_and_read(tmp_path / "p.html", shown)
     xyz, planes = page.scan(0)
 
     np.testing.assert_allclose(xyz, points[[0, 2], :3], atol=1e-4)
@@ -151,7 +153,7 @@ def test_points_without_a_place_are_left_out_and_counted(tmp_path: Path) -> None
 @pytest.mark.parametrize("extent", [0.0, 0.01, 100.0, 499.0])
 def test_positions_are_within_half_a_step(tmp_path: Path, extent: float) -> None:
     points = np.random.default_rng(0).uniform(-extent, extent, (1000, 4))
-    xyz, _ = write_and_read(tmp_path / "p.html", make_frame(points)).scan(0)
+    xyz, _ = write_and_read(tmp_path / "p.html", make_scan(points)).scan(0)
     error = np.abs(xyz - points[:, :3].astype(np.float32)).max()
     assert error <= max(extent, 1e-3) / 65_534 * 1.01
 
@@ -160,7 +162,7 @@ def test_a_huge_scan_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(pages, "MOST_POINTS", 100)
     points = np.random.default_rng(0).normal(size=(250, 4))
     ids = np.arange(250) % 20
-    page = write_and_read(tmp_path / "p.html", make_frame(points, labels=ids))
+    page = write_and_read(tmp_path / "p.html", make_scan(points, labels=ids))
     _, planes = page.scan(0)
 
     assert planes["labels"].tolist() == ids[::3].tolist()
@@ -176,18 +178,18 @@ def test_a_scan_of_120_thousand_points_takes_under_two_megabytes(tmp_path: Path)
     for method in ("rv", "bev", "ensemble", "amvnet"):
         labels[method] = np.where(rng.random(len(points)) < 0.1, 13, truth)
 
-    frame = make_frame(points, truth, **labels)
-    frame = replace(frame, uncertain=disagreement > 0.1, disagreement=disagreement)
-    path = pages.write_page(tmp_path / "p.html", [frame], SEMANTICKITTI, "")
+    shown = make_scan(points, truth, **labels)
+    shown = replace(shown, uncertain=disagreement > 0.1, disagreement=disagreement)
+    path = pages.write_page(tmp_path / "p.html", [shown], SEMANTICKITTI, "")
 
     assert path.stat().st_size < 2e6
 
 
-def test_the_same_frames_give_the_same_bytes(tmp_path: Path) -> None:
+def test_the_same_scans_give_the_same_bytes(tmp_path: Path) -> None:
     points, raw = street(3)
-    frame = make_frame(points, labels=SEMANTICKITTI.to_train(raw))
-    first = pages.write_page(tmp_path / "a.html", [frame], SEMANTICKITTI, "t")
-    second = pages.write_page(tmp_path / "b.html", [frame], SEMANTICKITTI, "t")
+    shown = make_scan(points, labels=SEMANTICKITTI.to_train(raw))
+    first = pages.write_page(tmp_path / "a.html", [shown], SEMANTICKITTI, "t")
+    second = pages.write_page(tmp_path / "b.html", [shown], SEMANTICKITTI, "t")
 
     assert first.read_bytes() == second.read_bytes()
 
@@ -237,14 +239,14 @@ def test_no_script_runs_but_the_package_s_own(world: Path) -> None:
 
 def hostile_page(path: Path) -> Page:
     points, raw = street(5)
-    frame = replace(make_frame(points, labels=SEMANTICKITTI.to_train(raw)), name=HOSTILE)
+    shown = replace(make_scan(points, labels=SEMANTICKITTI.to_train(raw)), name=HOSTILE)
     taxonomy = replace(SEMANTICKITTI, classes=(HOSTILE, *SEMANTICKITTI.classes[1:]))
-    return read_page(pages.write_page(path, [frame], taxonomy, HOSTILE))
+    return read_page(pages.write_page(path, [shown], taxonomy, HOSTILE))
 
 
 def test_names_stay_names(tmp_path: Path) -> None:
     page = hostile_page(tmp_path / "p.html")
-    harmless = write_and_read(tmp_path / "q.html", make_frame(street(5)[0]))
+    harmless = write_and_read(tmp_path / "q.html", make_scan(street(5)[0]))
 
     assert tags(page) == tags(harmless)
     assert page.texts["<title>"] == HOSTILE
@@ -255,7 +257,7 @@ def test_names_stay_names(tmp_path: Path) -> None:
 
 def test_a_name_that_is_no_unicode_is_written(tmp_path: Path) -> None:
     name = os.fsdecode(b"caf\xe9")
-    page = write_and_read(tmp_path / "p.html", make_frame(street(5)[0]), title=name)
+    page = write_and_read(tmp_path / "p.html", make_scan(street(5)[0]), title=name)
     assert page.texts["<title>"] == "caf?"
 
 
@@ -479,7 +481,7 @@ def test_the_picture_shows_what_is_asked_for_at_its_place(tmp_path: Path, browse
     truth = np.where(points[:, 1] > 0, 1, 15)
     labels = np.where(points[:, 0] > 0, truth, 13)
     path = tmp_path / "p.html"
-    pages.write_page(path, [make_frame(points, truth, labels=labels)], SEMANTICKITTI, "")
+    pages.write_page(path, [make_scan(points, truth, labels=labels)], SEMANTICKITTI, "")
     car = SEMANTICKITTI.colors[1]
     building = SEMANTICKITTI.colors[13]
     green = SEMANTICKITTI.colors[15]

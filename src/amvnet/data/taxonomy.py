@@ -82,8 +82,9 @@ class Taxonomy:
         for kind, values in (("colours", self.colors), ("raw ids", self.train_to_raw)):
             expected = f"{self.size + 1} {kind} (ignored and {self.size} classes)"
             self._check(len(values) == self.size + 1, expected, len(values))
-        self._check_different("classes", self.classes)
-        self._check_different("ids", self.train_to_raw)
+        for kind, entries in (("class", self.classes), ("id", self.train_to_raw)):
+            twice = [entry for entry in entries if entries.count(entry) > 1]
+            self._check(not twice, f"no {kind} twice", twice[:1])
 
     def _check(self, holds: bool, expected: str, found: Any) -> None:
         """Raise an InputError unless a condition holds: a file of a stranger may hold anything."""
@@ -96,14 +97,6 @@ class Taxonomy:
     def _check_range(self, kind: str, numbers: Sequence[int], last: int) -> None:
         wrong = [number for number in numbers if not 0 <= number <= last]
         self._check(not wrong, f"{kind} 0..{last}", wrong)
-
-    def _check_different(self, kind: str, values: Sequence[Any]) -> None:
-        for value in values:
-            if values.count(value) > 1:
-                raise InputError(
-                    f"taxonomy {self.name}: expected different {kind}, found {shown(value)} twice; "
-                    "correct the table"
-                )
 
     @property
     def size(self) -> int:

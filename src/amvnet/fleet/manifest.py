@@ -15,7 +15,7 @@ from pyarrow.fs import FileType
 
 from amvnet.data.formats.detect import PACKED, named_ending
 from amvnet.data.formats.find import is_scan_name
-from amvnet.data.formats.registry import RECORDINGS
+from amvnet.data.formats.registry import SERIES_READERS
 from amvnet.errors import InputError
 from amvnet.fleet.storage import Place, reaching
 
@@ -128,7 +128,7 @@ def _in_blocks(folder: str, prefix: str, files: Iterable[str]) -> Iterator[pa.Ta
         drives.setdefault(ending, []).append((f"{folder}/{file}", f"{prefix}{stem}"))
 
     for ending, scans in drives.items():
-        if ending in RECORDINGS:
+        if ending in SERIES_READERS:
             raise InputError(
                 f"{scans[0][0]}: expected files of one scan for --ray, found a "
                 "recording; segment it without --ray"

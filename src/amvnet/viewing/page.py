@@ -24,7 +24,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.files import atomic_write
 from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
-from amvnet.viewing.frames import RIGHT, UNLABELLED, UNSCORED, Frame, frame_of
+from amvnet.viewing.shown_scans import RIGHT, UNLABELLED, UNSCORED, ShownScan, shown_scan
 
 # Points of one scan. Of larger scans the page shows every second or third point, so that phones
 # keep up.
@@ -90,8 +90,8 @@ def show(result: Segmentation, path: Path | str | None = None, open_browser: boo
     """
     origin = result.require_origin()
     title = Path(origin.scan.name).name or "scan"
-    frame = frame_of(result, origin)
-    page = write_page(path or temporary_page(), [frame], origin.taxonomy, title)
+    shown = shown_scan(result, origin)
+    page = write_page(path or temporary_page(), [shown], origin.taxonomy, title)
     if open_browser:
         open_page(page)
     return page
@@ -107,11 +107,13 @@ def open_page(path: Path) -> None:
     webbrowser.open(path.resolve().as_uri())
 
 
-def write_page(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy, title: str) -> Path:
+def write_page(
+    path: Path | str, scans: Iterable[ShownScan], taxonomy: Taxonomy, title: str
+) -> Path:
     """Write scans as one self-contained page; it appears whole or not at all.
 
     Args:
-        frames: the scans, in the order of the page's slider.
+        scans: in the order of the page's slider.
 
     Returns:
         The path that was written.
@@ -119,27 +121,27 @@ def write_page(path: Path | str, frames: Iterable[Frame], taxonomy: Taxonomy, ti
     Raises:
         InputError: if the file cannot be written.
     """
-    packed = [pack(frame) for frame in frames]
+    packed = [pack(shown) for shown in scans]
     page = assemble(packed, taxonomy, title)
     with atomic_write(path) as part:
         part.write_bytes(page.encode("utf-8", "replace"))  # file names may not be Unicode
     return Path(path)
 
 
-def pack(frame: Frame) -> Packed:
+def pack(shown: ShownScan) -> Packed:
     """Quantise one scan: positions to int16 within the scan's extent, all other values to bytes.
 
     The planes begin with x, y and z: for each, the low bytes and then the high bytes of the
     differences between consecutive points. The planes of `about["planes"]` follow, with one byte
     per point.
     """
-    in_reach = frame.valid & (np.abs(frame.points[:, :3]) <= REACH).all(axis=1)
+    in_reach = shown.valid & (np.abs(shown.points[:, :3]) <= REACH).all(axis=1)
     indices = np.flatnonzero(in_reach)
-    left_out = len(frame.points) - len(indices)
+    left_out = len(shown.points) - len(indices)
     stride = max(1, math.ceil(len(indices) / MOST_POINTS))
     indices = indices[::stride]
 
-    xyz = frame.points[indices, :3].astype(np.float64)
+    xyz = shown.points[indices, :3].astype(np.float64)
     center, step = _quantisation(xyz)
     steps = np.round((xyz - center) / step).astype(np.int16)
 
@@ -147,12 +149,12 @@ def pack(frame: Frame) -> Packed:
     for axis in steps.T:
         data += _differences(axis)
     planes = {}
-    for name, values in _byte_planes(frame).items():
+    for name, values in _byte_planes(shown).items():
         planes[name] = values[indices]
         data += planes[name].tobytes()
 
     about = {
-        "name": frame.name,
+        "name": shown.name,
         "count": len(indices),
         "note": _note(left_out, stride),
         "center": center.tolist(),
@@ -164,7 +166,7 @@ def pack(frame: Frame) -> Packed:
     return Packed(
         about=about,
         planes=base64.b64encode(zlib.compress(data, 9)).decode("ascii"),
-        present=_class_ids(planes, (*frame.labels, "truth")),
+        present=_class_ids(planes, (*shown.labels, "truth")),
         height=height,
         intensity=_highest_intensity(planes["intensity"]),
         ground=ground,
@@ -235,17 +237,17 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     }
 
 
-def _byte_planes(frame: Frame) -> dict[str, np.ndarray]:
+def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
     """Return all values of the points but their positions, (N,) uint8 each, by name."""
-    planes = {"intensity": _to_bytes(np.nan_to_num(frame.points[:, 3]))}
+    planes = {"intensity": _to_bytes(np.nan_to_num(shown.points[:, 3]))}
 
-    if frame.truth is not None:
-        planes["truth"] = frame.truth.astype(np.uint8)
-    for method, ids in frame.labels.items():
+    if shown.truth is not None:
+        planes["truth"] = shown.truth.astype(np.uint8)
+    for method, ids in shown.labels.items():
         planes[method] = ids.astype(np.uint8)
-    if frame.uncertain is not None and frame.disagreement is not None:
-        planes["uncertain"] = frame.uncertain.astype(np.uint8)
-        planes["disagreement"] = _to_bytes(frame.disagreement)
+    if shown.uncertain is not None and shown.disagreement is not None:
+        planes["uncertain"] = shown.uncertain.astype(np.uint8)
+        planes["disagreement"] = _to_bytes(shown.disagreement)
 
     return planes
 

@@ -38,7 +38,7 @@ def bench(
     from amvnet.cli.tables import timing_table
     from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.simulated import simulate
-    from amvnet.data.formats.registry import read_cloud
+    from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
     from amvnet.files import atomic_write
     from amvnet.inference.timing import UNCERTAIN, Job, time_job, untrained

@@ -9,11 +9,10 @@ import re
 import shutil
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from functools import cache, wraps
+from functools import cache
 from pathlib import Path
-from typing import ParamSpec
 
 import numpy as np
 
@@ -43,21 +42,8 @@ CACHE_BYTES = 25 * 10**9
 ABANDONED = 3600  # seconds after which an unfinished street is that of a killed process
 
 
-P = ParamSpec("P")
-
-
-def _with_input_errors(simulate: Callable[P, Path]) -> Callable[P, Path]:
-    """Return the simulator's function, but with errors as `InputError`."""
-
-    @wraps(simulate)
-    def wrapped(*arguments: P.args, **options: P.kwargs) -> Path:
-        with one_line_errors(str, only=(SimulationError,)):
-            return simulate(*arguments, **options)
-
-    return wrapped
-
-
-simulate = _with_input_errors(simulate_streets)
+# The simulator, with its errors as `InputError`.
+simulate = one_line_errors(str, only=(SimulationError,))(simulate_streets)
 
 
 class SimulatedStreets(Dataset):

@@ -13,7 +13,7 @@ from amvnet.data.formats.cloud import Cloud, reading
 from amvnet.data.formats.detect import FOLDER
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
-from amvnet.data.formats.recording import Decode, Recording
+from amvnet.data.formats.series import Decode, ScanSeries
 from amvnet.errors import InputError
 
 # Other messages of sensors, by the beginning of their type, and what turns them into PointCloud2
@@ -40,7 +40,7 @@ EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
 
-def open_bag(path: Path, ending: str, topic: str | None = None) -> Recording:
+def open_bag(path: Path, ending: str, topic: str | None = None) -> ScanSeries:
     """Open the scans of one topic of a bag, ordered by time.
 
     Args:
@@ -61,7 +61,7 @@ def open_bag(path: Path, ending: str, topic: str | None = None) -> Recording:
     count = counts[topic]
     if not 0 < count <= size_of(path) // MIN_MESSAGE:
         raise InputError(f"{path}: expected scans under {topic}, found {count} messages; {ADVICE}")
-    return Recording(path, count, partial(_read_messages, path, ending, topic), ADVICE, topic)
+    return ScanSeries(path, count, partial(_read_messages, path, ending, topic), ADVICE, topic)
 
 
 def _read_messages(path: Path, ending: str, topic: str) -> Iterator[Decode]:

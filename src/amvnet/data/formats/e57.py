@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.formats.cloud import Cloud, check_point_count, reading
-from amvnet.data.formats.recording import Decode, Recording
+from amvnet.data.formats.series import Decode, ScanSeries
 from amvnet.errors import InputError
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -21,7 +21,7 @@ EXPECTED = "an E57 file"
 ADVICE = "write the file again"
 
 
-def open_e57(path: Path) -> Recording:
+def open_e57(path: Path) -> ScanSeries:
     """Open the scans of an E57 file, each in the frame of the instrument at its place.
 
     Raises:
@@ -36,7 +36,7 @@ def open_e57(path: Path) -> Recording:
         for index in range(count):
             yield partial(_read_scan, path, index)
 
-    return Recording(path, count, scans, ADVICE)
+    return ScanSeries(path, count, scans, ADVICE)
 
 
 def _read_scan(path: Path, index: int, name: str) -> Cloud:

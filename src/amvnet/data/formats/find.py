@@ -19,7 +19,7 @@ from amvnet.data.formats.detect import (
     is_dead_link,
     named_ending,
 )
-from amvnet.data.formats.registry import RECORDINGS, RecordedScans, read_file
+from amvnet.data.formats.registry import SERIES_READERS, open_series, read_file
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
@@ -113,17 +113,32 @@ def list_scans(
         yield from scans
 
 
+def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
+    """Read the only scan that a text names.
+
+    Args:
+        layout: as `list_scans`.
+
+    Raises:
+        InputError: if it is missing, of another format, broken, or not the only one.
+    """
+    scans = list(list_scans(path, layout=layout))
+    if len(scans) > 1:
+        raise InputError(
+            f"{path}: expected one scan, found {len(scans)}; segment it with amvnet predict"
+        )
+    return scans[0].read()
+
+
 def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> list[NamedScan]:
     """Return the scans of a file or a bag."""
     ending = ending_of(file)
-    if ending not in RECORDINGS:
+    if ending not in SERIES_READERS:
         source = str(file.parent / f"*{ending}")
         return [NamedScan(name, source, file, ending, partial(read_file, file, ending, layout))]
 
-    recording = RecordedScans(file, ending, topic)
     scans = []
-    for index in range(len(recording)):
-        read = partial(recording.read, index)
+    for index, read in enumerate(open_series(file, ending, topic)):
         scans.append(NamedScan(f"{name}/{index:06d}", str(file), file, ending, read))
     return scans
 

@@ -20,8 +20,8 @@ from amvnet.data.formats.fields import Arrays, Choose
 from amvnet.data.formats.packed import unpacked
 from amvnet.data.formats.raw import read_raw
 from amvnet.data.formats.reader_process import call
-from amvnet.data.formats.recording import Recording
-from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.formats.rows import RowLayout
+from amvnet.data.formats.series import ScanSeries
 from amvnet.errors import InputError
 
 OPEN_FILES = 4  # that the process with limits keeps open
@@ -46,7 +46,7 @@ COLUMN_READERS: dict[str, Callable[[Path, Choose], Arrays]] = {
     ".feather": arrow.read_columns,
     **dict.fromkeys(TEXT, text.read_columns),
 }
-RECORDINGS: dict[str, Callable[[Path, str, str | None], Recording]] = {
+SERIES_READERS: dict[str, Callable[[Path, str, str | None], ScanSeries]] = {
     **dict.fromkeys((FOLDER, *BAGS), open_bag),
     ".e57": lambda path, *_: open_e57(path),
 }
@@ -61,37 +61,15 @@ PACKAGES = {
 WITH_LIMITS = (*PACKAGES, *PACKED)  # of the files of one scan
 
 
-def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read the only scan of a file.
-
-    Args:
-        layout: what rows of numbers without names hold, as far as the user says it.
-
-    Raises:
-        InputError: if the file is missing, of another format, broken, or a bag of several scans.
-    """
-    path = Path(path)
-    ending = ending_of(path)
-    if ending not in RECORDINGS:
-        return read_file(path, ending, layout)
-
-    scans = RecordedScans(path, ending)
-    if len(scans) > 1:
-        raise InputError(
-            f"{path}: expected one scan, found {len(scans)}; segment it with amvnet predict"
-        )
-    return scans.read(0)
-
-
 def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
     """Read a file of one scan.
 
     Args:
         ending: as `ending_of` returns it.
-        layout: as `read_cloud`.
+        layout: what rows of numbers without names hold, as far as the user says it.
 
     Raises:
-        InputError: as `read_cloud`.
+        InputError: if the file is broken, or needs a package that is missing.
     """
     if ending not in WITH_LIMITS:
         return _read(path, ending, layout)
@@ -139,8 +117,10 @@ def first_of(names: Sequence[str], wanted: Sequence[str], path: Path) -> str:
     )
 
 
-class RecordedScans:
-    """The scans of one file of several, read in the process with limits.
+def open_series(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
+    """Return what reads each scan of a file of several, in the process with limits.
+
+    In order is fastest.
 
     Args:
         path: the file, or the folder of a ROS 2 bag.
@@ -150,22 +130,13 @@ class RecordedScans:
     Raises:
         InputError: if the file is broken, has no scan, or needs a package that is missing.
     """
+    key = uuid4().hex
+    values = _with_limits("count_with_limits", path, ending, topic, key)
+    return [partial(_read_one, path, ending, topic, key, index) for index in range(values["count"])]
 
-    def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
-        self.path = path
-        self._what = (ending, topic, uuid4().hex)
-        self._count: int = _with_limits("count_with_limits", path, *self._what)["count"]
 
-    def __len__(self) -> int:
-        return self._count
-
-    def read(self, index: int) -> Cloud:
-        """Read the scan at this index, from 0. In order is fastest.
-
-        Raises:
-            InputError: if it is broken.
-        """
-        return Cloud(**_with_limits("recorded_with_limits", self.path, *self._what, index))
+def _read_one(path: Path, *what: Any) -> Cloud:
+    return Cloud(**_with_limits("series_with_limits", path, *what))
 
 
 def _with_limits(function: str, path: Path, ending: str, *arguments: Any) -> dict[str, Any]:
@@ -199,7 +170,7 @@ def _read_column(path: Path, ending: str, names: Sequence[str]) -> np.ndarray:
 
 def _ending_of_one(path: Path) -> str:
     ending = ending_of(path)
-    if ending in RECORDINGS or ending in PACKED:
+    if ending in SERIES_READERS or ending in PACKED:
         raise InputError(
             f"{path}: expected one scan, found a packed {ending} file; unpack the file first"
         )
@@ -226,13 +197,13 @@ def count_with_limits(path: str, *what: str) -> dict[str, int]:
     return {"count": len(_open(path, *what))}
 
 
-def recorded_with_limits(path: str, *what: Any) -> dict[str, Any]:
+def series_with_limits(path: str, *what: Any) -> dict[str, Any]:
     """Return the attributes of a cloud in a file of several."""
     *which, index = what
     return vars(_open(path, *which).read(index))
 
 
 @lru_cache(OPEN_FILES)
-def _open(path: str, ending: str, topic: str | None, _key: str) -> Recording:
+def _open(path: str, ending: str, topic: str | None, _key: str) -> ScanSeries:
     """Open a file; the key is another each time that it is opened, as it may have changed."""
-    return RECORDINGS[ending](Path(path), ending, topic)
+    return SERIES_READERS[ending](Path(path), ending, topic)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan
@@ -29,7 +30,7 @@ UNSCORED = (40, 47, 58)
 
 
 @dataclass(frozen=True)
-class Frame:
+class ShownScan:
     """One scan and what is known about its N points.
 
     Attributes:
@@ -54,12 +55,12 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Frames:
-    """The frames of some scans; each is read and labelled when it is needed.
+class ShownScans:
+    """Scans to look at; each is read and labelled when it is needed.
 
     Attributes:
         taxonomy: the classes of the ids.
-        scans: the scans, in the order of the frames.
+        scans: the scans, in order.
         segmenter: labels the scans by every method, or None.
         labels: a folder of predictions as `predict` writes them, or the label file of one scan, or
             None.
@@ -91,8 +92,18 @@ class Frames:
     def __len__(self) -> int:
         return len(self.scans)
 
-    def each(self, progress: Progress = no_progress) -> Iterator[Frame]:
-        """Yield the frames in order, and report the progress.
+    def spaced(self, count: int) -> ShownScans:
+        """Return at most `count` of the scans, evenly spaced.
+
+        Raises:
+            InputError: if `count` is below 1.
+        """
+        if count < 1:
+            raise InputError(f"expected a number of scans from 1, found {count}; say --scans 5")
+        return replace(self, scans=evenly_spaced(self.scans, count))
+
+    def each(self, progress: Progress = no_progress) -> Iterator[ShownScan]:
+        """Yield the scans in order, and report the progress.
 
         Raises:
             InputError: if a file is broken or missing.
@@ -100,19 +111,19 @@ class Frames:
         at_once = 1 if self.segmenter is None else self.segmenter.at_once
 
         progress(0, len(self))
-        frames = stream_scans(self.scans, _load_with_labels, self._frame, at_once)
-        with closing(frames):
-            for done, frame in enumerate(frames, start=1):
-                yield frame
+        scans = stream_scans(self.scans, _load_with_labels, self._show, at_once)
+        with closing(scans):
+            for done, shown in enumerate(scans, start=1):
+                yield shown
                 progress(done, len(self))
 
-    def _frame(self, scan_input: InputScan, loaded: LoadedScan) -> Frame:
+    def _show(self, scan_input: InputScan, loaded: LoadedScan) -> ShownScan:
         scan = check_scan(loaded.scan)
-        frame = Frame(scan_input.title, scan.points, scan.valid, scan.labels)
+        shown = ShownScan(scan_input.title, scan.points, scan.valid, scan.labels)
 
         if self.labels is not None:
             ids = scan_input.read_labels(self.labels, len(scan), self.taxonomy)
-            frame = replace(frame, labels={"labels": ids})
+            shown = replace(shown, labels={"labels": ids})
 
         segmenter = self.segmenter
         if segmenter is not None:
@@ -120,16 +131,16 @@ class Frames:
                 segmenter = segmenter.by_ring()
             result = segmenter(scan)
             assert result.origin is not None
-            frame = replace(frame_of(result, result.origin), name=frame.name)
-        return frame
+            shown = replace(shown_scan(result, result.origin), name=shown.name)
+        return shown
 
 
 def _load_with_labels(scan: InputScan) -> LoadedScan:
     return scan.load(labels=True)
 
 
-def frame_of(result: Segmentation, origin: Origin) -> Frame:
-    """Return the frame of a scan that was segmented.
+def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
+    """Return what is shown of a scan that was segmented.
 
     It has the labels of the result, of each network, and of the ensemble if there are two.
     """
@@ -145,10 +156,10 @@ def frame_of(result: Segmentation, origin: Origin) -> Frame:
 
     labels = {name: expand_labels(values, scan.valid) for name, values in probabilities.items()}
     labels[origin.method] = result.labels
-    frame = Frame(Path(scan.name).name or "scan", scan.points, scan.valid, scan.labels, labels)
+    shown = ShownScan(Path(scan.name).name or "scan", scan.points, scan.valid, scan.labels, labels)
     if not has_two:
-        return frame
+        return shown
 
     similarity = cosine_similarity(probabilities["rv"], probabilities["bev"])
     disagreement = expand_to_scan((1 - similarity).clamp(0, 1), scan.valid)
-    return replace(frame, uncertain=result.uncertain, disagreement=disagreement)
+    return replace(shown, uncertain=result.uncertain, disagreement=disagreement)

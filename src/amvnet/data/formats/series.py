@@ -11,7 +11,7 @@ from amvnet.errors import InputError
 Decode = Callable[[str], Cloud]  # reads one scan, given its name for messages
 
 
-class Recording:
+class ScanSeries:
     """The scans of one file. One at a time is in memory.
 
     Args:
