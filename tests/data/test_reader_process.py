@@ -112,7 +112,7 @@ def test_the_process_ends_with_the_one_that_started_it(tmp_path: Path, ends: str
     code = (
         "import sys, time\n"
         "from amvnet.data.formats import reader_process\n"
-        "from amvnet.data.formats.registry import read_cloud\n"
+        "from amvnet.data.formats.find import read_cloud\n"
         "read_cloud(sys.argv[1])\n"
         "print(reader_process._process._popen.pid, reader_process._process._folder, flush=True)\n"
     )
