@@ -170,6 +170,14 @@ def test_the_mean_with_initial_weights_needs_their_classes() -> None:
     assert [line.split(":")[0] for line in lines] == ["rv", "bev"]
 
 
+def test_a_fine_tuning_can_be_tried(
+    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [*arguments(world, tmp_path / "run", str(world / "a")), "--dry-run"]
+    assert run_cli(*command) == (0, "")
+    assert "bev: " in capsys.readouterr().out
+
+
 def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
     world: Path, tmp_path: Path
 ) -> None:

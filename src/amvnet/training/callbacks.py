@@ -264,6 +264,25 @@ class Speed(Callback):
         return str(timedelta(seconds=round(ahead * elapsed / done)))
 
 
+class Trial(Callback):
+    """Ends a training after two steps.
+
+    Attributes:
+        ends: when each step ended, in seconds.
+    """
+
+    def __init__(self) -> None:
+        self.ends: list[float] = []
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        # A step may take several batches, whose gradients are accumulated.
+        if trainer.global_step > len(self.ends):
+            self.ends.append(time.perf_counter())
+        trainer.should_stop = len(self.ends) == 2
+
+
 class Bar(RichProgressBar):
     """Progress bar of an epoch with loss, mIoU, speed and the time left of the whole training."""
 

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from datetime import timedelta
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Literal
 
 import lightning as L
+import torch
 
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
+from amvnet.memory import peak_memory
+from amvnet.progress import say_nothing
+from amvnet.training.callbacks import Trial
 from amvnet.training.head import train_head
 from amvnet.training.networks import train_network
 from amvnet.training.plan import Plan
@@ -81,6 +88,54 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
     if plan.processes.first:
         folder.done_path.write_text("")
     return trained
+
+
+def try_out(plan: Plan, stage: StageName | Literal["all"], init: Weights | None = None) -> None:
+    """Take two steps of each network, and say what they and the training cost; leave no files.
+
+    Raises:
+        InputError: if the stage is the head, or a GPU's memory does not suffice.
+    """
+    if stage == "head":
+        raise InputError("expected --stage rv, bev or all for a dry run, found head; give one")
+
+    names = plan.recipe.stages if stage == "all" else (stage,)
+    weights = _first_weights(plan, init, names)
+    for name in names:
+        if name != "head":
+            plan.say(_try_out(plan, name, weights.resized(PART_OF[name], plan.recipe.model)))
+
+
+def _try_out(plan: Plan, name: str, weights: Weights) -> str:
+    """Take two steps of a network; return a line on them and the whole training."""
+    config = getattr(plan.recipe.training, name)
+    train = plan.scans.train
+    # Whole steps, even if there are fewer scans.
+    records = [train[index % len(train)] for index in range(2 * config.batch)]
+    scans = dataclasses.replace(plan.scans, train=records, val=())
+
+    trial = Trial()
+    with TemporaryDirectory() as folder:
+        short = dataclasses.replace(
+            plan, scans=scans, out=Path(folder), resume=False, say=say_nothing, bars=False
+        )
+        try:
+            train_network(short, name, weights, trial)
+        except torch.OutOfMemoryError:
+            raise InputError(
+                f"{name}: expected steps that fit into the GPU's memory, found {config.batch} "
+                f"scans in {config.accumulate} parts; set --training.{name}.accumulate to more"
+            ) from None
+
+    # The first step also sets things up, and is not timed.
+    seconds = (trial.ends[1] - trial.ends[0]) / config.batch
+    whole = timedelta(seconds=round(config.epochs * len(train) * seconds))
+    memory = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
+    return (
+        f"{name}: {seconds:.3g} s a scan in steps of {config.batch} scans, peak memory so far "
+        f"{(memory or peak_memory()) / 2**30:.1f} GiB; {config.epochs} epochs of {len(train)} "
+        f"scans take {whole} without validation"
+    )
 
 
 def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> Weights:

@@ -196,7 +196,7 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: Callback) -> N
 
     Args:
         keep_weights: writes weights at the end of each epoch, before the checkpoint, which
-            therefore never claims more than has been written.
+            therefore never claims more than has been written; or ends a trial.
 
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.

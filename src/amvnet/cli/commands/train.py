@@ -20,6 +20,7 @@ def train(
     train_sequences: str | None = None,
     val_sequences: str | None = None,
     with_val: bool = False,
+    dry_run: bool = False,
     taxonomy: Path | None = None,
 ) -> None:
     """Train the two networks and the point head.
@@ -43,6 +44,7 @@ def train(
         val_sequences: sequences or scenes, separated by commas, to validate on; default: the
             official split.
         with_val: train on these too, as for a benchmark's server; then nothing is validated.
+        dry_run: only take two steps of each network, and say what the training costs.
         taxonomy: a semantic-kitti.yaml with other classes.
     """
     from amvnet.data.datasets.joined import join
@@ -50,6 +52,7 @@ def train(
     from amvnet.distributed import device_of
     from amvnet.training.plan import Plan, open_parts, sized_by_init, without_mean
     from amvnet.training.run import train as train_stages
+    from amvnet.training.run import try_out
     from amvnet.weights.file import load
 
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
@@ -73,4 +76,7 @@ def train(
         processes=processes,
         scores=models.parse(),
     )
+    if dry_run:
+        try_out(plan, stage, weights)
+        return
     say(f"weights in {train_stages(plan, stage, weights)}")
