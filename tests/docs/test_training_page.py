@@ -105,7 +105,7 @@ def test_the_commands_on_training_run(page: str, least: int, downloads: Path) ->
     if page == "docs/training.md":
         assert (downloads / "entry.zip").stat().st_size
         assert "sequences/11/predictions/000000.label" in files(downloads / "entry")
-        assert (downloads / "runs/kitti/figures/methods.md").is_file()
+        assert (downloads / "runs/kitti/figures/methods.csv").is_file()
 
 
 def test_the_commands_on_fine_tuning_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
