@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Train the built-in weights, from streets to OUT/run/weights.safetensors; started again, it goes on.
+# Train the built-in weights, from streets to OUT/head/weights.safetensors; started again, it goes on.
 #
 #     benchmarks/shipped_weights.sh hdl64e|hdl32e OUT [INIT] [--KEY VALUE ...]
 #
@@ -21,7 +21,7 @@ case $sensor in
     hdl32e) recipe=simulated-hdl32e-compact ;;
     *) echo "expected hdl64e or hdl32e, found $sensor" >&2 && exit 2 ;;
 esac
-train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --out "$out/run" --resume "${init[@]}" "${small[@]}")
+train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --resume "${small[@]}")
 
 # Both networks at the same time, one on each core of a small machine.
 networks=(--train-sequences "$(seq -s, 0 999)" --training.rv.region_loss lovasz)
@@ -36,14 +36,19 @@ mkdir -p "$out"
 for stage in rv bev; do
     # The second network takes the classes that the first one has counted.
     while [[ $stage == bev && ! -f $out/run/class_counts.npz ]] && kill -0 %1; do sleep 5; done
-    OMP_NUM_THREADS=1 "${train[@]}" "${networks[@]}" --stage $stage "$@" > "$out/$stage.log" 2>&1 &
+    OMP_NUM_THREADS=1 "${train[@]}" --out "$out/run" "${init[@]}" "${networks[@]}" --stage $stage "$@" \
+        > "$out/$stage.log" 2>&1 &
 done
 wait %1
 wait %2
 
+# Class weights make the networks name rare classes too often on real streets.
+shifted=$out/shifted.safetensors
+python "$(dirname "$0")/shift_priors.py" "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$shifted"
+
 # The head learns on streets that the networks have not seen, under stronger changes of the sensor and from
 # disturbed scores: on streets like their own the networks are too sure, and the head would rely on them.
-"${train[@]}" "${networks[@]}" --stage head \
+"${train[@]}" --out "$out/head" --init "$shifted" --stage head \
     --train-sequences "$(seq -s, 800000 800154)" --training.head.views 1 --training.head.points 600000 \
     --training.head.epochs 10 --training.head.disturb 0.3 \
     --training.augment.tilt 4 --training.augment.height 0.4 --training.augment.drop 0.5 \

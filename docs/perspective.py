@@ -146,7 +146,7 @@ def car_points() -> tuple[np.ndarray, np.ndarray]:
 
 def class_colors(taxonomy: Any, labels: np.ndarray) -> np.ndarray:
     """Return (N, 3) colours, the dark ones lifted so that they show on a dark background."""
-    table = np.array(palette.class_colors(taxonomy.colors), np.float32)
+    table = np.array(palette.class_colors(taxonomy), np.float32)
     weights = np.array([0.3, 0.59, 0.11], np.float32)
     luminance = table @ weights
     share = np.clip((DARKEST - luminance) / (255 - luminance), 0, 1)[:, None]
