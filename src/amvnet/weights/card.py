@@ -43,6 +43,7 @@ def model_card(weights: Weights, name: str, licence: str | None = None) -> str:
         f"# {name}\n\n{_summary(weights)}",
         f"## How to use\n\n{_usage(weights, name)}",
         f"## Classes\n\n{classes}",
+        f"## Sizes\n\n{_sizes(weights)}",
         f"## Metrics\n\n{_metrics(weights)}",
     ]
     for part in weights.parts:
@@ -97,6 +98,17 @@ def _usage(weights: Weights, name: str) -> str:
     return (
         f"```python\nimport amvnet\n\n{call}\n```\n\n"
         "`points` is (N, 4): x, y, z in metres and intensity in [0, 1]."
+    )
+
+
+def _sizes(weights: Weights) -> str:
+    """Return a list of the sizes of the views, and the threshold of uncertain points."""
+    image = weights.model.range_view
+    grid = weights.model.polar_view
+    return (
+        f"- range view: {image.height} x {image.width}\n"
+        f"- polar view: {grid.radial} x {grid.angular} x {grid.vertical}\n"
+        f"- tau: {weights.model.assertion.threshold:g}"
     )
 
 
