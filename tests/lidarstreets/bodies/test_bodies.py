@@ -161,10 +161,10 @@ def test_leaves_differ_less_in_brightness_than_they_used_to() -> None:
 
 @pytest.fixture(scope="module")
 def scans() -> list[SimulatedScan]:
-    """One scan of each of eight streets."""
+    """One scan of each of sixteen streets."""
     pytest.importorskip("embreex")
     scans: list[SimulatedScan] = []
-    for seed in range(8):
+    for seed in range(16):
         scans += drive_street(HDL64E, 1, np.random.SeedSequence((7, seed)))
     return scans
 
@@ -172,7 +172,7 @@ def scans() -> list[SimulatedScan]:
 def test_a_few_percent_of_the_points_have_no_class(scans: list[SimulatedScan]) -> None:
     ids = np.concatenate([scan.semantickitti_ids() for scan in scans]) & 0xFFFF
     share = np.isin(ids, [0, 1, 52, 99]).mean()
-    assert 0.005 < share < 0.08
+    assert 0.01 < share < 0.08
 
 
 def test_ghosts_are_rare_and_have_no_instance(scans: list[SimulatedScan]) -> None:
