@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import gzip
 import resource
 import sys
-import zipfile
 from dataclasses import dataclass
 from datetime import timedelta
 from importlib.util import find_spec
@@ -20,14 +18,13 @@ from amvnet.data.formats.find import list_scans
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
-from fixtures.extra_writers import write_e57, write_sweep
+from fixtures.extra_writers import write_sweep
 from fixtures.scan_writers import WRITERS, some_points, write_bag2
 
 CASES = 200  # of each format
 METADATA = "drive/metadata.yaml"
-EXTRA = {"scan.feather": "pyarrow", "scan.e57": "pye57"}
-PACKED = ("kitti.bin.gz", "kitti.zip")
-FORMATS = [*WRITERS, *PACKED, METADATA, *EXTRA]
+EXTRA = {"scan.feather": "pyarrow"}
+FORMATS = [*WRITERS, METADATA, *EXTRA]
 HEADER = 400  # bytes: most headers are within them
 LONGEST = timedelta(seconds=10)
 MOST_MEMORY = 2 << 30  # bytes
@@ -98,16 +95,8 @@ def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
         write(folder / name, some_points())
     write_bag2(folder / "drive", {"/lidar": [some_points()]}, StoragePlugin.MCAP)
 
-    kitti = (folder / "kitti.bin").read_bytes()
-    (folder / "kitti.bin.gz").write_bytes(gzip.compress(kitti))
-    with zipfile.ZipFile(folder / "kitti.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("kitti.bin", kitti)
-
     if find_spec("pyarrow"):
         write_sweep(folder / "scan.feather", some_points())
-    if find_spec("pye57"):
-        axes = {f"cartesian{axis}": some_points()[:, i] for i, axis in enumerate("XYZ")}
-        write_e57(folder / "scan.e57", [{key: xyz.astype(float) for key, xyz in axes.items()}])
     return {name: (folder / name).read_bytes() for name in FORMATS if (folder / name).exists()}
 
 

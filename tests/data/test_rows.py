@@ -29,53 +29,65 @@ def row_bytes(table: np.ndarray, dtype: str) -> bytes:
     return table.astype(dtype).tobytes()
 
 
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("order", ["as recorded", "shuffled"])
-@pytest.mark.parametrize("columns", ["xyz", "xyzi", "xyzir", "xyzit", "xyzirt", "xyzrgb"])
-def test_columns_and_type_are_told_by_the_values(
-    table: np.ndarray, tmp_path: Path, columns: str, order: str, dtype: str
+@pytest.mark.parametrize("columns", ["xyzi", "xyzir"])
+def test_the_columns_of_kitti_and_nuscenes_are_told_by_the_values(
+    table: np.ndarray, tmp_path: Path, columns: str, order: str
 ) -> None:
-    rng = np.random.default_rng(0)
     if order == "shuffled":
-        table = rng.permutation(table)
-    rows = table[:, ["xyzirt".index(name) for name in columns.replace("rgb", "")]]
-    if columns == "xyzrgb":
-        rows = np.column_stack([rows, rng.integers(0, 256, (len(rows), 3))])
-
+        table = np.random.default_rng(0).permutation(table)
     path = tmp_path / "a.bin"
-    path.write_bytes(row_bytes(rows, dtype))
+    path.write_bytes(row_bytes(table[:, : len(columns)], "float32"))
+
     cloud = read_cloud(path)
-
-    np.testing.assert_array_equal(cloud.xyz, rows[:, :3].astype(dtype))
-    has_intensity = columns[3:4] == "i"
-    assert (cloud.intensity is not None) == has_intensity
-    if cloud.intensity is not None:
-        np.testing.assert_array_equal(cloud.intensity, rows[:, 3].astype(dtype))
-    assert (cloud.ring is not None) == ("ir" in columns)
-    if columns not in ("xyzi", "xyzir") or dtype == "float64":
-        assert f"rows of {rows.shape[1]} {dtype}" in cloud.note
+    np.testing.assert_array_equal(cloud.xyz, table[:, :3].astype("f4"))
+    np.testing.assert_array_equal(cloud.intensity, table[:, 3].astype("f4"))
+    assert (cloud.ring is not None) == ("r" in columns)
 
 
-def test_negative_intensities_and_lost_points_do_not_hide_the_columns(
-    table: np.ndarray, tmp_path: Path
-) -> None:
-    rows = table[:, :4].copy()
-    rows[:, 3] -= rows[:, 3].mean()
+def rows_of_other_layouts(table: np.ndarray) -> dict[str, bytes]:
+    """Return the bytes of files that are not as KITTI's and nuScenes'."""
+    rng = np.random.default_rng(0)
+    tables = {
+        "xyz": table[:, :3],
+        "times": table[:, [0, 1, 2, 3, 5]],
+        "rings and times": table,
+        "colours": np.column_stack([table[:, :3], rng.integers(0, 256, (len(table), 3))]),
+        "standardised": table[:, :4] - [0, 0, 0, 0.5],
+    }
+    files = {name: row_bytes(rows, "float32") for name, rows in tables.items()}
+    for count in (3, 4, 5, 6):
+        files[f"{count} doubles"] = row_bytes(table[:, :count], "float64")
+        files[f"{count} doubles of floats"] = row_bytes(table.astype("f4")[:, :count], "float64")
+    return files
+
+
+@pytest.mark.parametrize("order", ["as recorded", "shuffled"])
+def test_other_columns_are_asked_for(table: np.ndarray, tmp_path: Path, order: str) -> None:
+    if order == "shuffled":
+        table = np.random.default_rng(0).permutation(table)
+    for name, content in rows_of_other_layouts(table).items():
+        path = tmp_path / f"{name}.bin"
+        path.write_bytes(content)
+        fails(lambda path=path: read_cloud(path), path, "--columns", "--dtype")  # type: ignore[misc]
+
+
+def test_lost_and_wild_points_do_not_hide_the_columns(table: np.ndarray, tmp_path: Path) -> None:
+    rows = table[:, :4].astype("f4")
     rows[::7, :3] = np.nan
-    (tmp_path / "a.bin").write_bytes(row_bytes(rows, "float32"))
-    np.testing.assert_array_equal(read_cloud(tmp_path / "a.bin").xyz, rows[:, :3].astype("f4"))
+    rows[1] = (1e6, 0, 0, -1)
+    (tmp_path / "a.bin").write_bytes(rows.tobytes())
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.bin").xyz, rows[:, :3])
 
 
-@pytest.mark.parametrize("columns", [3, 4, 5, 6])
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("columns", [4, 5])
 def test_a_truncated_file_is_not_read_with_other_columns(
-    table: np.ndarray, tmp_path: Path, columns: int, dtype: str
+    table: np.ndarray, tmp_path: Path, columns: int
 ) -> None:
-    content = row_bytes(table[:, :columns], dtype)
+    content = row_bytes(table[:, :columns], "float32")
     path = tmp_path / "a.bin"
-    size = np.dtype(dtype).itemsize
     for removed in range(1, columns):
-        path.write_bytes(content[: len(content) - removed * size])
+        path.write_bytes(content[: len(content) - removed * 4])
         fails(lambda: read_cloud(path), path, "--columns", "--dtype")
 
 
@@ -91,17 +103,16 @@ def test_a_table_that_was_written_column_by_column_is_refused(
     """As the scans of Oxford RobotCar are: all x, then all y and so on."""
     path = tmp_path / "a.bin"
     path.write_bytes(row_bytes(table[:, :4].T, "float32"))
-    fails(lambda: read_cloud(path), path, "found values that fit none")
+    fails(lambda: read_cloud(path), path, "found values that fit neither")
 
 
 def test_the_user_s_columns_count(table: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
-    path.write_bytes(row_bytes(table[:, [5, 4, 2, 1, 0, 3]], "float64"))
-
     for dtype in (None, "float64"):
+        path.write_bytes(row_bytes(table[:, [5, 4, 2, 1, 0, 3]], dtype or "float32"))
         cloud = read_cloud(path, parse_layout("time,ring,z,y,x,intensity", dtype))
-        np.testing.assert_array_equal(cloud.xyz, table[:, :3])
-        np.testing.assert_array_equal(cloud.intensity, table[:, 3])
+        np.testing.assert_array_equal(cloud.xyz, table[:, :3].astype(dtype or "float32"))
+        np.testing.assert_array_equal(cloud.intensity, table[:, 3].astype(dtype or "float32"))
         np.testing.assert_array_equal(cloud.ring, table[:, 4])
     fails(lambda: read_cloud(path, parse_layout("x,y,z", "float16,float32")), "--columns")
 
@@ -140,6 +151,7 @@ def test_columns_of_arrays_can_be_named(table: np.ndarray, tmp_path: Path) -> No
         (None, "complex64", "--dtype"),
         (None, "object", "--dtype"),
         ("x,y,z", "float32,float32", "--dtype"),
+        (None, "float64", "--columns"),
     ],
 )
 def test_impossible_options_are_refused(columns: str | None, dtype: str | None, word: str) -> None:
@@ -164,11 +176,11 @@ HEADERS = {
 }
 
 
-def text_of(table: np.ndarray, separator: str = ",", decimal: str = ".") -> str:
+def text_of(table: np.ndarray, separator: str = ",") -> str:
     lines = []
     for row in table:
         numbers = [f"{value:.3f}" for value in row[:4]] + [f"{value:.0f}" for value in row[4:5]]
-        lines.append(separator.join(numbers).replace(".", decimal))
+        lines.append(separator.join(numbers))
     return "\n".join(lines) + "\n"
 
 
@@ -188,14 +200,12 @@ def test_text_is_read_with_any_header(table: np.ndarray, tmp_path: Path, header:
 
 
 @pytest.mark.parametrize("name", ["a.xyz", "a.txt", "a.csv", "a.asc", "a.pts", "a", "a.dat"])
-@pytest.mark.parametrize(
-    ("separator", "decimal"), [(" ", "."), ("\t", "."), ("; ", "."), (";", ","), ("  ", ",")]
-)
+@pytest.mark.parametrize("separator", [" ", "\t", "; ", ", ", "  "])
 def test_text_is_read_with_any_separator_and_name(
-    table: np.ndarray, tmp_path: Path, name: str, separator: str, decimal: str
+    table: np.ndarray, tmp_path: Path, name: str, separator: str
 ) -> None:
     path = tmp_path / name
-    path.write_text(text_of(table[:400], separator, decimal).replace("\n", "\r\n"))
+    path.write_text(text_of(table[:400], separator).replace("\n", "\r\n"))
     check_text(path, table[:400])
 
 

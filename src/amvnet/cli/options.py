@@ -42,10 +42,10 @@ class ScanChoice:
     """of bags, the topic of the scans; default: the only one with scans."""
     columns: str | None = None
     """of .bin, .npy and text files, what their columns hold, in order: x,y,z,intensity,ring, and
-    any other name for a column to leave out; default: as the values suggest."""
+    any other name for a column to leave out; default: by their names, or in this order."""
     dtype: str | None = None
-    """of .bin files, the type of the numbers: float32, float64, ..., or one for each of the
-    columns, separated by commas; default: as the values suggest."""
+    """of .bin files, with --columns, the type of the numbers: float32, float64, ..., or one for
+    each of the columns, separated by commas; default: float32."""
 
     def parse(self) -> ScanOptions:
         """Return the options as the inputs take them.

@@ -13,9 +13,8 @@ import pyarrow.csv
 import pyarrow.parquet
 from pyarrow.fs import FileType
 
-from amvnet.data.formats.detect import PACKED, named_ending
+from amvnet.data.formats.detect import BAGS, named_ending
 from amvnet.data.formats.find import is_scan_name
-from amvnet.data.formats.registry import SERIES_READERS
 from amvnet.errors import InputError
 from amvnet.fleet.storage import Place, reaching
 
@@ -128,7 +127,7 @@ def _in_blocks(folder: str, prefix: str, files: Iterable[str]) -> Iterator[pa.Ta
         drives.setdefault(ending, []).append((f"{folder}/{file}", f"{prefix}{stem}"))
 
     for ending, scans in drives.items():
-        if ending in SERIES_READERS:
+        if ending in BAGS:
             raise InputError(
                 f"{scans[0][0]}: expected files of one scan for --ray, found a "
                 "recording; segment it without --ray"
@@ -145,10 +144,9 @@ def _cut(scans: Sequence[tuple[str, str]], drive: str, sensor: str = "") -> Iter
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """Return a file's name without its ending, and the ending; `.bin.gz` ends in `.gz`."""
+    """Return a file's name without its ending, and the ending."""
     ending = named_ending(Path(name)) or ""
-    stem = name[: len(name) - len(ending)]
-    return (split_name(stem)[0] if ending in PACKED else stem), ending
+    return name[: len(name) - len(ending)], ending
 
 
 def _read_manifest(place: Place) -> Iterator[pa.Table]:

@@ -16,7 +16,7 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
-from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.formats.rows import UNKNOWN, USUAL_TYPE, RowLayout
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, errors_of, shown
@@ -357,7 +357,7 @@ def _parse(path: Path, tree: Any) -> Description:
         sensor=sensor,
         layout=RowLayout(
             columns=_texts("columns", tree.get("columns", ())),
-            dtypes=_texts("dtype", tree.get("dtype", ())),
+            dtypes=_texts("dtype", tree.get("dtype", USUAL_TYPE)),
         ),
     )
 

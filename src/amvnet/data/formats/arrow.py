@@ -7,22 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import check_point_count, reading
-from amvnet.data.formats.fields import Arrays, Choose
+from amvnet.data.formats.cloud import Arrays, Names, check_point_count, reading, require_columns
 from amvnet.errors import InputError
 
 EXPECTED = "a Feather file"
 ADVICE = "copy it again, or write the table with pyarrow.feather.write_feather"
 
 
-def read_columns(path: Path, choose: Choose) -> Arrays:
+def read_columns(path: Path, wanted: Names) -> Arrays:
     """Read some columns of a table.
 
-    Args:
-        choose: returns the columns to read, given the names of all.
-
     Raises:
-        InputError: if the file is not Feather or is truncated.
+        InputError: if the file is not Feather, is truncated or lacks a column.
     """
     with reading(path, EXPECTED, ADVICE):
         import pyarrow
@@ -33,7 +29,7 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
             except pyarrow.ArrowInvalid:
                 raise InputError(f"{path}: expected {EXPECTED} of version 2; {ADVICE}") from None
             all_names = reader.schema.names
-            columns = choose(all_names)
+            columns = require_columns(all_names, path, wanted)
             options = pyarrow.ipc.IpcReadOptions(included_fields=sorted(set(columns.values())))
             reader = pyarrow.ipc.open_file(file, options=options)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,7 +13,6 @@ from amvnet.data.formats.cloud import Cloud, reading
 from amvnet.data.formats.detect import FOLDER
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
-from amvnet.data.formats.series import Decode, ScanSeries
 from amvnet.errors import InputError
 
 # Other messages of sensors, by the beginning of their type, and what turns them into PointCloud2
@@ -40,8 +39,8 @@ EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
 
-def open_bag(path: Path, ending: str, topic: str | None = None) -> ScanSeries:
-    """Open the scans of one topic of a bag, ordered by time.
+class Bag:
+    """The scans of one topic of a bag, ordered by time. One at a time is in memory.
 
     Args:
         path: the file, or the folder of a ROS 2 bag.
@@ -51,26 +50,65 @@ def open_bag(path: Path, ending: str, topic: str | None = None) -> ScanSeries:
     Raises:
         InputError: if the bag cannot be read, or has no such topic, or more than one.
     """
-    if ending == FOLDER:
+
+    def __init__(self, path: Path, ending: str, topic: str | None = None) -> None:
         with reading(path, EXPECTED, ADVICE):
-            _check_unpacked(path)
-    with reading(path, EXPECTED, ADVICE), closing(_open_reader(path, ending)) as reader:
-        counts = _count_messages(reader)
-        topic = _choose_topic(counts, topic, path, _describe_others(reader))
+            if ending == FOLDER:
+                _check_unpacked(path)
+            with closing(_open_reader(path, ending)) as reader:
+                counts = _count_messages(reader)
+                topic = _choose_topic(counts, topic, path, _describe_others(reader))
 
-    count = counts[topic]
-    if not 0 < count <= size_of(path) // MIN_MESSAGE:
-        raise InputError(f"{path}: expected scans under {topic}, found {count} messages; {ADVICE}")
-    return ScanSeries(path, count, partial(_read_messages, path, ending, topic), ADVICE, topic)
+        count = counts[topic]
+        if not 0 < count <= size_of(path) // MIN_MESSAGE:
+            raise InputError(
+                f"{path}: expected scans under {topic}, found {count} messages; {ADVICE}"
+            )
+        self._path = path
+        self._ending = ending
+        self._topic = topic
+        self._count = count
 
+        # For reading in order without a seek: the index of the next message, and the rest of them.
+        self._next = 0
+        self._rest: Iterator[bytes] = iter(())
 
-def _read_messages(path: Path, ending: str, topic: str) -> Iterator[Decode]:
-    # A ROS 2 bag serialises in the same way in every storage format.
-    is_ros1 = ending == ".bag"
-    with closing(_open_reader(path, ending)) as reader:
-        connections = [c for c in _with_scans(reader) if c.topic == topic]
-        for _, _, data in reader.messages(connections=connections):
-            yield partial(_read_message, data, is_ros1)
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self, index: int) -> Cloud:
+        """Read the scan at this index, from 0. In order is fastest.
+
+        Raises:
+            InputError: if it is broken, or the bag ends before it.
+        """
+        if index != self._next or self._next == 0:
+            self._next = 0
+            self._rest = self._messages()
+
+        name = f"{self._path} ({self._topic}, {index})"
+        with reading(name, "a scan", ADVICE):
+            for data in self._rest:
+                self._next += 1
+                if self._next > index:
+                    if self._next == self._count:
+                        self._rest = iter(())  # closes the file
+                    return self._decode(data, name)
+
+        raise InputError(f"{name}: expected {self._count} scans, found {self._next}; {ADVICE}")
+
+    def _messages(self) -> Iterator[bytes]:
+        with closing(_open_reader(self._path, self._ending)) as reader:
+            connections = [each for each in _with_scans(reader) if each.topic == self._topic]
+            for _, _, data in reader.messages(connections=connections):
+                yield data
+
+    def _decode(self, data: bytes, name: str) -> Cloud:
+        # A ROS 2 bag serialises in the same way in every storage format.
+        is_ros1 = self._ending == ".bag"
+        types = types_of(is_ros1)
+        deserialise = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
+        return read_message(deserialise(data, CLOUD_TYPE), name)
 
 
 def _open_reader(path: Path, ending: str) -> Any:
@@ -140,12 +178,6 @@ def types_of(is_ros1: bool) -> Any:
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-
-
-def _read_message(data: bytes, is_ros1: bool, name: str) -> Cloud:
-    types = types_of(is_ros1)
-    deserialise = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
-    return read_message(deserialise(data, CLOUD_TYPE), name)
 
 
 def _count_messages(reader: Any) -> dict[str, int]:

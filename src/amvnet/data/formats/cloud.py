@@ -24,8 +24,10 @@ FLOAT_RANGES = (1.0, 255.0, 65535.0)
 INTEGER_RANGES = (255.0, 65535.0)  # integers are not fractions
 WILD_SHARE = 0.001  # of the intensities, which may be larger than the range of the others
 
-# Names of columns in lower case. If a file has several of them, the first in this order is used.
-COLUMN_NAMES = {
+Arrays = dict[str, np.ndarray]  # (N,) columns by key
+# The possible names of each column, by its key; the first that a file has is read.
+Names = Mapping[str, Sequence[str]]
+COLUMN_NAMES: Names = {
     "x": ("x",),
     "y": ("y",),
     "z": ("z",),
@@ -40,6 +42,7 @@ COLUMN_NAMES = {
     ),
     "ring": ("ring", "rings", "channel", "laser_id", "laser", "scalar_ring"),
 }
+OPTIONAL = ("intensity", "ring")  # columns that a file may lack
 
 
 @dataclass(frozen=True)
@@ -217,34 +220,38 @@ def require(source: Path | str, extra: str, *packages: str) -> None:
         )
 
 
-def find_columns(names: Sequence[str]) -> dict[str, int]:
-    """Find x, y, z, intensity and ring among the columns of a file.
+def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str, int]:
+    """Return the index of each wanted column that a file has, by its key.
 
-    Returns:
-        The index of each column by the key of `COLUMN_NAMES`, without those that the file lacks.
+    Args:
+        names: of the columns of the file; upper and lower case do not matter.
     """
     lower_names = list(map(str.lower, names))
 
     columns = {}
-    for key, aliases in COLUMN_NAMES.items():
-        for alias in aliases:
+    for key, aliases in wanted.items():
+        for alias in map(str.lower, aliases):
             if alias in lower_names:
                 columns[key] = lower_names.index(alias)
                 break
     return columns
 
 
-def require_columns(names: Sequence[str], path: Path | str) -> dict[str, int]:
-    """Find columns as `find_columns` does, and check that the coordinates are among them.
+def require_columns(
+    names: Sequence[str], path: Path | str, wanted: Names = COLUMN_NAMES
+) -> dict[str, int]:
+    """Find columns as `find_columns` does, and check that those not `OPTIONAL` are among them.
 
     Raises:
-        InputError: if x, y or z is missing.
+        InputError: if one is missing.
     """
-    columns = find_columns(names)
-    if not {"x", "y", "z"} <= set(columns):
+    columns = find_columns(names, wanted)
+    required = [key for key in wanted if key not in OPTIONAL]
+    if not set(required) <= set(columns):
+        expected = ", ".join(" or ".join(wanted[key]) for key in required)
         listing = ", ".join(names[:20]) or "none"
         raise InputError(
-            f"{path}: expected columns x, y, z, found {listing[:200]!a}; rename the columns"
+            f"{path}: expected columns {expected}, found {listing[:200]!a}; rename the columns"
         )
 
     return columns

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import re
-import zipfile
 from pathlib import Path
 
 from amvnet.data.formats.raw import NUSCENES_ENDING, load, usual_layout
-from amvnet.data.formats.rows import guess_rows
 from amvnet.data.formats.text import ADVICE as TEXT_ADVICE
 from amvnet.data.formats.text import find_table, is_text, read_head
 from amvnet.errors import InputError
 
 TEXT = (".xyz", ".txt", ".csv", ".asc", ".pts")
-PACKED = (".gz", ".zip")
 BAGS = (".bag", ".mcap", ".db3")
 FOLDER = ""  # instead of an ending: the folder of a ROS 2 bag
 METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
@@ -21,10 +18,9 @@ METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
 ENDINGS = (
     *(NUSCENES_ENDING, ".bin", ".pcd", ".ply", ".npy", ".npz"),
     *TEXT,
-    *PACKED,
     *(".las", ".laz"),
     *BAGS,
-    *(".feather", ".e57"),
+    ".feather",
 )
 
 # Kinds of files that are known, but not read: their endings, what they are, and what to do.
@@ -40,25 +36,14 @@ UNREADABLE = (
         "records such as Waymo's",
         "save the points of each scan with numpy.save, or as .feather with pandas' to_feather",
     ),
-    ((".rcp", ".rcs", ".ptx"), "scans of surveying software", "export them as .e57"),
-    (
-        (".obj", ".stl", ".vtk", ".vtp"),
-        "a mesh",
-        "save its points as .ply, for example with CloudCompare",
-    ),
-    (
-        (".pkl", ".pickle", ".pt", ".mat", ".h5"),
-        "variables of a program",
-        "save the points with numpy.save",
-    ),
+    ((".gz", ".bz2", ".7z"), "a packed file", "unpack it"),
 )
 
 
 # The first bytes of files.
 BEGINNINGS = {
     b"\x93NUMPY": ".npy",
-    b"\x1f\x8b": ".gz",
-    b"PK\x03\x04": ".zip",
+    b"PK\x03\x04": ".npz",
     b"VERSION": ".pcd",
     b"FIELDS": ".pcd",
     b"ply\n": ".ply",
@@ -69,7 +54,6 @@ BEGINNINGS = {
     b"SQLite format 3\x00": ".db3",
     b"ARROW1": ".feather",
     b"FEA1": ".feather",
-    b"ASTM-E57": ".e57",
 }
 BEGINNING = 4096  # bytes in which they must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
@@ -95,8 +79,6 @@ def ending_of(path: Path) -> str:
         ) from None
 
     ending = _begins_as(head[:BEGINNING])
-    if ending == ".zip":
-        return _ending_of_zip(path)
     if ending is not None:
         return ending
 
@@ -121,53 +103,24 @@ def _begins_as(beginning: bytes) -> str | None:
     return None
 
 
-def _ending_of_zip(path: Path) -> str:
-    """Return ".npz" for the arrays of NumPy in a zip file, else ".zip".
-
-    Raises:
-        InputError: if its name is that of files that are not read, such as PyTorch's.
-    """
-    if _has_arrays(path):
-        return ".npz"
-    _check_name(path)
-    return ".zip"
-
-
-def _has_arrays(path: Path) -> bool:
-    """Return whether a zip file is one of NumPy's; a broken one is, if its name says so."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return any(name.endswith(".npy") for name in archive.namelist())
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
-        return not path.name.lower().endswith(".zip")
-
-
 def _guess_ending(path: Path, named: str | None) -> str:
     """Return the ending that the values in a file tell, or else its name.
 
     Raises:
         InputError: if neither tells, or files of this kind are not read.
     """
-    data = load(path)
-    if usual_layout(data) is not None:
+    if usual_layout(load(path)) is not None:
         return ".bin"
     if named is not None:
         return named
 
-    _check_name(path)
-    if guess_rows(data) is not None:
-        return ".bin"
-    raise InputError(
-        f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; "
-        "convert it to one"
-    )
-
-
-def _check_name(path: Path) -> None:
-    """Raise InputError if files with this name are known, but not read."""
-    for endings, content, advice in UNREADABLE:
+    content, advice = "another format", "convert it to one"
+    for endings, kind, what_to_do in UNREADABLE:
         if path.name.lower().endswith(endings):
-            raise InputError(f"{path}: expected a scan file, found {content}; {advice}")
+            content, advice = kind, what_to_do
+    raise InputError(
+        f"{path}: expected a scan file ({', '.join(ENDINGS)}), found {content}; {advice}"
+    )
 
 
 def named_ending(path: Path) -> str | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, chain, islice
@@ -11,11 +11,10 @@ from typing import BinaryIO
 
 import numpy as np
 
+from amvnet.data.formats.cloud import Arrays
 from amvnet.errors import InputError
 
 HEADER = 65_536  # bytes of the longest header of a file
-Arrays = dict[str, np.ndarray]  # the (N,) values of some fields
-Choose = Callable[[Sequence[str]], dict[str, int]]  # the index of each field to read, by a key
 
 
 @dataclass(frozen=True)

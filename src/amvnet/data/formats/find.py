@@ -11,15 +11,16 @@ from pathlib import Path
 
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import (
+    BAGS,
     ENDINGS,
+    FOLDER,
     METADATA,
-    PACKED,
     TEXT,
     ending_of,
     is_dead_link,
     named_ending,
 )
-from amvnet.data.formats.registry import SERIES_READERS, open_series, read_file
+from amvnet.data.formats.registry import open_bag, read_file
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
@@ -133,12 +134,12 @@ def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
 def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> list[NamedScan]:
     """Return the scans of a file or a bag."""
     ending = ending_of(file)
-    if ending not in SERIES_READERS:
+    if ending not in (FOLDER, *BAGS):
         source = str(file.parent / f"*{ending}")
         return [NamedScan(name, source, file, ending, partial(read_file, file, ending, layout))]
 
     scans = []
-    for index, read in enumerate(open_series(file, ending, topic)):
+    for index, read in enumerate(open_bag(file, ending, topic)):
         scans.append(NamedScan(f"{name}/{index:06d}", str(file), file, ending, read))
     return scans
 
@@ -202,11 +203,7 @@ def is_scan_name(name: str) -> bool:
     """
     if name.startswith(".") or name.endswith(".uncertain.npy"):
         return False
-    # A packed file counts if its name says that it is a scan, such as scan.bin.gz.
     ending = named_ending(Path(name))
-    if ending in PACKED:
-        ending = named_ending(Path(name[: -len(ending)]))
-        return ending is not None and ending not in (*PACKED, *TEXT)
     return ending is not None and ending not in TEXT
 
 
@@ -220,10 +217,9 @@ def _is_text_scan(path: Path) -> bool:
 
 
 def scan_stem(path: Path) -> str:
-    """Return a scan file's name without its ending, also without `.pcd.bin` and `.bin.gz`."""
+    """Return a scan file's name without its ending, such as `.pcd.bin`."""
     name = path.absolute().name if path.name in ("", "..") else path.name
     if path.is_dir():
         return name
     ending = named_ending(Path(name)) or path.suffix
-    stem = name[: len(name) - len(ending)]
-    return scan_stem(Path(stem)) if ending in PACKED and named_ending(Path(stem)) else stem
+    return name[: len(name) - len(ending)]

@@ -16,7 +16,9 @@ import numpy as np
 
 from amvnet.data.formats.cloud import (
     MAX_BYTES,
+    Arrays,
     Cloud,
+    Names,
     check_point_count,
     find_columns,
     make_cloud,
@@ -24,14 +26,12 @@ from amvnet.data.formats.cloud import (
     require_columns,
     ring_indices,
 )
-from amvnet.data.formats.fields import Arrays, Choose
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
 # Names of the array to read, if there are several.
 KEYS = ("points", "positions", "xyz", "scan", "arr_0")
 FEW = 10  # an array with as few rows and more columns is transposed
-BLOCK = 1 << 20  # bytes read at once
 MOST_COLUMNS = 200  # of an array without names, of which one can be chosen
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # in which NumPy packs archives
 ADVICE = "save it again with np.save"
@@ -88,19 +88,19 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         return replace(cloud, intensity=intensity, ring=ring)
 
 
-def read_columns(path: Path, choose: Choose) -> Arrays:
+def read_columns(path: Path, wanted: Names) -> Arrays:
     """Read some columns of an array of points; those without names are called "0", "1", ...
 
     Raises:
         InputError: as `read_npy`.
     """
     array = read_array(path)
-    names = array.dtype.names
     numbers = range(min(array.shape[-1], MOST_COLUMNS))
+    names = array.dtype.names or tuple(map(str, numbers))
 
     columns = {}
-    for key, index in choose(names or tuple(map(str, numbers))).items():
-        columns[key] = array[..., index] if names is None else array[names[index]]
+    for key, index in require_columns(names, path, wanted).items():
+        columns[key] = array[..., index] if array.dtype.names is None else array[names[index]]
     return columns
 
 
@@ -160,9 +160,9 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
     """Read the array that starts here, if `size` bytes can hold what its header claims."""
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
-        shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
     else:
-        shape, fortran_order, dtype = np.lib.format.read_array_header_2_0(file)
+        shape, _, dtype = np.lib.format.read_array_header_2_0(file)
 
     is_numeric = dtype.names is not None or dtype.kind in "fiu"
     if dtype.hasobject or not is_numeric or not shape:
@@ -180,11 +180,8 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
     point_axes = shape[:1] if len(shape) < 3 else shape[:-1]
     check_point_count(math.prod(point_axes), path)
 
-    data = np.empty(length, np.uint8)
-    for start in range(0, length, BLOCK):
-        stop = min(start + BLOCK, length)
-        data[start:stop] = np.frombuffer(file.read(stop - start), np.uint8)
-    return data.view(dtype).reshape(shape, order="F" if fortran_order else "C")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:

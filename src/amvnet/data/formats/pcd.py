@@ -12,8 +12,15 @@ from typing import BinaryIO
 
 import numpy as np
 
-from amvnet.data.formats.cloud import MAX_BYTES, check_point_count, reading
-from amvnet.data.formats.fields import Arrays, Choose, Fields, read_header_line
+from amvnet.data.formats.cloud import (
+    MAX_BYTES,
+    Arrays,
+    Names,
+    check_point_count,
+    reading,
+    require_columns,
+)
+from amvnet.data.formats.fields import Fields, read_header_line
 from amvnet.errors import InputError
 
 KIND = "a PCD file"
@@ -32,21 +39,18 @@ LONGEST_REPETITION = 264  # bytes
 REPETITION_CODE = 3  # bytes
 
 
-def read_columns(path: Path, choose: Choose) -> Arrays:
+def read_columns(path: Path, wanted: Names) -> Arrays:
     """Read some fields of the points; of a field of several values the first.
 
     The points of an organised cloud (a grid) come row by row.
 
-    Args:
-        choose: returns the fields to read, given the names of all.
-
     Raises:
-        InputError: if the file is not PCD or is truncated.
+        InputError: if the file is not PCD, is truncated or lacks a field.
     """
     with reading(path, KIND, ADVICE), path.open("rb") as file:
         entries = _read_header(file, path)
         fields = _parse_fields(entries)
-        chosen = choose(fields.names)
+        chosen = require_columns(fields.names, path, wanted)
         points = _count_points(entries)
         encoding = entries["DATA"][0].lower()
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from amvnet.data.formats.cloud import check_point_count, reading
-from amvnet.data.formats.fields import Arrays, Choose, Fields, read_header_line
+from amvnet.data.formats.cloud import Arrays, Names, check_point_count, reading, require_columns
+from amvnet.data.formats.fields import Fields, read_header_line
 from amvnet.errors import InputError
 
 TYPES = {
@@ -58,14 +58,11 @@ class Element:
         return Fields(self.properties, dtypes, [1] * len(dtypes))
 
 
-def read_columns(path: Path, choose: Choose) -> Arrays:
+def read_columns(path: Path, wanted: Names) -> Arrays:
     """Read some properties of the vertices.
 
-    Args:
-        choose: returns the properties to read, given the names of all.
-
     Raises:
-        InputError: if the file is not PLY, is truncated, or has no vertices.
+        InputError: if the file is not PLY, is truncated, or lacks vertices or a property.
     """
     with reading(path, KIND, ADVICE), path.open("rb") as file:
         encoding, elements = _read_header(file, path)
@@ -79,7 +76,7 @@ def read_columns(path: Path, choose: Choose) -> Arrays:
             )
 
         fields = vertex.fields(BYTE_ORDERS[encoding])
-        chosen = choose(vertex.properties)
+        chosen = require_columns(vertex.properties, path, wanted)
         if encoding == "ascii":
             # Each value, and each line before the vertices, takes at least one digit and, but for
             # the last, a separator.

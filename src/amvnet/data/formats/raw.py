@@ -8,97 +8,60 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.formats.cloud import (
-    MOST_RINGS,
-    Cloud,
-    check_point_count,
-    split_records,
-)
-from amvnet.data.formats.rows import (
-    ADVICE,
-    COUNTS,
-    DTYPES,
-    ENOUGH,
-    NAMES,
-    UNKNOWN,
-    RowLayout,
-    are_rings,
-    guess_columns,
-    guess_dtype,
-    guess_rows,
-    named_cloud,
-)
+from amvnet.data.formats.cloud import MOST_RINGS, Cloud, check_point_count, split_records
+from amvnet.data.formats.rows import ADVICE, NAMES, UNKNOWN, RowLayout, are_rings, named_cloud
 from amvnet.errors import InputError
 
 KITTI_COLUMNS = 4  # x, y, z, intensity
 NUSCENES_COLUMNS = 5  # x, y, z, intensity 0..255, ring
 NUSCENES_ENDING = ".pcd.bin"
 FULL_INTENSITY = 255.0
-MAX_INTENSITY = 65535  # of any device
-NEAR = 500.0  # metres: coordinates of usual scans are smaller
-KITTI_ROWS = RowLayout(NAMES[:KITTI_COLUMNS], DTYPES[:1])
-NUSCENES_ROWS = RowLayout(NAMES, DTYPES[:1])
+KITTI_ROWS = RowLayout(NAMES[:KITTI_COLUMNS])
+NUSCENES_ROWS = RowLayout(NAMES)
+
 WIDEST = 8  # bytes of a number
 SAMPLE = 400_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # bytes: whole rows of either layout
+FEW = 4800  # bytes: the values of smaller files can fit any layout
+
+# Numbers in other columns or of another type are negative, or of any magnitude.
+MAX_INTENSITY = 65535  # of any device
+NEAR = 500.0  # metres: coordinates of usual scans are smaller
+USUAL = 0.999  # share of the points that must have such values: some may be wild
 
 
 def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read rows of 3 to 6 float32 or float64, or as the user says.
+    """Read rows as the user says, or else those of KITTI or nuScenes, whichever the values fit.
 
-    The columns and their type are inferred from the values. If that fails, the columns are
-    nuScenes' five if the name ends in `.pcd.bin`, else KITTI's four.
-
-    Args:
-        layout: what the user says.
+    A small file that fits neither is nuScenes' if its name ends in `.pcd.bin`, else KITTI's.
 
     Raises:
-        InputError: if the file is not a whole number of rows, or the values fit no layout.
+        InputError: if the file is not a whole number of rows, or the values fit neither layout.
     """
-    data = load(path, max(len(layout.columns), COUNTS[-1]))
-    if layout != UNKNOWN:
-        return _to_cloud(data, path, _complete(data, path, layout))
+    data = load(path, max(len(layout.columns), NUSCENES_COLUMNS))
+    if layout.columns:
+        return _to_cloud(data, path, layout)
 
     is_named = path.name.lower().endswith(NUSCENES_ENDING)
     usual = usual_layout(data, is_named)
-    if usual is None:
-        guess = guess_rows(data)
-        if guess is not None:
-            return _to_cloud(data, path, guess)
-
-        if len(data) >= ENOUGH:
-            raise InputError(
-                f"{path}: expected rows of {COUNTS[0]} to {COUNTS[-1]} {' or '.join(DTYPES)}, "
-                f"found values that fit none; {ADVICE}"
-            )
-        usual = NUSCENES_ROWS if is_named else KITTI_ROWS
+    if usual is None and len(data) >= FEW:
+        raise InputError(
+            f"{path}: expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found "
+            f"values that fit neither; {ADVICE}"
+        )
+    usual = usual or (NUSCENES_ROWS if is_named else KITTI_ROWS)
 
     full = FULL_INTENSITY if is_named and usual == NUSCENES_ROWS else None
     return replace(_to_cloud(data, path, usual), full=full, note="")
 
 
-def load(path: Path, columns: int = COUNTS[-1]) -> np.ndarray:
+def load(path: Path, columns: int = NUSCENES_COLUMNS) -> np.ndarray:
     """Return the (B,) bytes of a file.
 
     Raises:
-        InputError: if they are more than those of `MAX_POINTS` rows of so many columns.
+        InputError: if they are more than those of `MAX_POINTS` rows of as many columns.
     """
     check_point_count(path.stat().st_size // (WIDEST * columns), path)
     return np.fromfile(path, np.uint8)
-
-
-def _complete(data: np.ndarray, path: Path, layout: RowLayout) -> RowLayout:
-    """Return a layout with what the user did not say taken from the values.
-
-    Raises:
-        InputError: if the columns cannot be inferred.
-    """
-    dtypes = layout.dtypes or (guess_dtype(data) or DTYPES[0],)
-    columns = layout.columns or guess_columns(data, dtypes[0])
-    if columns is None:
-        raise InputError(
-            f"{path}: expected rows of {dtypes[0]}, found values that fit none; {ADVICE}"
-        )
-    return RowLayout(columns, dtypes)
 
 
 def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
@@ -191,11 +154,11 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
 def _is_kitti(table: np.ndarray) -> bool:
     """Return whether (N, 4) values can be x, y, z and intensity.
 
-    Intensities are never negative, but some coordinates are.
+    Intensities are never negative, but some coordinates are. Lost points may be NaN.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]
-
-    is_position = (np.abs(xyz) < NEAR).all() and (xyz < 0).any()
-    is_intensity = (intensity >= 0).all() and (intensity <= MAX_INTENSITY).all()
-    return bool(is_position and is_intensity)
+    is_lost = np.isnan(xyz).any(axis=1)
+    is_position = is_lost | (np.abs(xyz) < NEAR).all(axis=1)
+    is_intensity = np.isnan(intensity) | (intensity >= 0) & (intensity <= MAX_INTENSITY)
+    return bool((xyz < 0).any() and np.mean(is_position & is_intensity) >= USUAL)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-from codecs import BOM_UTF16_BE, BOM_UTF16_LE
-from collections.abc import Iterator
 from dataclasses import dataclass
 from io import StringIO
 from itertools import islice
@@ -12,8 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import MAX_POINTS, Cloud, check_point_count, find_columns, reading
-from amvnet.data.formats.fields import Arrays, Choose
+from amvnet.data.formats.cloud import (
+    MAX_POINTS,
+    Arrays,
+    Cloud,
+    Names,
+    check_point_count,
+    find_columns,
+    reading,
+    require_columns,
+)
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
@@ -26,15 +32,7 @@ COMMENTS = ("#", "//", "%")
 ENCODING = "utf-8-sig"
 UNDECODED = "\ufffd"  # what bytes that are no text become
 CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
-# Separators of the values, and decimal marks, in the order in which they are tried; None is any
-# white space.
-SEPARATORS: tuple[tuple[str | None, str], ...] = (
-    (";", "."),
-    (";", ","),
-    (",", "."),
-    (None, "."),
-    (None, ","),
-)
+SEPARATORS = (";", ",", None)  # of the values, in the order to try; None is any white space
 # Names of coordinates that other programs write, such as "Points:0" in ParaView and VeloView.
 POINTS = re.compile(r"points?(?:_m_xyz)?[:_](\d)")
 FIRST_RETURN = re.compile(r"([xyz])1")  # "X1 (m)" by ouster-cli
@@ -49,18 +47,14 @@ class TextTable:
 
     Attributes:
         separator: between the values of a line; None for any white space.
-        decimal: the decimal mark, "." or ",".
         skipped: lines before the first point.
-        encoding: of the text.
         count: the number of columns.
         names: those of the columns; empty if there are none.
     """
 
     separator: str | None
-    decimal: str
     skipped: int
     count: int
-    encoding: str
     names: tuple[str, ...] = ()
 
 
@@ -69,7 +63,7 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
 
     Columns are found by their names, if a line before the points has them; else they are x, y, z,
     intensity and, if the values are whole numbers, the ring. Values are separated by white space,
-    commas or semicolons, also with decimal commas.
+    commas or semicolons.
 
     Args:
         layout: what the user says; of it, the columns count.
@@ -98,19 +92,16 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         return named_cloud(list(values.T), names, str(path), note)
 
 
-def read_columns(path: Path, choose: Choose) -> Arrays:
-    """Read some columns of all points as float64.
-
-    Args:
-        choose: returns the columns to read, given the names of all: those of the file, in lower
-            case, or else "0", "1", ...
+def read_columns(path: Path, wanted: Names) -> Arrays:
+    """Read some columns of all points as float64; those without names are called "0", "1", ...
 
     Raises:
-        InputError: as `read_text_cloud`.
+        InputError: as `read_text_cloud`, or if a column is missing.
     """
     with reading(path, EXPECTED, ADVICE):
         table = _require_table(path)
-        chosen = choose(table.names or tuple(map(str, range(table.count))))
+        names = table.names or tuple(map(str, range(table.count)))
+        chosen = require_columns(names, path, wanted)
         values = _read_values(path, table, list(chosen.values()))
         return dict(zip(chosen, values.T, strict=True))
 
@@ -130,11 +121,9 @@ def read_head(path: Path) -> bytes:
 
 def find_table(head: bytes) -> TextTable | None:
     """Return how the lines of a text are to be read, given its head; None if it has no points."""
-    text, encoding = _decode(head)
-    lines = StringIO(text, newline=None).readlines()
-
-    for separator, decimal in SEPARATORS:
-        table = _match(lines, separator, decimal, encoding)
+    lines = StringIO(_decode(head), newline=None).readlines()
+    for separator in SEPARATORS:
+        table = _match(lines, separator)
         if table is not None:
             return table
     return None
@@ -142,45 +131,35 @@ def find_table(head: bytes) -> TextTable | None:
 
 def is_text(head: bytes) -> bool:
     """Return whether a file with this head is text, and not numbers in binary."""
-    text, _ = _decode(head)
+    text = _decode(head)
     return bool(text.split()) and UNDECODED not in text
 
 
-def _decode(head: bytes) -> tuple[str, str]:
-    """Return the whole lines of the head of a file, and their encoding; no lines if binary."""
-    encoding = "utf-16" if head.startswith((BOM_UTF16_LE, BOM_UTF16_BE)) else ENCODING
-    text = head.decode(encoding, errors="replace")
+def _decode(head: bytes) -> str:
+    """Return the whole lines of the head of a file; no lines if it is binary."""
+    text = head.decode(ENCODING, errors="replace")
     if len(head) == HEAD:
         text = text[: text.rfind("\n") + 1]
-    return ("", encoding) if CONTROL.search(text) else (text, encoding)
+    return "" if CONTROL.search(text) else text
 
 
-def _match(
-    lines: list[str], separator: str | None, decimal: str, encoding: str
-) -> TextTable | None:
-    """Return the table that starts after some lines, if it has these separators."""
+def _match(lines: list[str], separator: str | None) -> TextTable | None:
+    """Return the table that starts after some lines, if it has this separator."""
     names: tuple[str, ...] = ()
     for skipped, line in enumerate(lines):
         values = _split(line, separator)
-        if _are_numbers(values, names, decimal):
+        if _are_numbers(values, names):
             alike = list(filter(str.strip, lines[skipped : skipped + CHECKED]))
             # A header is not longer than the points; other text may end in a line of numbers.
             if len(alike) < min(skipped, CHECKED):
                 return None
             for other in alike:
                 row = _split(other, separator)
-                if len(row) != len(values) or not _are_numbers(row, names, decimal):
+                if len(row) != len(values) or not _are_numbers(row, names):
                     return None
 
             is_named = len(names) == len(values)
-            return TextTable(
-                separator,
-                decimal,
-                skipped,
-                count=len(values),
-                encoding=encoding,
-                names=names if is_named else (),
-            )
+            return TextTable(separator, skipped, len(values), names if is_named else ())
 
         candidates = tuple(map(_clean_name, _split(_uncomment(line), separator)))
         if {"x", "y", "z"} <= set(find_columns(candidates)):
@@ -211,7 +190,7 @@ def _clean_name(name: str) -> str:
     return "xyz"[int(match[1])] if match and int(match[1]) < 3 else bare
 
 
-def _are_numbers(values: list[str], names: tuple[str, ...], decimal: str) -> bool:
+def _are_numbers(values: list[str], names: tuple[str, ...]) -> bool:
     """Return whether the values of a line are numbers: those of the named columns, or else all."""
     if len(values) < 3:
         return False
@@ -220,7 +199,7 @@ def _are_numbers(values: list[str], names: tuple[str, ...], decimal: str) -> boo
 
     try:
         for value in values:
-            float(value.strip().strip('"').replace(decimal, "."))
+            float(value.strip().strip('"'))
     except ValueError:
         return False
     return True
@@ -228,13 +207,9 @@ def _are_numbers(values: list[str], names: tuple[str, ...], decimal: str) -> boo
 
 def _read_values(path: Path, table: TextTable, indices: range | list[int]) -> np.ndarray:
     """Return some columns of all points, (N, columns) float64."""
-    with path.open(encoding=table.encoding, errors="replace") as file:
-        lines: Iterator[str] = islice(file, table.skipped, None)
-        if table.decimal == ",":
-            lines = (line.replace(",", ".") for line in lines)
-
+    with path.open(encoding=ENCODING, errors="replace") as file:
         values = np.loadtxt(
-            lines,
+            islice(file, table.skipped, None),
             delimiter=table.separator,
             usecols=list(indices),
             max_rows=MAX_POINTS + 1,

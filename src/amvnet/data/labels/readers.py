@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from amvnet.data.formats.cloud import MAX_POINTS, reading
+from amvnet.data.formats.cloud import MAX_POINTS, reading, require_columns
 from amvnet.data.formats.detect import TEXT, ending_of
 from amvnet.data.formats.numpy_files import member_names, read_array
 from amvnet.data.formats.raw import count_rows
-from amvnet.data.formats.registry import COLUMN_READERS, first_of, read_column
+from amvnet.data.formats.registry import COLUMN_READERS, read_columns
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.ids import train_ids
 from amvnet.data.taxonomy import Taxonomy
@@ -19,6 +19,7 @@ from amvnet.errors import InputError
 # Types of the ids in files of nothing but ids, by bytes per point.
 INTEGERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.int64}
 COLUMNS = ("class", "label", "scalar_class", "scalar_label")  # the latter by CloudCompare
+KEY = "labels"  # of the column in what a reader returns
 ARRAYS = ("labels", "label", "class", "arr_0")  # of an archive
 LARGEST = np.iinfo(np.uint32).max
 ADVICE = "write the labels again, one whole number per point"
@@ -68,7 +69,7 @@ def _read_field(path: Path, field: str, layout: RowLayout) -> np.ndarray:
         return read_array(path, field)
 
     if ending in COLUMN_READERS:
-        return read_column(path, ending, (field,))
+        return read_columns(path, ending, {KEY: [field]})[KEY]
     raise InputError(
         f"{path}: expected a file with fields of labels ({', '.join(COLUMN_READERS)}), "
         f"found {ending or 'a bag'}; write the labels into files next to the scans"
@@ -85,9 +86,10 @@ def _read_usual(path: Path, count: int) -> np.ndarray:
         return read_array(path)
     if ending == ".npz":
         names = member_names(path)
-        return read_array(path, names[0] if len(names) == 1 else first_of(names, ARRAYS, path))
+        index = 0 if len(names) == 1 else require_columns(names, path, {KEY: ARRAYS})[KEY]
+        return read_array(path, names[index])
     if ending in COLUMN_READERS:
-        return read_column(path, ending, COLUMNS)
+        return read_columns(path, ending, {KEY: COLUMNS})[KEY]
     return _read_integers(path, count)
 
 
@@ -133,12 +135,12 @@ def _read_numbers(path: Path) -> np.ndarray:
 
 def _read_raw_column(path: Path, layout: RowLayout, field: str) -> np.ndarray:
     """Read a column of rows of numbers that the user described."""
-    if not layout.is_complete:
+    if not layout.columns:
         raise InputError(
-            f"{path}: expected columns and dtype of rows with labels, found none; "
-            "add columns: [x, y, z, intensity, label] and dtype: float32"
+            f"{path}: expected the columns of rows with labels, found none; "
+            "add columns: [x, y, z, intensity, label]"
         )
-    column = first_of(layout.columns, (field,), path)
+    index = require_columns(layout.columns, path, {KEY: [field]})[KEY]
     count = count_rows(path, layout.record, 1)
     records = np.fromfile(path, dtype=layout.record, count=min(count, MAX_POINTS))
-    return records[str(layout.columns.index(column))]
+    return records[str(index)]
