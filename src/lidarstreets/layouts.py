@@ -203,11 +203,11 @@ def _add_shared_rows(tables: Tables) -> None:
 
 
 def _add_scene(tables: Tables, sequence: Row) -> None:
-    """Add the rows of one scene: it, its samples, their scans, poses and labels."""
+    """Add the rows of one scene, its samples, and their scans, poses and labels."""
     name = sequence["scene"]
     scene = _token(name)
 
-    # The tokens of the samples and of their scans, with that of none before and after.
+    # Tokens of the samples and of their scans; an empty one before the first and after the last.
     samples = [""]
     tokens = [""]
     for index, scan in enumerate(sequence["scans"]):

@@ -98,7 +98,7 @@ def simulate(
         done += written
         progress(done, scans * sequences)
 
-    # The layout's tables cover all sequences in the folder, those of earlier calls too.
+    # The layout's tables cover all sequences in the folder, also those of earlier calls.
     markers = sorted((out / MARKERS).glob("*.json"))
     rows = [json.loads(path.read_text())["rows"] for path in markers]
     layout.complete(out, rows)

@@ -256,7 +256,7 @@ def structure(rng: np.random.Generator) -> Mesh:
     return _structure([block], Surface.PLASTER, rng)
 
 
-# Shares of the objects at the edge of a street, and of those in gardens and yards.
+# Shares of the objects at the edge of a street, and of objects in gardens and yards.
 _STREET: dict[Maker, float] = {
     bins: 0.36,
     cabinet: 0.22,

@@ -106,7 +106,7 @@ class Fence:
 
 
 def draw_fence(rng: np.random.Generator, kinds: dict[str, float] | None = None) -> Fence:
-    """Draw a kind of fence and its measures; the shares are those of gardens if None."""
+    """Draw a kind of fence and its measures, by default with the shares of gardens."""
     kind = weighted_choice(rng, GARDEN_KINDS if kinds is None else kinds)
     surfaces = KINDS[kind].surfaces
     if surfaces is WOODEN:

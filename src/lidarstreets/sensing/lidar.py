@@ -177,8 +177,8 @@ def _is_hidden(sensor: LidarModel) -> np.ndarray:
 class _NearestHits:
     """The nearest hit of each of R rays over all scenes; all columns are (R,).
 
-    Those of `Mesh` are of the triangle that is hit. The distance is infinite if there is none, and
-    `facing`, the product of ray and normal, is negative if the ray comes from outside.
+    The columns of `Mesh` describe the triangle that is hit. The distance is infinite if a ray hits
+    none; `facing`, the product of ray and normal, is negative if the ray comes from outside.
     """
 
     def __init__(
@@ -224,8 +224,8 @@ def trace(
 ) -> Hits:
     """Return what each shot of one rotation hits first, or where it ends in foliage.
 
-    The pose is the (4, 4) transform from the sensor's frame to that of the street and its scenes,
-    when the sensor looks ahead; the speed is along its x axis in metres per second.
+    The pose is the (4, 4) transform from the sensor's frame to the frame of the street, when the
+    sensor looks ahead; the speed is along its x axis in metres per second.
     """
     rays = rays_of(sensor)
     rotation = pose[:3, :3].astype(np.float32)
@@ -273,9 +273,9 @@ def _enter_foliage(
     direction: np.ndarray,
     rng: np.random.Generator,
 ) -> None:
-    """Extend rays that hit foliage to the leaf that stops them, or to what is behind it.
+    """Extend rays that hit foliage to the leaf that stops them, or to the surface behind it.
 
-    The length of the way inside is exponential: its mean is the depth of the foliage.
+    The distance inside is exponentially distributed; its mean is the depth of the foliage.
     """
     index = np.flatnonzero(nearest.depth > 0)  # of the rays that are still on their way
     clumps = np.zeros(len(index), dtype=np.int32)  # that each ray is inside of: clumps overlap
@@ -296,7 +296,7 @@ def _enter_foliage(
         stops = free_path < behind.distance
         nearest.distance[index[stops]] += free_path[stops]
 
-        # The other rays reach the next surface; they continue if it is that of foliage.
+        # The other rays reach the next surface; they continue if it is foliage.
         rows = np.flatnonzero(~stops)
         index = index[rows]
         clumps = clumps[rows]

@@ -24,7 +24,7 @@ GHOST_NEAREST = 0.5
 GHOST_MEAN = 6.0
 OWN_LASERS = 8  # the lowest lasers, which see racks and other parts of the car itself
 OWN_REACH = 2.0  # metres to the farthest of these parts
-DARK_SHARE = 0.35  # of the reflectivity, for returns of which most light is reflected elsewhere
+DARK_SHARE = 0.35  # of the reflectivity, if the surface reflects most light elsewhere
 NEIGHBOUR_ANGLE = 0.5  # degrees between neighbouring shots of one laser, at most
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidarstreets.errors import SimulationError
 
-# Standard deviations by which a device differs from its type, at most.
+# Largest difference between a device and its type, in standard deviations.
 MOST_DEVIATIONS = 2.5
 
 
@@ -37,8 +37,8 @@ class LidarModel:
     # Spread of the gains between lasers: scale of a Student's t distribution with three degrees
     # of freedom.
     gain_spread: float
-    # Power of a return, relative to a head-on one of a white surface at 10 m, at which the device
-    # reports half of the reflectivity.
+    # Power at which the device reports half of the reflectivity; 1 is the power of a head-on
+    # return from a white surface at 10 m.
     half_power: float
     # Seconds per rotation; the sensor looks ahead in the middle of it.
     rotation_period: float
@@ -54,10 +54,10 @@ class LidarModel:
     drop: float = 0.01
     # Range in metres at which the device reports half of the reflectivity, whatever the power.
     half_range: float = np.inf
-    # Brightness below which most returns have the intensity 0; 0 if none has because of it.
+    # Brightness below which most returns have the intensity 0; 0 if there is no such limit.
     least_brightness: float = 0.0
-    # Mean share by which the upper half of the lasers, which are focused far away, sees near
-    # surfaces darker.
+    # Mean share of the brightness of near surfaces that the upper half of the lasers loses: they
+    # are focused far away.
     near_loss: float = 0.0
     # Mean number of returns from the racks and the roof of the car itself.
     own_returns: float = 0.0
@@ -94,7 +94,7 @@ _HDL64E_SHADOW = (
     (328, 332, -90, -21.9), (336, 340, -90, -21.9),
 )  # fmt: skip
 
-# The shadow is that of KITTI's car.
+# The shadow is of KITTI's car.
 HDL64E = LidarModel(
     elevations=_HDL64E_ELEVATIONS,
     azimuth_steps=2180,
@@ -128,8 +128,8 @@ _HDL32E_SHADOW = (
     (170, 190, -90, -18),
 )  # fmt: skip
 
-# The lasers are evenly spaced. Noise, intensity and shadow are those of nuScenes, whose scans have
-# a point for every shot.
+# The lasers are evenly spaced. Noise, intensity and shadow are as in nuScenes, whose scans have a
+# point for every shot.
 HDL32E = LidarModel(
     elevations=tuple(10.67 - i * 4 / 3 for i in range(32)),
     azimuth_steps=1084,
@@ -172,8 +172,8 @@ def sensor_of(name: str) -> LidarModel:
 def draw_device(sensor: LidarModel, rng: np.random.Generator) -> LidarModel:
     """Return one device of a type of LiDAR as it is mounted on one car.
 
-    No number differs from that of the type by more than `MOST_DEVIATIONS` standard deviations. If
-    all spreads of a type are 0, its devices are equal to it.
+    Its numbers differ from the type's by at most `MOST_DEVIATIONS` standard deviations. If all
+    spreads of a type are 0, its devices are equal to it.
     """
 
     def draw() -> float:

@@ -38,7 +38,7 @@ def add_people(site: Site) -> None:
 
 
 def _random_places(site: Site, rate: float) -> Iterator[tuple[int, float]]:
-    """Yield random sides and x along the street; on average `rate`, less those beyond its ends."""
+    """Yield random sides and x along the street, about `rate` less those beyond its ends."""
     rng = site.rng
     for _ in range(rng.poisson(rate)):
         side = int(rng.choice([-1, 1]))

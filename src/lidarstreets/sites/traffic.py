@@ -10,7 +10,7 @@ from lidarstreets.mesh import Mesh, join, place
 from lidarstreets.sites.site import Site
 from lidarstreets.streets.plans import SideRoad
 
-# Shares of the vehicles that park along the street, and of those that drive.
+# Shares of the vehicles that park along the street, and of vehicles that drive.
 PARKED_VEHICLES = {
     cars.car: 0.860,
     trucks.truck: 0.054,

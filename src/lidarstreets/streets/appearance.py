@@ -78,7 +78,7 @@ def is_painted(plan: Plan, places: Places) -> np.ndarray:
     for lane, _ in style.lanes:
         painted |= (np.abs(t - lane) < 0.09) & (places.x % 60 < 3.5)
 
-    # None of these are in a junction; stop lines are in front of it.
+    # None of this paint is in a junction; stop lines are in front of it.
     painted &= places.crossing > 1
     painted |= (np.abs(places.crossing - 4.5) < 0.2) & (t < 0) & is_road
     is_stripe = (t % 1.0 < 0.5) & is_road

@@ -17,7 +17,7 @@ class SideRoad:
     """A road that leaves the street on one side.
 
     Attributes:
-        x, y: where its middle line meets that of the street, metres.
+        x, y: where its middle line meets the middle line of the street, metres.
         street_x: the same place along the street.
         yaw: its direction there, away from the street, radians.
         side: the side on which it leaves the street, -1 right and 1 left.

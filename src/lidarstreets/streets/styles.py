@@ -91,7 +91,7 @@ def draw_style(rng: np.random.Generator) -> Style:
     name = weighted_choice(rng, shares)
     kind = KINDS[name]
 
-    # The chances vary around those of the kind; a larger factor than 8 would make them vary less.
+    # The chances vary around the kind's; a larger factor than 8 would make them vary less.
     # A Dirichlet distribution does not allow 0, hence the small number.
     house, row, wood, field, lot = rng.dirichlet(np.array(kind.plots) * 8 + 1e-3).tolist()
 

@@ -277,7 +277,7 @@ def _flatbed(rng: np.random.Generator, load: Load) -> list[Mesh]:
 
 
 def _tipper(rng: np.random.Generator, load: Load) -> list[Mesh]:
-    """Return a _tipper's trough with ribs, heaped with gravel or empty."""
+    """Return the trough of a tipper with ribs, heaped with gravel or empty."""
     height = rng.uniform(0.7, 1.6)
     trough = box(
         (load.length * 0.92, load.width * 0.8, height),
@@ -318,7 +318,7 @@ def _tanker(rng: np.random.Generator, load: Load) -> list[Mesh]:
 
 
 def _mixer(rng: np.random.Generator, load: Load) -> list[Mesh]:
-    """Return the drum of a cement _mixer with its hopper and chute."""
+    """Return the drum of a cement mixer with its hopper and chute."""
     radius = load.width * 0.46
     low = (load.front - 0.5, 0, load.floor + radius * 0.9)
     belly = (load.middle, 0, load.floor + radius)
@@ -345,7 +345,7 @@ def _mixer(rng: np.random.Generator, load: Load) -> list[Mesh]:
 
 
 def _refuse(rng: np.random.Generator, load: Load) -> list[Mesh]:
-    """Return a _refuse body with a rounded tail and a hopper."""
+    """Return the body of a refuse truck with a rounded tail and a hopper."""
     top = min(load.top, 3.4)
     profile = [
         (load.rear + 0.9, load.floor), (load.front, load.floor), (load.front, top - 0.1),

@@ -46,7 +46,7 @@ def _wheels(label: Label, radius: float, rim: float, wheelbase: float) -> Mesh:
 def _frame(
     label: Label, radius: float, wheelbase: float, heights: tuple[float, float], is_low: bool
 ) -> Mesh:
-    """Return frame, saddle, pedals and handlebar; `heights` are those of saddle and bar."""
+    """Return frame, saddle, pedals and handlebar; `heights` are of saddle and bar."""
     saddle, bar = heights
     front = wheelbase / 2
     rear = -wheelbase / 2
