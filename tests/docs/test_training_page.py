@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 from zipfile import ZipFile
 
+import numpy as np
 import pytest
 
 from amvnet.config.recipes import recipe_names
 from amvnet.weights.file import load, save
 
+from fixtures.scan_writers import write_pcd
 from fixtures.worlds import (
     GOLDEN,
     commands_of,
@@ -111,12 +114,27 @@ def test_the_commands_on_training_run(page: str, least: int, downloads: Path) ->
 def test_the_commands_on_fine_tuning_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     make_streets(tmp_path / "data/kitti/dataset", ("00", "08"))
-    make_streets(tmp_path / "mine", ("00", "01", "02"), scans=1)
+    for sequence, site in (("00", "site_a"), ("08", "site_b")):
+        scans = tmp_path / f"data/kitti/dataset/sequences/{sequence}/velodyne"
+        (tmp_path / site / "clouds").mkdir(parents=True)
+        for path in scans.glob("*.bin"):
+            points = np.fromfile(path, np.float32).reshape(-1, 4)
+            write_pcd(tmp_path / site / "clouds" / f"{path.stem}.pcd", points, "binary")
+    page = (Path(__file__).parents[2] / "docs/finetuning.md").read_text(encoding="utf-8")
+    (description,) = re.findall(r"```yaml\n(.*?)```", page, re.S)
+    (tmp_path / "mine.yaml").write_text(description)
     save(fresh_weights(), tmp_path / "sim-hdl64e")
     write_recipe(tmp_path / "finetune.tiny.yaml", "finetune", training=ONE_EPOCH)
 
     commands = commands_of("docs/finetuning.md")
-    assert len(commands) == 3
+    assert len(commands) == 5
     for words in commands:
         run([word.replace("sim-hdl64e", "./sim-hdl64e") for word in words], tmp_path)
-    assert load("runs/finetuned").parts == ("range_net", "polar_net", "point_head")
+    for name in ("finetuned", "mine"):
+        assert load(f"runs/{name}").parts == ("range_net", "polar_net", "point_head")
+
+    # The classes are those of the initial weights, so the head stays as it is.
+    trained = load("runs/mine").tensors
+    for name, values in load("./sim-hdl64e").tensors.items():
+        if name.startswith("point_head."):
+            assert values.equal(trained[name]), name
