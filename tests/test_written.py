@@ -74,10 +74,6 @@ CASES = {
     "rank-scans": Case(
         f"rank {{world}}/data {WEIGHTS} --out {{out}}/r.csv --split all", "r-scans.csv"
     ),
-    "rank-pictures": Case(
-        f"rank {{world}}/data {WEIGHTS} --out {{out}}/r.csv --split all --pictures {{out}}",
-        "03.png",
-    ),
     "submit": Case(
         "submit {world}/data --predictions {world}/predictions --split val --out {out}/e.zip",
         "e.zip",
@@ -102,7 +98,7 @@ def test_a_users_file_stays_and_nothing_is_written(name: str, world: Path, tmp_p
     assert mine.read_bytes() != MINE
 
 
-@pytest.mark.parametrize("name", ["predict", "dataset", "fuse", "rank-pictures", "submit"])
+@pytest.mark.parametrize("name", ["predict", "dataset", "fuse", "rank", "submit"])
 def test_a_command_repeats_itself_but_does_not_replace_what_was_changed(
     name: str, world: Path, tmp_path: Path
 ) -> None:

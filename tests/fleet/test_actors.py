@@ -81,7 +81,7 @@ def test_workers_normalise_by_what_was_measured_and_not_by_their_own_scans(
     worker = LabelScans(replace(labelling, out=str(tmp_path)))
     drive = worker.measure(block)
     assert drive["height"] == pytest.approx(2.5, abs=0.05)
-    other = json.dumps([json.loads(drive["estimates"])[0] | {"quantiles": None}])
+    other = json.dumps(json.loads(drive["estimates"]) | {"quantiles": None})
 
     for estimates, is_same in ((drive["estimates"], True), (other, False)):
         worker(with_estimates(block, estimates).slice(len(block) - 1))

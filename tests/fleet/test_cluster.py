@@ -225,7 +225,7 @@ class Mortal:
         self.schema = results_schema(labelling.taxonomy)
 
     def measure(self, scans: pa.Table) -> dict[str, object]:
-        return {"drive": scans["drive"][0].as_py(), "assumed": "", "estimates": "[]"}
+        return {"drive": scans["drive"][0].as_py(), "assumed": "", "estimates": "null"}
 
     def __call__(self, batch: pa.Table) -> pa.Table:
         names = batch["name"].to_pylist()

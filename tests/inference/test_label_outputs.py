@@ -11,7 +11,6 @@ from typing import get_args
 import numpy as np
 import plyfile
 import pytest
-from pypcd4 import PointCloud
 
 from amvnet.cli.commands import predict as verbs
 from amvnet.data.formats.find import read_cloud
@@ -25,7 +24,7 @@ from fixtures.worlds import fails, files, fresh_weights, make_streets, run_cli
 
 COUNT = 60
 LOST = 7  # the index of a point with NaN
-WITH_POINTS = ("ply", "pcd")  # kinds of files with coordinates
+WITH_POINTS = ("ply",)  # kinds of files with coordinates
 
 
 @dataclass(frozen=True)
@@ -53,13 +52,6 @@ def read_ply(path: Path) -> LabelFile:
     return LabelFile(vertex["class"], xyz, colors, uncertain)
 
 
-def read_pcd(path: Path) -> LabelFile:
-    cloud = PointCloud.from_path(path)
-    colors = PointCloud.decode_rgb(cloud.pc_data["rgb"])
-    uncertain = cloud.pc_data["uncertain"] if "uncertain" in cloud.fields else None
-    return LabelFile(cloud.pc_data["label"], cloud.numpy(("x", "y", "z")), colors, uncertain)
-
-
 def read_npy(path: Path) -> LabelFile:
     raw = np.load(path, allow_pickle=False)
     assert raw.dtype == np.uint32
@@ -70,7 +62,6 @@ READERS: dict[str, Callable[[Path], LabelFile]] = {
     "label": lambda path: LabelFile(np.fromfile(path, "<u4")),
     "npy": read_npy,
     "ply": read_ply,
-    "pcd": read_pcd,
 }
 
 
@@ -139,7 +130,7 @@ def test_map_coordinates_keep_their_millimetres(kind: str, tmp_path: Path) -> No
     assert errors.max() < 0.0005
 
 
-@pytest.mark.parametrize("kind", ["ply", "pcd"])
+@pytest.mark.parametrize("kind", WITH_POINTS)
 def test_float64_takes_no_space_if_float32_is_exact_enough(kind: str, tmp_path: Path) -> None:
     xyz, ids, _ = make_scan()
     wide = xyz.astype(np.float64)
@@ -305,7 +296,7 @@ def test_one_network_alone_reports_no_uncertain_points(world: Path, tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("scan", "options"),
-    [("b.pcd", ("--format", "pcd")), ("a.bin", ("--format", "ply")), ("c.npz", ("--scores",))],
+    [("b.ply", ("--format", "ply")), ("a.bin", ("--format", "ply")), ("c.npz", ("--scores",))],
 )
 def test_scans_are_never_overwritten(
     scan: str, options: tuple[str, ...], world: Path, tmp_path: Path
@@ -313,7 +304,7 @@ def test_scans_are_never_overwritten(
     points = some_points(400)
     points.tofile(tmp_path / "a.bin")
     (tmp_path / "a.ply").write_bytes(b"another scan of mine")
-    write_pcd(tmp_path / "b.pcd", points, "binary")
+    write_pcd(tmp_path / "b.ply", points, "binary")
     np.savez(tmp_path / "c.npz", points=points)
 
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}

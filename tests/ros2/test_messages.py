@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
-from amvnet.data.labels.writers import LabelledPoints
-from amvnet_ros.messages import Message, encode_labels
+from amvnet_ros.messages import LabelledPoints, Message, encode_labels
 
 from fixtures.scan_writers import cloud_message, some_points
 

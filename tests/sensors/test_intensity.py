@@ -133,26 +133,24 @@ def test_missing_intensities_are_filled_in_as_the_weights_need_it(
         assert "much worse" in lines[0]
 
 
-def test_another_range_later_in_a_source_is_that_of_another_sensor() -> None:
-    first = []
-    for seed in range(3):
-        points = scan_points(seed=seed)
-        first.append(Cloud(points[:, :3], points[:, 3], name="a"))
+def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
+    clouds = []
+    for seed, (height, scale) in enumerate(((1.73, 1), (1.0, 255), (2.5, 255), (1.73, 1))):
+        points = scan_points(height, seed)
+        clouds.append(Cloud(points[:, :3], scale * points[:, 3], name=f"scan {seed}"))
 
     lines: list[str] = []
     normaliser = normaliser_for(weights_with({}), say=lines.append)
-    for cloud in first:
-        normaliser.expect("a", partial(Cloud, cloud.xyz, cloud.intensity, name="a"))
-    for height in (1.0, 2.5):
-        points = scan_points(height)
-        scan = normaliser(Cloud(points[:, :3], 255 * points[:, 3], name="b"), "a")
-        np.testing.assert_allclose(scan.points[:, 3], points[:, 3], atol=1e-6)
+    for cloud in clouds:
+        normaliser.expect("a", partial(replace, cloud))
+    for cloud in clouds:
+        alone, _ = normalise([cloud])
+        scan = normaliser(cloud, "a")
+        np.testing.assert_array_equal(scan.points, alone[0].points)
+        np.testing.assert_array_equal(scan.ring, alone[0].ring)
         assert ground_height(scan.points) == pytest.approx(1.73, abs=0.05)
-
-    points = scan_points()
-    scan = normaliser(Cloud(points[:, :3], points[:, 3], name="c"), "a")
-    np.testing.assert_array_equal(scan.points, points)
-    assert len(lines) == 2
+    (line,) = lines
+    assert "a has scans of other sensors" in line
 
 
 @pytest.mark.parametrize("record", [None, 3, {KEY: []}, {"augment": 1}])

@@ -10,7 +10,6 @@ import numpy as np
 
 from amvnet.data.formats.cloud import record_dtype
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, TYPES
-from amvnet.data.labels.writers import LabelledPoints
 
 FIELD_TYPE = "sensor_msgs/msg/PointField"
 HEADER_TYPE = "std_msgs/msg/Header"
@@ -39,6 +38,28 @@ class Message:
         stamp = message.header.stamp
         nanoseconds = stamp.sec * NANOSECONDS + stamp.nanosec
         return cls(nanoseconds, message.header.frame_id, message.height)
+
+
+@dataclass(frozen=True)
+class LabelledPoints:
+    """The points of a scan and their labels.
+
+    Attributes:
+        xyz: (N, 3) coordinates, metres.
+        raw: (N,) uint32 raw ids.
+        colors: (N, 3) uint8 RGB.
+        uncertain: (N,) bool, or None if unknown.
+    """
+
+    xyz: np.ndarray
+    raw: np.ndarray
+    colors: np.ndarray
+    uncertain: np.ndarray | None
+
+    def packed_colors(self) -> np.ndarray:
+        """Return (N,) little-endian float32 whose bits are the colours as PCL packs them."""
+        red, green, blue = self.colors.astype(np.uint32).T
+        return (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
 
 
 def encode_labels(

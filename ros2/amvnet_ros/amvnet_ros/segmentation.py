@@ -11,8 +11,7 @@ import numpy as np
 
 from amvnet.data.formats.cloud import reading
 from amvnet.data.formats.pointcloud2 import read_message
-from amvnet.data.labels.writers import LabelledPoints
-from amvnet_ros.messages import Message
+from amvnet_ros.messages import LabelledPoints, Message
 
 
 def _parameter(default: Any, description: str) -> Any:

@@ -20,7 +20,7 @@ DOTS_PER_INCH = 130
 ENTRIES = 3  # legend entries in a line, for each column of panels
 LEGEND_LINE = 0.2  # inches, height of one line of the legend
 LEGEND_MARGIN = 0.5  # inches
-DOT = 1.1  # area of a point in square typographic points, if REACH metres are shown
+DOT = 1.1  # area of a point in square typographic points
 
 Color = tuple[float, float, float]
 IGNORED: Color = (0.8, 0.8, 0.8)
@@ -56,8 +56,6 @@ class TopView:
         truth: (N,) train ids, or None.
         uncertain: (N,) bool, or None.
         title: a line above all panels.
-        reach: metres shown on each side.
-        marked: the name of the points in `uncertain`, for their panel and the legend.
     """
 
     points: np.ndarray
@@ -66,12 +64,10 @@ class TopView:
     truth: np.ndarray | None = None
     uncertain: np.ndarray | None = None
     title: str = ""
-    reach: float = REACH
-    marked: str = "uncertain"
 
 
 def draw_scan(path: Path | str, view: TopView) -> Path:
-    """Draw one scan from above, x to the right and y up, `reach` metres to each side.
+    """Draw one scan from above, x to the right and y up, 50 m to each side.
 
     The first row shows the truth and each prediction. Below each prediction are its errors
     (correct in grey, wrong in red; ignored points count as neither), below the truth the
@@ -93,8 +89,8 @@ def scan_figure(view: TopView) -> Any:
     entries = _class_entries(view)
     if view.truth is not None and view.predictions:
         entries.append(("wrong", _shares(WRONG)))
-    if view.uncertain is not None and view.marked:
-        entries.append((view.marked, _shares(UNCERTAIN)))
+    if view.uncertain is not None:
+        entries.append(("uncertain", _shares(UNCERTAIN)))
     return _figure(view, _grid(view), entries)
 
 
@@ -114,7 +110,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     uncertainty = None
     if view.uncertain is not None:
         total = len(view.uncertain)
-        uncertainty = _highlight(view.marked, view.uncertain, total, _shares(UNCERTAIN))
+        uncertainty = _highlight("uncertain", view.uncertain, total, _shares(UNCERTAIN))
     if truth is None:
         return [[*predictions]] if uncertainty is None else [[*predictions, uncertainty]]
 
@@ -181,7 +177,7 @@ def _figure(
         for column, panel in enumerate(row_panels):
             if panel is not None:
                 axes = figure.add_subplot(rows, columns, row * columns + column + 1)
-                _draw_panel(axes, view.points, panel, view.reach)
+                _draw_panel(axes, view.points, panel)
 
     if view.title:
         figure.suptitle(view.title, color=INK, fontsize=13)
@@ -189,8 +185,8 @@ def _figure(
     return figure
 
 
-def _draw_panel(axes: Any, points: np.ndarray, panel: _Panel, reach: float) -> None:
-    inside = (np.abs(points[:, :2]) <= reach).all(axis=1)
+def _draw_panel(axes: Any, points: np.ndarray, panel: _Panel) -> None:
+    inside = (np.abs(points[:, :2]) <= REACH).all(axis=1)
     xyz = points[inside, :3]
 
     # Higher points hide lower ones, and the points on top hide all others.
@@ -201,14 +197,14 @@ def _draw_panel(axes: Any, points: np.ndarray, panel: _Panel, reach: float) -> N
         xyz[order, 0],
         xyz[order, 1],
         c=panel.colors[inside][order],
-        s=DOT * REACH / reach,
+        s=DOT,
         marker="o",
         linewidths=0,
         rasterized=True,
     )
     axes.plot(0, 0, marker="+", color=INK, markersize=7)
 
-    axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", facecolor=GROUND)
+    axes.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal", facecolor=GROUND)
     axes.set_title(panel.title, color=INK, fontsize=11)
     axes.set_xlabel("x (m)", color=INK, fontsize=8)
     axes.set_ylabel("y (m)", color=INK, fontsize=8)

@@ -31,7 +31,7 @@ from amvnet.data.labels.writers import check_kind
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, did_you_mean
 from amvnet.export.engines import use_engine
-from amvnet.fleet.drives import describe_drive, parse_estimates
+from amvnet.fleet.drives import describe_drive, parse_estimate
 from amvnet.fleet.manifest import split_name
 from amvnet.fleet.storage import Place
 from amvnet.inference.listing import FileScan
@@ -238,13 +238,13 @@ class LabelScans:
         reader = self.labelling.make_reader(sensor, assumed.append)
         with self._fetch(rows, reader) as (files, _):
             assert reader.normaliser is not None
-            estimates = reader.normaliser.measure(source).medians
+            usual = reader.normaliser.measure(source).usual
             for scan in files:
                 with suppress(InputError):  # the line about the first scan that can be read
                     scan.load()
                     break
             line = assumed[0].replace(str(scan.path), scan.name) if assumed else ""
-        return describe_drive(source, sensor, line, estimates)
+        return describe_drive(source, sensor, line, usual)
 
     @contextmanager
     def _fetch(
@@ -276,7 +276,7 @@ class LabelScans:
         reader = labelling.make_reader(drive[0]["sensor"])
         if drive[0]["estimates"]:
             assert reader.normaliser is not None
-            reader.normaliser.recall(drive[0]["drive"], parse_estimates(drive[0]["estimates"]))
+            reader.normaliser.recall(drive[0]["drive"], parse_estimate(drive[0]["estimates"]))
 
         rows = []
         writing = deque[Future[Row]]()

@@ -163,7 +163,7 @@ class FleetRun:
         """Measure the drives of which only the first scans are known, and write them down."""
         rows = []
         for scans, row in self.workers.run("measure", list(self._first.values())):
-            rows.append(row or describe_drive(scans["drive"][0].as_py(), "", "", []))
+            rows.append(row or describe_drive(scans["drive"][0].as_py(), "", "", None))
         self._first.clear()
         self.results.add_drives(rows)
 

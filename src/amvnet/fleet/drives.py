@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -27,19 +26,17 @@ SCHEMA = pa.schema(
 )
 
 
-def describe_drive(
-    drive: str, sensor: str, assumed: str, estimates: Sequence[Estimate]
-) -> dict[str, Any]:
+def describe_drive(drive: str, sensor: str, assumed: str, usual: Estimate | None) -> dict[str, Any]:
     """Return the row of a drive.
 
     Args:
         sensor: its name in a manifest; empty if unknown.
         assumed: a line about the first scan.
-        estimates: one for each sensor of the first scans, the usual one first; none if these could
-            not be read.
+        usual: measured of the first scans; None if these could not be read, or are of several
+            sensors.
     """
-    frame = estimates[0].frame if estimates else Frame(height=None)
-    values = [dataclasses.asdict(estimate) for estimate in estimates]
+    frame = Frame() if usual is None else usual.frame
+    values = None if usual is None else dataclasses.asdict(usual)
     return {
         "drive": drive,
         "sensor": sensor,
@@ -51,13 +48,13 @@ def describe_drive(
     }
 
 
-def parse_estimates(text: str) -> list[Estimate]:
-    """Return the estimates in a row of a drive."""
-    estimates = []
-    for values in json.loads(text):
-        quantiles = values["quantiles"]
-        values["frame"] = Frame(**values["frame"])
-        values["lasers"] = SensorGeometry(**values["lasers"])
-        values["quantiles"] = None if quantiles is None else np.array(quantiles)
-        estimates.append(Estimate(**values))
-    return estimates
+def parse_estimate(text: str) -> Estimate | None:
+    """Return the estimate in a row of a drive."""
+    values = json.loads(text)
+    if values is None:
+        return None
+    quantiles = values["quantiles"]
+    values["frame"] = Frame(**values["frame"])
+    values["lasers"] = SensorGeometry(**values["lasers"])
+    values["quantiles"] = None if quantiles is None else np.array(quantiles)
+    return Estimate(**values)

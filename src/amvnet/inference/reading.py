@@ -32,8 +32,7 @@ class LoadedScan:
 
     Attributes:
         scan: as the segmenter takes it.
-        sensor: a title of what recorded it: the bag, folder or sequence, and what is unlike its
-            first scan.
+        sensor: what recorded it: the bag, folder or sequence.
         file_xyz: (N, 3) the coordinates as they are in the scan's file; None for a scan of a
             dataset.
     """
@@ -72,15 +71,14 @@ class FileReader:
         if self.normaliser is None:
             cloud = scan.read()
             normalised = cloud.to_scan()
-            title = scan.source
         else:
             if self.is_normalising:
                 self.normaliser.measure(scan.source)
             kept = self._kept.pop((scan.source, scan.name), None)
             cloud = scan.read() if kept is None else kept
-            normalised, title = self.normaliser.assign(cloud, scan.source)
+            normalised = self.normaliser(cloud, scan.source)
 
-        return LoadedScan(normalised, title, cloud.xyz)
+        return LoadedScan(normalised, scan.source, cloud.xyz)
 
     def _read_and_keep(self, scan: NamedScan) -> Cloud:
         """Read one of the first scans of a source, and forget those of others."""

@@ -168,7 +168,7 @@ class Segmentation:
     def save(self, path: Path | str) -> Path:
         """Write the labels, in the format of the path's ending; an existing file is replaced.
 
-        `.label` and `.npy` hold the raw ids; `.ply` and `.pcd` the points too, coloured by class,
+        `.label` and `.npy` hold the raw ids; `.ply` the points too, coloured by class,
         with the coordinates of the scan's file (`write_scan_labels` describes them).
 
         Returns:

@@ -127,7 +127,7 @@ def rank(
 
     def rank_scan(record: ScanRecord, scan: Scan) -> tuple[np.ndarray, float, int]:
         doubts = find_doubts(check_scan(scan), segmenter)
-        rows, _ = find_clusters(doubts)
+        rows = find_clusters(doubts)
         return rows, doubts.doubt.mean(), len(doubts.doubt)
 
     progress(0, len(records))
@@ -230,18 +230,10 @@ def _thing_sizes(xyz: np.ndarray, label: np.ndarray, valid: np.ndarray) -> np.nd
     return sizes
 
 
-def find_clusters(doubts: Doubts) -> tuple[np.ndarray, np.ndarray]:
-    """Group the doubted points of one scan into clusters.
-
-    Returns:
-        The (C,) clusters as rows of `ROW`, and the (N,) index of each point's cluster in them, -1
-        for points that are not doubted.
-    """
+def find_clusters(doubts: Doubts) -> np.ndarray:
+    """Group the doubted points of one scan into (C,) clusters, rows of `ROW`."""
     doubted = np.flatnonzero(doubts.doubt > 0)
     group = cluster(doubts.xyz[doubted], doubts.kind[doubted])
-    cluster_ids = np.full(len(doubts.doubt), -1)
-    cluster_ids[doubted] = group
-
     sizes = np.bincount(group)
     middle = doubted[_middle_points(doubts.xyz[doubted], group, sizes)]
     total_doubt = np.bincount(group, doubts.doubt[doubted])
@@ -257,7 +249,7 @@ def find_clusters(doubts: Doubts) -> tuple[np.ndarray, np.ndarray]:
     rows["bev"] = _most_common(doubts.bev[doubted], group, len(sizes))
     rows["label"] = doubts.label[middle]
     rows["kind"] = doubts.kind[middle]
-    return rows, cluster_ids
+    return rows
 
 
 def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.ndarray:

@@ -14,18 +14,13 @@ from amvnet.errors import InputError, errors_of
 from amvnet.scan import Scan
 from amvnet.sensors.frame import STEADY_TILT, Frame, find_frame, median_frame
 from amvnet.sensors.intensity import are_of_one_range, quantiles_of
-from amvnet.sensors.lasers import SensorGeometry, field_of_view, measure_lasers
+from amvnet.sensors.lasers import SensorGeometry, measure_lasers
 from amvnet.sensors.lidars import Sensor
 
 MEASURED = 5  # scans of a recording that are measured; later ones get the median of these
 STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
 SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
 LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
-
-# A scan is from a known sensor if some of its points differ by less. If not, all points decide.
-QUICK_STEP = 7  # only one of so many points; no multiple of it is a number of lasers
-QUICK_ANGLE = 3.0  # degrees
-QUICK_COUNT = 1.5  # factor between the numbers of points
 
 
 @dataclass(frozen=True)
@@ -36,15 +31,18 @@ class Estimate:
         frame: of the coordinates in the files.
         lasers: of the sensor, without its height.
         quantiles: of the intensities as they are in the files; None if there are none.
-        count: of the points.
         is_steady: whether the scans were recorded in one frame, at one height.
     """
 
     frame: Frame
     lasers: SensorGeometry
     quantiles: np.ndarray | None
-    count: int
     is_steady: bool = True
+
+    def is_like(self, other: Estimate) -> bool:
+        """Return whether scans are of one sensor: by their lasers and ranges of intensity."""
+        is_of_one_range = are_of_one_range(self.quantiles, other.quantiles)
+        return is_of_one_range and self.lasers.is_like(other.lasers)
 
 
 @dataclass(frozen=True)
@@ -69,25 +67,14 @@ class Gauge:
         usable = np.isfinite(cloud.xyz).all(axis=1) & (cloud.xyz != 0).any(axis=1)
         with errors_of(cloud.name):
             frame = find_frame(cloud.xyz[usable], self.sensor)
-        lasers = self.lasers(cloud, frame)
-        return Estimate(frame, lasers, quantiles_of(cloud.intensity), len(cloud.xyz))
 
-    def lasers(self, cloud: Cloud, frame: Frame) -> SensorGeometry:
-        """Measure the lasers of a scan whose frame is known."""
-        seen = self._seen(cloud, frame)
-        return measure_lasers(seen.points, seen.ring)
-
-    def _seen(self, cloud: Cloud, frame: Frame) -> Scan:
-        """Return the valid points of a scan as its sensor saw them.
-
-        All lasers are needed, in the order of the file, so that intensities do not count.
-        """
-        to_sensor, _ = self.rises(frame)
+        # The points as the sensor saw them; a point without an intensity was seen, too.
         scan = level_scan(cloud, frame.complete(self.sensor))
+        to_sensor, _ = self.rises(frame)
         seen = raise_points(scan, to_sensor)
         valid = scan.valid
-        ring = None if scan.ring is None else scan.ring[valid]
-        return dataclasses.replace(seen, points=seen.points[valid], ring=ring)
+        lasers = measure_lasers(seen.points[valid], None if scan.ring is None else scan.ring[valid])
+        return Estimate(frame, lasers, quantiles_of(cloud.intensity))
 
     def is_on_ground(self, frame: Frame) -> bool:
         """Return whether the origin of the coordinates lies on the ground, or below."""
@@ -118,48 +105,35 @@ class Gauge:
             return 0.0, 0.0
         return 0.0, height - usual
 
-    def may_have_recorded(self, cloud: Cloud, estimate: Estimate) -> bool:
-        """Return whether a scan may be from the sensor of an estimate, by its lasers.
-
-        Some of the points are enough for most scans. Their lasers are counted only if the field of
-        view or the number of points differs.
-        """
-        some = dataclasses.replace(cloud, xyz=cloud.xyz[::QUICK_STEP], intensity=None, ring=None)
-        ratio = len(cloud.xyz) / max(estimate.count, 1)
-        known = estimate.lasers.field_of_view
-        if known is None:
-            return True
-
-        if 1 / QUICK_COUNT < ratio < QUICK_COUNT:
-            ends = field_of_view(self._seen(some, estimate.frame).points)
-            if ends is not None and np.abs(np.subtract(ends, known)).max() < QUICK_ANGLE:
-                return True
-        return self.lasers(cloud, estimate.frame).is_like(estimate.lasers)
-
 
 class Recording:
-    """The scans of one source, and what was measured of the first ones.
+    """What is assumed of the scans of one source, by what is measured of the first ones.
 
-    A source usually has one sensor. Its scans get the median of the first `MEASURED` estimates;
-    scans of other sensors, told by their lasers and the range of their intensities, get their own.
+    All scans get the median of the first `MEASURED` estimates. If these are of several sensors,
+    each scan gets its own estimate.
+
+    Attributes:
+        usual: the median; None as long as nothing is measured, and for several sensors.
 
     Args:
         gauge: measures the scans.
     """
 
     def __init__(self, gauge: Gauge) -> None:
-        self.medians: list[Estimate] = []  # one for each sensor of the first scans
+        self.usual: Estimate | None = None
         self._gauge = gauge
-        self._estimates: list[list[Estimate]] = []  # those of each median
+        self._first: list[Estimate] = []
         self._is_learnt = False
 
-    @classmethod
-    def of(cls, gauge: Gauge, medians: Sequence[Estimate]) -> Recording:
-        """Return a recording that was measured before; without medians, each scan gets its own."""
-        recording = cls(gauge)
-        recording.medians = list(medians)
-        recording._is_learnt = True
-        return recording
+    @property
+    def is_mixed(self) -> bool:
+        """Whether the first scans are of several sensors."""
+        return self._is_learnt and self.usual is None
+
+    def recall(self, usual: Estimate | None) -> None:
+        """Take what was measured before; with None, each scan gets its own estimate."""
+        self.usual = usual
+        self._is_learnt = True
 
     def learn(self, first: Sequence[Callable[[], Cloud]]) -> None:
         """Measure the first scans; later ones add nothing.
@@ -172,66 +146,32 @@ class Recording:
                 with suppress(InputError):
                     self._add(self._gauge(read()))
 
-        self._is_learnt = bool(self.medians)
+        self._is_learnt = bool(self._first)
 
-    def estimate(self, cloud: Cloud) -> tuple[int | None, Estimate]:
-        """Return the estimate for a scan.
-
-        Returns:
-            Which of the sensors of the first scans it is from, None if from none of them; and what
-            to assume of the sensor.
+    def estimate(self, cloud: Cloud) -> Estimate:
+        """Return what to assume of the sensor of a scan.
 
         Raises:
             InputError: as `Gauge`.
         """
-        if self._is_learnt:
-            return self._recall(cloud)
+        if self._is_learnt and self.usual is not None and self.usual.is_steady:
+            return self.usual
 
         measured = self._gauge(cloud)
-        index = self._add(measured)
-        median = self.medians[index]
-        if median.is_steady:
-            return index, median
-        return index, dataclasses.replace(measured, quantiles=median.quantiles)
+        if not self._is_learnt:
+            self._add(measured)
+        if self.usual is None:
+            return measured
+        if self.usual.is_steady:
+            return self.usual
+        return dataclasses.replace(measured, quantiles=self.usual.quantiles)
 
-    def _recall(self, cloud: Cloud) -> tuple[int | None, Estimate]:
-        """Return the same as `estimate` for a scan that adds nothing to the medians."""
-        quantiles = quantiles_of(cloud.intensity)
-        measured: Estimate | None = None
-
-        for index, median in enumerate(self.medians):
-            if not are_of_one_range(quantiles, median.quantiles):
-                continue
-            if median.is_steady:
-                if self._gauge.may_have_recorded(cloud, median):
-                    return index, median
-                continue
-
-            # The frame of each scan is its own, so that its lasers are known only in that.
-            measured = measured or self._gauge(cloud)
-            if measured.lasers.is_like(median.lasers):
-                return index, dataclasses.replace(measured, quantiles=median.quantiles)
-        return None, measured or self._gauge(cloud)
-
-    def _add(self, estimate: Estimate) -> int:
-        """Add the estimate of one of the first scans; return the index of its sensor."""
-        index = self._sensor_of(estimate)
-        if index == len(self.medians):
-            self._estimates.append([])
-            self.medians.append(estimate)
-
-        self._estimates[index].append(estimate)
-        self.medians[index] = median_of(self._estimates[index])
-        self._is_learnt = sum(map(len, self._estimates)) == MEASURED
-        return index
-
-    def _sensor_of(self, estimate: Estimate) -> int:
-        """Return the index of the first sensor that is like that of an estimate."""
-        for index, median in enumerate(self.medians):
-            is_of_one_range = are_of_one_range(estimate.quantiles, median.quantiles)
-            if is_of_one_range and estimate.lasers.is_like(median.lasers):
-                return index
-        return len(self.medians)
+    def _add(self, estimate: Estimate) -> None:
+        """Add the estimate of one of the first scans."""
+        self._first.append(estimate)
+        is_of_one_sensor = all(each.is_like(self._first[0]) for each in self._first)
+        self.usual = median_of(self._first) if is_of_one_sensor else None
+        self._is_learnt = len(self._first) == MEASURED
 
 
 def median_of(estimates: Sequence[Estimate]) -> Estimate:
@@ -242,7 +182,6 @@ def median_of(estimates: Sequence[Estimate]) -> Estimate:
         median_frame(frames),
         SensorGeometry.median([estimate.lasers for estimate in estimates]),
         quantiles=np.median(quantiles, axis=0) if quantiles else None,
-        count=int(np.median([estimate.count for estimate in estimates])),
         is_steady=_are_steady(frames),
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -116,7 +116,7 @@ class Normaliser:
         expected: what the weights expect; None turns scans only as the sensor says, for people to
             look at.
         sensor: what is known of the sensor of the scans; the rest is measured.
-        say: called once for each sensor of a recording, with what was assumed.
+        say: called once for each recording, with what was assumed.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Normaliser:
         self._say = say
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
-        self._said: set[str] = set()  # of which sensors
+        self._said: set[str] = set()  # of which recordings
 
     def expect(self, source: str, read: Callable[[], Cloud]) -> None:
         """Announce the next scan of a source, before any is normalised.
@@ -155,36 +155,21 @@ class Normaliser:
         Raises:
             InputError: if no point is usable, or the unit of the coordinates is in doubt.
         """
-        scan, _ = self.assign(cloud, source)
-        return scan
-
-    def assign(self, cloud: Cloud, source: str) -> tuple[Scan, str]:
-        """Return the scan, and a title of its sensor: the source, and whether it is the usual one.
-
-        Raises:
-            InputError: if no point is usable, or the unit of the coordinates is in doubt.
-        """
         if self.expected is None:
-            return self._turn(cloud, source), source
+            return self._turn(cloud, source)
 
-        index, estimate = self.measure(source).estimate(cloud)
-        title = source
-        if index is None:
-            title = f"{source}, scans unlike the first ones"
-        elif index > 0:
-            lasers = describe_lasers(estimate.lasers.override(self.sensor))
-            title = f"{source}, another sensor or scale of intensity ({lasers})"
-
-        is_new = title not in self._said
-        if estimate.is_steady or is_new:
-            self._check_height(cloud, estimate.frame)
+        recording = self.measure(source)
+        estimate = recording.estimate(cloud)
+        self._check_height(cloud, estimate.frame)
         scan = normalise(cloud, estimate, self.sensor, self.expected)
-        if is_new:
-            self._said.add(title)
+
+        if source not in self._said:
+            self._said.add(source)
             line = describe(cloud, estimate, self.sensor, self.expected)
-            unlike = "; another sensor or scale of intensity than in the first scan"
-            self._say(line if index == 0 else f"{line}{unlike} of {source}")
-        return scan, title
+            if recording.is_mixed:
+                line += f"; {source} has scans of other sensors, so that each is measured alone"
+            self._say(line)
+        return scan
 
     def measure(self, source: str) -> Recording:
         """Return what is measured of a source: the first time, of the scans that were announced."""
@@ -193,9 +178,10 @@ class Normaliser:
             self._recordings[source].learn(self._first.pop(source, []))
         return self._recordings[source]
 
-    def recall(self, source: str, medians: Sequence[Estimate]) -> None:
+    def recall(self, source: str, usual: Estimate | None) -> None:
         """Normalise the scans of a source by what `measure` found before, in another process."""
-        self._recordings[source] = Recording.of(self._gauge(), medians)
+        self._recordings[source] = Recording(self._gauge())
+        self._recordings[source].recall(usual)
 
     def _gauge(self) -> Gauge:
         assert self.expected is not None
@@ -212,7 +198,8 @@ class Normaliser:
         rows of the range image are lasers, the lasers that decide the rows.
         """
         assert self.expected is not None
-        medians = [median for each in self._recordings.values() for median in each.medians]
+        recordings = self._recordings.values()
+        medians = [recording.usual for recording in recordings if recording.usual is not None]
         lasers = self.expected.lasers
         height = self.expected.sensor.height
         if medians:

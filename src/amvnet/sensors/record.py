@@ -57,6 +57,8 @@ def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
             continue
         if abs(value) < LARGEST:  # also false for NaN
             measures[key] = round(value) if key == "beams" else float(value)
+    if measures:
+        measures.setdefault("beams", None)  # a measured sensor need not be that of the data sheet
 
     try:
         return dataclasses.replace(sensor, **measures)

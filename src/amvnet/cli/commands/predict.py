@@ -23,7 +23,7 @@ from amvnet.progress import counted
 if TYPE_CHECKING:
     from amvnet.data.formats.rows import RowLayout
 
-FormatName = Literal["label", "npy", "ply", "pcd"]
+FormatName = Literal["label", "npy", "ply"]
 
 
 def predict(
@@ -61,7 +61,7 @@ def predict(
         scores: also write the probabilities of both networks.
         resume: continue an earlier run into the folder: segment only the scans that are new or were
             not done, with the same weights and options.
-        format: of scan files' labels: raw ids alone (label, npy), or coloured points (ply, pcd).
+        format: of scan files' labels: raw ids alone (label, npy), or coloured points (ply).
         uncertain: also write which points the two networks disagree on, as NAME.uncertain.npy.
         classes: write the ids of these classes, to which those of the weights are mapped: coarse,
             or a YAML file.

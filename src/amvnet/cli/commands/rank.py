@@ -16,7 +16,6 @@ def rank(
     compute: ComputeChoice,
     split: Split = "all",
     sequences: str | None = None,
-    pictures: Path | None = None,
     overwrite: bool = False,
 ) -> None:
     """Rank clusters of points, and scans, whose labels both views contradict, to check them.
@@ -28,25 +27,18 @@ def rank(
         compute: where and how the networks are computed.
         split: the official split.
         sequences: sequences or scenes instead, separated by commas.
-        pictures: folder for drawings of the first clusters from above.
         overwrite: replace files that amvnet did not write, too.
     """
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.ranking.label_errors import rank as rank_records
     from amvnet.ranking.label_errors import scans_path, write_ranking
-    from amvnet.ranking.pictures import draw, possible_files
     from amvnet.weights.file import load
     from amvnet.written import protecting
 
     # Before any scan is scored, so that no time is wasted.
     make_folder(out.parent)
-    files = [out, scans_path(out)]
-    if pictures is not None:
-        make_folder(pictures)
-        files += possible_files(pictures)
-
-    with protecting(files, overwrite):
+    with protecting([out, scans_path(out)], overwrite):
         loaded = load(weights)
         dataset = open_for_weights(data, loaded)
         records = labelled_scans(dataset, sequences, split)
@@ -57,6 +49,3 @@ def rank(
         scans = write_ranking(ranking, dataset.taxonomy, out)
         clusters = counted(len(ranking.clusters), "cluster")
         say(f"{clusters} in {out}, {counted(len(records), 'scan')} in {scans}")
-        if pictures is not None:
-            drawn = draw(ranking, dataset, segmenter, pictures)
-            say(f"{counted(len(drawn), 'picture')} in {pictures}")
