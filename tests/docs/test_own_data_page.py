@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pytest
 
 from amvnet.weights.file import load, save
 
