@@ -47,6 +47,7 @@ class Label(IntEnum):
     TRAFFIC_CONE = 301, "movable_object.trafficcone", 99
     CONSTRUCTION_VEHICLE = 302, "vehicle.construction", 20
     TRAILER = 303, "vehicle.trailer", 20
+    CAMPER = 304, "vehicle.truck", 20
 
     category: str
     raw: int

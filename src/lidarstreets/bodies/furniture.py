@@ -150,7 +150,8 @@ def sign(rng: np.random.Generator) -> Mesh:
     elif kind < 0.10:
         mesh = _chevron(rng)
     else:
-        height = rng.uniform(1.6, 2.8)  # of the lower edge of the upper sign
+        # The lower edge of the upper sign; a few are as low as a person.
+        height = rng.uniform(1.6, 2.8) if rng.random() < 0.88 else rng.uniform(0.4, 1.4)
         mast = part(
             [_pole(rng, height + 0.5, rng.uniform(0.025, 0.05))],
             Surface.METAL,

@@ -128,6 +128,26 @@ def bush(rng: np.random.Generator, radius: float) -> Mesh:
     return _ball(rng, radius, height, rng.uniform(0.02, 0.15))
 
 
+def slender_bush(rng: np.random.Generator) -> Mesh:
+    """Return a rose, a young thuja or a perennial: as tall as a person or lower, and narrower."""
+    radius = rng.uniform(0.1, 0.35)
+    height = rng.uniform(0.5, 1.9)
+    middle = height * rng.uniform(0.45, 0.7)
+
+    # Some are bare below.
+    half = min(middle, height - middle) if rng.random() < 0.5 else middle
+    radii = (radius, radius * rng.uniform(0.7, 1.3), half)
+    taper = rng.uniform(0.3, 1.0)
+    leaves = hull(rng, (0, 0, middle), radii, taper=taper, fine=False)
+    depth = rng.uniform(0.01, 0.3)
+    stem = tube((0, 0, -FOOT), (0, 0, middle), rng.uniform(0.01, 0.03), sides=4, closed=False)
+
+    return join(
+        part([stem], Surface.BARK, Label.VEGETATION),
+        foliage([leaves], depth, rng.normal(scale=0.6)),
+    )
+
+
 def _ball(rng: np.random.Generator, radius: float, height: float, depth: float) -> Mesh:
     radii = (radius, radius * rng.uniform(0.7, 1.3), height)
     clump = hull(rng, (0, 0, height * rng.uniform(0.6, 0.9)), radii, fine=radius > 1)

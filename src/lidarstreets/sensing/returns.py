@@ -126,6 +126,7 @@ def _intensity(
 
     brightness = reflectivity * noise * power**2 / (power**2 + sensor.half_power**2)
     brightness /= 1 + (hits.distance / sensor.half_range) ** FADING
+    brightness *= np.interp(hits.distance, *np.transpose(sensor.response))
     brightness *= 1 - lasers.near_loss[hits.ring] * is_near
 
     brightness[rng.random(count, np.float32) < dark] *= DARK_SHARE

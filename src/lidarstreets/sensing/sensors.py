@@ -54,6 +54,8 @@ class LidarModel:
     drop: float = 0.01
     # Range in metres at which the device reports half of the reflectivity, whatever the power.
     half_range: float = np.inf
+    # Ranges in metres, rising, and the factors on the brightness of returns at these ranges.
+    response: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
     # Brightness below which most returns have the intensity 0; 0 if there is no such limit.
     least_brightness: float = 0.0
     # Mean share of the brightness of near surfaces that the upper half of the lasers loses: they
@@ -143,12 +145,13 @@ HDL32E = LidarModel(
     gamma=2.6,
     decimals=3,
     gain_spread=0.05,
-    half_power=0.007,
+    half_power=0.002,
     rotation_period=0.05,
     counter_clockwise=False,
     keeps_lost_returns=True,
     layout="nuscenes",
     height_spread=0.10,
+    response=((3.5, 1.08), (7, 1.1), (12, 0.84), (19, 0.79), (31, 0.97), (52, 1.14)),
     shadow=_HDL32E_SHADOW,
 )
 

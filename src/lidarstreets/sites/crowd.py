@@ -23,7 +23,7 @@ OCCASIONS = {
     "stand by a car": 0.06,
 }
 # Occasions per person that `Style.people` counts, and parked two-wheelers per such person.
-PEOPLE_FACTOR = 1.4
+PEOPLE_FACTOR = 0.9
 TWO_WHEELER_FACTOR = 0.6
 END_MARGIN = 2.0  # metres: nobody is nearer to the end of a street
 

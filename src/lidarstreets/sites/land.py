@@ -306,5 +306,6 @@ def plant_bushes(plot: Plot, count: int, depth: float = 6.0) -> None:
     rng = plot.rng
     for _ in range(count):
         distance = plot.front + rng.uniform(0.8, max(depth, 1.5))
-        bush = plants.bush(rng, rng.uniform(0.3, 1.6))
+        is_slender = rng.random() < 0.3
+        bush = plants.slender_bush(rng) if is_slender else plants.bush(rng, rng.uniform(0.3, 1.6))
         plot.put(bush, plot.random_x(), distance)

@@ -11,6 +11,7 @@ from lidarstreets.streets.plans import Roundabout
 # Furniture per 100 m of street on each side.
 SIGNS = 3.0
 POSTS = 0.5
+SLENDER_BUSHES = 0.8  # times `Style.green`
 CLUTTER = 1.6
 SHELTERS = 0.15
 # Share of the streets of a kind with a crash barrier along one side.
@@ -47,6 +48,7 @@ def fill_roadside(site: Site, side: int) -> None:
     roadside = (
         (furniture.sign, SIGNS, kerb_t),
         (furniture.post, POSTS, back_t),
+        (plants.slender_bush, SLENDER_BUSHES * style.green, back_t),
         (clutter.clutter, CLUTTER, back_t),
         (clutter.shelter, SHELTERS, back_t),
     )

@@ -13,15 +13,17 @@ from lidarstreets.streets.plans import SideRoad
 # Shares of the vehicles that park along the street, and of vehicles that drive.
 PARKED_VEHICLES = {
     cars.car: 0.860,
-    trucks.truck: 0.054,
+    trucks.truck: 0.048,
     machines.trailer: 0.036,
+    machines.camper: 0.006,
     two_wheelers.motorcycle: 0.042,
     buses.bus: 0.004,
     machines.machine: 0.004,
 }
 DRIVING_VEHICLES = {
     cars.car: 0.880,
-    trucks.truck: 0.055,
+    trucks.truck: 0.049,
+    machines.camper: 0.006,
     buses.bus: 0.015,
     two_wheelers.motorcyclist: 0.04,
     machines.machine: 0.006,
@@ -29,7 +31,8 @@ DRIVING_VEHICLES = {
 }
 MOTORWAY_VEHICLES = {
     cars.car: 0.80,
-    trucks.truck: 0.17,
+    trucks.truck: 0.16,
+    machines.camper: 0.01,
     buses.bus: 0.02,
     two_wheelers.motorcyclist: 0.01,
 }

@@ -200,7 +200,7 @@ class Ground(MiddleLine):
     def tint(self, x: np.ndarray, y: np.ndarray, label: np.ndarray) -> np.ndarray:
         """Return the tint of the ground, as in `Mesh`; it varies from place to place."""
         tint = self._brightness.terrain_tint(x, y, label)
-        is_paved = label != Label.TERRAIN
+        is_paved = (label != Label.TERRAIN) & (label != Label.VEGETATION)
         along, t = self.street_coordinates(x[is_paved], y[is_paved])
         tint[is_paved] += self._brightness.repairs(along, t)
         return tint

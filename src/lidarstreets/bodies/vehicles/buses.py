@@ -5,7 +5,7 @@ import numpy as np
 from lidarstreets.bodies.vehicles.parts import glass, plates_and_lamps, wheels
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place
-from lidarstreets.solids import box, copies
+from lidarstreets.solids import box, copies, prism
 
 
 def bus(rng: np.random.Generator) -> Mesh:
@@ -15,8 +15,8 @@ def bus(rng: np.random.Generator) -> Mesh:
 
     kind = rng.random()
     if kind < 0.2:
-        length = rng.uniform(6.0, 8.5)
-        return _section(rng, length, width * 0.92, min(height, 2.9), (-0.28, 0.3))
+        minibus = _minibus if rng.random() < 0.6 else _small_bus
+        return minibus(rng, min(height, 2.9))
     if kind < 0.85:
         return _section(rng, rng.uniform(9.5, 13.5), width, height, (-0.26, 0.30))
 
@@ -25,6 +25,34 @@ def bus(rng: np.random.Generator) -> Mesh:
     bellows = part([box((1.2, width * 0.9, 2.5), (-0.6, 0, 0.4))], Surface.RUBBER, Label.BUS)
     bend = rng.normal(scale=0.1)
     return join(place(front, x=4.75), bellows, place(rear, x=-4.75, yaw=bend))
+
+
+def _small_bus(rng: np.random.Generator, height: float) -> Mesh:
+    return _section(rng, rng.uniform(6.0, 8.5), rng.uniform(2.1, 2.35), height, (-0.28, 0.3))
+
+
+def _minibus(rng: np.random.Generator, height: float) -> Mesh:
+    """Return a van with a bonnet and rows of seats."""
+    length = rng.uniform(5.3, 7.8)
+    width = rng.uniform(1.95, 2.2)
+    bonnet = rng.uniform(0.7, 1.2)
+    body = _section(rng, length - bonnet, width, height, (-0.25,))
+
+    half = length / 2
+    cabin = half - bonnet
+    sill = rng.uniform(1.1, 1.35)
+    lower = [
+        (cabin, 0.3), (half, 0.3), (half, 0.75), (half - 0.15, sill - 0.2), (cabin, sill)
+    ]  # fmt: skip
+    screen = [(cabin + 0.01, sill), (half - 0.3, sill - 0.1), (cabin + 0.01, height - 0.4)]
+
+    return join(
+        place(body, x=-bonnet / 2),
+        part([prism(lower, width * 0.96)], Surface.COATING, Label.BUS),
+        glass([prism(screen, width * 0.9)], Label.BUS, bool(rng.random() < 0.5)),
+        plates_and_lamps(Label.BUS, half, width, 0.5, 0.6),
+        wheels(Label.BUS, (cabin - 0.1,), width, 0.35, 0.25),
+    )
 
 
 def tram(rng: np.random.Generator) -> Mesh:

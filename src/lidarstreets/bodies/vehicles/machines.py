@@ -1,8 +1,8 @@
-"""Meshes of trailers, caravans and machines, which SemanticKITTI counts as other vehicles."""
+"""Meshes of trailers, caravans, motor homes and machines: SemanticKITTI's other vehicles."""
 
 import numpy as np
 
-from lidarstreets.bodies.vehicles.parts import glass, lamps, wheels
+from lidarstreets.bodies.vehicles.parts import glass, lamps, plates_and_lamps, wheels
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, scaled
@@ -71,6 +71,36 @@ def caravan(rng: np.random.Generator) -> Mesh:
         part([door, *_drawbar(length, floor + 0.1)], Surface.PLASTIC, Label.TRAILER),
         wheels(Label.TRAILER, _axles(rng, length), width, 0.33, 0.2),
         lamps(half, width, floor + 0.3, Label.TRAILER),
+    )
+
+
+def camper(rng: np.random.Generator) -> Mesh:
+    """Return a motor home: a van's cab and a living box, often with an alcove over the cab."""
+    length = rng.uniform(5.4, 7.5)
+    width = rng.uniform(2.0, 2.35)
+    height = rng.uniform(2.6, 3.2)
+    half = length / 2
+    door = half - rng.uniform(1.5, 2.0)
+    belt = 1.2
+
+    nose = [(door, 0.3), (half, 0.3), (half, 0.8), (half - 0.7, belt), (door, belt)]
+    screen = [(door, belt + 0.01), (half - 0.7, belt + 0.01), (door + 0.3, 2.05), (door, 2.05)]
+    living = box(
+        (door + half, width, height - 0.35), ((door - half) / 2, 0, 0.35), top=(0.99, 0.97)
+    )
+    white = [prism(nose, width * 0.92), living]
+    if rng.random() < 0.5:
+        alcove = [(door, 2.05), (door + 0.4, 2.05), (door + 1.1, 2.35), (door, height)]
+        white.append(prism(alcove, width))
+    panes = copies(box((0.9, width + 0.03, 0.5)), x=[-half * 0.5, half * 0.15], z=1.4)
+    awning = box((length * 0.5, 0.12, 0.12), (-0.3, -width / 2, height - 0.3))
+
+    return join(
+        part([*white, awning], Surface.LIGHT_PAINT, Label.CAMPER),
+        glass([prism(screen, width * 0.88)], Label.CAMPER, bool(rng.random() < 0.5)),
+        part([panes], Surface.GLASS, Label.CAMPER),
+        wheels(Label.CAMPER, (-half * 0.5, half * 0.7), width, 0.34),
+        plates_and_lamps(Label.CAMPER, half, width, 0.55, 0.7),
     )
 
 

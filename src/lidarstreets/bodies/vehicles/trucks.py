@@ -11,18 +11,13 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, prism, tube
 
-# Shares of semi-trailers and of motor homes among the trucks.
-SEMI_TRAILERS = 0.10
-CAMPERS = 0.12
+SEMI_TRAILERS = 0.10  # share of the trucks
 
 
 def truck(rng: np.random.Generator) -> Mesh:
     """Return a truck of any kind, from a small box truck to a semi-trailer."""
-    kind = rng.random()
-    if kind < SEMI_TRAILERS:
+    if rng.random() < SEMI_TRAILERS:
         return _semi_trailer(rng)
-    if kind < SEMI_TRAILERS + CAMPERS:
-        return _camper(rng)
 
     length = rng.uniform(5.2, 7.0) if rng.random() < 0.45 else rng.uniform(7.0, 11.0)
     is_light = length < 7.0
@@ -156,36 +151,6 @@ def _semi_trailer(rng: np.random.Generator) -> Mesh:
         wheels(Label.TRUCK, axles, width, 0.5, 0.35),
         plates_and_lamps(Label.TRUCK, half, width, 0.6, 0.8),
         *maker(rng, load),
-    )
-
-
-def _camper(rng: np.random.Generator) -> Mesh:
-    """Return a motor home: a van's cab and a living box, often with an alcove over the cab."""
-    length = rng.uniform(5.4, 7.5)
-    width = rng.uniform(2.0, 2.35)
-    height = rng.uniform(2.6, 3.2)
-    half = length / 2
-    door = half - rng.uniform(1.5, 2.0)
-    belt = 1.2
-
-    nose = [(door, 0.3), (half, 0.3), (half, 0.8), (half - 0.7, belt), (door, belt)]
-    screen = [(door, belt + 0.01), (half - 0.7, belt + 0.01), (door + 0.3, 2.05), (door, 2.05)]
-    living = box(
-        (door + half, width, height - 0.35), ((door - half) / 2, 0, 0.35), top=(0.99, 0.97)
-    )
-    white = [prism(nose, width * 0.92), living]
-    if rng.random() < 0.5:
-        alcove = [(door, 2.05), (door + 0.4, 2.05), (door + 1.1, 2.35), (door, height)]
-        white.append(prism(alcove, width))
-    panes = copies(box((0.9, width + 0.03, 0.5)), x=[-half * 0.5, half * 0.15], z=1.4)
-    awning = box((length * 0.5, 0.12, 0.12), (-0.3, -width / 2, height - 0.3))
-
-    return join(
-        part([*white, awning], Surface.LIGHT_PAINT, Label.TRUCK),
-        glass([prism(screen, width * 0.88)], Label.TRUCK, bool(rng.random() < 0.5)),
-        part([panes], Surface.GLASS, Label.TRUCK),
-        wheels(Label.TRUCK, (-half * 0.5, half * 0.7), width, 0.34),
-        plates_and_lamps(Label.TRUCK, half, width, 0.55, 0.7),
     )
 
 
