@@ -9,7 +9,9 @@ def read_table(path: Path) -> dict[str, dict[str, Any]]:
     """Read the rows of a TOML file by name; arrays become tuples."""
     table = tomllib.loads(path.read_text(encoding="utf-8"))
     for row in table.values():
-        for column, value in row.items():
-            if isinstance(value, list):
-                row[column] = tuple(value)
+        row.update({column: _without_lists(value) for column, value in row.items()})
     return table
+
+
+def _without_lists(value: Any) -> Any:
+    return tuple(map(_without_lists, value)) if isinstance(value, list) else value

@@ -1,10 +1,12 @@
 """The LiDARs that can be simulated, each a table of numbers."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from lidarstreets.errors import SimulationError
+from lidarstreets.tables import read_table
 
 # Largest difference between a device and its type, in standard deviations.
 MOST_DEVIATIONS = 2.5
@@ -79,83 +81,8 @@ class LidarModel:
     response_spread: float = 0.35
 
 
-# Degrees, from the top down: medians over the points of KITTI's scans, laser by laser.
-_HDL64E_ELEVATIONS = (
-    2.59, 2.20, 1.96, 1.51, 1.22, 0.81, 0.54, 0.17, -0.18, -0.59, -0.89,
-    -1.23, -1.58, -1.89, -2.17, -2.52, -2.84, -3.25, -3.51, -3.92, -4.22, -4.56,
-    -4.89, -5.18, -5.54, -5.85, -6.14, -6.41, -6.77, -7.14, -7.38, -7.76, -8.38,
-    -8.90, -9.35, -9.74, -10.20, -10.80, -11.30, -11.72, -12.17, -12.60, -13.12, -13.64,
-    -14.21, -14.64, -15.14, -15.51, -16.13, -16.66, -17.21, -17.67, -18.16, -18.58, -19.01,
-    -19.58, -20.07, -20.71, -21.17, -21.59, -22.01, -22.67, -23.13, -23.64,
-)  # fmt: skip
-
-_HDL64E_SHADOW = (
-    (-14, 14, -90, -20.9), (-22, 22, -90, -21.9), (28, 32, -90, -22.9), (132, 142, -90, -19.7),
-    (159, 167, -90, -13.0), (196, 206, -90, -13.0), (160, 208, -90, -18.1),
-    (140, 224, -90, -22.4), (230, 240, -90, -19.7), (284, 304, -22.4, -15.8),
-    (328, 332, -90, -21.9), (336, 340, -90, -21.9),
-)  # fmt: skip
-
-# The shadow is of KITTI's car.
-HDL64E = LidarModel(
-    elevations=_HDL64E_ELEVATIONS,
-    azimuth_steps=2180,
-    height=1.73,
-    min_range=1.3,
-    max_range=80.0,
-    range_noise=0.0085,
-    reach=560.0,
-    mixed=0.06,
-    gain=1.0,
-    gamma=1.0,
-    decimals=2,
-    gain_spread=0.12,
-    half_power=0.0038,
-    rotation_period=0.1,
-    counter_clockwise=True,
-    keeps_lost_returns=False,
-    layout="semantickitti",
-    height_spread=0.06,
-    shadow=_HDL64E_SHADOW,
-    half_range=44.0,
-    least_brightness=0.14,
-    near_loss=0.2,
-    own_returns=27.0,
-)
-
-_HDL32E_SHADOW = (
-    (-50, 50, -90, -23.5), (-52, 55, -90, -26), (-50, 62, -90, -27.5), (-60, 85, -90, -29),
-    (-80, 90, -90, -30), (120, 230, -90, -30), (125, 230, -90, -29), (132, 222, -90, -27.5),
-    (137, 220, -90, -26), (146, 213, -90, -23.5), (150, 205, -90, -22), (160, 195, -90, -21),
-    (170, 190, -90, -18),
-)  # fmt: skip
-
-# The lasers are evenly spaced. Noise, intensity and shadow are as in nuScenes, whose scans have a
-# point for every shot.
-HDL32E = LidarModel(
-    elevations=tuple(10.67 - i * 4 / 3 for i in range(32)),
-    azimuth_steps=1084,
-    height=1.84,
-    min_range=1.0,
-    max_range=100.0,
-    range_noise=0.005,
-    reach=230.0,
-    mixed=0.05,
-    gain=0.85,
-    gamma=2.6,
-    decimals=3,
-    gain_spread=0.05,
-    half_power=0.002,
-    rotation_period=0.05,
-    counter_clockwise=False,
-    keeps_lost_returns=True,
-    layout="nuscenes",
-    height_spread=0.10,
-    response=((3.5, 1.08), (7, 1.1), (12, 0.84), (19, 0.79), (31, 0.97), (52, 1.14)),
-    shadow=_HDL32E_SHADOW,
-)
-
-SENSORS: dict[str, LidarModel] = {"hdl64e": HDL64E, "hdl32e": HDL32E}
+_TABLE = read_table(Path(__file__).with_suffix(".toml"))
+SENSORS = {name: LidarModel(**row) for name, row in _TABLE.items()}
 
 
 def sensor_of(name: str) -> LidarModel:
