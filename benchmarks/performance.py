@@ -26,7 +26,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 import amvnet.inference.segmenter
-import amvnet.models.amvnet
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
@@ -36,10 +35,9 @@ from amvnet.data.labels.ids import write_ids
 from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
 from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, run_once, untrained
-from amvnet.models.amvnet import AMVNet, step
 from amvnet.models.layers import upsample
 from amvnet.models.methods import ONNX_ENGINES
-from amvnet.models.point_head import head_features, point_table
+from amvnet.models.point_head import PointHead, head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.polar_view import PolarGrid
 from lidarstreets import simulate
@@ -91,18 +89,16 @@ def without_sharing() -> None:
     """Compute the head's first layer for every neighbour of every uncertain point."""
 
     def settle(
-        self: AMVNet, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor
+        self: PointHead, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor
     ) -> Tensor:
-        head = self.point_head
-        assert head is not None
         table = point_table(points, f, g)
         logits = []
         for uncertain, neighbours in zip(index.split(2048), near.split(2048), strict=True):
-            point, rows = head_features(head.config, table, uncertain, neighbours)
-            logits.append(head(point, rows))
+            point, rows = head_features(self.config, table, uncertain, neighbours)
+            logits.append(self(point, rows))
         return torch.cat(logits).softmax(dim=1)
 
-    AMVNet.settle = step("head")(settle)  # type: ignore[method-assign]
+    PointHead.settle = settle  # type: ignore[method-assign]
 
 
 UNCHANGED = "as it is"
@@ -168,8 +164,6 @@ def build_salsanext(engine: str) -> tuple[nn.Module, torch.Tensor]:
     """Return SalsaNext in an engine, and an image for it."""
     net = SalsaNext().eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     image = torch.randn(1, CHANNELS, HEIGHT, WIDTH).contiguous(memory_format=torch.channels_last)
-    if engine == "compile":
-        net = torch.compile(net)
     if engine in ONNX_ENGINES:  # in float32 also next to int8
         path = cache_folder() / "salsanext.onnx"
         path.parent.mkdir(parents=True, exist_ok=True)

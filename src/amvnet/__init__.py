@@ -74,8 +74,7 @@ def load(
             `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
         device, method, precision, tau: as for `Segmenter`; "auto" chooses a device that the engine
             runs on.
-        engine: what runs the networks: "torch", "compile", "onnx", "int8", or "auto", the fastest
-            that gives the same labels here.
+        engine: what runs the networks: "torch", "onnx" or "int8".
 
     Raises:
         InputError: if there are no such weights, they lack a part that the method needs, or the

@@ -58,7 +58,6 @@ class SomeBroken(Exception):
 def one_line_errors(
     message: Callable[[BaseException], str],
     only: tuple[type[Exception], ...] = (Exception,),
-    leave: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
     """Turn whatever a library raises on bad input into an `InputError` of one line.
 
@@ -67,7 +66,6 @@ def one_line_errors(
     Args:
         message: returns the line for an exception.
         only: the exceptions to convert; others pass unchanged.
-        leave: exceptions to exclude from `only`; they pass unchanged, too.
 
     Raises:
         InputError: if the block raises one of the exceptions to convert, or a library written in
@@ -79,8 +77,7 @@ def one_line_errors(
         # A panic of a library written in Rust is no `Exception`, and no module exports its class.
         is_panic = type(error).__name__ == "PanicException"
         is_bad_input = isinstance(error, only) or is_panic
-        passes = isinstance(error, (InputError, *leave))
-        if passes or not is_bad_input:
+        if isinstance(error, InputError) or not is_bad_input:
             raise
         raise InputError(message(error)) from error
 

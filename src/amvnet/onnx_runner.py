@@ -139,10 +139,11 @@ class OnnxSegmenter:
 
     def _scores(self, points: np.ndarray, ring: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """Return (P, K) probabilities of finite points, and (P,) bool: which are uncertain."""
+        nowhere = np.zeros(len(points), dtype=bool)
         if self.method == "rv":
-            return self.score_range_view(points, ring), np.zeros(len(points), dtype=bool)
+            return self.score_range_view(points, ring), nowhere
         if self.method == "bev":
-            return self.score_polar_view(points), np.zeros(len(points), dtype=bool)
+            return self.score_polar_view(points), nowhere
 
         f = self.score_range_view(points, ring)
         g = self.score_polar_view(points)
@@ -196,18 +197,13 @@ class OnnxSegmenter:
         return softmax(np.concatenate(logits))
 
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
-        feed = {}
-        for entry, values in zip(self.description["graphs"][name]["inputs"], inputs, strict=True):
-            feed[entry["name"]] = values
+        names = [entry["name"] for entry in self.description["graphs"][name]["inputs"]]
+        feed = dict(zip(names, inputs, strict=True))
         return np.asarray(self._graphs[name].run(None, feed)[0])
 
 
 def _read_intensity(folder: Path, description: Mapping[str, Any]) -> TrainedIntensity | None:
-    """Return what the intensities of each scan are brought to; None if they stay as they are.
-
-    Raises:
-        InputError: if the description says neither.
-    """
+    """Return what the intensities of each scan are brought to; None if they stay as they are."""
     values = description.get("intensity")
     if values is None:
         return None

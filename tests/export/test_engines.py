@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 from torch.nn import functional as F
 
 import amvnet
@@ -27,7 +26,6 @@ from amvnet.models.layers import ConvBlock
 from amvnet.models.methods import MethodName
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
-from amvnet.models.streams import Score, one_after_the_other
 from amvnet.models.views.points import PointBatch
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan, trained_intensity
@@ -66,7 +64,8 @@ def check_equal(weights: Weights, engine: str) -> None:
     expected_segmenter = Segmenter(weights)
     segmenter = Segmenter(weights)
     torch_net = segmenter.model.range_net
-    assert use_engine(segmenter, engine) == engine
+    use_engine(segmenter, engine)
+    assert segmenter.engine == engine
     assert segmenter.model.range_net is not torch_net
 
     for seed in range(3):
@@ -160,7 +159,8 @@ def test_int8_keeps_nearly_all_labels_and_is_calibrated_once(
     said: list[str] = []
     for _ in range(2):
         segmenter = Segmenter(weights)
-        assert use_engine(segmenter, "int8", said.append) == "int8"
+        use_engine(segmenter, "int8", said.append)
+        assert segmenter.engine == "int8"
     assert len(said) == 1
     assert "calibrated" in said[0]
 
@@ -209,37 +209,6 @@ def test_onnx_takes_scans_one_by_one() -> None:
     fails(lambda: segmenter.model.range_net(torch.zeros(2, 6, 16, 64)), "one scan", "2")
 
 
-@pytest.mark.slow
-def test_compile_says_what_torch_says() -> None:
-    check_equal(fresh_weights(), "compile")
-
-
-@pytest.mark.parametrize("is_side_by_side", [True, False])
-def test_compiled_networks_do_not_share_threads_and_keep_a_gpu_s_streams(
-    is_side_by_side: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(engines, "_compiled", lambda function, shape, device: function)
-    segmenter = Segmenter(fresh_weights())
-
-    def streams(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
-        return score_range(), score_polar()
-
-    if not is_side_by_side:
-        segmenter.model.arrange = streams
-    use_engine(segmenter, "compile")
-    expected = one_after_the_other if is_side_by_side else streams
-    assert segmenter.model.arrange is expected
-
-
-def test_without_a_compiler_compile_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(*_: object) -> None:
-        raise RuntimeError("no working C++ compiler\nand a page of it")
-
-    monkeypatch.setattr(torch, "compile", lambda function: run)
-    segmenter = Segmenter(fresh_weights())
-    fails(lambda: use_engine(segmenter, "compile"), "no working C++ compiler", "engine torch")
-
-
 def test_other_engines_and_missing_libraries_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     segmenter = Segmenter(fresh_weights())
     fails(lambda: use_engine(segmenter, "tensorrt"), "tensorrt", "onnx")
@@ -249,11 +218,11 @@ def test_other_engines_and_missing_libraries_are_one_line(monkeypatch: pytest.Mo
     fails(lambda: use_engine(segmenter, "onnx"), "no_such_library", "amvnet[export]")
 
 
-def test_auto_is_torch_as_it_is() -> None:
+def test_the_engine_torch_leaves_the_networks_as_they_are() -> None:
     segmenter = Segmenter(fresh_weights())
     net = segmenter.model.range_net
-    assert use_engine(segmenter, "auto") == "torch"
-    assert engines.FASTEST == "torch"
+    use_engine(segmenter, "torch")
+    assert segmenter.engine == "torch"
     assert segmenter.model.range_net is net
 
 

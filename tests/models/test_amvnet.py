@@ -19,7 +19,7 @@ from amvnet.config.schema import PointHeadConfig
 from amvnet.models import point_head as point_head_module
 from amvnet.models.amvnet import LateFusion
 from amvnet.models.assertion import Disagreement
-from amvnet.models.layers import fold_batch_norms
+from amvnet.models.layers import freeze
 from amvnet.models.methods import arithmetic_mean, geometric_mean, maximum
 from amvnet.models.point_head import (
     head_features,
@@ -71,7 +71,7 @@ def test_folded_batch_norms_change_no_output_of_the_point_head() -> None:
     head.train()(point, rows)  # changes the norms' initial statistics
     before = head.eval()(point, rows)
 
-    fold_batch_norms(head)
+    freeze(head)
     torch.testing.assert_close(head(point, rows), before, rtol=1e-4, atol=1e-5)
     assert not any(isinstance(m, nn.BatchNorm1d) for m in head.modules())
 
@@ -293,7 +293,7 @@ def test_scoring_points_from_the_table_equals_scoring_their_features(
 ) -> None:
     head = trained_head(PointHeadConfig(), 19)
     if folded:
-        fold_batch_norms(head)
+        freeze(head)
 
     points = torch.cat([20 * torch.randn(3000, 3), torch.rand(3000, 1)], dim=1)
     f, g = (3 * torch.randn(2, 3000, 19)).softmax(dim=2)

@@ -28,7 +28,7 @@ class Settings:
     weights: str = _parameter("sim-hdl64e", "a name, a path, or hf-hub:OWNER/NAME")
     method: str = _parameter("amvnet", "amvnet, rv, rv-knn, bev, ensemble, arithmetic or maximum")
     device: str = _parameter("auto", "cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU")
-    engine: str = _parameter("auto", "auto, torch, compile or onnx")
+    engine: str = _parameter("torch", "torch, onnx or int8")
     precision: str = _parameter("auto", "float32, bfloat16, on a GPU float16, or auto")
     threads: int = _parameter(0, "of the processor; 0: as many as it has cores")
     sensor: str = _parameter("", "a name such as os1-64, or a YAML file; empty: measured")

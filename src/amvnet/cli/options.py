@@ -100,10 +100,9 @@ class ComputeChoice:
 
     device: str = "auto"
     """cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU."""
-    engine: EngineName = "auto"
-    """what runs the networks: torch, compile (starts slowly), onnx (ONNX Runtime), int8 (the same
-    in 8-bit integers, calibrated once; a few labels change), or auto, the fastest here that changes
-    none."""
+    engine: EngineName = "torch"
+    """what runs the networks: torch, onnx (ONNX Runtime), or int8 (the same in 8-bit integers,
+    calibrated once; a few labels change)."""
     precision: Precision = "auto"
     """of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32."""
     at_once: int | None = None

@@ -1,10 +1,10 @@
-"""Other engines for the networks of a segmenter: torch.compile, or ONNX Runtime, also in int8."""
+"""ONNX Runtime for the networks of a segmenter, also in int8."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
@@ -17,144 +17,64 @@ from amvnet.errors import InputError
 from amvnet.export.int8 import SIMULATED
 from amvnet.export.onnx import OPSET, check_libraries, export
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.graphs import without_graphs
-from amvnet.models.methods import METHODS, ONNX_ENGINES, EngineName
+from amvnet.models.methods import METHODS, EngineName
 from amvnet.models.polar_net import PolarNet
-from amvnet.models.precision import InPrecision
-from amvnet.models.streams import one_after_the_other, side_by_side
-from amvnet.models.views.range_view import CHANNELS
 from amvnet.onnx_runner import DESCRIPTION
 from amvnet.progress import Say, say_nothing
 
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
-FASTEST = "torch"  # what "auto" means: the others start slowly, see docs/performance.md
 # ONNX Runtime's execution providers, the fastest first
 PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecutionProvider")
 CACHE = "AMVNET_CACHE"  # the environment variable with the folder of exported networks
 
-Runner = Callable[[Tensor], Tensor]
 
+def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> None:
+    """Let an engine run the networks of a segmenter, which were set up for torch.
 
-def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> str:
-    """Let an engine run the networks of a segmenter from now on.
-
-    Everything around the networks stays with torch. `compile` takes a minute before the first scan.
-    `onnx` exports the networks once, in half a minute, and keeps them in `cache_folder`; it takes
-    scans one by one, and computes on a GPU if the installed ONNX Runtime can. So does `int8`, which
-    stays on the CPU and also converts the convolutions to 8-bit integers; it
-    calibrates them once, in a few minutes, on simulated scans of the weights' sensor.
+    Everything around the networks stays with torch. `onnx` exports the networks once, in half a
+    minute, and keeps them in `cache_folder`; it takes scans one by one, and computes on a GPU if
+    the installed ONNX Runtime can. So does `int8`, which stays on the CPU and also converts the
+    convolutions to 8-bit integers; it calibrates them once, in a few minutes, on simulated scans of
+    the weights' sensor.
 
     Args:
         engine: one of `ENGINES`.
         say: told what takes long.
 
-    Returns:
-        The name of the engine; for "auto", the one that it stands for.
-
     Raises:
-        InputError: if there is no such engine, it lacks a library, a compiler or the device, or the
-            sensor of the weights cannot be simulated for int8.
+        InputError: if there is no such engine, it lacks a library or the device, or the sensor of
+            the weights cannot be simulated for int8.
     """
     if engine not in ENGINES:
         raise InputError(
             f"expected an engine of {', '.join(ENGINES)}, found {engine!r}; use one of them"
         )
-
-    if engine == "auto":
-        engine = FASTEST
-    if engine == "compile":
-        _use_compile(segmenter)
-    if engine in ONNX_ENGINES:
-        _use_onnx(segmenter, engine, say)
-
-    segmenter.engine = engine
-    return engine
-
-
-def _use_compile(segmenter: Segmenter) -> None:
-    # A network is compiled for a number of threads; another one would compile it again.
-    segmenter.at_once = 1
-    if segmenter.model.arrange is side_by_side:
-        segmenter.model.arrange = one_after_the_other
-    parts = METHODS[segmenter.method].parts
-    sizes = segmenter.weights.model
-
-    if "range_net" in parts:
-        view = sizes.range_view
-        shape = (1, view.height, view.width, CHANNELS)
-        _set_range_net(segmenter, _compiled(_range_net(segmenter), shape, segmenter.device))
-
-    if "polar_net" in parts:
-        grid = sizes.polar_view
-        shape = (1, grid.radial, grid.angular, sizes.polar_net.pillar)
-        polar_net = _polar_net(segmenter)
-        polar_net.run_unet = _compiled(polar_net.unet, shape, segmenter.device)
-
-
-def _use_onnx(segmenter: Segmenter, engine: str, say: Say) -> None:
+    if engine == "torch":
+        return
     if segmenter.device != "cpu" or segmenter.precision != "float32":
         found = f"{segmenter.precision} on {segmenter.device}"
         raise InputError(
-            f"expected float32 on cpu for the engine {engine}, found {found}; use compile"
+            f"expected float32 on cpu for the engine {engine}, found {found}; use torch"
         )
 
     parts = METHODS[segmenter.method].parts
+    model = segmenter.model
     folder = exported(segmenter, SIMULATED if engine == "int8" else None, say)
     # A GPU does not take the unsigned activations of the int8 graphs.
-    providers = PROVIDERS[-1:] if engine == "int8" else installed_providers()
+    providers: Sequence[str] = PROVIDERS[-1:]
+    if engine == "onnx":
+        import onnxruntime
+
+        installed = onnxruntime.get_available_providers()
+        providers = [name for name in PROVIDERS if name in installed]
     if len(providers) > 1:
         say(f"the networks compute with the {providers[0]} of ONNX Runtime")
     if "range_net" in parts:
-        _set_range_net(segmenter, OnnxGraph(folder / "range_net.onnx", providers))
+        model.range_net = OnnxGraph(folder / "range_net.onnx", providers)
     if "polar_net" in parts:
-        _polar_net(segmenter).run_unet = OnnxGraph(folder / "polar_map.onnx", providers)
-
-
-def installed_providers() -> Sequence[str]:
-    """Return those of `PROVIDERS` that the installed ONNX Runtime has."""
-    import onnxruntime
-
-    installed = onnxruntime.get_available_providers()
-    return [name for name in PROVIDERS if name in installed]
-
-
-def _compiled(function: Runner, shape: tuple[int, ...], device: str) -> Any:
-    """Return a function or module compiled for inputs of a shape (1, H, W, C), and run it once."""
-    compiled = torch.compile(function)
-
-    try:
-        with torch.inference_mode():
-            compiled(torch.zeros(shape, device=device).permute(0, 3, 1, 2))
-    except Exception as error:  # of a dozen classes; most often there is no C++ compiler
-        reason = (str(error).splitlines() or [""])[0]
-        raise InputError(
-            f"expected torch.compile to work, found {reason}; use the engine torch"
-        ) from error
-
-    return compiled
-
-
-def _range_net(segmenter: Segmenter) -> nn.Module:
-    net = segmenter.model.range_net
-    return without_graphs(net.net if isinstance(net, InPrecision) else net)
-
-
-def _set_range_net(segmenter: Segmenter, net: nn.Module) -> None:
-    """Replace the range view's network; its precision stays."""
-    current = segmenter.model.range_net
-    if isinstance(current, InPrecision):
-        current.net = net
-    else:
-        segmenter.model.range_net = net
-
-
-def _polar_net(segmenter: Segmenter) -> PolarNet:
-    net = segmenter.model.polar_net
-    if isinstance(net, InPrecision):
-        net = net.net
-
-    assert isinstance(net, PolarNet)
-    return net
+        assert isinstance(model.polar_net, PolarNet)
+        model.polar_net.run_unet = OnnxGraph(folder / "polar_map.onnx", providers)
+    segmenter.engine = engine
 
 
 def cache_folder() -> Path:

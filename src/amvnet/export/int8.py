@@ -12,7 +12,7 @@ import numpy as np
 
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
-from amvnet.export.onnx_files import digest, quiet, strip, writer_errors
+from amvnet.export.onnx_files import digest, quiet, strip
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
@@ -56,17 +56,18 @@ def quantise(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Replace exported graphs by quantised ones, one after the other.
 
+    Of the scans, the first of every five checks, the others calibrate. A single one does both.
+
     Args:
         folder: the output folder of `amvnet export`.
         names: the graphs to quantise, all of them in `FIRST_KEPT`.
-        scans: the first of every five checks, the others calibrate. A single one does both.
 
     Yields:
         The name of each graph, with the new values in its description: `precision`, `sha256`, and
         `agreement`, the share of the points whose label by this network stays.
 
     Raises:
-        InputError: if a graph cannot be quantised, or the agreement is below `LEAST_AGREEMENT`.
+        InputError: if the agreement is below `LEAST_AGREEMENT`.
     """
     checking = list(scans[::CHECK_EVERY])
     calibrating = [scan for index, scan in enumerate(scans) if index % CHECK_EVERY] or checking
@@ -149,8 +150,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
 
     ready = path.with_suffix(".ready")
     quantised = path.with_suffix(".int8")
-    libraries = "onnx and onnxruntime"
-    with quiet("root"), writer_errors(path.stem, "onnxruntime.quantization", libraries):
+    with quiet("root"):
         quant_pre_process(path, ready, skip_symbolic_shape=True)
         quantize_static(
             ready,

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from amvnet.config.nested import to_dict
 from amvnet.errors import InputError
 from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
-from amvnet.export.onnx_files import digest, quiet, strip, writer_errors
+from amvnet.export.onnx_files import digest, quiet, strip
 from amvnet.files import atomic_write, make_folder, publish
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import AMVNet
@@ -77,25 +77,12 @@ class _Part(nn.Module):
         return self.part(x)
 
 
-@dataclass(frozen=True)
-class Exported:
-    """How well exported graphs agree with torch.
-
-    Attributes:
-        differences: the largest difference from torch, by graph, before int8.
-        agreement: the share of the labels that stay in int8, by graph; empty without int8.
-    """
-
-    differences: dict[str, float]
-    agreement: dict[str, float]
-
-
 def export(
     weights: Weights | Path | str,
     out: Path | str,
     progress: Progress = no_progress,
     int8: str | None = None,
-) -> Exported:
+) -> dict[str, dict[str, Any]]:
     """Write the graphs and `amvnet.json` into a folder.
 
     Args:
@@ -103,10 +90,14 @@ def export(
         int8: convert the convolutions to int8, calibrated with these scans: as `predict` takes
             them, or `simulated`.
 
+    Returns:
+        The descriptions of the graphs, by name: those in float32 with the largest `difference` from
+        torch, those in int8 with the `agreement`, the share of the labels that stay.
+
     Raises:
         InputError: if a library is missing, the weights have no network or need labels, there are
-            no scans, or a graph cannot be written, differs by more than `LARGEST_DIFFERENCE`, or
-            changes too many labels in int8; then the folder is as before.
+            no scans, or a graph differs by more than `LARGEST_DIFFERENCE` or changes too many
+            labels in int8; then the folder is as before.
     """
     check_libraries()
     loaded = weights if isinstance(weights, Weights) else load(weights)
@@ -119,17 +110,18 @@ def export(
     temporary = out / f".{uuid.uuid4().hex}.part"
     temporary.mkdir()
     try:
-        description, measured = _write_all(segmenter, scans, temporary, progress)
+        description = _write_all(segmenter, scans, temporary, progress)
         # An interruption must not leave the old description with new graphs.
         (out / DESCRIPTION).unlink(missing_ok=True)
-        for name in description["graphs"]:
+        graphs: dict[str, dict[str, Any]] = description["graphs"]
+        for name in graphs:
             publish(temporary / f"{name}.onnx", out / f"{name}.onnx")
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
     with atomic_write(out / DESCRIPTION) as file:
         _save(description, file)
-    return measured
+    return graphs
 
 
 def possible_files(out: Path) -> list[Path]:
@@ -139,12 +131,8 @@ def possible_files(out: Path) -> list[Path]:
 
 def _write_all(
     segmenter: Segmenter, scans: Sequence[Scan], folder: Path, progress: Progress
-) -> tuple[dict[str, Any], Exported]:
-    """Write the graphs, and convert the convolutions to int8 if there are scans to calibrate with.
-
-    Returns:
-        The content of `amvnet.json`, and how well the graphs agree with torch.
-    """
+) -> dict[str, Any]:
+    """Write the graphs, their convolutions in int8 if there are scans; return the description."""
     written: dict[str, dict[str, Any]] = {}
     with torch.no_grad():
         graphs = _graphs(segmenter)
@@ -154,19 +142,15 @@ def _write_all(
             progress(len(written), total)
             written[name] = _write(graph, name, folder / f"{name}.onnx")
 
-    differences = {name: graph["difference"] for name, graph in written.items()}
     description = describe_export(segmenter, written)
     _save(description, folder / DESCRIPTION)  # the calibration runs the graphs by it
     progress(len(graphs), total)
 
-    agreement: dict[str, float] = {}
-    for name, changes in quantise(folder, convolutions, scans):
-        graph_in_int8 = written[name] | changes
-        del graph_in_int8["difference"]
-        description["graphs"][name] = graph_in_int8
-        agreement[name] = changes["agreement"]
-        progress(len(graphs) + len(agreement), total)
-    return description, Exported(differences, agreement)
+    for count, (name, changes) in enumerate(quantise(folder, convolutions, scans), len(graphs) + 1):
+        del written[name]["difference"]
+        written[name] |= changes
+        progress(count, total)
+    return description
 
 
 def _save(description: dict[str, Any], path: Path) -> None:
@@ -306,7 +290,7 @@ def _artificial_scan(segmenter: Segmenter) -> PointBatch:
     points = np.column_stack([xyz, rng.random(POINTS)]).astype(np.float32)
     ring = rng.integers(0, model.range_view.height, POINTS)
 
-    return PointBatch.of([Scan(points, ring=ring)]).to(segmenter.device)
+    return PointBatch.of([Scan(points, ring=ring)])
 
 
 def _probabilities(scores: Tensor) -> Tensor:
@@ -326,7 +310,7 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
         axis = torch.export.Dim(DYNAMIC[name], min=1)
         axes = tuple({0: axis} for _ in graph.inputs)
 
-    with quiet("torch.onnx"), writer_errors(name, "torch.onnx", "torch and onnxscript"):
+    with quiet("torch.onnx"):
         program = torch.onnx.export(
             graph.module,
             tuple(graph.inputs.values()),

@@ -1,4 +1,4 @@
-"""Tame the libraries that write ONNX: their warnings, exceptions, and notes in the files."""
+"""Tame the libraries that write ONNX: their warnings, and notes in the files."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import hashlib
 import logging
 import warnings
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-
-from amvnet.errors import one_line_errors
 
 
 def digest(path: Path) -> str:
@@ -41,21 +39,3 @@ def quiet(name: str) -> Iterator[None]:
             yield
     finally:
         logger.setLevel(level)
-
-
-def writer_errors(name: str, writer: str, libraries: str) -> AbstractContextManager[None]:
-    """Turn any exception of a library, which may span pages, into an InputError of one line.
-
-    An OSError, such as a full disk, passes as it is.
-
-    Args:
-        name: of the graph.
-        writer: the library that writes it.
-        libraries: what the user should upgrade.
-    """
-
-    def message(error: BaseException) -> str:
-        kind = type(error).__name__
-        return f"{name}: expected a graph of {writer}, found {kind}; upgrade {libraries}"
-
-    return one_line_errors(message, leave=(OSError,))

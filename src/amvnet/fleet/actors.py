@@ -86,7 +86,7 @@ class Labelling:
     tau: float | None = None
     device: str = "auto"
     precision: Precision = "auto"
-    engine: EngineName = "auto"
+    engine: EngineName = "torch"
     batch: int = 1
     at_once: int | None = None
     sensor: Sensor = UNKNOWN_SENSOR

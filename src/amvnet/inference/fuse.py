@@ -16,7 +16,7 @@ from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults
 from amvnet.inference.reading import check_scan, normaliser_for
 from amvnet.inference.scores import SURE, ScorePair, check_probabilities
-from amvnet.inference.segmentation import Segmentation, to_segmentation
+from amvnet.inference.segmentation import Segmentation, fetch, unpack
 from amvnet.models.amvnet import LateFusion, Scores
 from amvnet.models.assertion import Disagreement
 from amvnet.models.point_head import PointHead
@@ -75,7 +75,8 @@ class Fusion:
                 torch.from_numpy(g_valid).clamp_min(SURE),
             )
 
-        return to_segmentation(scan.valid, Scores(scores.merged, scores.uncertain, None, None))
+        labels, fused = fetch(Scores(scores.merged, scores.uncertain, None, None))
+        return unpack(scan.valid, labels, fused, slice(None))
 
     def _check_shapes(self, scan: Scan, f: np.ndarray, g: np.ndarray) -> None:
         if f.shape != g.shape or f.ndim != 2 or len(f) != len(scan):

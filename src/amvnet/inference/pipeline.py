@@ -144,15 +144,25 @@ class Pipeline:
         done = self._read_done(settings, written)
         remaining = [scan for scan in self.scans if _key(scan) not in done]
 
-        journal = self._begin(settings, done, written, remaining)
-        faults = self._process(remaining, journal, progress)
         processes = self.execution.processes
+        journal = Journal(self.output.folder, settings, done.values(), processes)
+        if processes.first:
+            written.claim(self._paths_of(remaining))
+        processes.wait()  # so that no file is written before it is claimed
+
+        faults = self._process(remaining, journal, progress)
         try:
-            entries = self._finish(journal, written, remaining, is_new)
-            return entries, list(chain.from_iterable(processes.gather(faults)))
+            entries = journal.close()
+            if processes.first:
+                written.finish(self._paths_of(remaining))
+                if is_new:
+                    with suppress(OSError):  # stays unless all scans were broken
+                        self.output.folder.rmdir()
+            all_faults = list(chain.from_iterable(processes.gather(faults)))
         except ConnectionResetError as error:
             left = self._describe_left(settings, remaining)
             raise ConnectionResetError(error.errno, left, str(self.output.folder)) from error
+        return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], all_faults
 
     def _check_output(self) -> WrittenFiles:
         """Check that the output replaces no file of the user; return the record of the folder's.
@@ -210,21 +220,6 @@ class Pipeline:
             origins[_key(scan)] = digest[:DIGITS]
         return origins
 
-    def _begin(
-        self,
-        settings: Mapping[str, Any],
-        done: Mapping[str, Entry],
-        written: WrittenFiles,
-        remaining: Sequence[InputScan],
-    ) -> Journal:
-        """Begin the journal, and claim the files that will be written."""
-        processes = self.execution.processes
-        journal = Journal(self.output.folder, settings, done.values(), processes)
-        if processes.first:
-            written.claim(self._paths_of(remaining))
-        processes.wait()  # so that no file is written before it is claimed
-        return journal
-
     def _process(
         self, remaining: Sequence[InputScan], journal: Journal, progress: Progress
     ) -> list[str]:
@@ -239,22 +234,6 @@ class Pipeline:
                 faults.append(outcome)
         progress(len(share), len(share))
         return faults
-
-    def _finish(
-        self,
-        journal: Journal,
-        written: WrittenFiles,
-        remaining: Sequence[InputScan],
-        is_new: bool,
-    ) -> list[Entry]:
-        """End the journal and list the files; return the entries of this run's scans."""
-        entries = journal.close()
-        if self.execution.processes.first:
-            written.finish(self._paths_of(remaining))
-            if is_new:
-                with suppress(OSError):  # stays unless all scans were broken
-                    self.output.folder.rmdir()
-        return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries]
 
     def _describe_left(self, settings: Mapping[str, Any], remaining: Sequence[InputScan]) -> str:
         """Return whose scans are not done after a process has ended."""

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from zipfile import BadZipFile
 
 import numpy as np
+from scipy.special import softmax
 
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.errors import InputError, one_line_errors
@@ -48,11 +49,9 @@ class ScoreFolder:
     logits: bool = False
 
     def find(self, prediction: Path) -> Path:
-        """Return the file of a scan's scores.
+        """Return the file of a scan's scores, which is named as its predicted labels are.
 
-        Args:
-            prediction: path of the scan's predicted labels, relative to a folder of predictions;
-                its ending is ignored.
+        `prediction` is the path of these in a folder of predictions; its ending is ignored.
 
         Raises:
             InputError: if there is no such file.
@@ -69,12 +68,9 @@ class ScoreFolder:
         )
 
     def read(self, prediction: Path, scan: Scan, classes: int) -> np.ndarray:
-        """Return the (N, K) float32 class probabilities of a scan.
+        """Return the (N, K) float32 class probabilities of a scan, in the file of `find`.
 
         Rows of points that are not valid are not checked.
-
-        Args:
-            prediction: see `find`.
 
         Raises:
             InputError: if there is no such file, or it does not hold scores of this scan's points.
@@ -101,7 +97,7 @@ class ScoreFolder:
         valid = scores[scan.valid]
         if self.logits:
             check_finite(valid, str(path))
-            return _softmax(scores)
+            return softmax(scores, axis=1)
 
         check_probabilities(valid, str(path), f"apply softmax, or say --logits {self.side}")
         return scores
@@ -160,9 +156,7 @@ class ScorePair:
 
     def read(self, prediction: Path, scan: Scan, classes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the probabilities f and g of a scan, each as `ScoreFolder.read`."""
-        f = self.a.read(prediction, scan, classes)
-        g = self.b.read(prediction, scan, classes)
-        return f, g
+        return self.a.read(prediction, scan, classes), self.b.read(prediction, scan, classes)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings of both folders, as JSON types."""
@@ -174,16 +168,15 @@ class ScorePair:
 
     def options(self) -> list[str]:
         """Return the command-line options that give this pair."""
-        folders = (self.a, self.b)
-
         options = []
-        for scores in folders:
+        sides = []
+        for scores in (self.a, self.b):
             options += [f"--scores-{scores.side}", str(scores.folder)]
-        for scores in folders:
             if scores.key is not None:
                 options += [f"--key-{scores.side}", scores.key]
+            if scores.logits:
+                sides.append(scores.side)
 
-        sides = [scores.side for scores in folders if scores.logits]
         if sides:
             options += ["--logits", "both" if len(sides) == 2 else sides[0]]
         return options
@@ -194,11 +187,7 @@ class ScorePair:
 
 
 def check_probabilities(values: np.ndarray, name: str, advice: str) -> None:
-    """Check that (P, K) scores are class probabilities.
-
-    Args:
-        name: of the scores, for the message.
-        advice: what to do if they are not.
+    """Check that (P, K) scores are class probabilities; `advice` says what to do if they are not.
 
     Raises:
         InputError: if a value is negative or not finite, or a row does not add up to 1.
@@ -223,12 +212,6 @@ def check_finite(values: np.ndarray, name: str) -> None:
         raise InputError(
             f"{name}: expected finite scores, found NaN or infinity among them; give probabilities"
         )
-
-
-def _softmax(logits: np.ndarray) -> np.ndarray:
-    """Return the (N, K) probabilities of (N, K) logits."""
-    powers = np.exp(logits - logits.max(axis=1, keepdims=True))
-    return powers / powers.sum(axis=1, keepdims=True)
 
 
 def _digest(scores: ScoreFolder, records: Sequence[ScanRecord]) -> str:

@@ -219,12 +219,6 @@ def uncertain_share(labels: np.ndarray, uncertain: np.ndarray) -> float:
     return int(np.count_nonzero(uncertain)) / max(int(np.count_nonzero(labels)), 1)
 
 
-def to_segmentation(valid: np.ndarray, scores: Scores) -> Segmentation:
-    """Return the result for all points of a scan, given the scores of its valid points."""
-    labels, fetched = fetch(scores)
-    return unpack(valid, labels, fetched, slice(None))
-
-
 def fetch(scores: Scores) -> tuple[Tensor, Scores]:
     """Return the labels (P,) and the scores, in CPU memory; wait for a GPU only once."""
     on_gpu = scores.merged.is_cuda
@@ -247,11 +241,7 @@ def fetch(scores: Scores) -> tuple[Tensor, Scores]:
 def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> Segmentation:
     """Return the result for one scan of a batch.
 
-    Args:
-        valid: (N,) bool, the valid points of the scan.
-        labels: (P,) of the valid points of all scans.
-        scores: of the valid points of all scans.
-        points: the place of the scan's valid points among them.
+    Of its points, those that are valid, (N,) bool, have the places `points` in the batch.
     """
     return Segmentation(
         labels=expand_to_scan(labels[points], valid),

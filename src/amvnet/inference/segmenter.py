@@ -17,23 +17,13 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.reading import array_scan, check_scan, normaliser_for
-from amvnet.inference.segmentation import (
-    Origin,
-    Segmentation,
-    fetch,
-    unpack,
-)
+from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.memory import available_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.assertion import Disagreement
 from amvnet.models.graphs import Captured
 from amvnet.models.layers import freeze
-from amvnet.models.methods import (
-    METHODS,
-    MethodName,
-    Precision,
-    check_method,
-)
+from amvnet.models.methods import METHODS, MethodName, Precision, check_method
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.precision import InPrecision, check_device, choose_device, choose_precision
 from amvnet.models.streams import TwoStreams, side_by_side

@@ -91,15 +91,10 @@ def time_job(job: Job, runs: int, progress: Progress = no_progress) -> dict[str,
     """Time a job some times, and return a report for JSON.
 
     Raises:
-        InputError: if there is no run to time, the segmenter is not of AMVNet, or the share of
-            uncertain points is out of range.
+        InputError: if there is no run to time, or the share of uncertain points is out of range.
     """
     if runs < 1:
         raise InputError(f"expected one run or more, found {runs}; give a number from 1")
-    if job.segmenter.method != "amvnet":
-        raise InputError(
-            f"expected AMVNet to time, found the method {job.segmenter.method}; use amvnet"
-        )
     if job.share is not None and not 0 <= job.share <= 1:
         raise InputError(
             f"expected a share of uncertain points from 0 to 1, found {job.share}; give another"
@@ -147,7 +142,7 @@ class _Clock:
 
     def __init__(self, device: str) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
-        self._gpu = _is_cuda(device)
+        self._gpu = torch.device(device).type == "cuda"
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -166,7 +161,8 @@ def _report(job: Job, timings: Sequence[Timing]) -> dict[str, Any]:
         stages[stage] = _spread([1e3 * timing.seconds[stage] for timing in timings])
 
     device = job.segmenter.device
-    memory = torch.cuda.max_memory_allocated(device) if _is_cuda(device) else peak_memory()
+    is_gpu = torch.device(device).type == "cuda"
+    memory = torch.cuda.max_memory_allocated(device) if is_gpu else peak_memory()
     return {
         "engine": job.segmenter.engine,
         "precision": job.segmenter.precision,
@@ -186,10 +182,6 @@ def _spread(values: Sequence[float]) -> dict[str, float]:
     """Return the median and the quartiles."""
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75)).tolist()
     return {"median": median, "low": low, "high": high}
-
-
-def _is_cuda(device: str) -> bool:
-    return device.startswith("cuda")
 
 
 def untrained(recipe: Recipe) -> Weights:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -13,12 +12,7 @@ from torch import Tensor, nn
 from amvnet.config.schema import ModelConfig
 from amvnet.models.assertion import Assertion, Disagreement
 from amvnet.models.methods import Ensemble, geometric_mean
-from amvnet.models.point_head import (
-    PointHead,
-    nearest_neighbours,
-    sectors,
-    used_points_table,
-)
+from amvnet.models.point_head import PointHead, nearest_neighbours
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
 from amvnet.models.streams import Arrangement, one_after_the_other
@@ -47,25 +41,6 @@ class Scores:
     bev: Tensor | None
 
 
-def unwatched(name: str) -> AbstractContextManager[None]:
-    """Return a context that does nothing around a step."""
-    return nullcontext()
-
-
-def step(name: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return a decorator that runs a method of `LateFusion` within `self.watch(name)`."""
-
-    def mark(method: Callable[..., Any]) -> Callable[..., Any]:
-        @functools.wraps(method)
-        def watched(self: LateFusion, *args: Any) -> Any:
-            with self.watch(name):
-                return method(self, *args)
-
-        return watched
-
-    return mark
-
-
 class LateFusion(nn.Module):
     """The fusion of any two networks' class probabilities (sections 3.2 and 3.3 of the paper).
 
@@ -75,7 +50,7 @@ class LateFusion(nn.Module):
 
     Attributes:
         ensemble: combines f and g for the certain points, by the geometric mean as in the paper.
-        watch: returns the context in which a step runs, to time the steps; does nothing by default.
+        watch: returns the context in which a step runs, to time it; does nothing by default.
     """
 
     def __init__(self, assertion: Assertion, point_head: PointHead | None) -> None:
@@ -83,7 +58,7 @@ class LateFusion(nn.Module):
         self.assertion = assertion
         self.point_head = point_head
         self.ensemble: Ensemble = geometric_mean
-        self.watch: Watch = unwatched
+        self.watch: Watch = nullcontext
 
     def fuse(self, batch: PointBatch, f: Tensor, g: Tensor) -> Scores:
         """Return the fusion of f and g: (P, K) class probabilities."""
@@ -92,10 +67,10 @@ class LateFusion(nn.Module):
         y = self.merge(f, g, uncertain, h)
         return Scores(y, uncertain, f, g)
 
-    @step("compare")
     def compare(self, batch: PointBatch, f: Tensor, g: Tensor) -> Tensor:
         """Return u: (P,) bool, the uncertain points."""
-        return self.assertion(f, g, batch.points)
+        with self.watch("compare"):
+            return self.assertion(f, g, batch.points)
 
     def refine(self, batch: PointBatch, f: Tensor, g: Tensor, uncertain: Tensor) -> Tensor | None:
         """Return h: (U, K) class probabilities of the uncertain points; None without a head."""
@@ -107,40 +82,17 @@ class LateFusion(nn.Module):
         for scan in batch.slices():
             points = batch.points[scan]
             index = uncertain[scan].nonzero()[:, 0]  # (U,)
-            near = self.find_neighbours(points, index)  # (U, n)
-            parts.append(self.settle(points, f[scan], g[scan], index, near))
+            with self.watch("neighbours"):
+                near = nearest_neighbours(points, index, self.point_head.config.neighbours)
+            with self.watch("head"):
+                parts.append(self.point_head.settle(points, f[scan], g[scan], index, near))
         return concatenate(parts)
 
-    @step("neighbours")
-    def find_neighbours(self, points: Tensor, index: Tensor) -> Tensor:
-        """Return (U, n) indices of the neighbours of the points `index` (U,) of one scan."""
-        assert self.point_head is not None
-        return nearest_neighbours(points, index, self.point_head.config.neighbours)
-
-    @step("head")
-    def settle(self, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
-        """Return (U, K) class probabilities of some points of one scan by the point head.
-
-        Args:
-            points: (P, 4), all points of the scan.
-            f: (P, K) class probabilities by the first network.
-            g: (P, K) class probabilities by the second network.
-            index: (U,) indices of the points to classify.
-            near: (U, n) indices of their neighbours.
-        """
-        assert self.point_head is not None
-
-        h = f.new_empty(len(index), f.shape[1])
-        for part in sectors(points, index):
-            table, (i, k) = used_points_table(points, f, g, index[part], near[part])
-            h[part] = self.point_head.score(table, i, k).softmax(dim=1)
-        return h
-
-    @step("merge")
     def merge(self, f: Tensor, g: Tensor, uncertain: Tensor, h: Tensor | None) -> Tensor:
         """Return y: (P, K), h for the uncertain points and the ensemble for the others."""
-        y = self.ensemble(f, g)
-        return y if h is None else replace_uncertain(y, uncertain, h)
+        with self.watch("merge"):
+            y = self.ensemble(f, g)
+            return y if h is None else replace_uncertain(y, uncertain, h)
 
 
 class AMVNet(LateFusion):
@@ -175,23 +127,23 @@ class AMVNet(LateFusion):
         f, g = self.score(image, grid)
         return self.fuse(batch, f, g)
 
-    @step("project")
     def project(self, batch: PointBatch) -> tuple[RangeImage, PolarGrid]:
         """Return the two projections of a batch of scans."""
-        return self.range_view.project(batch), self.polar_view.project(batch)
+        with self.watch("project"):
+            return self.range_view.project(batch), self.polar_view.project(batch)
 
     def score(self, image: RangeImage, grid: PolarGrid) -> tuple[Tensor, Tensor]:
         """Return f and g: (P, K) class probabilities by the two networks."""
         return self.arrange(lambda: self.score_range(image), lambda: self.score_polar(grid))
 
-    @step("RV")
     def score_range(self, image: RangeImage) -> Tensor:  # (P, K)
-        logits = self.range_net(image.image).float().permute(0, 2, 3, 1)  # (B, H, W, K)
-        return image.to_points(logits.softmax(dim=3).permute(0, 3, 1, 2))
+        with self.watch("RV"):
+            logits = self.range_net(image.image).float().permute(0, 2, 3, 1)  # (B, H, W, K)
+            return image.to_points(logits.softmax(dim=3).permute(0, 3, 1, 2))
 
-    @step("BEV")
     def score_polar(self, grid: PolarGrid) -> Tensor:  # (P, K)
-        return grid.to_points(self.polar_net(grid)).float().softmax(dim=1)
+        with self.watch("BEV"):
+            return grid.to_points(self.polar_net(grid)).float().softmax(dim=1)
 
     def score_range_view(self, batch: PointBatch) -> Tensor:
         """Return f: (P, K) class probabilities by the range view alone."""
@@ -203,13 +155,7 @@ class AMVNet(LateFusion):
 
 
 def replace_uncertain(y: Tensor, uncertain: Tensor, h: Tensor) -> Tensor:
-    """Return y (P, K) with the rows h (U, K) of the uncertain points; on a CPU y is changed.
-
-    Args:
-        y: (P, K) class probabilities.
-        uncertain: (P,) bool, with U uncertain points.
-        h: (U, K) class probabilities of these, in order.
-    """
+    """Return y (P, K) with the rows h (U, K) of the U uncertain points; on a CPU y is changed."""
     if y.is_cpu:
         return y.index_put_((uncertain,), h)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,19 +13,9 @@ from amvnet.errors import InputError
 TINY = 1e-12  # keeps the cosine of scores without length finite
 
 
-class Assertion(Protocol):
-    """A function that finds the uncertain points.
-
-    Args:
-        f: (P, K) class probabilities of the range-view network.
-        g: (P, K) class probabilities of the bird's-eye-view network.
-        points: (P, 4) x, y, z in metres and intensity in [0, 1].
-
-    Returns:
-        (P,) bool: True if a point is uncertain.
-    """
-
-    def __call__(self, f: Tensor, g: Tensor, points: Tensor) -> Tensor: ...
+# Returns u (P,) bool, True if a point is uncertain, given the class probabilities f and g (P, K) of
+# the two networks and the points (P, 4): x, y, z in metres and intensity in [0, 1].
+Assertion = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)

@@ -22,34 +22,22 @@ def convolve(x: Tensor, weight: Tensor, bias: Tensor | None, stride: Pair, paddi
     Without gradients, oneDNN also computes the convolutions with kernels of one cell. For these
     `conv2d` calls MKL if there is one thread, which takes twice the time on an AMD processor.
     """
-    # Under autocast, conv2d chooses the type of the computation.
-    by_products = (
+    # Under autocast conv2d chooses the type, and an exporter has to see conv2d.
+    is_plain = (
         x.is_cpu
         and x.dtype == weight.dtype == torch.float32
-        and bias is None
-        and weight.requires_grad
-        and torch.is_grad_enabled()
         and not torch.is_autocast_enabled("cpu")
         and not torch.compiler.is_compiling()
-        and torch.backends.cpu.get_cpu_capability() == "AVX2"
     )
-    if by_products:
-        return _Convolution.apply(x, weight, stride, padding)
-    if weight.shape[2:] == (1, 1) and _can_call_onednn(x, weight):
-        return torch.mkldnn_convolution(x, weight, bias, padding, stride, (1, 1), 1)
+    if is_plain and torch.is_grad_enabled():
+        is_avx2 = torch.backends.cpu.get_cpu_capability() == "AVX2"
+        if is_avx2 and bias is None and weight.requires_grad:
+            return _Convolution.apply(x, weight, stride, padding)
+    elif is_plain and weight.shape[2:] == (1, 1) and torch.backends.mkldnn.is_available():
+        return torch.mkldnn_convolution(
+            x, weight, bias, padding=padding, stride=stride, dilation=(1, 1), groups=1
+        )
     return F.conv2d(x, weight, bias, stride, padding)
-
-
-def _can_call_onednn(x: Tensor, weight: Tensor) -> bool:
-    """Return whether oneDNN can compute a convolution without `conv2d`, which casts and exports."""
-    return (
-        x.is_cpu
-        and x.dtype == weight.dtype == torch.float32
-        and not torch.is_grad_enabled()
-        and not torch.is_autocast_enabled("cpu")
-        and not torch.compiler.is_compiling()
-        and torch.backends.mkldnn.is_available()
-    )
 
 
 class _Convolution(torch.autograd.Function):
@@ -74,18 +62,11 @@ class _Convolution(torch.autograd.Function):
 
 
 def weight_gradient(x: Tensor, grad: Tensor, kernel: Pair, stride: Pair, padding: Pair) -> Tensor:
-    """Return the gradient of a convolution's weights, (C', C, kernel height, kernel width).
+    """Return the gradient (C', C, kernel height, kernel width) of a convolution's weights.
 
-    The gradient of one tap is the product of the output's gradient with the input that the tap
-    sees. It is computed row by row: with the channels last in memory, the pixels of a row form
-    matrices that need no copy.
-
-    Args:
-        x: (B, C, H, W) input.
-        grad: (B, C', H', W') gradient of the output.
-        kernel: height and width of the kernel.
-        stride: of the rows and the columns.
-        padding: zeros on both sides of the rows and the columns of the input.
+    The gradient of one tap is the product of the output's gradient (B, C', H', W') with the input
+    (B, C, H, W) that the tap sees. It is computed row by row: with the channels last in memory, the
+    pixels of a row form matrices that need no copy.
     """
     height = (grad.shape[2] - 1) * stride[0] + 1
     width = (grad.shape[3] - 1) * stride[1] + 1

@@ -98,10 +98,3 @@ class Captured(nn.Module):
         with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
             output = self.net(static)
         return Graph(static, output, graph.replay)
-
-
-def without_graphs(net: nn.Module) -> nn.Module:
-    """Return the network itself if it is `Captured`, else as it is."""
-    inner = net.net if isinstance(net, Captured) else net
-    assert isinstance(inner, nn.Module)
-    return inner

@@ -35,10 +35,7 @@ class RingConv2d(nn.Conv2d):
 
 
 def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
-    """Pad the width circularly: (B, C, H, W) -> (B, C, H, left + W + right).
-
-    The pads may be wider than W.
-    """
+    """Pad the width circularly, by at most W: (B, C, H, W) -> (B, C, H, left + W + right)."""
     if not left and not right:
         return x
 
@@ -46,12 +43,8 @@ def wrap_width(x: Tensor, left: int, right: int) -> Tensor:
 
 
 def _pad_width(x: Tensor, left: int, right: int) -> Tensor:
-    width = x.shape[-1]
-
     # Unlike indexing, concatenating keeps the memory format.
-    if max(left, right) <= width:
-        return torch.cat([x[..., width - left :], x, x[..., :right]], dim=-1)
-    return x[..., torch.arange(-left, width + right, device=x.device) % width]
+    return torch.cat([x[..., x.shape[-1] - left :], x, x[..., :right]], dim=-1)
 
 
 class _WrapWidth(torch.autograd.Function):
@@ -177,14 +170,6 @@ def freeze(module: nn.Module) -> None:
     Batch norms are folded into the layers before them, so that the outputs stay the same up to
     rounding and are faster to compute. What depends on parameters alone is computed once.
     """
-    fold_batch_norms(module)
-    for layer in module.modules():
-        if isinstance(layer, RingConv2d):
-            layer.kernels = {}
-
-
-def fold_batch_norms(module: nn.Module) -> None:
-    """Fold the batch norms of a module in evaluation mode into the layers before them."""
     for layers in list(module.modules()):
         if not isinstance(layers, nn.Sequential):
             continue
@@ -196,3 +181,7 @@ def fold_batch_norms(module: nn.Module) -> None:
             elif isinstance(layer, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
                 layers[index] = fuse_linear_bn_eval(layer, norm)
                 layers[index + 1] = nn.Identity()
+
+    for layer in module.modules():
+        if isinstance(layer, RingConv2d):
+            layer.kernels = {}

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 MethodName = Literal["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble", "amvnet"]
 Precision = Literal["auto", "float32", "bfloat16", "float16"]  # of the two networks
-EngineName = Literal["auto", "torch", "compile", "onnx", "int8"]  # what runs the two networks
+EngineName = Literal["torch", "onnx", "int8"]  # what runs the two networks
 Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]  # f, g: (P, K) -> (P, K)
 
 ONNX_ENGINES = frozenset({"onnx", "int8"})  # both are ONNX Runtime

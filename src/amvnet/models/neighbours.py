@@ -17,7 +17,7 @@ Query = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
-    """Return (U, n) int32 indices of the n nearest other points of each point in `own`.
+    """Return (U, n) int32 indices of the n nearest others of each point `own` (U,) of xyz (P, 3).
 
     If a scan has fewer than n other points, the farthest is repeated. A lone point is its own
     neighbour.
@@ -25,11 +25,6 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
     pykdtree takes half of SciPy's time. If ties are frequent, SciPy chooses among points that are
     as near as the n-th, so that labels do not depend on which library is installed. (A sixth of
     the points of the real nuScenes scans at hand occur twice.)
-
-    Args:
-        xyz: (P, 3) metres.
-        own: (U,) indices of the points whose neighbours are searched for.
-        n: neighbours per point.
     """
     nearest = np.empty((len(own), n), dtype=np.int32)
     if not len(own):
@@ -51,10 +46,7 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
 def _search(
     query: Query, xyz: np.ndarray, own: np.ndarray, rows: np.ndarray, nearest: np.ndarray
 ) -> np.ndarray:
-    """Write some rows of the result of `nearest_others`, a part of them at a time.
-
-    Args:
-        rows: (R,) indices into `own` and `nearest`.
+    """Write the rows `rows` (R,) of the result of `nearest_others`, a part of them at a time.
 
     Returns:
         (R,) bool, as a `Query` returns it.
@@ -98,17 +90,10 @@ def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
 
 
 def _drop_self(nearest: np.ndarray, index: np.ndarray, n: int) -> np.ndarray:
-    """Drop each point from its own neighbours, and repeat the last one up to n neighbours.
+    """Return (U, n) neighbours without the points `index` (U,) themselves, given (U, m).
 
-    If many points coincide, a point may be missing from its own neighbours. Then the last one is
-    dropped instead.
-
-    Args:
-        nearest: (U, m) indices of neighbours, the nearest first.
-        index: (U,) indices of the points themselves.
-
-    Returns:
-        (U, n) indices.
+    The nearest are first. If there are fewer, the last one is repeated. If many points coincide, a
+    point may be missing from its own neighbours. Then the last one is dropped instead.
     """
     if nearest.shape[1] > 1:
         if (nearest[:, 0] == index).all():  # the usual case: no points coincide

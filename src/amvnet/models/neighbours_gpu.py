@@ -46,14 +46,10 @@ class Blocks:
 
 
 def nearest_others_by_blocks(xyz: Tensor, own: Tensor, n: int) -> Tensor:
-    """Return (U, n) int64 indices of the n nearest other points of each point in `own`.
+    """Return (U, n) int64 indices of the n nearest others of each point `own` (U,) of xyz (P, 3).
 
     The result is that of `amvnet.models.neighbours.nearest_others`, except for the choice among
     points that are equally near. The tensors stay on their device.
-
-    Args:
-        xyz: (P, 3) float32 metres, finite.
-        own: (U,) int64 indices of the points whose neighbours are searched for.
     """
     others = min(n, len(xyz) - 1)
     if not len(own) or others < 1:

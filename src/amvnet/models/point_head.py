@@ -50,6 +50,20 @@ class PointHead(nn.Module):
         encoded = self.mlp(rows.reshape(u * n, width)).view(u, n, self.config.hidden[-1])
         return self._classify(_pool(encoded), point)
 
+    def settle(self, points: Tensor, f: Tensor, g: Tensor, index: Tensor, near: Tensor) -> Tensor:
+        """Return (U, K) class probabilities of some points of one scan.
+
+        Args:
+            points: (P, 4), all points of the scan, with f and g, (P, K).
+            index: (U,) indices of the points to classify.
+            near: (U, n) indices of their neighbours.
+        """
+        h = f.new_empty(len(index), f.shape[1])
+        for part in sectors(points, index):
+            table, (i, k) = used_points_table(points, f, g, index[part], near[part])
+            h[part] = self.score(table, i, k).softmax(dim=1)
+        return h
+
     def score(self, table: Tensor, uncertain: Tensor, near: Tensor) -> Tensor:
         """Return the (U, K) logits of `forward(*head_features(...))`, at less cost.
 
@@ -101,22 +115,14 @@ def _pool(rows: Tensor) -> Tensor:
 
 
 def point_table(points: Tensor, f: Tensor, g: Tensor) -> Tensor:
-    """Return [f, g, x] of all points of a scan, (P, 2 K + 4), the table for `head_features`.
-
-    Args:
-        points: (P, 4) x: x, y, z in metres and intensity.
-        f: (P, K) class probabilities by the range view.
-        g: (P, K) class probabilities by the bird's-eye view.
-    """
+    """Return [f, g, x] of points x (P, 4) with class probabilities f, g (P, K): (P, 2 K + 4)."""
     return torch.cat([f, g, points], dim=1)
 
 
 def sectors(points: Tensor, index: Tensor) -> list[Tensor | slice]:
-    """Divide some points by their azimuth, so that each part and its neighbours are a few points.
+    """Divide the points `index` (U,) of a scan's points (P, 4) by their azimuth.
 
-    Args:
-        points: (P, 4), all points of a scan.
-        index: (U,) indices of the points to divide.
+    Each part and its neighbours are then few points.
 
     Returns:
         Places in `index`, at most `AT_ONCE` in each part; one part if there are not more points.
@@ -150,17 +156,10 @@ def used_points_table(
 def head_features(
     config: PointHeadConfig, table: Tensor, uncertain: Tensor, near: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return p_i = [f_i, g_i, x_i] of uncertain points and the rows [f_k, g_k, x_k - x_i] of S_i.
+    """Return p_i = [f_i, g_i, x_i] (U, 2 K + 4) of uncertain points, and their S_i.
 
-    The positions in p_i are scaled by `config.position_scale`.
-
-    Args:
-        table: (P, 2 K + 4) of one scan, from `point_table`.
-        uncertain: (U,) indices of the uncertain points.
-        near: (U, n) indices of their nearest neighbours.
-
-    Returns:
-        (U, 2 K + 4) and (U, n, 2 K + 4).
+    S_i (U, n, 2 K + 4) has the rows [f_k, g_k, x_k - x_i] of the neighbours `near` (U, n). The
+    table is that of `point_table`. The positions in p_i are scaled by `config.position_scale`.
     """
     point = table[uncertain]
     rows = table[near]
@@ -170,15 +169,10 @@ def head_features(
 
 
 def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
-    """Return (U, n) indices of the n nearest other points of each point in `index`, by x, y, z.
+    """Return (U, n) indices of the n nearest others of each point `index` (U,) of points (P, 4).
 
     If a scan has fewer than n other points, the farthest is repeated. A lone point is its own
     neighbour.
-
-    Args:
-        points: (P, 4), all points of a scan.
-        index: (U,) indices of the points whose neighbours are searched for.
-        n: neighbours per point.
     """
     if points.is_cuda:
         return nearest_others_by_blocks(points[:, :3], index, n)

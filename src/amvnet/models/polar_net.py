@@ -41,7 +41,7 @@ class PolarNet(nn.Module):
         self.drop = DropBlock(config.dropblock, config.dropblock_size)
         self.scores = nn.Conv2d(widths[0], vertical * classes, 1)
 
-        # An engine's compiled or exported equivalent of the U-Net; None uses the method.
+        # The captured or exported equivalent of the U-Net; None uses the method.
         self.run_unet: Callable[[Tensor], Tensor] | None = None
 
     def forward(self, grid: PolarGrid) -> Tensor:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -13,10 +12,8 @@ from amvnet.threads import run_parts
 Score = Callable[[], Tensor]  # runs one network; returns (P, K)
 
 
-class Arrangement(Protocol):
-    """Runs the networks of both views, and returns their scores in this order."""
-
-    def __call__(self, score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]: ...
+# Runs the networks of the range view and of the bird's-eye view, and returns f and g.
+Arrangement = Callable[[Score, Score], tuple[Tensor, Tensor]]
 
 
 def one_after_the_other(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:

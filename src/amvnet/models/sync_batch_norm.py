@@ -13,12 +13,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
     """Replace the batch norms inside a network by ones with statistics over all processes.
 
-    Args:
-        net: changed in place.
-        cuda: whether it runs on GPUs; PyTorch's own synchronised batch norm does not run on CPUs.
-
-    Returns:
-        The network.
+    PyTorch's own ones run on GPUs only (`cuda`). The network is changed in place and returned.
     """
     if cuda:
         return nn.SyncBatchNorm.convert_sync_batchnorm(net)

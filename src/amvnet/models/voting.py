@@ -33,16 +33,11 @@ class Voting:
     cutoff: float = 1.0
 
     def __call__(self, f: Tensor, batch: PointBatch, image: RangeImage) -> Tensor:
-        """Return each class's share of the votes on each point, (P, K).
+        """Return each class's share of the votes on each point, (P, K), given f (P, K).
 
         The points that vote are the point itself and the nearest point of each other pixel. Those
         with the least difference of range, weighted by `weights`, are chosen. If classes have
         equally many votes, the one with the vote of least difference has the larger share.
-
-        Args:
-            f: (P, K) class probabilities by the range view.
-            batch: the points.
-            image: their range images.
         """
         distance = batch.points[:, :3].norm(dim=1)
         pixels, is_outside = self._windows(image)

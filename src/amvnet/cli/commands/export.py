@@ -22,14 +22,14 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
     from amvnet.written import protecting
 
     with protecting(possible_files(out), overwrite), progress("exporting") as step:
-        exported = export_weights(weights, out, step, int8)
-    largest = max(exported.differences.values())
-    say(
-        f"{len(exported.differences)} graphs and amvnet.json in {out}; "
-        f"they differ from torch by at most {largest:.1e}"
-    )
-    for name, share in exported.agreement.items():
-        say(
-            f"{name} is in int8 now; on scans it was not calibrated with, "
-            f"{share:.1%} of its labels are as before"
-        )
+        graphs = export_weights(weights, out, step, int8)
+    differences = [graph["difference"] for graph in graphs.values() if "difference" in graph]
+    say(f"{len(graphs)} graphs and amvnet.json in {out}")
+    if differences:
+        say(f"those in float32 differ from torch by at most {max(differences):.1e}")
+    for name, graph in graphs.items():
+        if "agreement" in graph:
+            say(
+                f"{name} is in int8 now; on scans it was not calibrated with, "
+                f"{graph['agreement']:.1%} of its labels are as before"
+            )

@@ -121,11 +121,7 @@ def _cells(fractions: Tensor, cells: int) -> Tensor:
 def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tensor:
     """Return the (pixels,) int32 index of the nearest point in each pixel, -1 if it has none.
 
-    Args:
-        distance: (P,) metres from the sensor.
-        pixel: (P,) index of each point's pixel.
-        pixels: the number of pixels.
-        least: points nearer than this do not count, metres.
+    The points have a distance and a pixel, (P,); those nearer than `least` metres do not count.
     """
     # The bits of floats >= 0 sort as the floats do, so one integer minimum finds both the least
     # distance and its point.
