@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import pytest
 
 from amvnet.weights.file import load, save
 
