@@ -21,7 +21,7 @@ from amvnet.evaluation.metrics import Evaluation
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmenter import Segmenter
 from lidarstreets import simulate
-from lidarstreets.sensing.sensors import HDL64E, SENSORS, LidarModel
+from lidarstreets.sensing.sensors import SENSORS, LidarModel
 
 SEED = 78
 VLP32C = (
@@ -33,7 +33,9 @@ VLP32C = (
 
 def sensor(elevations: tuple[float, ...], height: float, steps: int) -> LidarModel:
     """Return an HDL-64E with other lasers, at another height, on no car."""
-    return replace(HDL64E, elevations=elevations, height=height, azimuth_steps=steps, shadow=())
+    return replace(
+        SENSORS["hdl64e"], elevations=elevations, height=height, azimuth_steps=steps, shadow=()
+    )
 
 
 def evenly(end: float, beams: int) -> tuple[float, ...]:
@@ -42,8 +44,8 @@ def evenly(end: float, beams: int) -> tuple[float, ...]:
 
 
 OTHERS = {
-    "hdl64e-1.0m": sensor(HDL64E.elevations, 1.0, 2180),
-    "hdl64e-2.5m": sensor(HDL64E.elevations, 2.5, 2180),
+    "hdl64e-1.0m": sensor(SENSORS["hdl64e"].elevations, 1.0, 2180),
+    "hdl64e-2.5m": sensor(SENSORS["hdl64e"].elevations, 2.5, 2180),
     "vlp32c-1.07m": sensor(VLP32C, 1.07, 1800),
     "64-22.5-1.0m": sensor(evenly(22.5, 64), 1.0, 1024),
     "64-22.5-1.73m": sensor(evenly(22.5, 64), 1.73, 1024),
