@@ -156,9 +156,11 @@ def _is_kitti(table: np.ndarray) -> bool:
 
     Intensities are never negative, but some coordinates are. Lost points may be NaN.
     """
-    xyz = table[:, :3]
-    intensity = table[:, 3]
-    is_lost = np.isnan(xyz).any(axis=1)
-    is_position = is_lost | (np.abs(xyz) < NEAR).all(axis=1)
+    # Column by column: a reduction over rows of three takes several times as long.
+    x, y, z, intensity = np.ascontiguousarray(table.T)
+    is_lost = np.isnan(x) | np.isnan(y) | np.isnan(z)
+    is_near = (np.abs(x) < NEAR) & (np.abs(y) < NEAR) & (np.abs(z) < NEAR)
     is_intensity = np.isnan(intensity) | (intensity >= 0) & (intensity <= MAX_INTENSITY)
-    return bool((xyz < 0).any() and np.mean(is_position & is_intensity) >= USUAL)
+    is_usual = (is_lost | is_near) & is_intensity
+    is_around = (x < 0).any() or (y < 0).any() or (z < 0).any()
+    return bool(is_around and np.mean(is_usual) >= USUAL)
