@@ -114,14 +114,14 @@ def inside(folder: Path | str, name: Path | str) -> Path:
     return folder / name
 
 
-def check_no_links(folder: Path, levels: int = 3) -> None:
+def check_no_links(folder: Path) -> None:
     """Check that the first levels of an output folder, which another library fills, have no links.
 
     Raises:
         InputError: if one of its folders is a link.
     """
-    for level in range(levels):
-        for path in folder.glob("/".join(["*"] * (level + 1))):
+    for pattern in ("*", "*/*", "*/*/*"):
+        for path in folder.glob(pattern):
             if path.is_dir():
                 _refuse_link(path)
 

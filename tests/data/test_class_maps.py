@@ -106,7 +106,7 @@ def test_predict_writes_the_ids_of_the_map_for_datasets_and_files(tmp_path: Path
         np.testing.assert_array_equal(found, expected)
 
     message = refusal(f"predict {data} --weights {weights} --out {tmp_path / 'o'} --classes coars")
-    assert "did you mean coarse?" in message
+    assert "expected coarse or a YAML file" in message
 
 
 def test_weights_of_one_benchmark_are_scored_on_the_other_by_coarse_classes(

@@ -28,16 +28,8 @@ def store_with(store: Stores, definitions: dict[str, str]) -> Any:
     return types
 
 
-@pytest.mark.parametrize(
-    ("kind", "driver"),
-    [
-        ("velodyne_msgs/msg/VelodyneScan", "velodyne_pointcloud"),
-        ("livox_ros_driver2/msg/CustomMsg", "livox_to_pointcloud2"),
-    ],
-)
-def test_a_bag_of_other_messages_says_what_turns_them_into_clouds(
-    tmp_path: Path, kind: str, driver: str
-) -> None:
+def test_a_bag_of_other_messages_says_how_they_become_clouds(tmp_path: Path) -> None:
+    kind = "velodyne_msgs/msg/VelodyneScan"
     path = tmp_path / "a.bag"
     store = store_with(Stores.ROS1_NOETIC, {kind: PACKETS})
     with BagWriter(path) as writer:
@@ -45,7 +37,7 @@ def test_a_bag_of_other_messages_says_what_turns_them_into_clouds(
         message = store.types[kind](np.zeros(9, np.uint8))
         writer.write(connection, 0, store.serialize_ros1(message, kind))
 
-    words = ("/packets", kind, driver)
+    words = ("/packets", kind, "driver")
     fails(lambda: list(list_scans(path)), *words)
     fails(lambda: list(list_scans(path, "/points")), "/points", *words)
 

@@ -375,8 +375,7 @@ def test_an_mcap_file_without_messages_of_ros_2_is_refused(tmp_path: Path) -> No
         path.write_bytes(b"\x89MCAP0\r\n" + header + bytes(100))
         fails(
             lambda: Bag(path, ".mcap"),
-            f"profile ros2, found '{profile.decode()}'",
-            "PointCloud2",
+            "Profile is not ros2",
         )
 
 

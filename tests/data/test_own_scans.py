@@ -114,7 +114,7 @@ def test_scans_without_a_label_file_are_left_out_of_the_training(tmp_path: Path)
 
     (tmp_path / "b/1.label").unlink()
     first = tmp_path / "b/0.label"  # that was looked for
-    fails(lambda: split_records(data_of(tmp_path), None, None), "labelled scans", first, "(2)")
+    fails(lambda: split_records(data_of(tmp_path), None, None), "labelled scans", first, "other 2")
 
 
 def data_of(folder: Path) -> OwnScans:
@@ -126,8 +126,7 @@ def test_splits_are_folders_patterns_or_lists_and_may_cut_through_a_folder(tmp_p
         (tmp_path / site).mkdir()
         for index in range(4):
             np.save(tmp_path / f"{site}/{index}.npy", some_points())
-    (tmp_path / "val.txt").write_text("# two scans\nb/0.npy\nb/1\n")
-    data = open_own(describe(tmp_path, split={"train": ["a", "b/[23]"], "val": "val.txt"}))
+    data = open_own(describe(tmp_path, split={"train": ["a", "b/[23]"], "val": ["b/0.npy", "b/1"]}))
 
     assert data.sequences("train") == ("a", "b-train")
     assert data.sequences("val") == ("b-val",)

@@ -379,8 +379,8 @@ def test_a_wrong_description_is_named(tmp_path: Path, text: str, words: list[str
 def test_wrong_options_are_named(tmp_path: Path) -> None:
     fails(lambda: make_sensor("eye"), "eye", "vlp16")
     fails(lambda: make_sensor(str(tmp_path / "no.yaml")), "no.yaml")
-    fails(lambda: make_sensor(rotate="1,2"), "--rotate", "90,0,0")
-    fails(lambda: make_sensor(intensity_scale="much"), "--intensity-scale")
+    fails(lambda: make_sensor(rotate="1,2"), "rotate", "90,0,0")
+    fails(lambda: make_sensor(intensity_scale="much"), "intensity_scale", "much")
 
 
 def test_sensors_are_described_as_they_are_simulated() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy, class_entries, user_taxonomy
-from amvnet.errors import InputError, did_you_mean, errors_of, shown
+from amvnet.errors import InputError, errors_of, shown
 from amvnet.files import parse_yaml, read_yaml
 
 COARSE_NAME = "coarse"
@@ -62,10 +62,8 @@ def class_map(name: str) -> ClassMap:
 
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
-        advice = "give coarse or a YAML file"
         raise InputError(
-            f"--classes: expected {COARSE_NAME} or a YAML file, found {name!r}"
-            + did_you_mean(name, [COARSE_NAME], advice)
+            f"--classes: expected {COARSE_NAME} or a YAML file, found {name!r}; give one of them"
         )
 
     with errors_of(path):

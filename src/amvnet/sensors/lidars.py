@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.errors import InputError, errors_of
+from amvnet.errors import InputError, errors_of, shown
 from amvnet.files import read_yaml
 
 # Metres over the ground on the cars of the datasets that weights are trained for: KITTI, nuScenes.
@@ -29,6 +29,7 @@ AXES = {
 }
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048}  # metres
 Triple = tuple[float, float, float]
+LARGEST = 1e9  # of the numbers that describe a sensor
 
 
 @dataclass(frozen=True)
@@ -63,26 +64,27 @@ class Sensor:
     offset: Triple | None = None
 
     def __post_init__(self) -> None:
-        top = 90 if self.fov_up is None else self.fov_up
-        scale = self.intensity_scale
-        is_below = self.fov_down is None or -90 <= self.fov_down < top
+        top = self.fov_up if isinstance(self.fov_up, int | float) else 90
+        is_whole = self.beams is None or type(self.beams) is int
+        is_below = _is_within(self.fov_down, -90, top) and self.fov_down != top
 
-        self._check("beams", self.beams is None or self.beams >= 1, "a whole number from 1")
+        self._check("name", isinstance(self.name, str), "a text")
+        self._check("beams", is_whole and _is_within(self.beams, 1, LARGEST), "a whole number")
         self._check("fov_up", _is_within(self.fov_up, -90, 90), "degrees from -90 to 90")
         self._check("fov_down", is_below, "degrees from -90 to 90, below fov_up")
         self._check("height", _is_within(self.height, 0, 100), "metres from 0 to 100")
-        self._check("intensity_scale", scale is None or 0 < scale < math.inf, "a number above 0")
-        self._check("unit", self.unit is None or self.unit in UNITS, f"one of {', '.join(UNITS)}")
-        self._check("axes", self.axes is None or self.axes in AXES, f"one of {', '.join(AXES)}")
-        self._check("rotate", _are_finite(self.rotate), "yaw,pitch,roll in degrees")
-        self._check("offset", _are_finite(self.offset), "x,y,z in metres")
+        is_scale = _is_within(self.intensity_scale, 0, LARGEST) and self.intensity_scale != 0
+        self._check("intensity_scale", is_scale, "a number above 0")
+        self._check("unit", self.unit in (None, *UNITS), f"one of {', '.join(UNITS)}")
+        self._check("axes", self.axes in (None, *AXES), f"one of {', '.join(AXES)}")
+        self._check("rotate", _is_triple(self.rotate), "yaw,pitch,roll in degrees, as 90,0,0")
+        self._check("offset", _is_triple(self.offset), "x,y,z in metres, as 0,0,1.2")
 
     def _check(self, key: str, is_valid: bool, expected: str) -> None:
         """Raise an InputError about an attribute unless its value is valid."""
         if not is_valid:
-            raise InputError(
-                f"{key}: expected {expected}, found {getattr(self, key)!r}; correct the value"
-            )
+            found = shown(getattr(self, key))
+            raise InputError(f"{key}: expected {expected}, found {found}; correct the value")
 
     @property
     def turn(self) -> np.ndarray:
@@ -109,13 +111,16 @@ class Sensor:
         return level
 
 
-def _is_within(value: float | None, low: float, high: float) -> bool:
-    """Return whether a value is unknown or lies between two limits."""
-    return value is None or low <= value <= high
+def _is_within(value: Any, low: float, high: float) -> bool:
+    """Return whether a value is unknown, or a number between two limits."""
+    return value is None or (isinstance(value, int | float) and low <= value <= high)
 
 
-def _are_finite(values: Triple | None) -> bool:
-    return values is None or all(map(math.isfinite, values))
+def _is_triple(values: Any) -> bool:
+    """Return whether values are unknown, or three finite numbers."""
+    if values is None:
+        return True
+    return isinstance(values, tuple) and len(values) == 3 and all(map(math.isfinite, values))
 
 
 def rotation_from_degrees(yaw: float, pitch: float, roll: float) -> np.ndarray:
@@ -146,15 +151,22 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
     Raises:
         InputError: if there is no such sensor, file or attribute, or a value is impossible.
     """
-    if sensor is None:
-        base = Sensor()
-    elif isinstance(sensor, Mapping):
-        base = Sensor(**_convert(sensor))
-    else:
+    changes = {key: value for key, value in options.items() if value is not None}
+    base = Sensor()
+    if isinstance(sensor, Mapping):
+        changes = {**sensor, **changes}
+    elif sensor is not None:
         base = _read_sensor(sensor)
 
-    changes = {key: value for key, value in options.items() if value is not None}
-    return dataclasses.replace(base, **_convert(changes, are_options=True))
+    names = [field.name for field in dataclasses.fields(Sensor)]
+    for key in changes:
+        if key not in names:
+            raise InputError(
+                f"expected one of {', '.join(names)}, found {shown(key)}; correct the key"
+            )
+    for key in {"rotate", "offset"} & set(changes):
+        changes[key] = _to_triple(changes[key])
+    return dataclasses.replace(base, **changes)
 
 
 def _read_sensor(text: str) -> Sensor:
@@ -178,49 +190,10 @@ def _read_sensor(text: str) -> Sensor:
         return make_sensor({"name": path.stem, **tree})
 
 
-def _to_whole(value: Any) -> int:
-    if int(value) != value:
-        raise ValueError
-    return int(value)
-
-
-def _to_triple(value: Any) -> Triple:
-    numbers = value.split(",") if isinstance(value, str) else value
-    a, b, c = map(float, numbers)
+def _to_triple(value: Any) -> Any:
+    """Return three numbers of a list, or of a text with commas; `Sensor` refuses anything else."""
+    try:
+        a, b, c = map(float, value.split(",") if isinstance(value, str) else value)
+    except (TypeError, ValueError, OverflowError):
+        return value
     return a, b, c
-
-
-# What converts a value of a file or an option to an attribute of `Sensor`, and what it takes.
-_CONVERTERS: dict[str, tuple[Callable[[Any], Any], str]] = {
-    **dict.fromkeys(("name", "unit", "axes"), (str, "a text")),
-    **dict.fromkeys(("fov_up", "fov_down", "height", "intensity_scale"), (float, "a number")),
-    "beams": (_to_whole, "a whole number"),
-    "rotate": (_to_triple, "yaw,pitch,roll such as 90,0,0"),
-    "offset": (_to_triple, "x,y,z such as 0,0,1.2"),
-}
-
-
-def _convert(values: Mapping[Any, Any], are_options: bool = False) -> dict[str, Any]:
-    """Convert values to the types of the attributes of `Sensor`.
-
-    Args:
-        are_options: whether messages should name the keys as options of the command line.
-
-    Raises:
-        InputError: if a key is no attribute, or a value cannot be converted.
-    """
-    attributes = {}
-    for key, value in values.items():
-        if key not in _CONVERTERS:
-            names = ", ".join(_CONVERTERS)
-            raise InputError(f"expected one of {names}, found {key!r}; correct the key")
-
-        convert, expected = _CONVERTERS[key]
-        try:
-            attributes[key] = convert(value)
-        except (ValueError, TypeError, OverflowError):
-            title = f"--{key}".replace("_", "-") if are_options else key
-            raise InputError(
-                f"{title}: expected {expected}, found {value!r}; correct the value"
-            ) from None
-    return attributes

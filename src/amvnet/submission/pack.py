@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import stat
 import zipfile
 from pathlib import Path
@@ -10,7 +11,7 @@ from amvnet.data.labels.ids import check_size
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.progress import Progress, no_progress
-from amvnet.submission.rules import Rules, Sources
+from amvnet.submission.rules import LIDAR_ALONE, Rules
 
 ENDING = ".zip"
 LEVEL = 6  # of deflate: 9 takes five to eight times as long and saves a sixth
@@ -24,7 +25,7 @@ def write(
     rules: Rules,
     folder: Path,
     out: Path,
-    sources: Sources | None = None,
+    use_external: bool = False,
     progress: Progress = no_progress,
 ) -> int:
     """Check a folder of predictions and pack it; the same predictions give the same bytes.
@@ -35,7 +36,7 @@ def write(
     Args:
         folder: predictions, under the file names of `rules`.
         out: NAME.zip; it appears whole or not at all.
-        sources: the data that the method uses, if the benchmark asks for them.
+        use_external: whether the method learnt from other data, too, if the benchmark asks for it.
         progress: called before each file and at the end.
 
     Returns:
@@ -63,10 +64,8 @@ def write(
         for name in rules.folders:
             _add(archive, name, b"")
         if rules.meta is not None:
-            _add(archive, rules.meta, (sources or Sources()).to_json())
-        for name in rules.texts:
-            if (folder / name).is_file():
-                _add(archive, name, (folder / name).read_bytes())
+            meta = {**LIDAR_ALONE, "use_external": use_external}
+            _add(archive, rules.meta, json.dumps({"meta": meta}).encode())
 
         for done, name in enumerate(names):
             progress(done, len(names))

@@ -7,9 +7,8 @@ The rules are those of the official checkers: `validate_submission.py` (task "se
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,19 +23,14 @@ from amvnet.errors import InputError
 TEST_SCANS = 20_351  # of SemanticKITTI (KITTI odometry 11 to 21); its server requires all of them
 
 
-@dataclass(frozen=True)
-class Sources:
-    """The data that a method uses, as nuScenes' submission.json declares them."""
-
-    use_camera: bool = False
-    use_lidar: bool = True
-    use_radar: bool = False
-    use_map: bool = False
-    use_external: bool = False
-
-    def to_json(self) -> bytes:
-        """Return the content of submission.json."""
-        return json.dumps({"meta": asdict(self)}).encode()
+# What a method uses, as nuScenes' submission.json declares it.
+LIDAR_ALONE = {
+    "use_camera": False,
+    "use_lidar": True,
+    "use_radar": False,
+    "use_map": False,
+    "use_external": False,
+}
 
 
 @dataclass(frozen=True)
@@ -50,8 +44,7 @@ class Rules:
         dtype: number type of the ids.
         unlabelled: whether points may have no class (train id 0).
         folders: names of the folders' entries, outer ones first, each with a trailing slash.
-        meta: name of submission.json, the file of `Sources`; None if there is none.
-        texts: names of text files that the archive may contain.
+        meta: name of submission.json, which says what the method uses; None if there is none.
         official: how many predictions the server expects, or None if it has no fixed number.
     """
 
@@ -62,7 +55,6 @@ class Rules:
     unlabelled: bool
     folders: tuple[str, ...]
     meta: str | None = None
-    texts: tuple[str, ...] = ()
     official: int | None = None
 
     def check_ids(self, data: bytes, path: Path) -> None:
@@ -109,7 +101,6 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
     for every scan in the `velodyne` folders, and 4 bytes per point, but does not check the ids. The
     server's evaluation reads unknown ids as "unlabeled" and stops at ids above 358; here, unknown
     ids are errors. A point may be unlabelled (it counts as missed) and the upper 16 bits are free.
-    The file description.txt is optional.
     """
     wanted = dataset.taxonomy.splits[split] if sequences is None else sorted(set(sequences))
     folders = ["sequences/"]
@@ -124,7 +115,6 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
         dtype=np.uint32,
         unlabelled=True,
         folders=tuple(folders),
-        texts=("description.txt", "sequences/description.txt"),
         official=TEST_SCANS if is_whole_test else None,
     )
 
@@ -137,7 +127,7 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
 
     The official validator requires a file for every key frame that the tables list for the split,
     one byte per point with a value of 1..16, and in submission.json a "meta" with exactly the five
-    keys of `Sources`, all true or false.
+    keys of `LIDAR_ALONE`, all true or false.
 
     Raises:
         InputError: if there are no such scenes, or they belong to several splits.

@@ -17,10 +17,6 @@ def submit(
     out: Path,
     split: Literal["train", "val", "test"] = "test",
     sequences: str | None = None,
-    use_camera: bool = False,
-    use_lidar: bool = True,
-    use_radar: bool = False,
-    use_map: bool = False,
     use_external: bool = False,
     overwrite: bool = False,
 ) -> None:
@@ -32,26 +28,19 @@ def submit(
         out: the archive to write, NAME.zip.
         split: the official split; the servers score test, the others are for trials.
         sequences: sequences or scenes instead, separated by commas, for trials.
-        use_camera: nuScenes: the method was given images.
-        use_lidar: nuScenes: the method was given LiDAR scans.
-        use_radar: nuScenes: the method was given radar.
-        use_map: nuScenes: the method was given the semantic map.
-        use_external: nuScenes: the method was given data that are not of nuScenes.
+        use_external: nuScenes: the method learnt from data that are not of nuScenes, too.
         overwrite: replace an archive that amvnet did not write, too.
     """
     from amvnet.submission import pack
-    from amvnet.submission.rules import Sources, rules_for
+    from amvnet.submission.rules import rules_for
     from amvnet.written import protecting
 
-    sources = Sources(use_camera, use_lidar, use_radar, use_map, use_external)
     rules = rules_for(open_data(data), split, parse_names(sequences))
-    if sources != Sources() and rules.meta is None:
-        raise InputError(
-            "expected no --use-... but to write an archive for nuScenes, found one; leave it out"
-        )
+    if use_external and rules.meta is None:
+        raise InputError("expected --use-external for nuScenes alone, found it; leave it out")
 
     with protecting([out], overwrite), progress("packing") as step:
-        count = pack.write(rules, predictions, out, sources, step)
+        count = pack.write(rules, predictions, out, use_external, step)
     packed = counted(count, "prediction")
     fit = "keeps" if count == 1 else "keep"
     say(f"{out}: {packed} of {rules.description} {fit} to the rules of {rules.taxonomy.name}")

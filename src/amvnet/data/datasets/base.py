@@ -103,20 +103,15 @@ class Dataset(ABC):
         """
         return len(self.read(record, labels=False))
 
-    def read_prediction(
-        self, record: ScanRecord, folder: Path, taxonomy: Taxonomy | None = None
-    ) -> np.ndarray:
+    def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:
         """Read the (N,) uint8 train ids (0..K) that were predicted for a scan.
-
-        Args:
-            taxonomy: the classes of the prediction; None means those of the dataset.
 
         Raises:
             InputError: if the file is missing, has another number of points or an unknown id.
         """
         path = Path(folder) / record.prediction
         raw = read_ids(path, _id_type(path), self.count_points(record))
-        return train_ids(path, raw, taxonomy or self.taxonomy)
+        return train_ids(path, raw, self.taxonomy)
 
     def write_prediction(
         self,

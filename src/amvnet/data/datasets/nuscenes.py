@@ -22,7 +22,6 @@ from amvnet.scan import Scan
 CHANNEL = "LIDAR_TOP"
 MINI = "v1.0-mini"
 TEST = "v1.0-test"
-MAX_LISTED = 20  # scenes in a message
 
 Row = dict[str, Any]  # a row of a table: values by column name
 
@@ -132,12 +131,9 @@ class NuScenes(Dataset):
         missing = sorted(set(sequences) - set(self._records_by_scene))
         if missing:
             scenes = sorted(self._records_by_scene)
-            listing = ", ".join(scenes[:MAX_LISTED])
-            if len(scenes) > MAX_LISTED:
-                listing += f" and {len(scenes) - MAX_LISTED} more"
             raise InputError(
-                f"{self.root}: expected the scene {missing[0]} in {self.version}, "
-                f"found no such scene in its tables; name one of {listing}"
+                f"{self.root}: expected the scene {missing[0]} in {self.version}, found no such "
+                f"scene in its tables; name some of its {len(scenes)}, such as {scenes[0]}"
             )
 
         records: list[ScanRecord] = []

@@ -62,7 +62,7 @@ class Description:
         taxonomy: the classes.
         scans: pattern of the scan files.
         labels: where the labels are; None if there are none.
-        split: names of folders, patterns and list files by split; empty if there is no split.
+        split: names of folders and scans, and patterns, by split; empty if there is no split.
         sensor: name or attributes of the sensor; None if it is to be measured.
         layout: of rows of numbers without names, what they hold.
     """
@@ -139,10 +139,8 @@ class OwnScans(Dataset):
             found = "no labels in the description"
             if place is not None:
                 scan = self._scans[records[0].name]
-                found = f"no {os.path.normpath(place.path_of(scan.path, scan.name))}"
-            if len(records) > 1:
-                found += f" and none for the other scans ({len(records) - 1})"
-
+                path = os.path.normpath(place.path_of(scan.path, scan.name))
+                found = f"no {path}, and none for the other {len(records) - 1} scans"
             raise InputError(
                 f"{self.spec}: expected labelled scans, found {found}; "
                 "correct labels in the file, or name other sequences"
@@ -257,8 +255,8 @@ class OwnScans(Dataset):
         folders = map(Path.as_posix, Path(name).parents)
         texts = {name, path.relative_to(self.root).as_posix(), self._folder_of(name), *folders}
         splits = []
-        for split, names in self._names.items():
-            if texts & names or any(fnmatchcase(name, pattern) for pattern in names):
+        for split, names in self.description.split.items():
+            if texts & set(names) or any(fnmatchcase(name, pattern) for pattern in names):
                 splits.append(split)
 
         if len(splits) > 1:
@@ -267,22 +265,6 @@ class OwnScans(Dataset):
                 f"{' and '.join(splits)}; correct the split"
             )
         return splits[0] if splits else ""
-
-    @cached_property
-    def _names(self) -> dict[str, frozenset[str]]:
-        """Folders, names of scans and patterns by split, with those in list files."""
-        names = {}
-        for split, entries in self.description.split.items():
-            texts: set[str] = set()
-
-            for entry in entries:
-                path = self.root / entry
-                if path.suffix in (".txt", ".lst") and path.is_file():
-                    texts.update(_read_list(path))
-                else:
-                    texts.add(entry.rstrip("/"))
-            names[split] = frozenset(texts)
-        return names
 
     def _read_labels(self, record: ScanRecord, count: int) -> np.ndarray | None:
         place = self.description.labels
@@ -301,12 +283,6 @@ def _fixed_part(pattern: str) -> Path:
             break
         fixed /= part
     return fixed
-
-
-def _read_list(path: Path) -> list[str]:
-    """Return the lines of a list of scans or folders; names may have the ending of the scans."""
-    lines = map(str.strip, path.read_text(encoding="utf-8", errors="replace").splitlines())
-    return [line for line in lines if line and not line.startswith("#")]
 
 
 def is_description(text: str) -> bool:
@@ -432,7 +408,11 @@ def _parse_labels(entry: Any) -> LabelPlace | None:
 def _parse_split(entry: Any) -> dict[str, tuple[str, ...]]:
     """Return the names by split."""
     _check_keys("split", entry, SPLITS)
-    return {split: _texts(f"split: {split}", values) for split, values in entry.items()}
+    splits = {}
+    for split, values in entry.items():
+        names = _texts(f"split: {split}", values)
+        splits[split] = tuple(name.rstrip("/") for name in names)
+    return splits
 
 
 def _check_keys(title: str, tree: Any, keys: Sequence[str], required: Sequence[str] = ()) -> None:

@@ -15,26 +15,10 @@ from amvnet.data.formats.pointcloud2 import CLOUD_TYPE, read_message
 from amvnet.data.formats.reader_process import DISK, DISK_PER_BYTE, size_of
 from amvnet.errors import InputError
 
-# Other messages of sensors, by the beginning of their type, and what turns them into PointCloud2
-# while the bag is played.
-DRIVERS = {
-    "velodyne_msgs/": "velodyne_pointcloud (ros2 launch velodyne_pointcloud "
-    "velodyne_transform_node-VLP16-launch.py)",
-    "ouster_ros/": "ouster_ros (ros2 launch ouster_ros replay.launch.xml bag_file:=BAG)",
-    "ouster_sensor_msgs/": "ouster_ros (ros2 launch ouster_ros replay.launch.xml bag_file:=BAG)",
-    "hesai_ros_driver/": "hesai_ros_driver with source_type 3",
-    "pandar_msgs/": "pandar_pointcloud (roslaunch pandar_pointcloud transform.launch)",
-    "rslidar_msg": "rslidar_sdk with msg_source 2",
-    "robosense": "rslidar_sdk with msg_source 2",
-    "nebula_msgs/": "nebula_ros with launch_hw:=false",
-    "livox_ros_driver": "livox_to_pointcloud2",
-}
 LISTED = 10  # topics in a message
 
 CHUNK = 1 << 20  # bytes that are unpacked at a time
 MIN_MESSAGE = 16  # bytes of a bag for each message, compressed ones too
-PROFILE = 17  # bytes of an MCAP file before its profile, a text after its length
-LONGEST_PROFILE = 20
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
@@ -129,26 +113,11 @@ def _open_reader(path: Path, ending: str) -> Any:
         FOLDER: DirectoryReader,
     }
 
-    if ending == ".mcap":
-        _check_profile(path)
     reader = readers[ending](path)
     if ending == FOLDER:
         reader.STORAGE_PLUGINS = {"mcap": McapReader, "sqlite3": open_database}
     reader.open()
     return reader
-
-
-def _check_profile(path: Path) -> None:
-    """Raise InputError if the messages of an MCAP file are not those of ROS 2."""
-    with path.open("rb") as file:
-        file.seek(PROFILE)
-        length = int.from_bytes(file.read(4), "little")
-        profile = file.read(min(length, LONGEST_PROFILE)).decode("latin-1")
-    if profile != "ros2":
-        raise InputError(
-            f"{path}: expected an MCAP file with the profile ros2, found {profile!a}; write the "
-            "scans as PointCloud2 messages of ROS 2, or as .pcd"
-        )
 
 
 def _check_unpacked(folder: Path) -> None:
@@ -194,24 +163,19 @@ def _with_scans(reader: Any) -> list[Any]:
 
 
 def _describe_others(reader: Any) -> str:
-    """Return what else is in a bag, and what turns messages of sensors into scans."""
+    """Return what else is in a bag, and how messages of sensors become scans."""
     topics = []
-    advice = "give a bag with scans"
     for connection in reader.connections:
-        if connection.msgtype == CLOUD_TYPE:
-            continue
-        topics.append(f"{connection.topic} ({connection.msgtype}, {connection.msgcount})")
-        for beginning, driver in DRIVERS.items():
-            if connection.msgtype.startswith(beginning):
-                advice = (
-                    f"{connection.topic} has other messages of a sensor: play the bag with "
-                    f"{driver} running, and record the PointCloud2 topic that it publishes"
-                )
+        if connection.msgtype != CLOUD_TYPE:
+            topics.append(f"{connection.topic} ({connection.msgtype}, {connection.msgcount})")
 
     listing = ", ".join(topics[:LISTED]) or "no topic"
     if len(topics) > LISTED:
         listing += f" and {len(topics) - LISTED} more"
-    return f"found {listing}; {advice}"
+    return (
+        f"found {listing}; give a bag with scans, or play this one with the driver of the sensor "
+        "running, and record the PointCloud2 topic that it publishes"
+    )
 
 
 def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, without_scans: str) -> str:

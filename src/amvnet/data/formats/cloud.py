@@ -269,11 +269,6 @@ def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
     )
 
 
-def split_records(records: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the (N,) columns of (N,) records by name, without a copy."""
-    return {name: records[name] for name in records.dtype.names or ()}
-
-
 def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     """Return the cloud of the (N,) columns x, y, z and, if present, intensity and ring.
 

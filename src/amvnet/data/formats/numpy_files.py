@@ -15,6 +15,7 @@ from typing import BinaryIO, cast
 import numpy as np
 
 from amvnet.data.formats.cloud import (
+    COLUMN_NAMES,
     MAX_BYTES,
     Arrays,
     Cloud,
@@ -94,13 +95,21 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
     Raises:
         InputError: as `read_npy`.
     """
-    array = read_array(path)
+    return _columns_of(read_array(path), path, wanted)
+
+
+def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
     numbers = range(min(array.shape[-1], MOST_COLUMNS))
     names = array.dtype.names or tuple(map(str, numbers))
 
     columns = {}
     for key, index in require_columns(names, path, wanted).items():
         columns[key] = array[..., index] if array.dtype.names is None else array[names[index]]
+        if columns[key].dtype.kind not in "fiu" or columns[key].ndim > array.ndim:
+            raise InputError(
+                f"{path}: expected a number per point in the column {names[index]!a}, found "
+                f"{array.dtype[index]}; {ADVICE}"
+            )
     return columns
 
 
@@ -186,7 +195,7 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
 
 def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
     if array.dtype.names is not None:
-        return _from_named_columns(array, array.dtype.names, path)
+        return make_cloud(_columns_of(array.ravel(), path, COLUMN_NAMES), str(path))
     if array.ndim not in (2, 3) or array.shape[-1] < 3:
         raise InputError(
             f"{path}: expected numbers of shape (N, 3), (N, 4), (N, 5) or (H, W, C), "
@@ -208,16 +217,3 @@ def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
     if array.ndim == 3:
         note = f"range image of {array.shape[0]} x {array.shape[1]} row by row, {describe(names)}"
     return named_cloud(list(table.T), names, str(path), note)
-
-
-def _from_named_columns(array: np.ndarray, names: tuple[str, ...], path: Path) -> Cloud:
-    records = array.ravel()
-    columns = {}
-    for key, index in require_columns(names, path).items():
-        columns[key] = records[names[index]]
-        if columns[key].ndim > 1 or columns[key].dtype.kind not in "fiu":
-            raise InputError(
-                f"{path}: expected a number per point in the column {names[index]!a}, found "
-                f"{array.dtype[index]}; {ADVICE}"
-            )
-    return make_cloud(columns, str(path))

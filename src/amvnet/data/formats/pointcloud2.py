@@ -15,7 +15,6 @@ from amvnet.data.formats.cloud import (
     make_cloud,
     record_dtype,
     require_columns,
-    split_records,
 )
 from amvnet.errors import InputError
 
@@ -64,4 +63,4 @@ def read_message(message: Any, name: str) -> Cloud:
     shape = (message.height, message.width)
     strides = (row_step, message.point_step)
     records = np.ndarray(shape, dtype, data, strides=strides).ravel()
-    return make_cloud(split_records(records), name)
+    return make_cloud({key: records[key] for key in columns}, name)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
-from amvnet.data.formats.cloud import MOST_RINGS, Cloud, check_point_count, split_records
+from amvnet.data.formats.cloud import MOST_RINGS, Cloud, check_point_count
 from amvnet.data.formats.rows import ADVICE, NAMES, UNKNOWN, RowLayout, are_rings, named_cloud
 from amvnet.errors import InputError
 
@@ -73,7 +73,8 @@ def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
         )
 
     check_point_count(len(data) // size, path)
-    columns = list(split_records(data.view(layout.record)).values())
+    records = data.view(layout.record)
+    columns = [records[name] for name in layout.record.names or ()]
     return named_cloud(columns, layout.columns, str(path), layout.describe())
 
 
