@@ -143,6 +143,7 @@ def _fault_of(name: Path) -> str | None:
         longest = max(len(os.fsencode(part)) for part in name.parts)
     except UnicodeEncodeError:
         return "characters that no file name can have"
+
     return f"more than {LONGEST_NAME} bytes" if longest > LONGEST_NAME else None
 
 
@@ -158,6 +159,7 @@ def checked_token(text: Any) -> str:
             "expected tokens without separators and control characters, "
             f"found {shown(text)}; correct the table"
         )
+
     return text
 
 
@@ -228,6 +230,7 @@ class _BoundedLoader(yaml.SafeLoader):
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
+
         return node
 
     def construct_scalar(self, node: Any) -> Any:

@@ -67,17 +67,8 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     fails(lambda: read_cloud(path), path, 'pip install "amvnet[datasets]"')
 
 
-@pytest.mark.parametrize(
-    ("name", "word"),
-    [
-        ("a.tfrecord", "Waymo"),
-        ("a.parquet", "Waymo"),
-        ("a.pkl", "convert"),
-        ("a.bin.gz", "unpack"),
-        ("a.pcap", "VeloView"),
-    ],
-)
-def test_formats_that_are_not_read_say_what_to_do(tmp_path: Path, name: str, word: str) -> None:
+@pytest.mark.parametrize("name", ["a.parquet", "a.pkl", "a.pcap", "a.bin.gz"])
+def test_formats_that_are_not_read_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(bytes(range(256)))
-    fails(lambda: read_cloud(path), path, word)
+    fails(lambda: read_cloud(path), path, "convert it", "PointCloud2")

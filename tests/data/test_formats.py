@@ -471,12 +471,6 @@ def test_intensities_are_scaled_by_their_range(tmp_path: Path, largest: int, kin
     np.testing.assert_allclose(read_scan(path).points[:, 3], points[:, 3], atol=0.002)
 
 
-def test_text_that_is_called_bin_is_said_to_be_text(tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
-    path.write_text("Notes on the drive of Monday, with the car's own LiDAR.\n" * 40)
-    fails(lambda: read_scan(path), path, "text")
-
-
 def test_a_dimension_of_las_with_rings_is_read(tmp_path: Path) -> None:
     las = laspy.read(write_las(tmp_path / "a.las", some_points()))
     assert read_cloud(tmp_path / "a.las").ring is None

@@ -168,7 +168,6 @@ def test_predictions_come_back_as_the_users_ids(site: Path, tmp_path: Path) -> N
         ({"labels": {"colour": 1}}, "colour"),
         ({"labels": "truth.npy"}, "{name}"),
         ({"split": {"training": "a"}}, "training"),
-        ({"sensor": 3}, "sensor"),
         ({"clases": {}, "extra": 1}, "extra"),
     ],
 )

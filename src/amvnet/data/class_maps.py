@@ -47,6 +47,7 @@ class ClassMap:
                 f"--classes {self.target.name}: expected a map of the classes of {taxonomy.name} "
                 f"({', '.join(taxonomy.classes)[:200]}), found none of them; write a YAML file"
             )
+
         return np.array(train_ids, dtype=np.uint8)
 
 

@@ -108,10 +108,6 @@ def rank(
 
     A few scans are in memory at a time, and 35 bytes for each cluster.
 
-    Args:
-        progress: called at the start and after each scan, with the number of scans done and in
-            all.
-
     Raises:
         InputError: if the weights lack a network or do not have the dataset's classes, or a scan
             has no labels.

@@ -122,13 +122,9 @@ def _lowest_points(xyz: np.ndarray) -> np.ndarray:
 
 
 def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
-    """Return (a, b, c) of the plane z = a x + b y + c that most low points agree with.
+    """Return (a, b, c) of the plane z = a x + b y + c that most (M, 3) low points agree with.
 
     None if every plane is too steep. The draws are seeded: the same points give the same plane.
-
-    Args:
-        low: (M, 3) low points.
-        weight: (M,) their weights.
     """
     rng = np.random.default_rng(0)
     triples = low[rng.choice(len(low), (TRIES, 3), p=weight / weight.sum())]  # (tries, 3, 3)

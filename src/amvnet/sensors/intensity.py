@@ -158,9 +158,6 @@ def are_quantiles(values: Any) -> TypeGuard[list[float]]:
 def check_quantiles(values: Any, source: str) -> list[float]:
     """Return the quantiles that a file holds.
 
-    Args:
-        values: of the file.
-
     Raises:
         InputError: if they cannot be quantiles.
     """
@@ -189,8 +186,8 @@ def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
 
 def is_constant(quantiles: np.ndarray | Sequence[float]) -> bool:
     """Return whether nearly all intensities are the same, so that they say nothing."""
-    low, median, high = quantiles[1], quantiles[5], quantiles[9]
-    return bool(high - low <= CONSTANT * abs(median))
+    spread = quantiles[9] - quantiles[1]
+    return bool(spread <= CONSTANT * abs(quantiles[5]))
 
 
 def are_of_one_range(a: np.ndarray | None, b: np.ndarray | None) -> bool:
@@ -304,7 +301,8 @@ def check_intensity(scan: Scan) -> Scan:
     if not is_outside.any():
         return scan
     if is_outside.sum() > max(WILD_SHARE * valid.sum(), 1):
-        low, high = intensity[valid].min(), intensity[valid].max()
+        low = intensity[valid].min()
+        high = intensity[valid].max()
         raise InputError(
             f"{scan.name or 'scan'}: expected intensities in [0, 1], found {low:g} to {high:g}; "
             "divide them by the largest possible one, as amvnet predict does for scan files"

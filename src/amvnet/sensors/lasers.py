@@ -55,6 +55,7 @@ class SensorGeometry:
                 medians[key] = float(np.median(known))
         if "beams" in medians:
             medians["beams"] = round(medians["beams"])
+
         return cls(**medians)
 
     def has_ends_of(self, other: SensorGeometry) -> bool:

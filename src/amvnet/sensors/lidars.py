@@ -156,13 +156,12 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
     if isinstance(sensor, Mapping):
         changes = {**sensor, **changes}
     elif sensor is not None:
-        base = _read_sensor(sensor)
+        base = _read_sensor(str(sensor))
 
-    names = [field.name for field in dataclasses.fields(Sensor)]
     for key in changes:
-        if key not in names:
+        if key not in vars(base):
             raise InputError(
-                f"expected one of {', '.join(names)}, found {shown(key)}; correct the key"
+                f"expected one of {', '.join(vars(base))}, found {shown(key)}; correct the key"
             )
     for key in {"rotate", "offset"} & set(changes):
         changes[key] = _to_triple(changes[key])
@@ -177,7 +176,7 @@ def _read_sensor(text: str) -> Sensor:
     path = Path(text)
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(
-            f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {text!r}; "
+            f"expected a sensor of {', '.join(SENSORS)} or a YAML file, found {shown(text)}; "
             "give one of them"
         )
 

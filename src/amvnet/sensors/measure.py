@@ -114,9 +114,6 @@ class Recording:
 
     Attributes:
         usual: the median; None as long as nothing is measured, and for several sensors.
-
-    Args:
-        gauge: measures the scans.
     """
 
     def __init__(self, gauge: Gauge) -> None:
@@ -169,7 +166,7 @@ class Recording:
     def _add(self, estimate: Estimate) -> None:
         """Add the estimate of one of the first scans."""
         self._first.append(estimate)
-        is_of_one_sensor = all(each.is_like(self._first[0]) for each in self._first)
+        is_of_one_sensor = all(map(estimate.is_like, self._first))
         self.usual = median_of(self._first) if is_of_one_sensor else None
         self._is_learnt = len(self._first) == MEASURED
 
@@ -178,6 +175,7 @@ def median_of(estimates: Sequence[Estimate]) -> Estimate:
     """Return the median of each value that is known."""
     frames = [estimate.frame for estimate in estimates]
     quantiles = [each.quantiles for each in estimates if each.quantiles is not None]
+
     return Estimate(
         median_frame(frames),
         SensorGeometry.median([estimate.lasers for estimate in estimates]),
@@ -194,6 +192,7 @@ def _are_steady(frames: Sequence[Frame]) -> bool:
     if heights and max(heights) - min(heights) >= STEADY:
         return False
     turns = np.array([(frame.pitch, frame.roll) for frame in frames])
+
     return bool((np.ptp(turns, axis=0) < STEADY_TILT).all())
 
 

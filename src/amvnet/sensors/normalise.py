@@ -137,10 +137,6 @@ class Normaliser:
 
         The first ones are measured even if another scan is normalised before them, as after an
         interruption or in one of several processes.
-
-        Args:
-            source: name of the bag or folder.
-            read: reads the scan.
         """
         first = self._first.setdefault(source, [])
         if len(first) < MEASURED:
@@ -148,9 +144,6 @@ class Normaliser:
 
     def __call__(self, cloud: Cloud, source: str) -> Scan:
         """Return a scan as the weights expect it; its points keep their order and number.
-
-        Args:
-            source: name of the bag or folder that the scan is from.
 
         Raises:
             InputError: if no point is usable, or the unit of the coordinates is in doubt.

@@ -38,7 +38,6 @@ class Rules:
     """What an archive must contain and what it may contain.
 
     Attributes:
-        taxonomy: the classes.
         description: of the scans, in words.
         points: the predictions that it must contain, by name, with the number of points of each.
         dtype: number type of the ids.

@@ -78,9 +78,7 @@ def show(result: Segmentation, path: Path | str | None = None, open_browser: boo
     It shows the labels, those of each network, uncertain points, and errors if the scan has labels.
 
     Args:
-        result: of a `Segmenter`.
         path: the file, NAME.html; by default in a temporary folder.
-        open_browser: whether to open the page in a browser.
 
     Returns:
         The path of the page.
@@ -94,6 +92,7 @@ def show(result: Segmentation, path: Path | str | None = None, open_browser: boo
     page = write_page(path or temporary_page(), [shown], origin.taxonomy, title)
     if open_browser:
         open_page(page)
+
     return page
 
 
@@ -110,16 +109,9 @@ def open_page(path: Path) -> None:
 def write_page(
     path: Path | str, scans: Iterable[ShownScan], taxonomy: Taxonomy, title: str
 ) -> Path:
-    """Write scans as one self-contained page; it appears whole or not at all.
+    """Write scans, in the order of the page's slider, as one self-contained page.
 
-    Args:
-        scans: in the order of the page's slider.
-
-    Returns:
-        The path that was written.
-
-    Raises:
-        InputError: if the file cannot be written.
+    The file appears whole or not at all.
     """
     packed = [pack(shown) for shown in scans]
     page = assemble(packed, taxonomy, title)

@@ -43,8 +43,6 @@ class Part:
     """A dataset that is mixed in.
 
     Attributes:
-        dataset: reads the scans.
-        records: the scans to train on.
         share: of the scans of an epoch; None takes every scan once per epoch.
     """
 
@@ -119,24 +117,15 @@ class Joined(Dataset):
         turn = epoch * self.places[member - 1] + place
         original = records[_order(member, len(records))[turn % len(records)]]
 
-        return MixedRecord(
-            name=f"{member + 1}.{place}/{original.name}",
-            sequence=f"{member + 1}/{original.sequence}",
-            points_path=original.points_path,
-            labels_path=original.labels_path,
-            prediction=original.prediction,
-            member=member,
-            place=place,
-            original=original,
-        )
+        fields = vars(original) | {
+            "name": f"{member + 1}.{place}/{original.name}",
+            "sequence": f"{member + 1}/{original.sequence}",
+        }
+        return MixedRecord(**fields, member=member, place=place, original=original)
 
 
 def join(scans: TrainingScans, parts: Sequence[Part]) -> TrainingScans:
     """Return scans to train on, with others mixed in; the scans to validate with stay.
-
-    Args:
-        scans: of the first dataset.
-        parts: the others; their classes must be the same.
 
     Raises:
         InputError: if a dataset has other classes, scans of a user's own are mixed with others, or

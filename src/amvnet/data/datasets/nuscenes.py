@@ -56,7 +56,6 @@ class NuScenes(Dataset):
     Args:
         root: the folder that holds `samples/` and `v1.0-*/`.
         version: "v1.0-mini", "v1.0-trainval" or "v1.0-test".
-        taxonomy: the classes.
 
     Raises:
         InputError: if `root` does not have this layout, the version is ambiguous, or a table is
@@ -124,6 +123,7 @@ class NuScenes(Dataset):
             official = self._split(scene)
             if split in ("all", official, official.removeprefix("mini_")):
                 scenes.append(scene)
+
         return tuple(scenes)
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:

@@ -316,13 +316,6 @@ def _parse(path: Path, tree: Any) -> Description:
             "name the folder of the data as root"
         )
 
-    sensor = tree.get("sensor")
-    if sensor is not None and not isinstance(sensor, str | Mapping):
-        raise InputError(
-            f"sensor: expected a name or attributes such as height: 0.9, found {shown(sensor)}; "
-            "correct it"
-        )
-
     return Description(
         path,
         root,
@@ -330,7 +323,7 @@ def _parse(path: Path, tree: Any) -> Description:
         scans=scans,
         labels=_parse_labels(tree.get("labels")),
         split=_parse_split(tree.get("split") or {}),
-        sensor=sensor,
+        sensor=tree.get("sensor"),
         layout=RowLayout(
             columns=_texts("columns", tree.get("columns", ())),
             dtypes=_texts("dtype", tree.get("dtype", USUAL_TYPE)),
@@ -379,6 +372,7 @@ def _ids(title: str, values: Any) -> list[int]:
                 f"found {shown(raw_id)}; correct them"
             )
         ids.append(raw_id & INSTANCE_MASK)
+
     return ids
 
 

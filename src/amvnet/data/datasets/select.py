@@ -11,12 +11,7 @@ from amvnet.errors import InputError
 
 @dataclass(frozen=True)
 class TrainingScans:
-    """The scans of a training run.
-
-    Attributes:
-        dataset: the dataset that the scans belong to.
-        train: the scans to train on.
-        val: the scans to validate with; may be empty.
+    """The scans of a dataset to train on, and those to validate with, which may be none.
 
     Raises:
         InputError: if a scan is in both `train` and `val`.
@@ -45,8 +40,7 @@ def split_records(
     to validate and the others to train.
 
     Args:
-        train: the sequences to train on; None for those of the official split.
-        val: the sequences to validate with; None for those of the official split.
+        train, val: sequences; None for those of the official split.
         with_val: train on the sequences of `val`, too, and validate with none.
 
     Raises:

@@ -21,7 +21,6 @@ class SemanticKitti(Dataset):
 
     Args:
         root: the folder that holds `sequences/`, or `sequences` itself.
-        taxonomy: the classes that the labels were written with.
 
     Raises:
         InputError: if `root` does not have this layout.

@@ -125,6 +125,7 @@ class SimulatedStreets(Dataset):
         sequence = _name(number)
         scan = _name(index)
         folder = self.root / f"streets-{self.sensor}-{_simulator()}" / sequence / scan
+
         return ScanRecord(
             name=f"{sequence}/{scan}",
             sequence=sequence,

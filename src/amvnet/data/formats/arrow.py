@@ -23,6 +23,6 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         with pyarrow.OSFile(str(path)) as file:
             names = pyarrow.ipc.open_file(file).schema.names
         chosen = require_columns(names, path, wanted)
-        table = feather.read_table(path, columns=sorted({names[i] for i in chosen.values()}))
+        table = feather.read_table(path, columns=list(map(names.__getitem__, chosen.values())))
         check_point_count(len(table), path)
         return {key: table[names[index]].to_numpy() for key, index in chosen.items()}

@@ -136,21 +136,15 @@ def _why_unusable(xyz: np.ndarray) -> str:
     if not len(xyz):
         return "expected a scan with points, found 0 points; leave the file out"
 
-    is_finite = np.isfinite(xyz).all(axis=1)
-    if not is_finite.any():
+    distant = np.isfinite(xyz).all(axis=1) & (np.abs(xyz) >= FARTHEST).any(axis=1)
+    if distant.any():
         return (
-            "expected finite coordinates, found NaN, infinity or 0, 0, 0 in every point; "
-            "leave the file out"
-        )
-
-    is_near = (np.abs(xyz[is_finite]) < FARTHEST).all(axis=1)
-    if is_near.any():
-        return (
-            "expected finite intensities, found NaN or infinity in every point; leave the file out"
+            f"expected metres from the sensor, found points farther than {FARTHEST / 1000:g} km, "
+            "as in map coordinates; subtract the sensor's position x,y,z with --offset -x,-y,-z"
         )
     return (
-        f"expected metres from the sensor, found every point farther than {FARTHEST / 1000:g} km, "
-        "as in map coordinates; subtract the sensor's position x,y,z with --offset -x,-y,-z"
+        "expected finite coordinates and intensities, found NaN, infinity or 0, 0, 0 in every "
+        "point; leave the file out"
     )
 
 
@@ -186,7 +180,6 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
     Readers raise all kinds of exceptions on broken bytes. An InputError passes unchanged.
 
     Args:
-        path: the file, or another name of the input.
         expected: what was expected there, such as "a PCD file".
         advice: what the user can do about it.
 
@@ -203,11 +196,7 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
 
 def require(source: Path | str, extra: str, *packages: str) -> None:
-    """Check that the packages for a file or a format are installed.
-
-    Args:
-        extra: the extra of this package that installs them.
-        packages: what they are imported as.
+    """Check that the packages of an extra are installed, by the names of their modules.
 
     Raises:
         InputError: if one is missing.
@@ -246,12 +235,15 @@ def require_columns(
         InputError: if one is missing.
     """
     columns = find_columns(names, wanted)
-    required = [key for key in wanted if key not in OPTIONAL]
-    if not set(required) <= set(columns):
-        expected = ", ".join(" or ".join(wanted[key]) for key in required)
+    expected = []
+    for key, aliases in wanted.items():
+        if key not in OPTIONAL:
+            expected.append(" or ".join(aliases))
+    if not set(wanted) <= {*columns, *OPTIONAL}:
         listing = ", ".join(names[:20]) or "none"
         raise InputError(
-            f"{path}: expected columns {expected}, found {listing[:200]!a}; rename the columns"
+            f"{path}: expected columns {', '.join(expected)}, found {listing[:200]!a}; "
+            "rename the columns"
         )
 
     return columns

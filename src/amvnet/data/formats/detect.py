@@ -6,8 +6,7 @@ import re
 from pathlib import Path
 
 from amvnet.data.formats.raw import NUSCENES_ENDING, load, usual_layout
-from amvnet.data.formats.text import ADVICE as TEXT_ADVICE
-from amvnet.data.formats.text import find_table, is_text, read_head
+from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
 
 TEXT = (".xyz", ".txt", ".csv", ".asc", ".pts")
@@ -22,23 +21,6 @@ ENDINGS = (
     *BAGS,
     ".feather",
 )
-
-# Kinds of files that are known, but not read: their endings, what they are, and what to do.
-UNREADABLE = (
-    (
-        (".pcap", ".pcapng", ".lvx", ".lvx2", ".osf"),
-        "the packets of a sensor",
-        "convert them with its maker's software: VeloView writes .csv, PandarView 2 .pcd, Livox "
-        "Viewer .las, ouster-cli source FILE save FILE.csv; or record PointCloud2 with its driver",
-    ),
-    (
-        (".tfrecord", ".parquet"),
-        "records such as Waymo's",
-        "save the points of each scan with numpy.save, or as .feather with pandas' to_feather",
-    ),
-    ((".gz", ".bz2", ".7z"), "a packed file", "unpack it"),
-)
-
 
 # The first bytes of files.
 BEGINNINGS = {
@@ -63,7 +45,7 @@ def ending_of(path: Path) -> str:
     """Return the ending that a file should have, by its first bytes, or else by its name.
 
     Raises:
-        InputError: if neither tells, or files of this kind are not read.
+        InputError: if neither tells.
     """
     if path.is_dir():
         return FOLDER
@@ -87,8 +69,6 @@ def ending_of(path: Path) -> str:
         return named if named in TEXT else TEXT[0]
 
     if named in (NUSCENES_ENDING, ".bin"):
-        if is_text(head):
-            raise InputError(f"{path}: expected rows of numbers, found other text; {TEXT_ADVICE}")
         return named
     return _guess_ending(path, named)
 
@@ -107,19 +87,16 @@ def _guess_ending(path: Path, named: str | None) -> str:
     """Return the ending that the values in a file tell, or else its name.
 
     Raises:
-        InputError: if neither tells, or files of this kind are not read.
+        InputError: if neither tells.
     """
     if usual_layout(load(path)) is not None:
         return ".bin"
     if named is not None:
         return named
 
-    content, advice = "another format", "convert it to one"
-    for endings, kind, what_to_do in UNREADABLE:
-        if path.name.lower().endswith(endings):
-            content, advice = kind, what_to_do
     raise InputError(
-        f"{path}: expected a scan file ({', '.join(ENDINGS)}), found {content}; {advice}"
+        f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; convert it to "
+        "one, or play the packets of a sensor with its driver and record PointCloud2 in a bag"
     )
 
 

@@ -45,17 +45,12 @@ class Fields:
         return sum(self.counts)
 
     def read_binary(self, file: BinaryIO, count: int, chosen: dict[str, int]) -> Arrays:
-        """Read some fields of the next records, each field's first value.
-
-        Args:
-            count: of the records; fewer are returned if the file ends before.
-            chosen: the index of each field, by the key that it gets.
-        """
+        """Read the first value of chosen fields, by their index, of at most `count` records."""
         records = np.fromfile(file, self.record, count)
         return {key: records[str(index)][:, 0] for key, index in chosen.items()}
 
     def read_text(self, file: BinaryIO, count: int, chosen: dict[str, int], path: Path) -> Arrays:
-        """Read some fields of the next lines of numbers, as `read_binary` does.
+        """Read chosen fields of the next lines of numbers, as `read_binary` does.
 
         Raises:
             InputError: if there are fewer lines.

@@ -38,7 +38,6 @@ class NamedScan:
         source: the same for all scans of one recording: the bag, or the folder and the ending.
         path: the file or the bag.
         ending: that the file should have, by its content (`ending_of`); empty if it is broken.
-        read: reads it.
     """
 
     name: str
@@ -151,24 +150,20 @@ def _refuse(message: str) -> Cloud:
 def _scans_in(folder: Path) -> list[Path]:
     """Return the scans of a folder; its text files only if there are no others."""
     paths = sorted(filter(is_scan_file, folder.iterdir()))
-    if paths:
-        return paths
-    return sorted(filter(_is_text_scan, folder.iterdir()))
+    return paths or sorted(filter(_is_text_scan, folder.iterdir()))
 
 
 def _matches(pattern: str) -> list[Path]:
     """Return the scans that match a pattern, and those of the folders that match."""
     paths: list[Path] = []
-    unnamed: list[Path] = []
     for text in sorted(glob.glob(pattern, recursive=True)):
         path = Path(text)
         if is_scan_file(path) or _is_text_scan(path):
             paths.append(path)
         elif path.is_dir() and "**" not in pattern:
             paths += _scans_in(path)
-        elif path.is_file():
-            unnamed.append(path)
-    return paths or unnamed
+
+    return paths
 
 
 def _advice_to_find(path: Path) -> str:

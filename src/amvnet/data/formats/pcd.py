@@ -89,6 +89,7 @@ def _parse_fields(entries: dict[str, list[str]]) -> Fields:
     counts = list(map(int, entries.get("COUNT", ["1"] * len(names))))
     if not len(names) == len(dtypes) == len(counts) or min(counts) < 0:
         raise ValueError(f"{len(names)} FIELDS, {len(dtypes)} TYPE, COUNT {counts[:20]}")
+
     return Fields(names, dtypes, counts)
 
 

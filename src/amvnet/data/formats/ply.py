@@ -38,14 +38,7 @@ ADVICE = "write the file again"
 
 @dataclass
 class Element:
-    """One element of a file, such as `vertex`.
-
-    Attributes:
-        name: its name.
-        count: how many rows it has.
-        properties: the names of its properties.
-        types: of its properties, as in the file; "list" for a list.
-    """
+    """One element of a file, such as `vertex`, with `count` rows; the type of a list is "list"."""
 
     name: str
     count: int

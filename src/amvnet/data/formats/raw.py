@@ -129,6 +129,7 @@ def usual_layout(data: np.ndarray, is_named: bool = False) -> RowLayout | None:
     if len(data) % KITTI_ROWS.record.itemsize:
         return None
     table = data[:SAMPLE].view(np.float32).reshape(-1, KITTI_COLUMNS)
+
     return KITTI_ROWS if _is_kitti(table) else None
 
 

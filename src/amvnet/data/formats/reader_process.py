@@ -147,6 +147,7 @@ class _Process:
         self._replies.close()
         shutil.rmtree(self._folder, ignore_errors=True)
         is_slow = hasattr(signal, "SIGXCPU") and code == -signal.SIGXCPU
+
         return "takes too long" if is_slow else "stops its reader"
 
 

@@ -90,9 +90,12 @@ def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cl
     Raises:
         InputError: if the bag is broken, has no scan, or needs a package that is missing.
     """
-    key = uuid4().hex
-    count = _with_limits("bag_length_within_limits", path, ending, topic, key)["count"]
-    return [partial(_read_one, path, ending, topic, key, index) for index in range(count)]
+    which = (path, ending, topic, uuid4().hex)
+    count = _with_limits("bag_length_within_limits", *which)["count"]
+    readers = []
+    for index in range(count):
+        readers.append(partial(_read_one, *which, index))
+    return readers
 
 
 def _read_one(path: Path, *what: Any) -> Cloud:

@@ -30,7 +30,6 @@ USED = 7  # columns without names that are looked at
 COMMENTS = ("#", "//", "%")
 # Numbers are ASCII; comments and names of columns may be in any encoding.
 ENCODING = "utf-8-sig"
-UNDECODED = "\ufffd"  # what bytes that are no text become
 CONTROL = re.compile(r"[\x00-\x08\x0e-\x1f]")
 SEPARATORS = (";", ",", None)  # of the values, in the order to try; None is any white space
 # Names of coordinates that other programs write, such as "Points:0" in ParaView and VeloView.
@@ -129,12 +128,6 @@ def find_table(head: bytes) -> TextTable | None:
     return None
 
 
-def is_text(head: bytes) -> bool:
-    """Return whether a file with this head is text, and not numbers in binary."""
-    text = _decode(head)
-    return bool(text.split()) and UNDECODED not in text
-
-
 def _decode(head: bytes) -> str:
     """Return the whole lines of the head of a file; no lines if it is binary."""
     text = head.decode(ENCODING, errors="replace")
@@ -218,4 +211,5 @@ def _read_values(path: Path, table: TextTable, indices: range | list[int]) -> np
             ndmin=2,
         )
     check_point_count(len(values), path)
+
     return values

@@ -54,14 +54,12 @@ def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
             f"{path}: expected {count} ids, one per point, found shape {ids.shape}; "
             "segment the whole scan"
         )
+
     return ids
 
 
 def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> None:
     """Check the size of a file of labels; an error names the likely mistake.
-
-    Args:
-        name: the beginning of the message.
 
     Raises:
         InputError: if the size is not that of `count` labels of `dtype`.

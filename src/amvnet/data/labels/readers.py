@@ -32,7 +32,7 @@ def read_scan_labels(
     field: str | None = None,
     layout: RowLayout = UNKNOWN,
 ) -> np.ndarray:
-    """Read the labels of a scan from a file of labels, or from a field of the scan's file.
+    """Read (N,) uint8 train ids from a file of labels, or from a field of the scan's file.
 
     Without a field, the ending decides the format: `.npy`, `.npz`, text with a number per line, or
     the usual column of `.pcd`, `.ply`, `.las`, `.laz`, `.feather`; any other file holds integers of
@@ -43,9 +43,6 @@ def read_scan_labels(
         field: name of the column; of `.npz`, also of an array next to the points; of arrays and
             text without names, the number of the column, from 0.
         layout: of rows without names, what they hold.
-
-    Returns:
-        (N,) uint8 train ids.
 
     Raises:
         InputError: if the file is missing or broken, lacks the field, or has another number of
@@ -143,4 +140,5 @@ def _read_raw_column(path: Path, layout: RowLayout, field: str) -> np.ndarray:
     index = require_columns(layout.columns, path, {KEY: [field]})[KEY]
     count = count_rows(path, layout.record, 1)
     records = np.fromfile(path, dtype=layout.record, count=min(count, MAX_POINTS))
+
     return records[str(index)]
