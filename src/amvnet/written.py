@@ -134,7 +134,6 @@ def protecting(paths: Sequence[Path], overwrite: bool = False) -> Iterator[None]
 
     Args:
         paths: the files that the block may write; those that it leaves as they are stay the user's.
-        overwrite: whether to replace a user's files, too.
 
     Raises:
         InputError: before the block, if a user's file would be replaced.

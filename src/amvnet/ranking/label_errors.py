@@ -274,11 +274,8 @@ def _frequencies(kind: np.ndarray) -> np.ndarray:
 def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
     """Write the clusters to a CSV file, and the scans to another one next to it.
 
-    Args:
-        path: the file of the clusters, NAME.csv.
-
     Returns:
-        The file of the scans, NAME-scans.csv.
+        The file of the scans: NAME-scans.csv if `path` is NAME.csv.
     """
     _write(path, COLUMNS, _cluster_rows(ranking, taxonomy))
     _write(scans_path(path), SCAN_COLUMNS, _scan_rows(ranking))

@@ -284,10 +284,6 @@ def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) 
     """Return the view with rows by elevation, for lasers between two elevations.
 
     Its field of view is wider by half a step at each end, so that the lasers lie inside.
-
-    Args:
-        ends: elevations of the highest and the lowest laser, degrees.
-        steps: how many steps the elevations between them are divided into.
     """
     top, bottom = ends
     half = (top - bottom) / (2 * steps)

@@ -20,6 +20,7 @@ from amvnet.files import checked_token
 from amvnet.scan import Scan
 
 CHANNEL = "LIDAR_TOP"
+MAX_LISTED = 20  # scenes in a message
 MINI = "v1.0-mini"
 TEST = "v1.0-test"
 
@@ -133,7 +134,7 @@ class NuScenes(Dataset):
             scenes = sorted(self._records_by_scene)
             raise InputError(
                 f"{self.root}: expected the scene {missing[0]} in {self.version}, found no such "
-                f"scene in its tables; name some of its {len(scenes)}, such as {scenes[0]}"
+                f"scene in its tables; name one of {', '.join(scenes[:MAX_LISTED])}"
             )
 
         records: list[ScanRecord] = []

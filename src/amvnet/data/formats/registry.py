@@ -92,7 +92,7 @@ def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cl
     """
     which = (path, ending, topic, uuid4().hex)
     count = _with_limits("bag_length_within_limits", *which)["count"]
-    readers = []
+    readers: list[Callable[[], Cloud]] = []
     for index in range(count):
         readers.append(partial(_read_one, *which, index))
     return readers
