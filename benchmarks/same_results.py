@@ -47,8 +47,8 @@ REAL = "real"  # a link to the real scans, so that no output names their place
 CACHE = "cache"  # of exported networks
 LAS_DATE = slice(90, 94)  # of the header: day of the year and year, two bytes each
 
-# Files with nothing to compare. Checkpoints and TensorBoard's curves hold times; the weights and
-# the metrics.csv of each stage have what matters of them.
+# Files with nothing to compare. Checkpoints and TensorBoard's curves hold times; the weights
+# of each stage have what matters of them.
 LEFT_OUT = {REAL, CACHE, LOG, DIGESTS}
 LEFT_OUT_ANYWHERE = ("*.ckpt", "*.tfevents.*")
 

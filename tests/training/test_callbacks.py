@@ -77,15 +77,18 @@ def test_an_average_that_is_saved_and_loaded_goes_on_as_before() -> None:
         assert torch.equal(resumed.average[name], value)
 
 
-def test_a_network_has_the_averaged_weights_only_within_the_block() -> None:
+def test_a_network_has_the_averaged_weights_only_in_the_validation() -> None:
     net = small_net()
     callback = AverageWeights(0.9)
     begin(net, callback)
     take_steps(net, callback, 0, 4)
 
     before = deepcopy(net.state_dict())
-    with callback.inserted(net):
-        for name, value in net.state_dict().items():
-            assert torch.equal(value, callback.average[name])
+    trainer: Any = SimpleNamespace()
+    module: Any = SimpleNamespace(trained=net)
+    callback.on_validation_start(trainer, module)
+    for name, value in net.state_dict().items():
+        assert torch.equal(value, callback.average[name])
+    callback.on_validation_end(trainer, module)
     for name, value in net.state_dict().items():
         assert torch.equal(value, before[name])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -163,7 +162,9 @@ def test_every_scan_of_a_step_has_the_same_share_of_its_gradient(
     """Also in the last step of an epoch, which may have fewer parts, and one with fewer scans."""
     config = NetworkTraining(epochs=1, batch=batch * parts, lr=1e-3)
     view: Any = None
-    stage = NetworkStage(view, torch.nn.Linear(1, 1), config, SEMANTICKITTI, None)
+    stage = NetworkStage(
+        view, torch.nn.Linear(1, 1), config=config, taxonomy=SEMANTICKITTI, weights=None
+    )
     loader = SimpleNamespace(batch_size=batch, sampler=range(scans))
     trainer: Any = SimpleNamespace(accumulate_grad_batches=parts, train_dataloader=loader)
     stage._trainer = trainer
@@ -175,14 +176,6 @@ def test_every_scan_of_a_step_has_the_same_share_of_its_gradient(
             # Lightning divides by the number of parts, and the loss is a mean over the part.
             share_of_scan = stage.share_of_step(size, index) / parts / size
             assert share_of_scan == pytest.approx(1 / sum(in_step))
-
-
-def test_the_numbers_of_a_network_reach_its_stage() -> None:
-    config = NetworkTraining(epochs=1, batch=2, lr=1e-3)
-    config = replace(config, accumulate=2, clip=0.7, ema=0.9, initial=0.3)
-    view: Any = None
-    stage = NetworkStage(view, torch.nn.Linear(1, 1), config, SEMANTICKITTI, None)
-    assert (stage.accumulate, stage.clip, stage.ema, stage.initial) == (2, 0.7, 0.9, 0.3)
 
 
 @pytest.mark.parametrize("is_normalised", [False, True])

@@ -40,7 +40,8 @@ def plan_with(config: NetworkTraining) -> Plan:
 def polar_stage(config: NetworkTraining = CONFIG) -> PolarStage:
     torch.manual_seed(0)
     model = build_amvnet(MODEL_CONFIG, SEMANTICKITTI.size)
-    return PolarStage(model.polar_view, model.polar_net.eval(), config, SEMANTICKITTI, None)
+    shared = {"config": config, "taxonomy": SEMANTICKITTI, "weights": None}
+    return PolarStage(model.polar_view, model.polar_net.eval(), **shared)
 
 
 def batch_of_two() -> tuple[PointBatch, torch.Tensor]:

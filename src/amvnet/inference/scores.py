@@ -166,21 +166,6 @@ class ScorePair:
 
         return settings
 
-    def options(self) -> list[str]:
-        """Return the command-line options that give this pair."""
-        options = []
-        sides = []
-        for scores in (self.a, self.b):
-            options += [f"--scores-{scores.side}", str(scores.folder)]
-            if scores.key is not None:
-                options += [f"--key-{scores.side}", scores.key]
-            if scores.logits:
-                sides.append(scores.side)
-
-        if sides:
-            options += ["--logits", "both" if len(sides) == 2 else sides[0]]
-        return options
-
     def digests(self, records: Sequence[ScanRecord]) -> dict[str, str]:
         """Return a digest of each model's scores of some scans, the same wherever the files lie."""
         return {scores.side: _digest(scores, records) for scores in (self.a, self.b)}

@@ -191,6 +191,6 @@ def untrained(recipe: Recipe) -> Weights:
 
     tensors: dict[str, Tensor] = {}
     for part in PARTS:
-        tensors |= part_state(part, getattr(model, part))
+        tensors |= part_state(part, getattr(model, part).state_dict())
 
     return Weights(recipe.model, taxonomy, recipe.sensor, tensors)

@@ -43,7 +43,6 @@ class HeadStage(Stage):
     """
 
     name = "head"
-    unit = "points"
     in_float32 = True  # it multiplies so little that a lower precision would save nothing
     config: HeadTraining
 
@@ -54,10 +53,6 @@ class HeadStage(Stage):
         self.trained: PointHead = head
         self.train_points = train
         self.val_points = val
-
-    def size_of(self, batch: HeadBatch) -> int:
-        _, _, labels, _ = batch
-        return len(labels)
 
     def training_step(self, batch: HeadBatch, index: int) -> Tensor:
         point, rows, labels, _ = batch
@@ -160,7 +155,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
 def _make_loaders(plan: Plan, train: HeadPoints, val: HeadPoints | None) -> Loaders:
     config = plan.recipe.training.head
     seed = plan.recipe.training.seed
-    labels = train.labels() if config.balance else None
+    labels = train.labels if config.balance else None
     draw = PointDraw(len(train), config.drawn, labels, config.balance)
     train_loader = _loader(train, PointSampler(draw, config.batch, seed, True, plan.processes))
     if val is None:

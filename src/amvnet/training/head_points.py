@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,54 +42,66 @@ HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
 def point_dtype(classes: int, neighbours: int) -> np.dtype:
     """Return the type of a point on disk, for K classes and n neighbours; see `HeadBatch`."""
     width = 2 * classes + POINT_VALUES
-
     return np.dtype(
         [
             ("point", np.float16, width),
             ("rows", np.float16, (neighbours, width)),
-            ("labels", np.uint8),
             ("stands_for", np.float32),
         ]
     )
 
 
-@dataclass(frozen=True)
 class HeadPoints:
-    """The labelled uncertain points of some scans in a file, and statistics of all their points.
+    """The labelled uncertain points of some scans on disk, and statistics of all their points.
 
-    Attributes:
-        path: the file of U points.
+    Args:
+        paths: the files of the points, one for each process that scored scans.
         dtype: of a point, from `point_dtype`.
-        size: U.
+        files: (U,) which file has a point; in its file, the points have the same order.
+        labels: (U,) train ids.
         certain: (K + 1, K + 1) confusion matrix of the ensemble over the certain points.
         uncertain_share: share of the labelled points that are uncertain.
     """
 
-    path: Path
-    dtype: np.dtype
-    size: int
-    certain: np.ndarray
-    uncertain_share: float
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        dtype: np.dtype,
+        files: np.ndarray,
+        labels: np.ndarray,
+        *,
+        certain: np.ndarray,
+        uncertain_share: float,
+    ) -> None:
+        self.paths = paths
+        self.dtype = dtype
+        self.labels = labels
+        self.certain = certain
+        self.uncertain_share = uncertain_share
+
+        self._files = files
+        self._rows = np.empty(len(files), dtype=np.int64)  # of each point in its file
+        for number in range(len(paths)):
+            is_here = files == number
+            self._rows[is_here] = np.arange(np.count_nonzero(is_here))
 
     def __len__(self) -> int:
-        return self.size
+        return len(self.labels)
 
     def __getitem__(self, index: np.ndarray) -> HeadBatch:
         """Return the points with these (U,) indices, in this order."""
-        points = self._on_disk()[index]
+        points = np.empty(len(index), dtype=self.dtype)
+        for number, path in enumerate(self.paths):
+            is_here = self._files[index] == number
+            if is_here.any():
+                on_disk = np.memmap(path, self.dtype, "r")
+                points[is_here] = on_disk[self._rows[index[is_here]]]
 
         point = torch.from_numpy(points["point"].copy())
         rows = torch.from_numpy(points["rows"].copy())
-        labels = torch.from_numpy(points["labels"].copy())
+        labels = torch.from_numpy(self.labels[index])
         stands_for = torch.from_numpy(points["stands_for"].copy())
         return point.float(), rows.float(), labels.long(), stands_for
-
-    def labels(self) -> np.ndarray:
-        """Return the (U,) train ids of the points; this reads all of the file."""
-        return np.array(self._on_disk()["labels"])
-
-    def _on_disk(self) -> np.ndarray:
-        return np.memmap(self.path, self.dtype, "r", shape=(self.size,))
 
 
 class PointDraw:
@@ -206,8 +217,9 @@ class PointGatherer:
         points = self._gather(scans, keys, folder, assertion, say)
         if len(points) < least:
             say("head: the networks agree everywhere; it learns from points drawn from all")
-            everywhere = self._gather(scans, keys, folder, _everywhere, say)
-            points = replace(everywhere, uncertain_share=points.uncertain_share)
+            share = points.uncertain_share
+            points = self._gather(scans, keys, folder, _everywhere, say)
+            points.uncertain_share = share
 
         if len(points) < least:
             raise InputError(
@@ -251,7 +263,7 @@ class PointGatherer:
         # Score this process's share of the scans.
         ids = self.weights.taxonomy.size + 1
         matrices = np.zeros((2, ids, ids), dtype=np.int64)
-        counts = []
+        labels_of_scans = []
         share = processes.share(keys)
         limit = self.plan.recipe.training.head.points
         most = -(-limit // len(keys))  # points of a scan, rounded up
@@ -260,21 +272,28 @@ class PointGatherer:
 
         with (folder / str(processes.rank)).open("wb") as file:
             for number, key in enumerate(share, start=1):
-                points, scan_matrices = self._gather_scan(scans, key, scorer, assertion, most)
+                points, labels, scan_matrices = self._gather_scan(
+                    scans, key, scorer, assertion, most
+                )
                 points.tofile(file)
-                counts.append(len(points))
+                labels_of_scans.append(labels)
                 matrices += scan_matrices
                 if tenths.ends(number, len(share)):
                     say(f"head: scored {number * len(keys) // len(share)} of {len(keys)} scans")
 
-        counts_by_rank = processes.gather(counts)
+        # The points of all scans, in their order; the processes take the scans in turns.
+        labels_by_rank = processes.gather(labels_of_scans)
+        turns = [divmod(index, processes.size) for index in range(len(keys))]
+        ordered = [labels_by_rank[rank][turn] for turn, rank in turns]
+        files = np.repeat([rank for _, rank in turns], [len(labels) for labels in ordered])
+
         certain, uncertain = np.sum(processes.gather(matrices), axis=0)
         labelled = certain[1:].sum() + uncertain.sum()
-
         return HeadPoints(
-            path=_join(folder, counts_by_rank, self._dtype.itemsize, processes),
-            dtype=self._dtype,
-            size=sum(map(sum, counts_by_rank)),
+            [folder / str(rank) for rank in range(processes.size)],
+            self._dtype,
+            files,
+            np.concatenate(ordered),
             certain=certain,
             uncertain_share=float(uncertain.sum() / max(labelled, 1)),
         )
@@ -282,12 +301,13 @@ class PointGatherer:
     @torch.inference_mode()
     def _gather_scan(
         self, scans: ScanSet, key: Key, scorer: Scorer, assertion: Assertion, most: int
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Score one scan, and draw at most `most` of its uncertain points.
 
         Returns:
-            (U,) points of `point_dtype`, and the (2, K + 1, K + 1) confusion matrices of the
-            ensemble over the certain and over all uncertain points of the scan.
+            (U,) points of `point_dtype`, their (U,) uint8 train ids, and the (2, K + 1, K + 1)
+            confusion matrices of the ensemble over the certain and over all uncertain points of the
+            scan.
         """
         device = self._device
         seeds = [self.plan.recipe.training.seed, *key]
@@ -314,9 +334,8 @@ class PointGatherer:
         points = np.empty(len(index), dtype=self._dtype)
         points["point"] = point.cpu().numpy()
         points["rows"] = rows.cpu().numpy()
-        points["labels"] = labels[index].cpu().numpy()
         points["stands_for"] = len(candidates) / max(len(index), 1)
-        return points, matrices
+        return points, labels[index].cpu().numpy().astype(np.uint8), matrices
 
     def _disturbed(
         self, f: Tensor, g: Tensor, points: Tensor, rng: np.random.Generator
@@ -359,32 +378,3 @@ def _ensemble_matrices(f: Tensor, g: Tensor, labels: Tensor, uncertain: Tensor) 
     over_certain = confusion(truth[~mask], prediction[~mask], classes)
     over_uncertain = confusion(truth[mask], prediction[mask], classes)
     return np.stack([over_certain, over_uncertain])
-
-
-def _join(
-    folder: Path, counts_by_rank: Sequence[Sequence[int]], point_bytes: int, processes: Processes
-) -> Path:
-    """Join the files of all processes, named by rank, with the points in the order of the scans.
-
-    Args:
-        counts_by_rank: for each process, the points of each of its scans; processes take the scans
-            in turns.
-    """
-    path = folder / "points"
-    if processes.first:
-        parts = [folder / str(rank) for rank in range(processes.size)]
-        with ExitStack() as stack, path.open("wb") as joined:
-            files = []
-            for part in parts:
-                files.append(stack.enter_context(part.open("rb")))
-
-            for index in range(sum(map(len, counts_by_rank))):
-                turn, rank = divmod(index, processes.size)
-                count = counts_by_rank[rank][turn]
-                joined.write(files[rank].read(count * point_bytes))
-
-        for part in parts:
-            part.unlink()
-
-    processes.wait()
-    return path

@@ -10,8 +10,6 @@ from torch import Tensor, nn
 
 from amvnet.config.schema import NetworkTraining
 from amvnet.data.datasets.simulated import SimulatedStreets
-from amvnet.data.taxonomy import Taxonomy
-from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.views.points import PointBatch, occurring
@@ -40,36 +38,17 @@ REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 class NetworkStage(Stage):
     """The base of the two networks' stages, which learn from batches of scans by AdamW.
 
-    A subclass defines `logits` and `loss`.
-
-    The other arguments are those of `Stage`.
+    A subclass defines `logits`. The other arguments are those of `Stage`.
     """
 
-    unit = "scans"
     config: NetworkTraining
     view: RangeView | PolarView
     default_region_loss: RegionLoss  # the paper's
 
-    def __init__(
-        self,
-        view: RangeView | PolarView,
-        net: nn.Module,
-        config: NetworkTraining,
-        taxonomy: Taxonomy,
-        weights: np.ndarray | None,
-        processes: Processes = ALONE,
-    ) -> None:
-        super().__init__(config, taxonomy, weights, processes)
+    def __init__(self, view: RangeView | PolarView, net: nn.Module, **shared: Any) -> None:
+        super().__init__(**shared)
         self.view = view
         self.trained = net
-        self.accumulate = config.accumulate
-        self.clip = config.clip
-        self.ema = config.ema
-        self.initial = config.initial
-        self.hold = config.hold
-
-    def size_of(self, batch: Batch) -> int:
-        return batch[0].count
 
     def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
         """Return what the loss is computed on, and the (P, K) logits of all points.
@@ -214,10 +193,15 @@ def make_stage(
 ) -> RangeStage | PolarStage:
     """Return the stage rv or bev of a model, given the (K,) class weights of its loss."""
     config = getattr(plan.recipe.training, name)
-    shared = (config, plan.scans.dataset.taxonomy, weights, plan.processes)
+    shared: dict[str, Any] = {
+        "config": config,
+        "taxonomy": plan.scans.dataset.taxonomy,
+        "weights": weights,
+        "processes": plan.processes,
+    }
     if name == "rv":
-        return RangeStage(model.range_view, model.range_net, *shared)
-    return PolarStage(model.polar_view, model.polar_net, *shared)
+        return RangeStage(model.range_view, model.range_net, **shared)
+    return PolarStage(model.polar_view, model.polar_net, **shared)
 
 
 def make_loaders(

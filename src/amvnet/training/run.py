@@ -15,7 +15,7 @@ import torch
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
 from amvnet.memory import peak_memory
-from amvnet.progress import say_nothing
+from amvnet.progress import counted, say_nothing
 from amvnet.training.callbacks import Trial
 from amvnet.training.head import train_head
 from amvnet.training.networks import train_network
@@ -24,7 +24,6 @@ from amvnet.training.run_folder import (
     PART_OF,
     StageFolder,
     check_begun,
-    initial_digests,
     stage_settings,
     write_record,
 )
@@ -45,8 +44,6 @@ def train(
         raise InputError(f"expected --stage head for scores of other models, found {stage}; add it")
 
     # Check all stages before anything is written, and before hours are spent on the first.
-    if init is not None:
-        _check_init(plan, init, names)
     weights = _first_weights(plan, init, names)
     for name in names:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
@@ -130,11 +127,11 @@ def _try_out(plan: Plan, name: str, weights: Weights) -> str:
     # The first step also sets things up, and is not timed.
     seconds = (trial.ends[1] - trial.ends[0]) / config.batch
     whole = timedelta(seconds=round(config.epochs * len(train) * seconds))
+    epochs = f"{counted(config.epochs, 'epoch')} of {counted(len(train), 'scan')}"
     memory = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
     return (
         f"{name}: {seconds:.3g} s a scan in steps of {config.batch} scans, peak memory so far "
-        f"{(memory or peak_memory()) / 2**30:.1f} GiB; {config.epochs} epochs of {len(train)} "
-        f"scans take {whole} without validation"
+        f"{(memory or peak_memory()) / 2**30:.1f} GiB; {epochs}: {whole} without validation"
     )
 
 
@@ -186,26 +183,3 @@ def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
         f"({init.taxonomy.name}) but {', '.join(of_part)}, which are new"
     )
     return weights
-
-
-def _check_init(plan: Plan, init: Weights, names: Sequence[str]) -> None:
-    """Raise InputError if a part of the initial weights would be ignored.
-
-    A finished stage of this folder, or one that is resumed, goes on from its own weights. If it
-    was begun with the same initial weights, or has become them, nothing is ignored.
-    """
-    empty = Weights(plan.recipe.model, plan.scans.dataset.taxonomy)
-    for name, part in PART_OF.items():
-        folder = StageFolder(plan, name)
-        is_resumed = name in names and folder.is_begun
-        if part not in init.parts or not (folder.is_finished or is_resumed):
-            continue
-
-        digest = init.digest(part)
-        finished = folder.finished(empty)
-        is_the_same = part in finished.parts and finished.digest(part) == digest
-        if not is_the_same and digest not in initial_digests(plan.out, part):
-            raise InputError(
-                f"{folder.path}: expected no earlier run of the stage {name} for other "
-                f"weights with {part}, found one; leave out --init, or give another folder"
-            )

@@ -1,12 +1,10 @@
-"""What a run keeps in its folder: its recipe, how to repeat it, and how far each stage is."""
+"""What a run keeps in its folder: its recipe, its data, and how far each stage is."""
 
 from __future__ import annotations
 
 import hashlib
 import platform
-import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -14,10 +12,9 @@ from typing import Any
 
 import yaml
 
-from amvnet.config.nested import from_dict, to_dict
-from amvnet.config.schema import ModelConfig, TrainingConfig
-from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.joined import Joined, own_records
+from amvnet.config.nested import to_dict
+from amvnet.data.datasets.base import ScanRecord
+from amvnet.data.datasets.joined import Joined
 from amvnet.errors import InputError
 from amvnet.files import atomic_write, parse_yaml
 from amvnet.models.methods import BOTH_NETWORKS
@@ -54,10 +51,6 @@ class StageFolder:
         return self.path / "done"
 
     @property
-    def is_begun(self) -> bool:
-        return (self.path / LAST).is_file()
-
-    @property
     def is_finished(self) -> bool:
         return self.weights_path.is_file() and self.done_path.is_file()
 
@@ -73,12 +66,10 @@ class StageFolder:
 def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
     """Write recipe.yaml, and the entry of a stage (or "all") in run.yaml.
 
-    The entry names the data, the versions, the weights to begin with, and the command that repeats
-    the call.
+    The entry names the data, the versions and the weights to begin with.
     """
     dataset = plan.scans.dataset
     entry: dict[str, Any] = {
-        "repeat": shlex.join(_repeat_command(plan, stage, init is not None)),
         "versions": {name: version(name) for name in PACKAGES},
         "python": platform.python_version(),
         "data": dataset.specs if isinstance(dataset, Joined) else dataset.spec,
@@ -98,16 +89,6 @@ def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
     _write_yaml(plan.out / "run.yaml", entries)
 
 
-def initial_digests(out: Path, part: str) -> set[str]:
-    """Return the digests of the initial weights of a part that calls in a run's folder had."""
-    digests = set()
-    for entry in _entries(out / "run.yaml").values():
-        init = entry.get("init") if isinstance(entry, dict) else None
-        if isinstance(init, dict) and isinstance(init.get(part), str):
-            digests.add(init[part])
-    return digests
-
-
 def _write_yaml(path: Path, tree: dict[str, Any]) -> None:
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
@@ -120,32 +101,6 @@ def _entries(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return entries if isinstance(entries, dict) else {}
-
-
-def _repeat_command(plan: Plan, stage: str, has_init: bool) -> list[str]:
-    """Return the words of the command that repeats a call."""
-    scans = plan.scans
-    command = ["amvnet", "train", str(plan.out / "recipe.yaml")]
-    for spec in _specs(scans.dataset):
-        command += ["--data", spec]
-    command += ["--stage", stage]
-    command += ["--train-sequences", ",".join(sequence_names(own_records(scans.train)))]
-    if scans.val:
-        command += ["--val-sequences", ",".join(sequence_names(scans.val))]
-    else:
-        command += ["--with-val"]
-    if has_init:
-        # The path of the initial weights is not known here; run.yaml has digests of their parts.
-        command += ["--init", "WEIGHTS"]
-    if plan.scores is not None:
-        command += plan.scores.options()
-
-    return [*command, "--out", f"{plan.out}-again"]
-
-
-def _specs(dataset: Dataset) -> list[str]:
-    """Return what each of the joined datasets, or the only one, is opened with."""
-    return dataset.specs if isinstance(dataset, Joined) else [dataset.spec]
 
 
 def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
@@ -197,8 +152,7 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
             f"{folder}: expected no earlier run, found one; add --resume or give another folder"
         )
 
-    path = folder / SETTINGS
-    begun = _with_defaults(_entries(path))
+    begun = _entries(folder / SETTINGS)
     if begun != settings:
         changes = describe_changes(begun, settings)
         raise InputError(
@@ -207,19 +161,6 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
             + (f" and {len(changes) - MOST_CHANGES} more" if len(changes) > MOST_CHANGES else "")
             + "; resume it with those, or give another folder"
         )
-
-
-def _with_defaults(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of an earlier run with the defaults of values that it does not name.
-
-    Values that were added to the recipes since then had no influence on it.
-    """
-    complete = dict(settings)
-    for key, kind in (("model", ModelConfig), ("training", TrainingConfig)):
-        with suppress(InputError):
-            values = to_dict(from_dict(kind, settings.get(key), key))
-            complete[key] = {name: values[name] for name in settings[key]}
-    return complete
 
 
 def describe_changes(earlier: dict[str, Any], settings: dict[str, Any]) -> list[str]:

@@ -13,7 +13,12 @@ from typing import Any, Final, Literal
 import lightning as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.callbacks import (
+    Callback,
+    LearningRateMonitor,
+    ModelCheckpoint,
+    RichProgressBar,
+)
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.strategies import DDPStrategy
 from torch import Tensor, nn
@@ -27,14 +32,7 @@ from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.memory import keep_freed_memory
 from amvnet.models.sync_batch_norm import synchronise_batch_norms
 from amvnet.models.views.points import PointBatch
-from amvnet.training.callbacks import (
-    AverageWeights,
-    Bar,
-    Curves,
-    EpochLines,
-    SeedBatches,
-    Speed,
-)
+from amvnet.training.callbacks import AverageWeights, EpochLines, SeedBatches
 from amvnet.training.loaders import count_classes
 from amvnet.training.losses import class_weights
 from amvnet.training.plan import Plan
@@ -60,16 +58,8 @@ class Stage(L.LightningModule):
     """
 
     name: str  # the value of --stage
-    unit: str  # what a batch consists of
     trained: nn.Module  # the part of the model that this stage trains
     in_float32 = False  # whatever precision the recipe has
-
-    # What a stage may have besides; see `NetworkTraining`.
-    accumulate = 1
-    clip: float | None = None
-    ema = 0.0
-    initial = 0.0
-    hold = 0.0
 
     def __init__(
         self,
@@ -88,10 +78,6 @@ class Stage(L.LightningModule):
         self.register_buffer("class_weights", tensor, persistent=False)
 
         self.matrix = self.empty_matrix()
-
-    def size_of(self, batch: Any) -> int:
-        """Return how many units a batch has."""
-        raise NotImplementedError
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
         """Convert floating-point values of a batch to the precision of the weights."""
@@ -143,7 +129,7 @@ class Stage(L.LightningModule):
         # The schedule needs two steps before its peak, more than a very short training has.
         least = math.ceil(2 / self.config.warmup)
         steps = max(int(self.trainer.estimated_stepping_batches), least)
-        held = int(self.hold * steps)
+        held = int(getattr(self.config, "hold", 0) * steps)
         peak = math.ceil(self.config.warmup * steps - 1)
         self._held = range(peak + 1, peak + 1 + held)
 
@@ -236,8 +222,8 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: Callback) -> N
         plugins=[environment()],
         max_epochs=stage.config.epochs,
         limit_val_batches=0 if val is None else None,
-        accumulate_grad_batches=stage.accumulate,
-        gradient_clip_val=stage.clip,
+        accumulate_grad_batches=getattr(stage.config, "accumulate", 1),
+        gradient_clip_val=getattr(stage.config, "clip", None),
         callbacks=_callbacks(stage, plan, keep_weights, has_bar),
         default_root_dir=folder,
         logger=TensorBoardLogger(folder, name="", version=""),
@@ -258,21 +244,19 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: Callback) -> N
 def _callbacks(stage: Stage, plan: Plan, keep_weights: Callback, has_bar: bool) -> list[Callback]:
     """Return the callbacks of a stage, those that write before the checkpoint."""
     folder = plan.out / stage.name
-    speed = Speed()
     callbacks: list[Callback] = [
-        speed,
         keep_weights,
         KeepSignals(),
         SeedBatches(plan.recipe.training.seed, plan.processes.rank),
-        Curves(folder / "metrics.csv"),
         ModelCheckpoint(
             folder, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
         ),
         LearningRateMonitor(),
-        Bar(speed) if has_bar else EpochLines(speed, plan.say, stage.name),
+        RichProgressBar() if has_bar else EpochLines(plan.say, stage.name),
     ]
-    if stage.ema or stage.initial:
-        callbacks.append(AverageWeights(stage.ema, stage.initial))
+    config = stage.config
+    if isinstance(config, NetworkTraining) and (config.ema or config.initial):
+        callbacks.append(AverageWeights(config.ema, config.initial))
     return callbacks
 
 

@@ -238,13 +238,12 @@ class Weights:
             ) from None
 
 
-def part_state(part: str, module: torch.nn.Module) -> dict[str, Tensor]:
-    """Return copies on the CPU of a module's parameters, named as in `Weights.tensors`."""
-    state = {}
-    for key, tensor in module.state_dict().items():
-        state[f"{part}.{key}"] = tensor.detach().cpu().clone().contiguous()
-
-    return state
+def part_state(part: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return copies on the CPU of a part's parameters, named as in `Weights.tensors`."""
+    copies = {}
+    for key, tensor in state.items():
+        copies[f"{part}.{key}"] = tensor.detach().cpu().clone().contiguous()
+    return copies
 
 
 def save(weights: Weights, path: Path | str, half: bool = False) -> Path:

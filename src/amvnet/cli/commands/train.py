@@ -37,7 +37,8 @@ def train(
         models: with --stage head, two models to train a head for.
         stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them. Of weights for
-            other classes, all layers but the last ones are taken.
+            other classes, all layers but the last ones are taken. Stages that the folder already
+            has keep their own weights.
         resume: continue an earlier run in the folder.
         train_sequences: sequences or scenes, separated by commas, to train on; default: the
             official split.

@@ -194,8 +194,3 @@ def split_share(spec: str) -> tuple[str, float | None]:
             f"{spec}: expected a share of an epoch above 0 and below 1, found {text}; correct it"
         )
     return data, share
-
-
-def own_records(records: Sequence[ScanRecord]) -> list[ScanRecord]:
-    """Return the scans that are not mixed in."""
-    return [record for record in records if not isinstance(record, MixedRecord)]
