@@ -1,10 +1,8 @@
-"""Several processes, started by torchrun or SLURM, train, predict and evaluate like one."""
+"""Several processes, started by torchrun or SLURM, train and evaluate like one."""
 
 from __future__ import annotations
 
 import os
-import re
-import signal
 import socket
 import subprocess
 import sys
@@ -135,55 +133,17 @@ def test_processes_that_slurm_has_started_find_each_other(world: Path, tmp_path:
     assert largest_difference(weights, load(world / "run/rv/last.safetensors")) < 1e-5
 
 
-# The command line, whose second process is killed while it writes its second scan.
-MORTAL = """
-import itertools, os, signal, sys
-from amvnet.cli.main import main
-from amvnet.inference.pipeline import Pipeline
-
-write = Pipeline.write
-calls = itertools.count()
-
-def write_or_die(*values):
-    if os.environ["SLURM_PROCID"] == "1" and next(calls) == 1:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return write(*values)
-
-Pipeline.write = write_or_die
-sys.exit(main())
-"""
-
-
-def test_if_a_process_dies_the_other_does_its_share_and_says_what_is_left(
-    world: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "labels"
-    words = ["predict", world / "data", "--weights", world / "run", "--sequences", "00,08"]
-    (code, output), (killed, _) = slurm(["-c", MORTAL, *words, "--out", out])
-    assert (code, killed) == (1, -signal.SIGKILL)
-    last = output.splitlines()[-1]
-    assert re.search(r"labels: a process has ended; [34] of the 4 scans of process 1 are", last)
-    assert "--resume" in last
-    assert 4 <= len(list(out.rglob("*.label"))) < 8
-
-    assert one_process(*words, "--out", out, "--resume") == 0
-    assert len(list(out.rglob("*.label"))) == 8
-
-
-def test_processes_share_the_scans_of_predict_and_evaluate(world: Path, tmp_path: Path) -> None:
+def test_processes_share_the_scans_of_evaluate(world: Path, tmp_path: Path) -> None:
     data = world / "data"
     weights = ["--weights", world / "run"]
     for name, run in (("one", one_process), ("two", two_processes)):
         out = tmp_path / name
-        predicted = ["--out", out / "labels", "--scores", "--sequences", "00,08"]
-        assert run("predict", data, *weights, *predicted) == 0
         written = ["--json", out / "all.json", "--pictures", out / "pictures"]
         evaluated = ["--sequences", "08", *written]
         assert run("evaluate", data, *weights, *evaluated) == 0
 
     names = files(tmp_path / "one")
     assert files(tmp_path / "two") == names
-    assert len(files(tmp_path / "one/labels")) == 16
     for name in names:
         contents = (tmp_path / "one" / name).read_bytes()
         assert (tmp_path / "two" / name).read_bytes() == contents, name

@@ -27,9 +27,8 @@ from amvnet.data.formats.find import NamedScan
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.inference.listing import DatasetScan, FileScan, InputScan
+from amvnet.inference.listing import DatasetScan, FileReader, FileScan, InputScan
 from amvnet.inference.pipeline import OutputOptions, Pipeline
-from amvnet.inference.reading import FileReader
 from amvnet.inference.segmenter import Segmentation
 from amvnet.scan import Scan
 from amvnet.weights.file import save

@@ -18,7 +18,7 @@ import torch
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.inference.journal import JOURNAL, PATTERN, Entry, Journal, read_journals
+from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan
 from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
 from amvnet.inference.predict import predict as predict_scans
@@ -206,7 +206,7 @@ def test_a_killed_run_goes_on_where_it_stopped(
             time.sleep(0.005)
         process.kill()
         process.wait()
-        assert list(out.glob(".unfinished-*")), "the run was over before it was killed"
+        assert (out / UNFINISHED).exists(), "the run was over before it was killed"
         check_kept(out, times)
         times = {path.name: path.stat().st_mtime_ns for path in out.glob("0*.label")}
 
@@ -240,7 +240,7 @@ def test_a_run_is_not_resumed_with_other_options(world: Path, whole: Path, tmp_p
         assert f"another {key};" in line
     check_same(out, whole)
 
-    (out / JOURNAL).rename(out / PATTERN.replace("*", "0"))
+    (out / JOURNAL).rename(out / UNFINISHED)
     assert "another method;" in refusal(predict(world, out, "--resume --method rv"))
 
     # Without --resume it starts over.
@@ -389,7 +389,7 @@ def test_the_journal_is_at_most_as_late_as_the_writing(world: Path, tmp_path: Pa
 
     def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
         time.sleep(0.1)  # longer than the writing takes
-        lines.append(len((tmp_path / ".unfinished-0.jsonl").read_text().splitlines()) - 1)
+        lines.append(len((tmp_path / UNFINISHED).read_text().splitlines()) - 1)
         return list(map(no_segmentation, loaded))
 
     Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI).run({})

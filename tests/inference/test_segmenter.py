@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -329,7 +329,7 @@ def test_a_scan_of_a_file_is_segmented_by_its_rings_if_it_is_normalised(
     height = segmenter.model.range_view.config.height
     scan = Scan(POINTS, ring=np.random.default_rng(0).integers(0, height, len(POINTS)))
     loaded = SimpleNamespace(scan=scan, file_xyz=None)
-    source = SimpleNamespace(
+    source: Any = SimpleNamespace(
         load=lambda labels: loaded, is_normalised=is_normalised, path=Path("a.bin")
     )
     actual = segmenter._segment_input(source, []).scores

@@ -37,7 +37,7 @@ WRONG_INPUT = 2
 SOME_BROKEN = 3
 
 GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done
-SHARED = ("train", "predict", "evaluate", "ablate")  # verbs whose work several processes can share
+SHARED = ("train", "evaluate", "ablate")  # verbs whose work several processes can share
 
 _DATA = {"data": {"metavar": "DATA"}}
 _INPUTS = {"inputs": {"metavar": "INPUT", "nargs": "+"}}

@@ -34,10 +34,10 @@ from amvnet.export.engines import use_engine
 from amvnet.fleet.drives import describe_drive, parse_estimate
 from amvnet.fleet.manifest import split_name
 from amvnet.fleet.storage import Place
-from amvnet.inference.listing import FileScan
+from amvnet.inference.listing import FileReader, FileScan
 from amvnet.inference.pipeline import ExecutionOptions, Outcome, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
-from amvnet.inference.reading import FileReader, normaliser_for
+from amvnet.inference.reading import normaliser_for
 from amvnet.inference.scan_stream import AHEAD
 from amvnet.inference.segmentation import Segmentation, uncertain_share
 from amvnet.inference.segmenter import Segmenter

@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import PARTS, atomic_write, make_folder
 from amvnet.written import folder_lock, hold, is_held
 
 JOURNAL = ".amvnet-journal.jsonl"  # of a run that has ended
-PATTERN = ".unfinished-*.jsonl"  # one file per process, until the run ends
+UNFINISHED = ".unfinished.jsonl"  # until the run ends
 
 
 class Entry(NamedTuple):
@@ -51,42 +50,21 @@ class Journal:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        settings: Mapping[str, Any],
-        done: Iterable[Entry] = (),
-        processes: Processes = ALONE,
+        self, folder: Path, settings: Mapping[str, Any], done: Iterable[Entry] = ()
     ) -> None:
         self.folder = folder
-        self.processes = processes
-        self.path = folder / PATTERN.replace("*", str(processes.rank))
-        self._settings = dict(settings)
+        self.path = folder / UNFINISHED
         _check_alone(folder)
-        processes.wait()  # until all have read the earlier journals, before they are replaced
 
         make_folder(folder)
-        if processes.first:
-            with folder_lock(folder):
-                _check_alone(folder)
-                self._file = self._begin(done)
-                self._remove_old_files()
-        processes.wait()
-        if not processes.first:
-            self._file = self._begin()
-
-    def _begin(self, done: Iterable[Entry] = ()) -> IO[str]:
-        """Write the beginning of the journal, and hold it until the run ends."""
-        _write(self.path, self._settings, done)
-        file = self.path.open("a")
-        hold(file)
-        return file
-
-    def _remove_old_files(self) -> None:
-        """Remove the journals of earlier runs, and the files that these did not finish."""
-        (self.folder / JOURNAL).unlink(missing_ok=True)
-        journals = [path for path in self.folder.glob(PATTERN) if path != self.path]
-        for path in [*journals, *self.folder.rglob(PARTS)]:
-            path.unlink()
+        with folder_lock(folder):
+            _check_alone(folder)
+            _write(self.path, settings, done)
+            self._file = self.path.open("a")
+            hold(self._file)
+            (folder / JOURNAL).unlink(missing_ok=True)
+            for path in folder.rglob(PARTS):  # that earlier runs did not finish
+                path.unlink()
 
     def add(self, entry: Entry) -> None:
         """Write down that a scan is done."""
@@ -94,25 +72,17 @@ class Journal:
         self._file.flush()
 
     def close(self) -> dict[str, Entry]:
-        """End the run of all processes; return all entries by the name of the scan.
+        """End the run; return all entries by the name of the scan.
 
-        The journals become one, by which a later run leaves out what is done.
+        A later run leaves out what the journal has.
         """
         self._file.close()
-        self.processes.wait()
-        entries: dict[str, Entry] = {}
-        for path in self.folder.glob(PATTERN):
-            for entry in _read(path)[1]:
-                entries[entry.scan] = entry
-        self.processes.wait()  # until all have read
-
-        if self.processes.first:
-            if entries:
-                _write(self.folder / JOURNAL, self._settings, entries.values())
-            for path in self.folder.glob(PATTERN):
-                path.unlink()
-        self.processes.wait()
-        return entries
+        _, entries = _read(self.path)
+        if entries:
+            self.path.replace(self.folder / JOURNAL)
+        else:
+            self.path.unlink()
+        return {entry.scan: entry for entry in entries}
 
 
 def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]:
@@ -122,7 +92,7 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
         InputError: if that run had other settings.
     """
     done: dict[str, Entry] = {}
-    for path in [folder / JOURNAL, *folder.glob(PATTERN)]:
+    for path in (folder / JOURNAL, folder / UNFINISHED):
         if not path.is_file():
             continue
         earlier_settings, entries = _read(path)
@@ -140,7 +110,7 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
 
 def _check_alone(folder: Path) -> None:
     """Raise InputError if another run is writing into the folder."""
-    if any(is_held(path) for path in folder.glob(PATTERN)):
+    if is_held(folder / UNFINISHED):
         raise InputError(
             f"{folder}: expected a folder for this run alone, found another run that is writing "
             "into it; wait until it ends, or change --out"

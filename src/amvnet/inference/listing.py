@@ -1,17 +1,19 @@
-"""List the scans of a user's inputs: datasets, scan files, bags, and folders of these."""
+"""The scans of a user's inputs: datasets, scan files, bags, and folders of these."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Protocol, overload
+from typing import overload
 
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord, choose_records
 from amvnet.data.datasets.open import open_if_dataset
 from amvnet.data.datasets.own import OwnScans
+from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
@@ -20,7 +22,7 @@ from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
-from amvnet.inference.reading import FileReader, LoadedScan, normalised_by
+from amvnet.inference.reading import normalised_by
 from amvnet.inference.segmentation import Segmentation
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Normaliser
@@ -43,69 +45,36 @@ class ScanOptions:
     layout: RowLayout = UNKNOWN
 
 
-class InputScan(Protocol):
-    """One scan of the inputs, not read yet.
+@dataclass(frozen=True)
+class LoadedScan:
+    """A scan in memory.
+
+    Attributes:
+        scan: as the segmenter takes it.
+        sensor: what recorded it: the bag, folder or sequence.
+        file_xyz: (N, 3) the coordinates as they are in the scan's file; None for a scan of a
+            dataset.
+    """
+
+    scan: Scan
+    sensor: str = ""
+    file_xyz: np.ndarray | None = None
+
+
+class DatasetScan:
+    """A scan of a dataset, not read yet; its labels are in the dataset's format and classes.
+
+    Args:
+        written: the classes of the labels that are written; None means those of the dataset.
 
     Attributes:
         name: for messages, unique among the scans of one input.
         title: a short name for people who look at the scan.
-        source: the recording that it is from: a bag, a folder, a sequence.
+        source: the recording that it is from: a sequence.
         path: the file that the scan is read from.
         scores_path: of the `.npz` of its scores, relative to a folder of predictions.
         is_normalised: whether `ring` is the row of each point in the range image, for
             `Segmenter.by_ring`.
-    """
-
-    name: str
-    title: str
-    source: str
-    path: Path
-    scores_path: Path
-    is_normalised: bool
-
-    def labels_path(self, kind: str) -> Path:
-        """Return the path of the file of its labels, relative to a folder of predictions.
-
-        Args:
-            kind: the format for scan files; datasets have their own.
-        """
-
-    def load(self, labels: bool = False) -> LoadedScan:
-        """Read the scan, with the ground truth if `labels` and there is any.
-
-        Raises:
-            InputError: if it cannot be read.
-        """
-
-    def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-        """Read the (N,) train ids of the scan's points.
-
-        Args:
-            path: a folder of predictions; for scan files, also a label file.
-            count: N.
-            taxonomy: turns the raw ids of scan files into train ids; datasets have their own.
-
-        Raises:
-            InputError: if they cannot be read.
-        """
-
-    def write_labels(
-        self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
-    ) -> Path:
-        """Write labels into a folder of predictions; return the path of the file.
-
-        Args:
-            loaded: what `load` returned.
-            kind: the format for scan files; datasets have their own.
-            taxonomy: turns the train ids of scan files into raw ids; datasets have their own.
-        """
-
-
-class DatasetScan:
-    """A scan of a dataset.
-
-    Args:
-        written: the classes of the labels that are written; None means those of the dataset.
     """
 
     def __init__(
@@ -122,17 +91,29 @@ class DatasetScan:
         self.is_normalised = dataset.is_normalised
 
     def labels_path(self, kind: str) -> Path:
+        """Return the path of the file of its labels, relative to a folder of predictions."""
         return Path(self.record.prediction)
 
     def load(self, labels: bool = False) -> LoadedScan:
+        """Read the scan, with the ground truth if `labels` and there is any.
+
+        Raises:
+            InputError: if it cannot be read.
+        """
         return LoadedScan(self.dataset.read(self.record, labels=labels), self.source)
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+        """Read the (N,) train ids of the scan's points from a folder of predictions.
+
+        Raises:
+            InputError: if they cannot be read.
+        """
         return self.dataset.read_prediction(self.record, path)
 
     def write_labels(
         self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
     ) -> Path:
+        """Write labels into a folder of predictions; return the path of the file."""
         return self.dataset.write_prediction(self.record, folder, result.labels, self.written)
 
 
@@ -144,8 +125,49 @@ def _title_of(record: ScanRecord) -> str:
     return f"{record.sequence}/{time}"
 
 
+class FileReader:
+    """Reads scan files, normalised to what some weights expect.
+
+    Scans that were read to measure their sensor are kept until they are asked for, so that each
+    file is read once.
+
+    Args:
+        normaliser: normalises the scans; None reads them as they are.
+    """
+
+    def __init__(self, normaliser: Normaliser | None) -> None:
+        self.normaliser = normaliser
+        self.is_normalising = normaliser is not None and normaliser.expected is not None
+        self._kept: dict[tuple[str, str], Cloud] = {}  # by source and name, of one source
+
+    def expect(self, scan: NamedScan) -> None:
+        """Announce a scan; call this for the scans of a source in their order."""
+        if self.normaliser is not None:
+            self.normaliser.expect(scan.source, partial(self._read_and_keep, scan))
+
+    def read(self, scan: NamedScan) -> LoadedScan:
+        """Read a scan; raise InputError if it cannot be read, or no point is usable."""
+        if self.normaliser is None:
+            cloud = scan.read()
+            return LoadedScan(cloud.to_scan(), scan.source, cloud.xyz)
+
+        if self.is_normalising:
+            self.normaliser.measure(scan.source)
+        kept = self._kept.pop((scan.source, scan.name), None)
+        cloud = scan.read() if kept is None else kept
+        return LoadedScan(self.normaliser(cloud, scan.source), scan.source, cloud.xyz)
+
+    def _read_and_keep(self, scan: NamedScan) -> Cloud:
+        """Read one of the first scans of a source, and forget those of others."""
+        if any(source != scan.source for source, _ in self._kept):
+            self._kept.clear()
+        cloud = scan.read()
+        self._kept[scan.source, scan.name] = cloud
+        return cloud
+
+
 class FileScan:
-    """A scan in a file or a bag."""
+    """A scan in a file or a bag, not read yet; its attributes are those of `DatasetScan`."""
 
     def __init__(self, scan: NamedScan, reader: FileReader) -> None:
         self.scan = scan
@@ -158,12 +180,21 @@ class FileScan:
         self.is_normalised = reader.is_normalising
 
     def labels_path(self, kind: str) -> Path:
+        """Return the path of its labels in a format, relative to a folder of predictions."""
         return Path(f"{self.name}.{kind}")
 
     def load(self, labels: bool = False) -> LoadedScan:
+        """Read the scan; raise InputError if it cannot be read."""
         return self.reader.read(self.scan)
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
+        """Read the (N,) train ids of the scan's points; raise InputError if they cannot be read.
+
+        Args:
+            path: a label file, or a folder of predictions.
+            count: N.
+            taxonomy: turns raw ids into train ids.
+        """
         if path.is_dir():
             stem = path / self.name
             paths = [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]
@@ -173,6 +204,13 @@ class FileScan:
     def write_labels(
         self, folder: Path, loaded: LoadedScan, result: Segmentation, kind: str, taxonomy: Taxonomy
     ) -> Path:
+        """Write labels into a folder of predictions; return the path of the file.
+
+        Args:
+            loaded: what `load` returned.
+            kind: one of `writers.KINDS`.
+            taxonomy: turns train ids into raw ids.
+        """
         assert loaded.file_xyz is not None
         return write_scan_labels(
             inside(folder, self.name),
@@ -182,6 +220,9 @@ class FileScan:
             taxonomy,
             uncertain=result.uncertain if result.has_two_networks else None,
         )
+
+
+InputScan = DatasetScan | FileScan
 
 
 def list_inputs(

@@ -19,12 +19,10 @@ import numpy as np
 from amvnet.data.formats.registry import COLUMN_READERS
 from amvnet.data.labels.writers import check_kind, write_uncertain
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError, SomeBroken, memory_for
 from amvnet.files import atomic_write, inside
 from amvnet.inference.journal import Entry, Journal, read_journals
-from amvnet.inference.listing import InputScan
-from amvnet.inference.reading import LoadedScan
+from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
 from amvnet.progress import Progress, no_progress
@@ -73,13 +71,12 @@ class OutputOptions:
 
 @dataclass(frozen=True)
 class ExecutionOptions:
-    """How many scans are computed at a time, and by which processes.
+    """How many scans are computed at a time.
 
     Attributes:
         batch: scans that go through the networks together; the labels are the same up to rounding.
         at_once: scans that are segmented at the same time, each with its share of the threads.
         resume: leave out the scans that an earlier run into the same folder has done.
-        processes: those that share the scans.
 
     Raises:
         InputError: if the batch is below 1.
@@ -88,7 +85,6 @@ class ExecutionOptions:
     batch: int = 1
     at_once: int = 1
     resume: bool = False
-    processes: Processes = ALONE
 
     def __post_init__(self) -> None:
         if self.batch < 1:
@@ -108,11 +104,11 @@ class Pipeline:
     """Reads, segments and writes scans at the same time.
 
     Attributes:
-        scans: the scans, for all processes together.
+        scans: the scans.
         segment: segments scans that have been read.
         output: what is written, and where.
         taxonomy: the classes of the labels.
-        execution: how many scans at a time, and by which processes.
+        execution: how many scans at a time.
     """
 
     scans: Sequence[InputScan]
@@ -137,32 +133,23 @@ class Pipeline:
         Raises:
             InputError: if two scans would have the same files, an output folder is that of a scan,
                 a file of the user would be replaced, or another run is writing into the folder.
-            ConnectionResetError: if another process has ended before its share was done.
         """
         is_new = not self.output.folder.exists()
         written = self._check_output()
         done = self._read_done(settings, written)
         remaining = [scan for scan in self.scans if _key(scan) not in done]
 
-        processes = self.execution.processes
-        journal = Journal(self.output.folder, settings, done.values(), processes)
-        if processes.first:
-            written.claim(self._paths_of(remaining))
-        processes.wait()  # so that no file is written before it is claimed
-
+        # Files are claimed before any is written.
+        journal = Journal(self.output.folder, settings, done.values())
+        written.claim(self._paths_of(remaining))
         faults = self._process(remaining, journal, progress)
-        try:
-            entries = journal.close()
-            if processes.first:
-                written.finish(self._paths_of(remaining))
-                if is_new:
-                    with suppress(OSError):  # stays unless all scans were broken
-                        self.output.folder.rmdir()
-            all_faults = list(chain.from_iterable(processes.gather(faults)))
-        except ConnectionResetError as error:
-            left = self._describe_left(settings, remaining)
-            raise ConnectionResetError(error.errno, left, str(self.output.folder)) from error
-        return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], all_faults
+
+        entries = journal.close()
+        written.finish(self._paths_of(remaining))
+        if is_new:
+            with suppress(OSError):  # stays unless all scans were broken
+                self.output.folder.rmdir()
+        return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
     def _check_output(self) -> WrittenFiles:
         """Check that the output replaces no file of the user; return the record of the folder's.
@@ -223,29 +210,16 @@ class Pipeline:
     def _process(
         self, remaining: Sequence[InputScan], journal: Journal, progress: Progress
     ) -> list[str]:
-        """Do this process's share of the scans; return a line for each that is broken."""
-        share = self.execution.processes.share(remaining)
+        """Segment scans; return a line for each that is broken."""
         faults = []
-        for count, outcome in enumerate(self.stream(share)):
-            progress(count, len(share))
+        for count, outcome in enumerate(self.stream(remaining)):
+            progress(count, len(remaining))
             if isinstance(outcome, Entry):
                 journal.add(outcome)
             else:
                 faults.append(outcome)
-        progress(len(share), len(share))
+        progress(len(remaining), len(remaining))
         return faults
-
-    def _describe_left(self, settings: Mapping[str, Any], remaining: Sequence[InputScan]) -> str:
-        """Return whose scans are not done after a process has ended."""
-        done = read_journals(self.output.folder, settings)
-        size = self.execution.processes.size
-        shares = []
-        for rank in range(size):
-            share = remaining[rank::size]
-            count = sum(_key(scan) not in done for scan in share)
-            if count:
-                shares.append(f"{count} of the {len(share)} scans of process {rank}")
-        return f"a process has ended; {' and '.join(shares)} are left for --resume"
 
     def _paths_of(self, scans: Sequence[InputScan]) -> list[Path]:
         """Return the paths of the files of scans, relative to the folder."""

@@ -1,18 +1,14 @@
-"""Read the scans of the inputs, normalised to what some weights expect."""
+"""Scans as some weights expect them: arrays, scan files and a user's own datasets."""
 
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_with_classes
 from amvnet.data.datasets.own import OwnScans
-from amvnet.data.formats.cloud import Cloud
-from amvnet.data.formats.find import NamedScan
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError
 from amvnet.progress import Say, say_nothing
@@ -24,69 +20,6 @@ from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
 
 MOST_COLUMNS = 64  # of an array of points; one with more is transposed
-
-
-@dataclass(frozen=True)
-class LoadedScan:
-    """A scan in memory.
-
-    Attributes:
-        scan: as the segmenter takes it.
-        sensor: what recorded it: the bag, folder or sequence.
-        file_xyz: (N, 3) the coordinates as they are in the scan's file; None for a scan of a
-            dataset.
-    """
-
-    scan: Scan
-    sensor: str = ""
-    file_xyz: np.ndarray | None = None
-
-
-class FileReader:
-    """Reads scan files, normalised to what some weights expect.
-
-    Scans that were read to measure their sensor are kept until they are asked for, so that each
-    file is read once.
-
-    Args:
-        normaliser: normalises the scans; None reads them as they are.
-    """
-
-    def __init__(self, normaliser: Normaliser | None) -> None:
-        self.normaliser = normaliser
-        self._kept: dict[tuple[str, str], Cloud] = {}  # by source and name, of one source
-
-    @property
-    def is_normalising(self) -> bool:
-        """Whether `ring` of a scan is the row of each point in the range image."""
-        return self.normaliser is not None and self.normaliser.expected is not None
-
-    def expect(self, scan: NamedScan) -> None:
-        """Announce a scan; call this for the scans of a source in their order."""
-        if self.normaliser is not None:
-            self.normaliser.expect(scan.source, partial(self._read_and_keep, scan))
-
-    def read(self, scan: NamedScan) -> LoadedScan:
-        """Read a scan; raise InputError if it cannot be read, or no point is usable."""
-        if self.normaliser is None:
-            cloud = scan.read()
-            normalised = cloud.to_scan()
-        else:
-            if self.is_normalising:
-                self.normaliser.measure(scan.source)
-            kept = self._kept.pop((scan.source, scan.name), None)
-            cloud = scan.read() if kept is None else kept
-            normalised = self.normaliser(cloud, scan.source)
-
-        return LoadedScan(normalised, scan.source, cloud.xyz)
-
-    def _read_and_keep(self, scan: NamedScan) -> Cloud:
-        """Read one of the first scans of a source, and forget those of others."""
-        if any(source != scan.source for source, _ in self._kept):
-            self._kept.clear()
-        cloud = scan.read()
-        self._kept[scan.source, scan.name] = cloud
-        return cloud
 
 
 def array_scan(

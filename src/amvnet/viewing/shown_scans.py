@@ -13,8 +13,8 @@ import torch
 from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.listing import InputScan
-from amvnet.inference.reading import LoadedScan, check_scan
+from amvnet.inference.listing import InputScan, LoadedScan
+from amvnet.inference.reading import check_scan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Origin, Segmentation, expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter

@@ -13,7 +13,6 @@ from amvnet.cli.options import (
     ComputeChoice,
     ScanChoice,
     SensorChoice,
-    join_processes,
     parse_classes,
 )
 from amvnet.errors import InputError, shown
@@ -108,9 +107,8 @@ def predict(
     from amvnet.inference.predict import predict as predict_inputs
 
     _refuse_urls([*inputs, out])
-    processes = join_processes()
     sensor = known.parse()
-    segmenter = compute.segmenter(load(weights), method, tau, processes)
+    segmenter = compute.segmenter(load(weights), method, tau)
 
     with progress("segmenting") as step:
         written = predict_inputs(
@@ -118,7 +116,7 @@ def predict(
             segmenter,
             OutputOptions(Path(out), format, scores, uncertain, overwrite),
             options=choice.parse(),
-            execution=ExecutionOptions(batch, resume=resume, processes=processes),
+            execution=ExecutionOptions(batch, resume=resume),
             sensor=sensor,
             classes=class_map,
             progress=step,
