@@ -17,7 +17,6 @@ test-slow: .venv/installed .venv/fleet  ## the tests that take minutes, and thos
 
 bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN="--scan FILE" for a scan of yours
 	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8,compile
-	$(BIN)/amvnet bench --recipe semantickitti $(SCAN)
 
 docs: .venv/docs  ## the site of docs/, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

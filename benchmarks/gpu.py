@@ -40,12 +40,15 @@ from amvnet.config.schema import (
     PolarViewConfig,
     RangeNetConfig,
     RangeViewConfig,
+    Recipe,
 )
+from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.inference.segmenter import Segmenter
-from amvnet.inference.timing import STAGES, Job, run_once, untrained
+from amvnet.inference.timing import STAGES, Job, run_once
+from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.scan import Scan
-from amvnet.weights.file import Weights, save
+from amvnet.weights.file import PARTS, Weights, part_state, save
 from lidarstreets import simulate
 
 TINY = ModelConfig(
@@ -104,6 +107,16 @@ def main() -> None:
             measure_size(size, untrained(recipe), scan, options)
             measure_predict(size, untrained(recipe), folder, options)
         measure_training(folder, options)
+
+
+def untrained(recipe: Recipe) -> Weights:
+    """Return random weights of a recipe's sizes."""
+    taxonomy = TAXONOMIES[recipe.taxonomy]
+    model = build_amvnet(recipe.model, taxonomy.size)
+    tensors = {}
+    for part in PARTS:
+        tensors |= part_state(part, getattr(model, part).state_dict())
+    return Weights(recipe.model, taxonomy, recipe.sensor, tensors)
 
 
 def print_machine(options: Options, scan: Scan) -> None:

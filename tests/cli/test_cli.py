@@ -406,11 +406,10 @@ def test_bench_times_every_stage(world: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_benchs_figures_add_up(world: Path, tmp_path: Path) -> None:
-    options = f"--scan {world}/lone.bin --runs 3 --uncertain 0.25 --json {tmp_path}/b.json"
+    options = f"--scan {world}/lone.bin --runs 3 --json {tmp_path}/b.json"
     succeed(f"bench --weights {world}/w.safetensors {options}")
     figures = read_json(tmp_path / "b.json")
     assert figures["points"] == 300
-    assert figures["uncertain"] == 75
     assert figures["runs"] == 3
     assert figures["peak_memory_mib"] > 100
 
@@ -422,10 +421,3 @@ def test_benchs_figures_add_up(world: Path, tmp_path: Path) -> None:
     total = sum(medians.values())
     assert 0 < mean < total
     assert total == pytest.approx(figures["all_ms"]["median"], rel=0.5)
-
-
-def test_bench_times_a_recipe_with_random_weights(
-    world: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    succeed(f"bench --recipe {world}/recipe.yaml --scan {world}/lone.bin --runs 1")
-    assert "10.0% of them uncertain" in " ".join(capsys.readouterr().out.split())

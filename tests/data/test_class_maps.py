@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,7 @@ import pytest
 import yaml
 
 from amvnet.data.class_maps import class_map
-from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
-from amvnet.errors import InputError
-from amvnet.evaluation.metrics import Evaluation
-from amvnet.evaluation.scoring import _check_left_out
 from amvnet.weights.file import save
 
 from fixtures.worlds import (
@@ -155,72 +150,3 @@ def test_two_classes_of_one_name_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "few.yaml"
     path.write_text("classes: {1: [road], '1': [car]}")
     fails(lambda: class_map(str(path)), path, "no class twice, found ['1']")
-
-
-def score_with_map(tmp_path: Path, classes: dict[str, list[str]]) -> tuple[int, str, Path]:
-    """Score perfect predictions of `make_streets` by a map; return the code, errors and figures."""
-    data = make_streets(tmp_path / "data")
-    target = tmp_path / "out/sequences/08/predictions"
-    shutil.copytree(data / "sequences/08/labels", target)
-    (tmp_path / "few.yaml").write_text(yaml.safe_dump({"classes": classes}))
-    figures = tmp_path / "figures.json"
-    code, error = run_cli(
-        *("evaluate", data, "--predictions", tmp_path / "out", "--json", figures),
-        *("--classes", tmp_path / "few.yaml"),
-    )
-    return code, error, figures
-
-
-def test_classes_that_a_map_leaves_out_are_named_with_their_share(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, error, figures = score_with_map(
-        tmp_path, {"flat": ["road", "sidewalk"], "vehicle": ["car"]}
-    )
-    assert (code, error) == (0, "")
-
-    paths = sorted((tmp_path / "data/sequences/08/labels").glob("*.label"))
-    raw = np.concatenate([np.fromfile(path, np.uint32) for path in paths])
-    share = np.count_nonzero(raw == 50) / np.count_nonzero(raw)
-    assert 0 < share < 0.5
-    left_out = json.loads(figures.read_text())["left_out"]
-    assert left_out == {"building": pytest.approx(share)}
-    assert f"building: left out, {share:.1%} of the labelled points" in capsys.readouterr().out
-
-
-def test_a_map_that_leaves_out_most_of_the_points_is_refused(tmp_path: Path) -> None:
-    code, error, figures = score_with_map(tmp_path, {"vehicle": ["car"]})
-    assert code == 2
-    assert error.count("\n") == 1
-    assert all(name in error for name in ("road", "building", "--classes"))
-    assert not figures.exists()
-
-
-@pytest.mark.parametrize(("left_out", "is_refused"), [(5, False), (6, True)])
-def test_a_map_may_leave_out_half_of_the_points_and_no_more(
-    tmp_path: Path, left_out: int, is_refused: bool
-) -> None:
-    dataset = open_dataset(str(make_streets(tmp_path / "data")))
-    scored = np.ones(10 - left_out, dtype=int)
-    evaluation = Evaluation(SEMANTICKITTI)
-    evaluation.add(np.ones((len(scored), 3)), scored, {"a": scored})
-    evaluation.left_out["building"] += left_out
-    if not is_refused:
-        _check_left_out(evaluation, dataset)
-        return
-    with pytest.raises(InputError, match="building"):
-        _check_left_out(evaluation, dataset)
-
-
-def test_parts_of_an_evaluation_add_up_to_the_classes_left_out_of_the_whole() -> None:
-    points = np.ones((6, 3))
-    truth = np.array([0, 1, 2, 0, 0, 1])
-    is_left_out = np.array([True, False, False, True, False, False])
-    parts = []
-    for part in (slice(0, 2), slice(2, 6), slice(0, 6)):
-        evaluation = Evaluation(SEMANTICKITTI)
-        evaluation.add(points[part], truth[part], {"a": truth[part]})
-        evaluation.left_out["b"] += int(is_left_out[part].sum())
-        parts.append(evaluation)
-    first, second, whole = parts
-    assert (first + second).left_out_shares() == whole.left_out_shares() == {"b": 2 / 5}

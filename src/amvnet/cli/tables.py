@@ -55,8 +55,6 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 
     for name in taxonomy.classes:
         table.add_row(name, *[_percent(method["iou"][name]) for method in figures])
-    for name, share in report.get("left_out", {}).items():
-        table.add_row(f"{name}: left out, {share:.1%} of the labelled points")
     table.add_section()
     for key, row_title in OVERALL.items():
         table.add_row(row_title, *[_percent(method[key]) for method in figures])

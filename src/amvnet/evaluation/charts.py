@@ -188,11 +188,9 @@ def _percent(value: float | None) -> float | None:
 
 def _figure(title: str) -> tuple[Any, Any]:
     """Return an empty Matplotlib figure with a title, and its axes."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=SIZE, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.set_title(title, fontsize=10)
     axes.spines["top"].set_visible(False)

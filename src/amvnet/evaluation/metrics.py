@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -111,9 +110,6 @@ class Evaluation:
         points: number of points in these scans, labelled or not.
         uncertain: number of uncertain points.
         asked: number of points of which it is known whether they are uncertain.
-        labelled: number of points with a class here.
-        left_out: by name, the points of classes of the data that have none here; `truth` of `add`
-            has them as 0.
     """
 
     taxonomy: Taxonomy
@@ -122,8 +118,6 @@ class Evaluation:
     points: int = 0
     uncertain: int = 0
     asked: int = 0
-    labelled: int = 0
-    left_out: Counter[str] = field(default_factory=Counter)
 
     def add(
         self,
@@ -152,16 +146,10 @@ class Evaluation:
 
         self.scans += 1
         self.points += len(points)
-        self.labelled += int(np.count_nonzero(truth))
 
         if uncertain is not None:
             self.uncertain += int(np.count_nonzero(uncertain))
             self.asked += len(uncertain)
-
-    def left_out_shares(self) -> dict[str, float]:
-        """Return the shares of the labelled points that are in classes left out, by name."""
-        total = self.labelled + self.left_out.total()
-        return {name: points / total for name, points in self.left_out.items()}
 
     def __add__(self, other: Evaluation) -> Evaluation:
         """Return an evaluation of the scans of both, which have the same classes."""
@@ -172,8 +160,6 @@ class Evaluation:
             total.points += part.points
             total.uncertain += part.uncertain
             total.asked += part.asked
-            total.labelled += part.labelled
-            total.left_out += part.left_out
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
@@ -186,16 +172,13 @@ class Evaluation:
         for method, matrices in self.matrices.items():
             methods[method] = self._method_report(matrices)
 
-        figures = {
+        return {
             "dataset": dataset,
             "scans": self.scans,
             "points": self.points,
             "uncertain_fraction": _ratio(self.uncertain, self.asked),
             "methods": methods,
         }
-        if self.left_out:
-            figures["left_out"] = self.left_out_shares()
-        return figures
 
     def _method_report(self, matrices: np.ndarray) -> dict[str, Any]:
         bins = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -37,7 +36,6 @@ Result = TypeVar("Result")
 MethodLabels = tuple[dict[str, np.ndarray], np.ndarray | None]
 
 PICTURES = 4  # scans that are drawn, evenly spaced
-MOST_LEFT_OUT = 0.5  # of the labelled points, in classes that a map of classes leaves out
 
 
 @dataclass(frozen=True)
@@ -72,8 +70,7 @@ def evaluate(
         processes: the processes that share the scans; each returns the evaluation of all scans.
 
     Raises:
-        InputError: if a scan has no ground truth, or the map leaves out most of the labelled
-            points.
+        InputError: if a scan has no ground truth.
     """
     own = dataset.taxonomy
     classes = labeller.classes
@@ -92,30 +89,13 @@ def evaluate(
         truth = table[scan.labels]
         ids, uncertain = labels
         evaluation.add(scan.points, truth, ids, uncertain)
-        for train_id in np.flatnonzero(table[1:] == 0) + 1:
-            count = int(np.count_nonzero(scan.labels == train_id))
-            evaluation.left_out += Counter({own.names[train_id]: count})
         if pictures is not None and record.name in pictured:
             view = TopView(
                 scan.points, taxonomy, ids, truth, uncertain=uncertain, title=record.name
             )
             draw_scan(inside(pictures, f"{record.name.replace('/', '_')}.png"), view)
 
-    total = sum(processes.gather(evaluation), Evaluation(taxonomy))
-    _check_left_out(total, dataset)
-    return total
-
-
-def _check_left_out(evaluation: Evaluation, dataset: Dataset) -> None:
-    """Raise InputError if a map of classes leaves out so much that scores say little."""
-    shares = evaluation.left_out_shares()
-    share = sum(shares.values())
-    if share > MOST_LEFT_OUT:
-        raise InputError(
-            f"{dataset.root}: expected a map (--classes) of most of the labelled points, found "
-            f"{share:.0%} of them in classes that it leaves out ({', '.join(shares)}); "
-            "write a YAML file that names these, too"
-        )
+    return sum(processes.gather(evaluation), Evaluation(taxonomy))
 
 
 def stream_labelled(

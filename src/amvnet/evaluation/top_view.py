@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +23,10 @@ LEGEND_LINE = 0.2  # inches, height of one line of the legend
 LEGEND_MARGIN = 0.5  # inches
 DOT = 1.1  # area of a point in square typographic points
 
-Color = tuple[float, float, float]
-IGNORED: Color = (0.8, 0.8, 0.8)
-PLAIN: Color = (0.75, 0.75, 0.75)
-GROUND = "white"
-INK = "black"
-LINES = "0.6"
+IGNORED = (0.8, 0.8, 0.8)  # RGB in [0, 1]
+PLAIN = (0.75, 0.75, 0.75)
+
+Color = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -77,21 +76,27 @@ def draw_scan(path: Path | str, view: TopView) -> Path:
     Returns:
         The path that was written.
     """
+    from matplotlib.figure import Figure
+
+    grid = _grid(view)
+    entries = _legend_entries(view)
+    columns = len(grid[0])
+    legend_lines = math.ceil(len(entries) / (ENTRIES * columns))
+    height = len(grid) * PANEL + LEGEND_LINE * legend_lines + LEGEND_MARGIN
+    figure = Figure(figsize=(columns * PANEL, height), layout="constrained")
+
+    panels = itertools.chain.from_iterable(grid)
+    for number, panel in enumerate(panels, start=1):
+        if panel is not None:
+            _draw_panel(figure.add_subplot(len(grid), columns, number), view.points, panel)
+    if view.title:
+        figure.suptitle(view.title, fontsize=13)
+    _draw_legend(figure, entries, columns)
+
     path = Path(path)
-    figure = scan_figure(view)
     with atomic_write(path) as part:
-        figure.savefig(part, format="png", dpi=DOTS_PER_INCH, facecolor=GROUND)
+        figure.savefig(part, format="png", dpi=DOTS_PER_INCH)
     return path
-
-
-def scan_figure(view: TopView) -> Any:
-    """Return the Matplotlib figure that `draw_scan` writes."""
-    entries = _class_entries(view)
-    if view.truth is not None and view.predictions:
-        entries.append(("wrong", _shares(WRONG)))
-    if view.uncertain is not None:
-        entries.append(("uncertain", _shares(UNCERTAIN)))
-    return _figure(view, _grid(view), entries)
 
 
 def _grid(view: TopView) -> list[list[_Panel | None]]:
@@ -110,7 +115,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     uncertainty = None
     if view.uncertain is not None:
         total = len(view.uncertain)
-        uncertainty = _highlight("uncertain", view.uncertain, total, _shares(UNCERTAIN))
+        uncertainty = _highlight("uncertain", view.uncertain, total, UNCERTAIN)
     if truth is None:
         return [[*predictions]] if uncertainty is None else [[*predictions, uncertainty]]
 
@@ -118,7 +123,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     errors = []
     for title, ids in view.predictions.items():
         wrong = (ids != truth) & labelled
-        errors.append(_highlight(f"errors of {title}", wrong, labelled.sum(), _shares(WRONG)))
+        errors.append(_highlight(f"errors of {title}", wrong, labelled.sum(), WRONG))
 
     first_row: list[_Panel | None] = [_Panel("truth", palette[truth], labelled), *predictions]
     if uncertainty is None and not errors:
@@ -126,63 +131,35 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     return [first_row, [uncertainty, *errors]]
 
 
-def _highlight(title: str, mask: np.ndarray, total: int, color: Color) -> _Panel:
+def _highlight(title: str, mask: np.ndarray, total: int, color: Sequence[int]) -> _Panel:
     """Return a panel with the points of a mask in one colour and all others in grey.
 
     The title also gives the number of these points as a share of `total`.
     """
     share = np.count_nonzero(mask) / max(total, 1)
-    colors = np.where(mask[:, None], color, PLAIN)
+    colors = np.where(mask[:, None], np.divide(color, 255), PLAIN)
     return _Panel(f"{title} ({share:.1%})", colors, mask)
 
 
-def _shares(color: tuple[int, int, int]) -> Color:
-    """Return a colour in [0, 1]."""
-    red, green, blue = color
-    return red / 255, green / 255, blue / 255
-
-
-def _class_entries(view: TopView) -> list[tuple[str, Color]]:
-    """Return (name, colour) of the classes that appear, for the legend; "ignored" comes last."""
-    taxonomy = view.taxonomy
+def _legend_entries(view: TopView) -> list[tuple[str, Color]]:
+    """Return (name, colour) of the classes that appear, and of wrong and uncertain points."""
     arrays = list(view.predictions.values())
     if view.truth is not None:
         arrays.append(view.truth)
     class_ids = np.unique(np.concatenate(arrays)).tolist()
 
-    entries: list[tuple[str, Color]] = []
+    colors = class_colors(view.taxonomy)
+    entries: list[tuple[str, Sequence[int]]] = []
     for class_id in class_ids:
         if class_id > 0:
-            color = _shares(class_colors(taxonomy)[class_id])
-            entries.append((taxonomy.classes[class_id - 1], color))
-    if 0 in class_ids:
-        entries.append(("ignored", IGNORED))
-    return entries
+            entries.append((view.taxonomy.names[class_id], colors[class_id]))
+    if view.truth is not None and view.predictions:
+        entries.append(("wrong", WRONG))
+    if view.uncertain is not None:
+        entries.append(("uncertain", UNCERTAIN))
 
-
-def _figure(
-    view: TopView, grid: list[list[_Panel | None]], entries: list[tuple[str, Color]]
-) -> Any:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    rows = len(grid)
-    columns = len(grid[0])
-    legend_lines = math.ceil(len(entries) / (ENTRIES * columns))
-    height = rows * PANEL + (LEGEND_LINE * legend_lines + LEGEND_MARGIN)
-    figure = Figure(figsize=(columns * PANEL, height), facecolor=GROUND, layout="constrained")
-    FigureCanvasAgg(figure)
-
-    for row, row_panels in enumerate(grid):
-        for column, panel in enumerate(row_panels):
-            if panel is not None:
-                axes = figure.add_subplot(rows, columns, row * columns + column + 1)
-                _draw_panel(axes, view.points, panel)
-
-    if view.title:
-        figure.suptitle(view.title, color=INK, fontsize=13)
-    _draw_legend(figure, entries, columns)
-    return figure
+    shares = [(name, tuple(np.divide(color, 255))) for name, color in entries]
+    return [*shares, ("ignored", IGNORED)] if 0 in class_ids else shares
 
 
 def _draw_panel(axes: Any, points: np.ndarray, panel: _Panel) -> None:
@@ -193,38 +170,24 @@ def _draw_panel(axes: Any, points: np.ndarray, panel: _Panel) -> None:
     order = np.argsort(xyz[:, 2], kind="stable")
     order = order[np.argsort(panel.on_top[inside][order], kind="stable")]
 
-    axes.scatter(
-        xyz[order, 0],
-        xyz[order, 1],
-        c=panel.colors[inside][order],
-        s=DOT,
-        marker="o",
-        linewidths=0,
-        rasterized=True,
-    )
-    axes.plot(0, 0, marker="+", color=INK, markersize=7)
+    x, y, _ = xyz[order].T
+    axes.scatter(x, y, c=panel.colors[inside][order], s=DOT, linewidths=0, rasterized=True)
+    axes.plot(0, 0, marker="+", color="black", markersize=7)
 
-    axes.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal", facecolor=GROUND)
-    axes.set_title(panel.title, color=INK, fontsize=11)
-    axes.set_xlabel("x (m)", color=INK, fontsize=8)
-    axes.set_ylabel("y (m)", color=INK, fontsize=8)
-    axes.tick_params(colors=INK, labelsize=8)
-    for spine in axes.spines.values():
-        spine.set_color(LINES)
+    axes.set(xlim=(-REACH, REACH), ylim=(-REACH, REACH), aspect="equal")
+    axes.set_title(panel.title, fontsize=11)
+    axes.set_xlabel("x (m)", fontsize=8)
+    axes.set_ylabel("y (m)", fontsize=8)
+    axes.tick_params(labelsize=8)
 
 
-def _draw_legend(figure: Any, entries: list[tuple[str, Color]], columns: int) -> None:
+def _draw_legend(figure: Any, entries: Sequence[tuple[str, Color]], columns: int) -> None:
     from matplotlib.patches import Patch
 
-    handles = []
-    for name, color in entries:
-        handles.append(Patch(facecolor=color, edgecolor="0.5", linewidth=0.5, label=name))
-
     figure.legend(
-        handles=handles,
+        handles=[Patch(facecolor=color, edgecolor="0.5", label=name) for name, color in entries],
         loc="outside lower center",
-        ncols=min(len(handles), ENTRIES * columns),
+        ncols=min(len(entries), ENTRIES * columns),
         frameon=False,
-        labelcolor=INK,
         fontsize=9,
     )

@@ -12,27 +12,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from amvnet.config.schema import Recipe
-from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.errors import InputError
 from amvnet.inference.segmentation import label_ids
 from amvnet.inference.segmenter import Segmenter
 from amvnet.memory import peak_memory
-from amvnet.models.amvnet import build_amvnet
-from amvnet.models.assertion import cosine_similarity
 from amvnet.models.methods import geometric_mean
 from amvnet.models.streams import one_after_the_other
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
-from amvnet.weights.file import PARTS, Weights, part_state
 
 STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")
 FUSION = ("compare", "neighbours", "head", "merge")
 MEAN = "mean"  # what the ensemble does instead of the fusion
 WARM_UP = 2  # runs that do not count
-UNCERTAIN = 0.1  # of the points, for random weights, which cannot tell
 MEBIBYTE = 2**20
 
 
@@ -44,14 +37,11 @@ class Job:
         segmenter: with all of AMVNet.
         read: reads the scan.
         write: writes its (P,) train ids.
-        share: of the points that count as uncertain: those on which the networks agree least; None
-            means as tau says.
     """
 
     segmenter: Segmenter
     read: Callable[[], Scan]
     write: Callable[[np.ndarray], object]
-    share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -72,33 +62,14 @@ class Timing:
         return sum(self.seconds[stage] for stage in stages) / self.all
 
 
-@dataclass(frozen=True)
-class LeastAgreeing:
-    """An assertion: the share of the points on which the networks agree least is uncertain."""
-
-    share: float
-
-    def __call__(self, f: Tensor, g: Tensor, points: Tensor) -> Tensor:
-        count = round(self.share * len(f))
-        least = cosine_similarity(f, g).topk(count, largest=False).indices
-
-        uncertain = torch.zeros(len(f), dtype=torch.bool, device=f.device)
-        uncertain[least] = True
-        return uncertain
-
-
 def time_job(job: Job, runs: int, progress: Progress = no_progress) -> dict[str, Any]:
     """Time a job some times, and return a report for JSON.
 
     Raises:
-        InputError: if there is no run to time, or the share of uncertain points is out of range.
+        InputError: if there is no run to time.
     """
     if runs < 1:
         raise InputError(f"expected one run or more, found {runs}; give a number from 1")
-    if job.share is not None and not 0 <= job.share <= 1:
-        raise InputError(
-            f"expected a share of uncertain points from 0 to 1, found {job.share}; give another"
-        )
 
     timings = []
     for run in range(runs + WARM_UP):
@@ -116,8 +87,6 @@ def run_once(job: Job) -> Timing:
     model = copy.copy(job.segmenter.model)
     model.watch = clock
     model.arrange = one_after_the_other
-    if job.share is not None:
-        model.assertion = LeastAgreeing(job.share)
 
     with clock("read"):
         scan = job.read()
@@ -182,15 +151,3 @@ def _spread(values: Sequence[float]) -> dict[str, float]:
     """Return the median and the quartiles."""
     low, median, high = np.quantile(values, (0.25, 0.5, 0.75)).tolist()
     return {"median": median, "low": low, "high": high}
-
-
-def untrained(recipe: Recipe) -> Weights:
-    """Return random weights of a recipe's sizes, to time them."""
-    taxonomy = TAXONOMIES[recipe.taxonomy]
-    model = build_amvnet(recipe.model, taxonomy.size)
-
-    tensors: dict[str, Tensor] = {}
-    for part in PARTS:
-        tensors |= part_state(part, getattr(model, part).state_dict())
-
-    return Weights(recipe.model, taxonomy, recipe.sensor, tensors)

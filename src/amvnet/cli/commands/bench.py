@@ -13,10 +13,8 @@ from amvnet.cli.options import WEIGHTS, ComputeChoice
 def bench(
     compute: ComputeChoice,
     weights: str = WEIGHTS,
-    recipe: str | None = None,
     scan: Path | None = None,
     runs: int = 10,
-    uncertain: float | None = None,
     tau: float | None = None,
     json: Path | None = None,
 ) -> None:
@@ -25,29 +23,21 @@ def bench(
     Args:
         compute: where and how the networks are computed; one scan is timed at a time.
         weights: a weights file, or the name of a built-in one.
-        recipe: the name of a recipe, or a YAML file, whose networks are timed with random weights
-            instead.
         scan: the scan to time with; by default a simulated one.
         runs: the number of timed runs, after two warm-up runs; medians and quartiles are shown.
-        uncertain: the share of the points that counts as uncertain; default: the share that the
-            networks disagree on, or 0.1 with --recipe.
         tau: the cosine similarity of the two networks' probabilities up to which points are
             uncertain, in [0, 1]; default: that of the weights.
         json: also write the figures to this file.
     """
     from amvnet.cli.tables import timing_table
-    from amvnet.config.recipes import load_recipe
     from amvnet.data.datasets.simulated import simulate
     from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
     from amvnet.files import atomic_write
-    from amvnet.inference.timing import UNCERTAIN, Job, time_job, untrained
+    from amvnet.inference.timing import Job, time_job
     from amvnet.weights.file import load
 
-    timed_weights = load(weights) if recipe is None else untrained(load_recipe(recipe))
-    if recipe is not None and uncertain is None:
-        uncertain = UNCERTAIN
-    segmenter = compute.segmenter(timed_weights, "amvnet", tau)
+    segmenter = compute.segmenter(load(weights), "amvnet", tau)
 
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
@@ -59,7 +49,6 @@ def bench(
             segmenter,
             read=lambda: read_cloud(scan).to_scan(),
             write=lambda ids: write_ids(folder / "labels.label", ids),
-            share=uncertain,
         )
         with progress("timing") as step:
             report = time_job(job, runs, step)
