@@ -113,7 +113,7 @@ def untrained(recipe: Recipe) -> Weights:
     """Return random weights of a recipe's sizes."""
     taxonomy = TAXONOMIES[recipe.taxonomy]
     model = build_amvnet(recipe.model, taxonomy.size)
-    tensors = {}
+    tensors: dict[str, torch.Tensor] = {}
     for part in PARTS:
         tensors |= part_state(part, getattr(model, part).state_dict())
     return Weights(recipe.model, taxonomy, recipe.sensor, tensors)

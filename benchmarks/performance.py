@@ -30,11 +30,10 @@ import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
 from amvnet import read as read_scan
-from amvnet.config.recipes import load_recipe
 from amvnet.data.labels.ids import write_ids
 from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
 from amvnet.inference.segmenter import Segmenter
-from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, run_once, untrained
+from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, run_once
 from amvnet.models.layers import upsample
 from amvnet.models.methods import ONNX_ENGINES
 from amvnet.models.point_head import PointHead, head_features, point_table
@@ -127,8 +126,7 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
         The median seconds of each stage and of SalsaNext's forward pass, timed in turn.
     """
     remove_optimisations(options.variant)
-    weights = untrained(load_recipe(options.recipe)) if options.recipe else "sim-hdl64e"
-    segmenter = Segmenter(weights)
+    segmenter = Segmenter("sim-hdl64e")
     use_engine(segmenter, options.engines)
     salsanext, image = build_salsanext(options.engines)
 
@@ -139,7 +137,6 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
             segmenter,
             read=lambda: read_scan(options.scan),
             write=lambda ids: write_ids(target, ids),
-            share=options.uncertain,
         )
         for _ in range(WARM_UP + options.runs):
             started = time.perf_counter()
@@ -180,9 +177,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--engines", default="torch")
-    parser.add_argument("--recipe")
     # Share of the points; by default as the networks disagree
-    parser.add_argument("--uncertain", type=float)
     parser.add_argument("--short", action="store_true")  # the engines alone
     parser.add_argument("--variant")  # to measure in this process; for `run_variant`
     options = parser.parse_args()
@@ -229,10 +224,6 @@ def run_variant(
     """Run `measure` in a process of its own."""
     command = [sys.executable, __file__, "--scan", str(scan), "--runs", str(options.runs)]
     command += ["--variant", variant, "--engines", engine]
-    if options.recipe:
-        command += ["--recipe", options.recipe]
-    if options.uncertain is not None:
-        command += ["--uncertain", str(options.uncertain)]
 
     output = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     return json.loads(output.splitlines()[-1])

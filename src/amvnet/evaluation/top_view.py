@@ -26,7 +26,7 @@ DOT = 1.1  # area of a point in square typographic points
 IGNORED = (0.8, 0.8, 0.8)  # RGB in [0, 1]
 PLAIN = (0.75, 0.75, 0.75)
 
-Color = tuple[float, ...]
+Color = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,9 @@ def _legend_entries(view: TopView) -> list[tuple[str, Color]]:
     if view.uncertain is not None:
         entries.append(("uncertain", UNCERTAIN))
 
-    shares = [(name, tuple(np.divide(color, 255))) for name, color in entries]
+    shares: list[tuple[str, Color]] = []
+    for name, (red, green, blue) in entries:
+        shares.append((name, (red / 255, green / 255, blue / 255)))
     return [*shares, ("ignored", IGNORED)] if 0 in class_ids else shares
 
 
