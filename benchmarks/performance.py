@@ -3,7 +3,6 @@
 Also measure what each optimisation gives, by taking it away.
 
 python benchmarks/performance.py [--scan FILE] [--rounds N] [--runs N] [--engines torch,onnx]
-                                 [--uncertain SHARE]
 """
 
 from __future__ import annotations
