@@ -181,7 +181,7 @@ def plan(names: int) -> None:
 
         def run(self, method: str, tables: list[pa.Table]) -> Iterator[tuple[pa.Table, Any]]:
             for table in tables:
-                yield table, describe_drive(table["drive"][0].as_py(), "", "", None)
+                yield table, describe_drive(table["drive"][0].as_py(), "", None)
 
     class MadeUp(Place):
         def kind(self) -> FileType:

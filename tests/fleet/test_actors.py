@@ -186,15 +186,6 @@ def test_wrong_options_are_refused_before_any_work(labelling: Labelling) -> None
     fails(lambda: replace(labelling, kind="mcap"), "mcap")
     fails(lambda: replace(labelling, method="rv", uncertain=True), "--uncertain")
     fails(lambda: replace(labelling, tau=2.0), "tau")
-    fails(lambda: labelling.sensor_named("vlp61"), "vlp16")
-
-
-def test_a_manifest_names_the_sensor_of_a_drive_and_options_count_more(
-    labelling: Labelling,
-) -> None:
-    known = replace(labelling.sensor, height=1.1)
-    sensor = replace(labelling, sensor=known).sensor_named("vlp16")
-    assert (sensor.name, sensor.beams, sensor.height) == ("vlp16", 16, 1.1)
 
 
 def test_files_of_any_storage_of_fsspec_are_read_and_written() -> None:

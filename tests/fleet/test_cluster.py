@@ -182,7 +182,7 @@ def test_wrong_input_is_one_line_before_a_cluster_is_started(fleet: Path, bucket
         ),
         (f"{fleet}/scans {weights} --out {fleet}/scans/x --format ply --ray", ("--out",)),
         (f"{fleet}/scans {weights} --out x --ray scans", ("address", "scans")),
-        (f"{fleet}/scans {weights} --out x --ray --workers 4:2", ("--workers", "4:2")),
+        (f"{fleet}/scans {weights} --out x --ray --workers 0", ("--workers", "found 0")),
         (f"{fleet}/scans {weights} --out x --ray --topic points", ("--topic",)),
         (f"simulated-hdl64e:{fleet} {weights} --out x --ray", ("dataset", "without --ray")),
         (f"s3://fleet/scans {weights} --out x", ("s3://fleet/scans", "say --ray")),
@@ -204,7 +204,7 @@ def labelling_of(fleet: Path, out: str) -> Labelling:
 
 
 def block_of(drive: str, *names: str) -> pa.Table:
-    rows = [{"path": f"{name}.bin", "name": name, "drive": drive, "sensor": ""} for name in names]
+    rows = [{"path": f"{name}.bin", "name": name, "drive": drive} for name in names]
     return pa.Table.from_pylist(rows)
 
 
@@ -246,7 +246,7 @@ def run_of(
     monkeypatch.setattr(workers_module, "LabelScans", Mortal)
     monkeypatch.setattr(workers_module, "RETRIES", 0)
     labelling = labelling_of(fleet, str(tmp_path))
-    with closing(Workers(labelling, (1, 1))) as workers:
+    with closing(Workers(labelling, 1)) as workers:
         yield FleetRun(labelling, Results(Place.of(str(tmp_path)), {}), workers)
 
 
@@ -285,5 +285,5 @@ def test_workers_that_cannot_start_are_one_line(
 ) -> None:
     ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
     monkeypatch.setattr(workers_module, "LabelScans", Reluctant)
-    with closing(Workers(labelling_of(fleet, "x"), (1, 1))) as workers:
+    with closing(Workers(labelling_of(fleet, "x"), 1)) as workers:
         fails(lambda: list(workers.run("measure", [block_of("a", "1")])), "install it")

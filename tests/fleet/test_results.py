@@ -167,7 +167,7 @@ def test_drives_are_read_as_they_were_measured(out: Place) -> None:
     unknown = Estimate(Frame(), SensorGeometry(), quantiles=None)
     estimates = {"a": measured, "b": unknown, "c": None}
     for resume, (drive, estimate) in enumerate(estimates.items()):
-        row = describe_drive(drive, "vlp16", "line", estimate)
+        row = describe_drive(drive, "line", estimate)
         Results(out, SETTINGS, resume=bool(resume)).add_drives([row])
 
     drives = Results(out, SETTINGS, resume=True).drives

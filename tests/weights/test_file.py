@@ -97,13 +97,13 @@ def test_the_description_can_be_read_without_this_package(weights: Weights, path
     assert description["metrics"] == weights.metrics
 
 
-def test_half_precision_halves_the_size_and_hardly_changes_the_scores(
-    weights: Weights, path: Path, tmp_path: Path
+def test_parameters_of_half_precision_hardly_change_the_scores(
+    weights: Weights, tmp_path: Path
 ) -> None:
-    half = save(weights, tmp_path / "half.safetensors", half=True)
-
-    count = sum(tensor.numel() for tensor in weights.tensors.values() if tensor.ndim > 1)
-    assert path.stat().st_size - half.stat().st_size == pytest.approx(2 * count, abs=2000)
+    tensors = {}
+    for name, tensor in weights.tensors.items():
+        tensors[name] = tensor.half() if tensor.ndim > 1 else tensor
+    half = save(replace(weights, tensors=tensors), tmp_path / "half.safetensors")
     assert np.abs(ensemble_scores(load(half)) - ensemble_scores(weights)).max() < 0.02
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
@@ -17,19 +18,6 @@ from amvnet.models.methods import title_of
 from amvnet.progress import counted
 from amvnet.weights.file import built_in
 
-PACKAGES = (
-    "amvnet",
-    "torch",
-    "lightning",
-    "numpy",
-    "scipy",
-    "safetensors",
-    "trimesh",
-    "embreex",
-    "laspy",
-    "rosbags",
-    "huggingface_hub",
-)
 OVERALL = {
     "miou": "mIoU",
     "miou_present": "mIoU, classes present",
@@ -106,7 +94,8 @@ def _times(spread: Mapping[str, float]) -> tuple[str, str]:
 def installation_table() -> Table:
     """Return the table of what is installed: versions, devices, built-in weights and recipes."""
     table = Table(title="AMVNet", show_header=False, show_edge=False)
-    for name in PACKAGES:
+    required = [re.split(r"[^\w.-]", line)[0] for line in metadata.requires("amvnet") or ()]
+    for name in ("amvnet", *dict.fromkeys(required)):  # some of them for several extras
         table.add_row(name, _version(name))
     table.add_row("python", platform.python_version())
 

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import groupby
 from operator import itemgetter
@@ -29,7 +29,7 @@ from amvnet.data.formats.registry import read_file
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError, did_you_mean
+from amvnet.errors import InputError
 from amvnet.export.engines import use_engine
 from amvnet.fleet.drives import describe_drive, parse_estimate
 from amvnet.fleet.manifest import split_name
@@ -45,7 +45,7 @@ from amvnet.memory import keep_freed_memory
 from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import METHODS, EngineName, MethodName, Precision, check_method
 from amvnet.progress import Say, say_nothing
-from amvnet.sensors.lidars import SENSORS, Sensor
+from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights
 
 TRANSFERS = 8  # files that are read from, or written to, object storage at the same time
@@ -133,22 +133,6 @@ class Labelling:
             "classes": "" if self.classes is None else repr(self.classes),
         }
 
-    def sensor_named(self, name: str) -> Sensor:
-        """Return what is known of a LiDAR, given its name in a manifest; empty if unknown.
-
-        Raises:
-            InputError: if there is no such LiDAR.
-        """
-        if not name:
-            return self.sensor
-        if name not in SENSORS:
-            raise InputError(
-                f"expected the name of a LiDAR in the column sensor, found {name!r}"
-                f"{did_you_mean(name, SENSORS, 'leave it empty if it is another one')}"
-            )
-        known = {key: value for key, value in vars(self.sensor).items() if value not in (None, "")}
-        return replace(SENSORS[name], **known)
-
     def make_segmenter(self) -> Segmenter:
         """Return the segmenter of a worker.
 
@@ -163,9 +147,9 @@ class Labelling:
         use_engine(segmenter, self.engine)
         return segmenter
 
-    def make_reader(self, sensor: str, say: Say = say_nothing) -> FileReader:
-        """Return what reads the scans of a drive, given the name of its LiDAR."""
-        return FileReader(normaliser_for(self.weights, self.sensor_named(sensor), say))
+    def make_reader(self, say: Say = say_nothing) -> FileReader:
+        """Return what reads the scans of a drive."""
+        return FileReader(normaliser_for(self.weights, self.sensor, say))
 
 
 def results_schema(taxonomy: Taxonomy) -> pa.Schema:
@@ -196,8 +180,8 @@ def results_schema(taxonomy: Taxonomy) -> pa.Schema:
 class LabelScans:
     """Labels scan files, for `map_batches` of Ray Data with `batch_format="pyarrow"`.
 
-    A batch has a row for each scan with the columns `path`, `name`, `drive`, `sensor` and
-    `estimates`, of which only the first is needed. Scans of one drive should follow one another:
+    A batch has a row for each scan with the columns `path`, `name`, `drive` and `estimates`, of
+    which only the first is needed. Scans of one drive should follow one another:
     what is measured of its sensor is in `estimates` (`measure`), or else it is measured on the
     first scans of the drive in the batch.
     """
@@ -230,12 +214,12 @@ class LabelScans:
         """Measure the sensor of a drive on its first scans; return its row in the table of drives.
 
         Args:
-            scans: a row for each, with the columns `path`, `name`, `drive` and `sensor`.
+            scans: a row for each, with the columns `path`, `name` and `drive`.
         """
         rows = scans.to_pylist()
-        source, sensor = rows[0]["drive"], rows[0]["sensor"]
+        source = rows[0]["drive"]
         assumed: list[str] = []
-        reader = self.labelling.make_reader(sensor, assumed.append)
+        reader = self.labelling.make_reader(assumed.append)
         with self._fetch(rows, reader) as (files, _):
             assert reader.normaliser is not None
             usual = reader.normaliser.measure(source).usual
@@ -244,7 +228,7 @@ class LabelScans:
                     scan.load()
                     break
             line = assumed[0].replace(str(scan.path), scan.name) if assumed else ""
-        return describe_drive(source, sensor, line, usual)
+        return describe_drive(source, line, usual)
 
     @contextmanager
     def _fetch(
@@ -273,7 +257,7 @@ class LabelScans:
         """Label scans of one drive."""
         start = time.perf_counter()
         labelling = self.labelling
-        reader = labelling.make_reader(drive[0]["sensor"])
+        reader = labelling.make_reader()
         if drive[0]["estimates"]:
             assert reader.normaliser is not None
             reader.normaliser.recall(drive[0]["drive"], parse_estimate(drive[0]["estimates"]))
@@ -341,7 +325,7 @@ class LabelScans:
 def _complete(row: Row) -> Row:
     """Return the row of a scan with all columns; what is not known is empty."""
     name = row.get("name") or split_name(Path(row["path"]).name)[0]
-    others = {key: row.get(key) or "" for key in ("drive", "sensor", "estimates")}
+    others = {key: row.get(key) or "" for key in ("drive", "estimates")}
     return {"path": row["path"], "name": name, **others}
 
 

@@ -19,7 +19,7 @@ from amvnet.fleet.drives import describe_drive
 from amvnet.fleet.manifest import NameSet, list_blocks
 from amvnet.fleet.results import DRIVES, Results
 from amvnet.fleet.storage import Place
-from amvnet.fleet.workers import QUEUED, Limits, Workers, check_address, connect
+from amvnet.fleet.workers import QUEUED, Workers, check_address, connect
 from amvnet.inference.journal import Entry
 from amvnet.inference.pipeline import check_faults
 from amvnet.inference.predict import report
@@ -35,7 +35,7 @@ def label_fleet(
     inputs: Sequence[str],
     labelling: Labelling,
     address: str | None = None,
-    limits: Limits | None = None,
+    most: int | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = no_progress,
@@ -47,7 +47,7 @@ def label_fleet(
         inputs: as `list_blocks` takes them.
         labelling: how scans are labelled, and where the results go.
         address: as `connect` takes it.
-        limits: of the number of workers, as `Workers` takes them.
+        most: number of workers, as `Workers` takes it.
         resume: go on with an earlier run into the same folder.
         overwrite: write into a folder that has other files.
         say: is told what was assumed of the sensors, and at the end how sure the labels are.
@@ -70,7 +70,7 @@ def label_fleet(
     results = Results(out, labelling.settings, resume, overwrite)
 
     connect(address)
-    with closing(Workers(labelling, limits)) as workers:
+    with closing(Workers(labelling, most)) as workers:
         run = FleetRun(labelling, results, workers, progress, say)
         blocks = chain([first], listing)
         try:
@@ -136,7 +136,7 @@ class FleetRun:
         """Return the scans of some blocks that are not done.
 
         Raises:
-            InputError: if two scans have the same name, or a sensor is unknown.
+            InputError: if two scans have the same name.
         """
         names = pa.concat_tables(window)["name"].to_pylist()
         is_new = self._names.add(names)
@@ -150,7 +150,6 @@ class FleetRun:
         for block in window:
             drive = block["drive"][0].as_py()
             if drive not in self.results.drives and drive not in self._first:
-                self.labelling.sensor_named(block["sensor"][0].as_py())  # raises if it is unknown
                 self._first[drive] = block.slice(0, MEASURED)
             is_done = self.results.done.has(block["name"].to_pylist())
             rest = block.filter(~is_done) if is_done.any() else block
@@ -163,7 +162,7 @@ class FleetRun:
         """Measure the drives of which only the first scans are known, and write them down."""
         rows = []
         for scans, row in self.workers.run("measure", list(self._first.values())):
-            rows.append(row or describe_drive(scans["drive"][0].as_py(), "", "", None))
+            rows.append(row or describe_drive(scans["drive"][0].as_py(), "", None))
         self._first.clear()
         self.results.add_drives(rows)
 

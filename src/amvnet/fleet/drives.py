@@ -16,7 +16,6 @@ from amvnet.sensors.measure import Estimate
 SCHEMA = pa.schema(
     {
         "drive": pa.string(),
-        "sensor": pa.string(),  # its name in a manifest
         "assumed": pa.string(),
         "height": pa.float64(),  # metres over the ground
         "pitch": pa.float64(),  # degrees that turn the scans level
@@ -26,11 +25,10 @@ SCHEMA = pa.schema(
 )
 
 
-def describe_drive(drive: str, sensor: str, assumed: str, usual: Estimate | None) -> dict[str, Any]:
+def describe_drive(drive: str, assumed: str, usual: Estimate | None) -> dict[str, Any]:
     """Return the row of a drive.
 
     Args:
-        sensor: its name in a manifest; empty if unknown.
         assumed: a line about the first scan.
         usual: measured of the first scans; None if these could not be read, or are of several
             sensors.
@@ -39,7 +37,6 @@ def describe_drive(drive: str, sensor: str, assumed: str, usual: Estimate | None
     values = None if usual is None else dataclasses.asdict(usual)
     return {
         "drive": drive,
-        "sensor": sensor,
         "assumed": assumed,
         "height": frame.height,
         "pitch": frame.pitch,

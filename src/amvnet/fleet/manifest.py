@@ -20,7 +20,7 @@ from amvnet.fleet.storage import Place, reaching
 
 BLOCK = 64  # scans
 MANIFESTS = (".parquet", ".csv")
-COLUMNS = ("path", "name", "drive", "sensor")  # of a manifest; only the first is needed
+COLUMNS = ("path", "name", "drive")  # of a manifest; only the first is needed
 CSV_BYTES = 16 << 20  # of a manifest, read at a time
 
 
@@ -135,12 +135,11 @@ def _in_blocks(folder: str, prefix: str, files: Iterable[str]) -> Iterator[pa.Ta
         yield from _cut(scans, f"{folder}/*{ending}")
 
 
-def _cut(scans: Sequence[tuple[str, str]], drive: str, sensor: str = "") -> Iterator[pa.Table]:
+def _cut(scans: Sequence[tuple[str, str]], drive: str) -> Iterator[pa.Table]:
     """Yield the scans of a drive, each a URL and a name, in blocks."""
     for start in range(0, len(scans), BLOCK):
         urls, names = zip(*scans[start : start + BLOCK], strict=True)
-        count = len(urls)
-        yield pa.table([urls, names, count * [drive], count * [sensor]], names=COLUMNS)
+        yield pa.table([urls, names, len(urls) * [drive]], names=COLUMNS)
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -153,12 +152,12 @@ def _read_manifest(place: Place) -> Iterator[pa.Table]:
     """Yield the scans of a manifest; rows of one drive need not follow one another."""
     folder = place.url.rpartition("/")[0]
     for rows in _read_batches(place):
-        drives: dict[tuple[str, str], list[tuple[str, str]]] = {}
+        drives: dict[str, list[tuple[str, str]]] = {}
         for row in rows:
             url, name, drive = _resolve(row, folder)
-            drives.setdefault((drive, row.get("sensor") or ""), []).append((url, name))
-        for (drive, sensor), scans in drives.items():
-            yield from _cut(scans, drive, sensor)
+            drives.setdefault(drive, []).append((url, name))
+        for drive, scans in drives.items():
+            yield from _cut(scans, drive)
 
 
 def _resolve(row: dict[str, Any], folder: str) -> tuple[str, str, str]:

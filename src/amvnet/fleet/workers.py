@@ -30,8 +30,6 @@ QUEUED = 2  # tables that a worker has at a time, so that it need not wait for t
 PATIENCE = 1.0  # seconds between two looks at signals
 ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-\[\]]+:\d+")
 
-Limits = tuple[int, int]  # the least and the largest number of workers
-
 
 def check_address(address: str | None) -> None:
     """Raise InputError if a text is no address: it may be an input that follows --ray."""
@@ -86,15 +84,15 @@ class Workers:
 
     Args:
         labelling: how scans are labelled.
-        limits: the least number of workers, which are started at once, and the largest; None means
-            one for each GPU of the cluster, or else for each four cores.
+        most: number of workers, if there is work for all; None means one for each GPU of the
+            cluster, or else for each four cores.
 
     Raises:
         InputError: if the device is a GPU, and the cluster has none.
     """
 
-    def __init__(self, labelling: Labelling, limits: Limits | None = None) -> None:
-        self._limits, resources = _share_cluster(labelling.device, limits)
+    def __init__(self, labelling: Labelling, most: int | None = None) -> None:
+        self._most, resources = _share_cluster(labelling.device, most)
         self._labelling = ray.put(labelling)
         self._class: Any = ray.remote(**resources)(LabelScans)
         self._starting: dict[Any, Any] = {}  # by the reference that is ready when they are
@@ -162,10 +160,9 @@ class Workers:
             loads[worker] += 1
 
     def _grow(self, wanted: int) -> None:
-        """Start workers until there are as many as wanted, within the limits."""
-        least, most = self._limits
+        """Start workers until there are as many as wanted, or as many as there may be."""
         present = len(self._ready) + len(self._starting)
-        for _ in range(min(max(least, wanted), most) - present):
+        for _ in range(min(wanted, self._most) - present):
             worker = self._class.remote(self._labelling)
             self._starting[worker.__ray_ready__.remote()] = worker
 
@@ -193,7 +190,7 @@ class Workers:
             ray.kill(worker)
 
 
-def _share_cluster(device: str, limits: Limits | None) -> tuple[Limits, dict[str, Any]]:
+def _share_cluster(device: str, most: int | None) -> tuple[int, dict[str, Any]]:
     """Return how many workers there are, and what each needs, as options of Ray.
 
     Raises:
@@ -205,10 +202,10 @@ def _share_cluster(device: str, limits: Limits | None) -> tuple[Limits, dict[str
     if device.startswith("cuda") and not gpus:
         raise InputError("--device: expected a cluster with a GPU, found none; leave it out")
     if gpus and device != "cpu":
-        return limits or (1, gpus), {"num_gpus": 1, "num_cpus": 1}
+        return most or gpus, {"num_gpus": 1, "num_cpus": 1}
 
-    each = max(min(CORES, cores // (limits or (1, 1))[1]), 1)
-    return limits or (1, max(cores // each, 1)), {"num_cpus": each}
+    each = max(min(CORES, cores // (most or 1)), 1)
+    return most or max(cores // each, 1), {"num_cpus": each}
 
 
 def _reason(error: BaseException) -> str:

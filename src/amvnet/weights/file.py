@@ -246,11 +246,8 @@ def part_state(part: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return copies
 
 
-def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
+def save(weights: Weights, path: Path | str) -> Path:
     """Write a weights file, whole or not at all.
-
-    Args:
-        half: write matrices and kernels as float16, for inference only; halves the file.
 
     Returns:
         The path of the file.
@@ -267,13 +264,9 @@ def save(weights: Weights, path: Path | str, half: bool = False) -> Path:
         "training": weights.training,
         "metrics": weights.metrics,
     }
-    tensors = {}
-    for key, tensor in weights.tensors.items():
-        tensors[key] = tensor.half() if half and tensor.ndim > 1 else tensor
-
     with atomic_write(path) as part:
         try:
-            save_file(tensors, part, metadata={KEY: json.dumps(description)})
+            save_file(dict(weights.tensors), part, metadata={KEY: json.dumps(description)})
         except SafetensorError as error:  # such as a full disk
             raise OSError(errno.EIO, str(error).splitlines()[0], str(path)) from None
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +14,7 @@ from amvnet.cli.options import (
     SensorChoice,
     parse_classes,
 )
-from amvnet.errors import InputError, shown
+from amvnet.errors import InputError
 from amvnet.models.methods import MethodName
 from amvnet.progress import counted
 
@@ -42,7 +41,7 @@ def predict(
     batch: int = 1,
     overwrite: bool = False,
     ray: str | bool = False,
-    workers: str | None = None,
+    workers: int | None = None,
 ) -> None:
     """Segment datasets, scans, bags, or folders of scans.
 
@@ -68,12 +67,14 @@ def predict(
         overwrite: replace files in the folder that amvnet did not write, too.
         ray: share the scans among the workers of a Ray cluster, and write a table of results;
             without an address, Ray starts on this machine.
-        workers: of --ray, their number, or MIN:MAX; default: one for each GPU, or for each 4 cores.
+        workers: of --ray, their number; default: one for each GPU, or for each 4 cores.
     """
     from amvnet.weights.file import load
 
     class_map = parse_classes(classes)
     if ray:
+        if workers is not None and workers < 1:
+            raise InputError(f"--workers: expected a number from 1, found {workers}; give another")
         cluster = _import_cluster()
         labelling = cluster.Labelling(
             load(weights),
@@ -94,7 +95,7 @@ def predict(
                 inputs,
                 labelling,
                 address=None if ray is True else ray,
-                limits=_parse_workers(workers),
+                most=workers,
                 resume=resume,
                 overwrite=overwrite,
                 progress=step,
@@ -160,18 +161,3 @@ def _refuse_urls(texts: Sequence[str]) -> None:
     for text in texts:
         if "://" in text:
             raise InputError(f"{text}: expected a path, found a URL; say --ray to use it")
-
-
-def _parse_workers(text: str | None) -> tuple[int, int] | None:
-    """Parse a number of workers, or the least and the largest number.
-
-    Raises:
-        InputError: if it is neither.
-    """
-    if text is None:
-        return None
-    match = re.fullmatch(r"([1-9]\d{0,5})(?::([1-9]\d{0,5}))?", text)
-    least, most = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
-    if least > most:
-        raise InputError(f"--workers: expected a number or MIN:MAX, found {shown(text)}; say 1:8")
-    return least, most
