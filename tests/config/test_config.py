@@ -257,3 +257,42 @@ def test_a_number_out_of_its_range_is_an_input_error_that_says_the_range(
 ) -> None:
     with pytest.raises(InputError, match=r"mine\.yaml: .*expected .* found .*correct the value"):
         load_recipe(write_recipe(tmp_path, text))
+
+
+def test_what_earlier_versions_wrote_is_read_if_it_asks_for_nothing_else() -> None:
+    """The model and the training of weights and recipes of commit 0ab4d2a, but for the defaults."""
+    earlier = {
+        "model": {
+            "assertion": {
+                "name": "disagreement",
+                "threshold": None,
+                "others": [],
+                "other_thresholds": [],
+                "combine": "any",
+            },
+            "point_head": {"pooling": "max", "heads": 1},
+        },
+        "training": {
+            "head": {"folds": 1},
+            "joint": {"batch": 2, "ema": 0.99},
+            "adapt": {"rounds": 1},
+            "augment": {"far_drop": 0.0, "intensity_noise": 0.0},
+        },
+    }
+    assert from_dict(Recipe, earlier) == Recipe()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("assertion name", "entropy"),
+        ("assertion others", ["margin"]),
+        ("assertion other_thresholds", [0.1]),
+        ("point_head pooling", "attention"),
+        ("point_head heads", 2),
+    ],
+)
+def test_what_was_removed_is_refused_by_its_name(field: str, value: Any) -> None:
+    part, name = field.split()
+    with pytest.raises(InputError, match=f"{part}: {name}: expected .* found .* was removed"):
+        from_dict(ModelConfig, {part: {name: value}})

@@ -254,3 +254,16 @@ def test_for_other_classes_of_the_same_number_the_same_layers_are_new() -> None:
         weights.tensors["range_net.scores.weight"]
     )
     assert len(new) < len(weights.tensors) / 3
+
+
+def test_weights_that_name_values_of_removed_options_are_read(
+    weights: Weights, path: Path, tmp_path: Path
+) -> None:
+    with safe_open(path, "np") as file:
+        description = json.loads(file.metadata()["amvnet"])
+    description["model"]["assertion"] |= {"name": "disagreement", "others": [], "combine": "any"}
+    description["model"]["point_head"] |= {"pooling": "max", "heads": 1}
+
+    earlier = tmp_path / "earlier.safetensors"
+    save_file(dict(weights.tensors), earlier, metadata={"amvnet": json.dumps(description)})
+    assert load(earlier).model == weights.model

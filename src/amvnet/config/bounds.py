@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, get_args, get_type_hints
 
 from amvnet.errors import InputError, shown
 
@@ -43,9 +44,19 @@ NotNegative = Annotated[float, Range(0)]
 Positive = Annotated[float, Range(0, open=True)]
 Share = Annotated[float, Range(0, 1)]
 
+# Values by field that earlier versions wrote, and that ask for nothing else than what is done now.
+# None: any value.
+Obsolete = Mapping[str, Sequence[Any] | None]
+
 
 class Checked:
-    """A base class of dataclasses whose numbers must be finite and in their `Range`."""
+    """A base class of dataclasses whose numbers must be finite and in their `Range`.
+
+    Attributes:
+        obsolete: values that files of earlier versions may still name; they are skipped.
+    """
+
+    obsolete: ClassVar[Obsolete] = {}
 
     def __post_init__(self) -> None:
         """Check every number.

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
-from amvnet.config.bounds import Checked, Count, NotNegative, Positive, Range, Share
+from amvnet.config.bounds import Checked, Count, NotNegative, Obsolete, Positive, Range, Share
 
 StageName = Literal["rv", "bev", "head"]
 
@@ -166,6 +166,14 @@ class AssertionConfig(Checked):
     threshold: Share = 0.85
     """tau: the largest cosine similarity of the two networks' scores of an uncertain point."""
 
+    obsolete: ClassVar[Obsolete] = {
+        "threshold": (None,),  # the default
+        "name": ("disagreement",),
+        "others": ([],),
+        "other_thresholds": ([],),
+        "combine": ("any", "all"),
+    }
+
 
 @dataclass(frozen=True)
 class PointHeadConfig(Checked):
@@ -186,6 +194,8 @@ class PointHeadConfig(Checked):
         super().__post_init__()
 
         self.check(len(self.hidden) > 0, "one or more hidden layers", "none")
+
+    obsolete: ClassVar[Obsolete] = {"pooling": ("max",), "heads": (1,)}
 
 
 @dataclass(frozen=True)
@@ -244,6 +254,8 @@ class AugmentConfig(Checked):
     """Probability of taking every second band of elevation from another scan (LaserMix; open)."""
     paste: Share = 0.0
     """Probability of adding the rare objects of another scan, also turned (PolarMix; open)."""
+
+    obsolete: ClassVar[Obsolete] = {"intensity_noise": (0.0,), "far_drop": (0.0,)}
 
 
 @dataclass(frozen=True)
@@ -323,6 +335,8 @@ class HeadTraining(Checked):
     balance: Share = 0.0
     """How far draws even out the classes: 0 draws points alike, 1 classes equally often (open)."""
 
+    obsolete: ClassVar[Obsolete] = {"folds": (1,)}
+
 
 @dataclass(frozen=True)
 class TrainingConfig(Checked):
@@ -351,6 +365,8 @@ class TrainingConfig(Checked):
     """Lightning's accelerator: auto, cpu, gpu."""
     compile: bool = False
     """Compile the network with torch.compile: a slow start, then faster steps."""
+
+    obsolete: ClassVar[Obsolete] = {"joint": None, "adapt": None}
 
     def __post_init__(self) -> None:
         super().__post_init__()
