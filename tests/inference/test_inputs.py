@@ -73,6 +73,21 @@ def test_if_the_first_scans_of_a_folder_differ_each_is_measured_alone(
     assert "has scans of other sensors, so that each is measured alone" in lines[0]
 
 
+def test_a_scan_of_another_sensor_after_the_first_ones_is_measured_alone_and_told(
+    tmp_path: Path,
+) -> None:
+    for seed in range(MEASURED + 2):
+        write(tmp_path / "both", f"a{seed}", "os1-64", 1.0, seed)
+    write(tmp_path / "both", "b", "vlp16", 2.5)
+    write(tmp_path / "alone", "b", "vlp16", 2.5)
+
+    scans, _, lines = normalised(tmp_path / "both")
+    expected = normalised(tmp_path / "alone")[0]["b"]
+    np.testing.assert_array_equal(scans["b"].points, expected.points)
+    assert len(lines) == 2
+    assert "another sensor" in lines[1]
+
+
 def test_a_sensor_that_misses_points_is_still_the_same_one(tmp_path: Path) -> None:
     """Not even half of the points, as in a tunnel or in rain, make another sensor."""
     for seed in range(MEASURED + 3):

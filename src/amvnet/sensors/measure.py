@@ -21,6 +21,7 @@ MEASURED = 5  # scans of a recording that are measured; later ones get the media
 STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
 SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
 LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
+QUICK_STEP = 7  # of the points, one of so many tells most sensors; no number of lasers has it
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,10 @@ class Gauge:
         with errors_of(cloud.name):
             frame = find_frame(cloud.xyz[usable], self.sensor)
 
+        return self._measure(cloud, frame)
+
+    def _measure(self, cloud: Cloud, frame: Frame) -> Estimate:
+        """Measure lasers and intensities of a scan whose frame is known."""
         # The points as the sensor saw them; a point without an intensity was seen, too.
         scan = level_scan(cloud, frame.complete(self.sensor))
         to_sensor, _ = self.rises(frame)
@@ -75,6 +80,23 @@ class Gauge:
         valid = scan.valid
         lasers = measure_lasers(seen.points[valid], None if scan.ring is None else scan.ring[valid])
         return Estimate(frame, lasers, quantiles_of(cloud.intensity))
+
+    def recognises(self, cloud: Cloud, usual: Estimate) -> bool:
+        """Return whether a scan is from the sensor of an estimate, in the frame of that.
+
+        Some of the points are enough for most scans.
+        """
+        for step in (QUICK_STEP, 1):
+            part = dataclasses.replace(
+                cloud,
+                xyz=cloud.xyz[::step],
+                intensity=None if cloud.intensity is None else cloud.intensity[::step],
+                ring=None if cloud.ring is None else cloud.ring[::step],
+            )
+            with suppress(InputError):
+                if self._measure(part, usual.frame).is_like(usual):
+                    return True
+        return False
 
     def is_on_ground(self, frame: Frame) -> bool:
         """Return whether the origin of the coordinates lies on the ground, or below."""
@@ -109,8 +131,8 @@ class Gauge:
 class Recording:
     """What is assumed of the scans of one source, by what is measured of the first ones.
 
-    All scans get the median of the first `MEASURED` estimates. If these are of several sensors,
-    each scan gets its own estimate.
+    Its scans get the median of the first `MEASURED` estimates. If these are of several sensors,
+    each scan gets its own estimate, and so does a later scan of another sensor.
 
     Attributes:
         usual: the median; None as long as nothing is measured, and for several sensors.
@@ -145,23 +167,27 @@ class Recording:
 
         self._is_learnt = bool(self._first)
 
-    def estimate(self, cloud: Cloud) -> Estimate:
-        """Return what to assume of the sensor of a scan.
+    def estimate(self, cloud: Cloud) -> tuple[Estimate, bool]:
+        """Return what to assume of the sensor of a scan, and whether it is that of the first scans.
 
         Raises:
             InputError: as `Gauge`.
         """
         if self._is_learnt and self.usual is not None and self.usual.is_steady:
-            return self.usual
+            if self._gauge.recognises(cloud, self.usual):
+                return self.usual, True
+            return self._gauge(cloud), False
 
         measured = self._gauge(cloud)
         if not self._is_learnt:
             self._add(measured)
         if self.usual is None:
-            return measured
+            return measured, True
+        if not measured.is_like(self.usual):
+            return measured, False
         if self.usual.is_steady:
-            return self.usual
-        return dataclasses.replace(measured, quantiles=self.usual.quantiles)
+            return self.usual, True
+        return dataclasses.replace(measured, quantiles=self.usual.quantiles), True
 
     def _add(self, estimate: Estimate) -> None:
         """Add the estimate of one of the first scans."""

@@ -116,7 +116,7 @@ class Normaliser:
         expected: what the weights expect; None turns scans only as the sensor says, for people to
             look at.
         sensor: what is known of the sensor of the scans; the rest is measured.
-        say: called once for each recording, with what was assumed.
+        say: called with what was assumed, once for each recording and once for other sensors in it.
     """
 
     def __init__(
@@ -152,15 +152,18 @@ class Normaliser:
             return self._turn(cloud, source)
 
         recording = self.measure(source)
-        estimate = recording.estimate(cloud)
+        estimate, is_usual = recording.estimate(cloud)
         self._check_height(cloud, estimate.frame)
         scan = normalise(cloud, estimate, self.sensor, self.expected)
 
-        if source not in self._said:
-            self._said.add(source)
+        title = source if is_usual else f"{source}, other sensors"
+        if title not in self._said:
+            self._said.add(title)
             line = describe(cloud, estimate, self.sensor, self.expected)
             if recording.is_mixed:
                 line += f"; {source} has scans of other sensors, so that each is measured alone"
+            if not is_usual:
+                line += f"; another sensor or scale of intensity than {source} begins with"
             self._say(line)
         return scan
 

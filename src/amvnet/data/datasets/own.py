@@ -140,7 +140,9 @@ class OwnScans(Dataset):
             if place is not None:
                 scan = self._scans[records[0].name]
                 path = os.path.normpath(place.path_of(scan.path, scan.name))
-                found = f"no {path}, and none for the other {len(records) - 1} scans"
+                found = f"no {path}"
+                if len(records) > 1:
+                    found += f", and none for the other {len(records) - 1} scans"
             raise InputError(
                 f"{self.spec}: expected labelled scans, found {found}; "
                 "correct labels in the file, or name other sequences"
