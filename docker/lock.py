@@ -12,7 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 # All but the tests, the loggers of other services, and the fleet.
-EXTRAS = ("simulate", "formats", "datasets", "export", "hub")
+EXTRAS = ("simulate", "formats", "export", "hub")
 
 # constraints.txt pins torch, which pins these itself, and not all of them are on every machine.
 OF_TORCH = ("cuda-", "nvidia-", "torch", "triton")

@@ -71,9 +71,6 @@ CASES = {
         f"fuse {{world}}/data {SCORES} --out {{out}}", "sequences/08/predictions/000000.label"
     ),
     "rank": Case(f"rank {{world}}/data {WEIGHTS} --out {{out}}/r.csv --split all", "r.csv"),
-    "rank-scans": Case(
-        f"rank {{world}}/data {WEIGHTS} --out {{out}}/r.csv --split all", "r-scans.csv"
-    ),
     "submit": Case(
         "submit {world}/data --predictions {world}/predictions --split val --out {out}/e.zip",
         "e.zip",

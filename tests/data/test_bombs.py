@@ -231,18 +231,6 @@ def endless_definitions(path: Path) -> None:
 # --- other formats ---
 
 
-def feather_of_long_values(path: Path) -> None:
-    pyarrow = pytest.importorskip("pyarrow")
-    feather = pytest.importorskip("pyarrow.feather")
-    kind = pyarrow.binary(200)
-    column = pyarrow.FixedSizeBinaryArray.from_buffers(
-        kind, 4_000_000, [None, pyarrow.py_buffer(bytes(800_000_000))]
-    )
-    feather.write_feather(
-        pyarrow.table(dict.fromkeys("xyz", column)), path, compression="zstd", chunksize=10**8
-    )
-
-
 def laz_of_many_points(path: Path) -> None:
     content = bytearray(write_las(path, some_points()).read_bytes())
     struct.pack_into("<I", content, 107, 10_000_000)
@@ -298,7 +286,6 @@ BOMBS: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "metadata": ("scan", metadata_of_merges, "metadata"),
     "schema.db3": ("scan", endless_schema, "takes too long"),
     "definitions.db3": ("scan", endless_definitions, "definitions.db3"),
-    "long.feather": ("scan", feather_of_long_values, "long.feather"),
     "many.las": ("scan", laz_of_many_points, "many.las"),
     "long.xyz": ("scan", long_text, ""),
     "number.xyz": ("scan", long_number, ""),

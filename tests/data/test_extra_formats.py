@@ -1,4 +1,4 @@
-"""Formats that other packages write: messages of sensors, and Feather."""
+"""Formats that other packages write: messages of sensors, and what is not read."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from amvnet.data.formats.find import list_scans, read_cloud
 
-from fixtures.extra_writers import write_sweep
-from fixtures.scan_writers import some_points
 from fixtures.worlds import fails
 
 PACKETS = "uint8[] data\n"
@@ -42,32 +40,14 @@ def test_a_bag_of_other_messages_says_how_they_become_clouds(tmp_path: Path) -> 
     fails(lambda: list(list_scans(path, "/points")), "/points", *words)
 
 
-# --- Feather ---
-
-
-def test_a_table_is_read_by_the_names_of_its_columns(tmp_path: Path) -> None:
-    points = some_points()
-    cloud = read_cloud(write_sweep(tmp_path / "a.feather", points))
-    np.testing.assert_array_equal(cloud.xyz, points[:, :3].astype("f2").astype("f4"))
-    assert cloud.intensity_scale() == 255
-
-
-def test_broken_feather_is_refused(tmp_path: Path) -> None:
-    content = write_sweep(tmp_path / "log.feather", some_points()).read_bytes()
-    path = tmp_path / "a.feather"
-    for size in (7, 100, len(content) // 2, len(content) - 9):
-        path.write_bytes(content[:size])
-        fails(lambda: read_cloud(path), path)
-
-
 def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a"
-    path.write_bytes(b"ARROW1\0\0")
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    fails(lambda: read_cloud(path), path, 'pip install "amvnet[datasets]"')
+    path.write_bytes(b"LASF\0\0")
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    fails(lambda: read_cloud(path), path, 'pip install "amvnet[formats]"')
 
 
-@pytest.mark.parametrize("name", ["a.parquet", "a.pkl", "a.pcap", "a.bin.gz"])
+@pytest.mark.parametrize("name", ["a.parquet", "a.feather", "a.pkl", "a.pcap", "a.bin.gz"])
 def test_formats_that_are_not_read_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(bytes(range(256)))

@@ -6,7 +6,6 @@ import resource
 import sys
 from dataclasses import dataclass
 from datetime import timedelta
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -18,13 +17,11 @@ from amvnet.data.formats.find import list_scans
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
-from fixtures.extra_writers import write_sweep
 from fixtures.scan_writers import WRITERS, some_points, write_bag2
 
 CASES = 200  # of each format
 METADATA = "drive/metadata.yaml"
-EXTRA = {"scan.feather": "pyarrow"}
-FORMATS = [*WRITERS, METADATA, *EXTRA]
+FORMATS = [*WRITERS, METADATA]
 HEADER = 400  # bytes: most headers are within them
 LONGEST = timedelta(seconds=10)
 MOST_MEMORY = 2 << 30  # bytes
@@ -95,17 +92,13 @@ def contents(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
         write(folder / name, some_points())
     write_bag2(folder / "drive", {"/lidar": [some_points()]}, StoragePlugin.MCAP)
 
-    if find_spec("pyarrow"):
-        write_sweep(folder / "scan.feather", some_points())
-    return {name: (folder / name).read_bytes() for name in FORMATS if (folder / name).exists()}
+    return {name: (folder / name).read_bytes() for name in FORMATS}
 
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_a_broken_file_gives_a_scan_or_an_error_of_one_line(
     name: str, contents: dict[str, bytes], tmp_path: Path
 ) -> None:
-    if name in EXTRA:
-        pytest.importorskip(EXTRA[name])
     file = tmp_path / name
     scan_path = file
     if name == METADATA:

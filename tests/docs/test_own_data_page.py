@@ -56,7 +56,7 @@ def test_every_command_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.Monk
     sensor = load("runs/robot").training["range_net"]["sensor"]
     assert (sensor["fov_up"], sensor["fov_down"]) == pytest.approx((15, -15), abs=2)
     assert sensor["height"] == 1.73 != HEIGHT
-    assert "site_c" in Path("next-scans.csv").read_text()
+    assert "site_c" in Path("next.csv").read_text()
 
 
 def test_the_file_of_the_page_is_the_one_that_is_tested() -> None:

@@ -145,8 +145,7 @@ def _analyzed(dataset: Dataset, segmenter: Segmenter) -> Any:
 
 
 def _ranked(dataset: Dataset, segmenter: Segmenter) -> Any:
-    ranking = rank(dataset, dataset.records(["08"]), segmenter)
-    return [ranking.clusters.tolist(), ranking.scans.tolist(), ranking.scores.tolist()]
+    return rank(dataset, dataset.records(["08"]), segmenter).tolist()
 
 
 def _viewed(dataset: Dataset, segmenter: Segmenter) -> Any:

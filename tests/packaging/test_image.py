@@ -22,7 +22,7 @@ from amvnet.cli.main import VERBS
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS = ("simulate", "formats", "datasets", "export", "hub")  # of the image
+EXTRAS = ("simulate", "formats", "export", "hub")  # of the image
 
 
 class Instruction(NamedTuple):

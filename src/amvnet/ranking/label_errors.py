@@ -6,10 +6,9 @@ These points are grouped into clusters, and the most doubtful clusters come firs
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -37,12 +36,11 @@ FEW = 20.0
 COMMON = 0.5
 
 COLUMNS = ("rank", "scan", "score", "x", "y", "z", "points", "point", "rv", "bev", "label")
-SCAN_COLUMNS = ("rank", "scan", "score", "points", "clusters")
 
 # One cluster. Its middle point is the one nearest to the mean of its points.
 ROW = np.dtype(
     [
-        ("scan", np.int32),  # index of the scan in `Ranking.records`
+        ("scan", np.int32),  # index of the scan among those that are ranked
         ("score", np.float32),
         ("xyz", np.float32, 3),  # metres, of the middle point
         ("points", np.int32),  # number of points
@@ -79,34 +77,18 @@ class Doubts:
     whole: np.ndarray
 
 
-@dataclass(frozen=True)
-class Ranking:
-    """The clusters of a dataset, the most doubtful first, and its S scans.
-
-    Attributes:
-        records: (S,) scans, in the order of the dataset.
-        clusters: (C,) rows of `ROW`.
-        scans: (S,) indices into `records`, the most doubtful first.
-        scores: (S,) mean doubt of the points of each scan in `scans`.
-        sizes: (S,) number of points of each scan in `scans`.
-    """
-
-    records: Sequence[ScanRecord]
-    clusters: np.ndarray
-    scans: np.ndarray
-    scores: np.ndarray
-    sizes: np.ndarray
-
-
 def rank(
     dataset: Dataset,
     records: Sequence[ScanRecord],
     segmenter: Segmenter,
     progress: Progress = no_progress,
-) -> Ranking:
-    """Rank the doubtful clusters of some labelled scans, and the scans.
+) -> np.ndarray:
+    """Return the doubtful clusters of some labelled scans, the most doubtful first.
 
     A few scans are in memory at a time, and 35 bytes for each cluster.
+
+    Returns:
+        (C,) rows of `ROW`.
 
     Raises:
         InputError: if the weights lack a network or do not have the dataset's classes, or a scan
@@ -117,37 +99,21 @@ def rank(
     if not {"range_net", "polar_net"} <= set(segmenter.weights.parts):
         raise InputError("expected weights with both networks, found only one; train the other")
 
-    rows_by_scan = [np.zeros(0, dtype=ROW)]  # so that there may be no scans
-    mean_doubts = np.zeros(len(records))
-    sizes = np.zeros(len(records), dtype=np.int64)
-
-    def rank_scan(record: ScanRecord, scan: Scan) -> tuple[np.ndarray, float, int]:
-        doubts = find_doubts(check_scan(scan), segmenter)
-        rows = find_clusters(doubts)
-        return rows, doubts.doubt.mean(), len(doubts.doubt)
+    def rank_scan(record: ScanRecord, scan: Scan) -> np.ndarray:
+        return find_clusters(find_doubts(check_scan(scan), segmenter))
 
     progress(0, len(records))
-    ranked = stream_scans(records, dataset.read, rank_scan, segmenter.at_once)
-    for index, (rows, mean_doubt, size) in enumerate(ranked):
-        rows["scan"] = index
+    rows_by_scan = [np.zeros(0, dtype=ROW)]  # so that there may be no scans
+    for rows in stream_scans(records, dataset.read, rank_scan, segmenter.at_once):
+        rows["scan"] = len(rows_by_scan) - 1
         rows_by_scan.append(rows)
-        mean_doubts[index] = mean_doubt
-        sizes[index] = size
-        progress(index + 1, len(records))
+        progress(len(rows_by_scan) - 1, len(records))
 
     clusters = np.concatenate(rows_by_scan)
-    clusters["score"] /= _frequencies(clusters["kind"]) ** COMMON
-
+    _, kind, counts = np.unique(clusters["kind"], return_inverse=True, return_counts=True)
+    clusters["score"] /= counts[kind] ** COMMON
     # A stable sort keeps equal scores in the dataset's order, on every machine.
-    scan_order = np.argsort(-mean_doubts, kind="stable")
-    cluster_order = np.argsort(-clusters["score"], kind="stable")
-    return Ranking(
-        records,
-        clusters=clusters[cluster_order],
-        scans=scan_order,
-        scores=mean_doubts[scan_order],
-        sizes=sizes[scan_order],
-    )
+    return clusters[np.argsort(-clusters["score"], kind="stable")]
 
 
 def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
@@ -265,59 +231,27 @@ def _most_common(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
     return table.argmax(axis=1)
 
 
-def _frequencies(kind: np.ndarray) -> np.ndarray:
-    """Return for each element the number of elements with its value."""
-    _, index, counts = np.unique(kind, return_inverse=True, return_counts=True)
-    return counts[index]
-
-
-def write_ranking(ranking: Ranking, taxonomy: Taxonomy, path: Path) -> Path:
-    """Write the clusters to a CSV file, and the scans to another one next to it.
-
-    Returns:
-        The file of the scans: NAME-scans.csv if `path` is NAME.csv.
-    """
-    _write(path, COLUMNS, _cluster_rows(ranking, taxonomy))
-    _write(scans_path(path), SCAN_COLUMNS, _scan_rows(ranking))
-    return scans_path(path)
-
-
-def scans_path(path: Path) -> Path:
-    """Return the file of the scans, given that of the clusters."""
-    return path.with_name(f"{path.stem}-scans{path.suffix}")
-
-
-def _write(path: Path, columns: Sequence[str], rows: Iterator[list[Any]]) -> None:
-    """Write rows to a CSV file, with their ranks as the first column."""
+def write_clusters(
+    clusters: np.ndarray, records: Sequence[ScanRecord], taxonomy: Taxonomy, path: Path
+) -> None:
+    """Write the clusters of some scans to a CSV file, with their ranks as the first column."""
+    names = ("", *taxonomy.classes)
     with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        for position, row in enumerate(rows, start=1):
-            writer.writerow([position, *row])
-
-
-def _cluster_rows(ranking: Ranking, taxonomy: Taxonomy) -> Iterator[list[Any]]:
-    """Yield the row of each cluster, without its rank."""
-    names = ("", *taxonomy.classes)
-    for row in ranking.clusters:
-        x, y, z = row["xyz"]
-
-        yield [
-            ranking.records[row["scan"]].name,
-            f"{row['score']:.4f}",
-            f"{x:.2f}",
-            f"{y:.2f}",
-            f"{z:.2f}",
-            row["points"],
-            row["point"],
-            names[row["rv"]],
-            names[row["bev"]],
-            names[row["label"]],
-        ]
-
-
-def _scan_rows(ranking: Ranking) -> Iterator[list[Any]]:
-    """Yield the row of each scan, without its rank."""
-    cluster_counts = np.bincount(ranking.clusters["scan"], minlength=len(ranking.records))
-    for scan, score, size in zip(ranking.scans, ranking.scores, ranking.sizes, strict=True):
-        yield [ranking.records[scan].name, f"{score:.5f}", size, cluster_counts[scan]]
+        writer.writerow(COLUMNS)
+        for position, row in enumerate(clusters, start=1):
+            x, y, z = row["xyz"]
+            values = [
+                position,
+                records[row["scan"]].name,
+                f"{row['score']:.4f}",
+                f"{x:.2f}",
+                f"{y:.2f}",
+                f"{z:.2f}",
+                row["points"],
+                row["point"],
+                names[row["rv"]],
+                names[row["bev"]],
+                names[row["label"]],
+            ]
+            writer.writerow(values)

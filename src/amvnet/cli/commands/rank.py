@@ -18,12 +18,12 @@ def rank(
     sequences: str | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Rank clusters of points, and scans, whose labels both views contradict, to check them.
+    """Rank clusters of points whose labels both views contradict, to check them.
 
     Args:
         data: the dataset, with labels.
         weights: a weights file with both networks, or the name of a built-in one.
-        out: the table of the clusters, FILE.csv; that of the scans is FILE-scans.csv.
+        out: the table of the clusters, FILE.csv.
         compute: where and how the networks are computed.
         split: the official split.
         sequences: sequences or scenes instead, separated by commas.
@@ -32,20 +32,20 @@ def rank(
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.ranking.label_errors import rank as rank_records
-    from amvnet.ranking.label_errors import scans_path, write_ranking
+    from amvnet.ranking.label_errors import write_clusters
     from amvnet.weights.file import load
     from amvnet.written import protecting
 
     # Before any scan is scored, so that no time is wasted.
     make_folder(out.parent)
-    with protecting([out, scans_path(out)], overwrite):
+    with protecting([out], overwrite):
         loaded = load(weights)
         dataset = open_for_weights(data, loaded)
         records = labelled_scans(dataset, sequences, split)
         segmenter = compute.segmenter(loaded, "ensemble")
 
         with progress("scoring") as step:
-            ranking = rank_records(dataset, records, segmenter, step)
-        scans = write_ranking(ranking, dataset.taxonomy, out)
-        clusters = counted(len(ranking.clusters), "cluster")
-        say(f"{clusters} in {out}, {counted(len(records), 'scan')} in {scans}")
+            clusters = rank_records(dataset, records, segmenter, step)
+        write_clusters(clusters, records, dataset.taxonomy, out)
+        found = counted(len(clusters), "cluster")
+        say(f"{found} of {counted(len(records), 'scan')} in {out}")

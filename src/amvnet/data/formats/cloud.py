@@ -195,8 +195,8 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
         yield
 
 
-def require(source: Path | str, extra: str, *packages: str) -> None:
-    """Check that the packages of an extra are installed, by the names of their modules.
+def require(source: Path | str, packages: Sequence[str]) -> None:
+    """Check that packages of the extra `formats` are installed, by the names of their modules.
 
     Raises:
         InputError: if one is missing.
@@ -205,7 +205,7 @@ def require(source: Path | str, extra: str, *packages: str) -> None:
     if missing:
         raise InputError(
             f"{source}: expected the package {' and '.join(missing)}, found none; "
-            f'run pip install "amvnet[{extra}]"'
+            'run pip install "amvnet[formats]"'
         )
 
 

@@ -19,7 +19,6 @@ ENDINGS = (
     *TEXT,
     *(".las", ".laz"),
     *BAGS,
-    ".feather",
 )
 
 # The first bytes of files.
@@ -34,8 +33,6 @@ BEGINNINGS = {
     b"#ROSBAG": ".bag",
     b"\x89MCAP0\r\n": ".mcap",
     b"SQLite format 3\x00": ".db3",
-    b"ARROW1": ".feather",
-    b"FEA1": ".feather",
 }
 BEGINNING = 4096  # bytes in which they must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file

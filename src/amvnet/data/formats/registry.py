@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from amvnet.data.formats import arrow, las, numpy_files, pcd, ply, text
+from amvnet.data.formats import las, numpy_files, pcd, ply, text
 from amvnet.data.formats.bags import Bag
 from amvnet.data.formats.cloud import COLUMN_NAMES, Arrays, Cloud, Names, make_cloud, require
 from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, TEXT
@@ -34,16 +34,13 @@ COLUMN_READERS: dict[str, Callable[[Path, Names], Arrays]] = {
     ".ply": ply.read_columns,
     ".las": las.read_columns,
     ".laz": las.read_columns,
-    ".feather": arrow.read_columns,
     **dict.fromkeys(TEXT, text.read_columns),
 }
 
-# Files that are read in the process with limits: the extra of this package that reads them, and the
-# packages that it installs.
+# Packages of the extra `formats`. Files that need them are read in the process with limits.
 PACKAGES = {
-    **dict.fromkeys((".las", ".laz"), ("formats", "laspy", "lazrs")),
-    **dict.fromkeys((FOLDER, *BAGS), ("formats", "rosbags")),
-    ".feather": ("datasets", "pyarrow"),
+    **dict.fromkeys((".las", ".laz"), ("laspy", "lazrs")),
+    **dict.fromkeys((FOLDER, *BAGS), ("rosbags",)),
 }
 
 
@@ -104,7 +101,7 @@ def _read_one(path: Path, *what: Any) -> Cloud:
 
 def _with_limits(function: str, path: Path, ending: str, *arguments: Any) -> dict[str, Any]:
     """Call a function of this module in the process with limits, if the packages are there."""
-    require(path, *PACKAGES[ending])
+    require(path, PACKAGES[ending])
     return call(f"{__name__}:{function}", path, ending, *arguments)
 
 

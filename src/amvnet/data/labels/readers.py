@@ -35,8 +35,8 @@ def read_scan_labels(
     """Read (N,) uint8 train ids from a file of labels, or from a field of the scan's file.
 
     Without a field, the ending decides the format: `.npy`, `.npz`, text with a number per line, or
-    the usual column of `.pcd`, `.ply`, `.las`, `.laz`, `.feather`; any other file holds integers of
-    8, 16, 32 or 64 bits and nothing else.
+    the usual column of `.pcd`, `.ply`, `.las`, `.laz`; any other file holds integers of 8, 16, 32
+    or 64 bits and nothing else.
 
     Args:
         count: the number of points of the scan.
