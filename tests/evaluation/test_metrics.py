@@ -12,7 +12,6 @@ import pytest
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
-from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation, confusion, metrics
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -226,10 +225,3 @@ def test_distance_bins_are_open_at_both_ends() -> None:
 
     bins = evaluation.report("x")["methods"]["rv"]["by_distance"]
     assert [extent["points"] for extent in bins] == [1, 1, 0, 0, 0]
-
-
-def test_what_does_not_fit_is_refused() -> None:
-    with pytest.raises(InputError, match="of one shape"):
-        confusion(np.zeros(3, int), np.zeros(4, int), 16)
-    with pytest.raises(InputError, match=r"0\.\.16"):
-        confusion(np.zeros(1, int), np.full(1, 17), 16)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import dataclasses
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -179,19 +180,8 @@ class Taxonomy:
         return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields in JSON's types, for `from_dict`.
-
-        `raw_to_train` becomes a list of pairs, because keys in JSON are always text.
-        """
-        return {
-            "name": self.name,
-            "classes": list(self.classes),
-            "colors": list(map(list, self.colors)),
-            "raw_to_train": list(map(list, self.raw_to_train.items())),
-            "train_to_raw": list(self.train_to_raw),
-            "splits": {split: list(sequences) for split, sequences in self.splits.items()},
-            "counts_absent": self.counts_absent,
-        }
+        """Return the fields for JSON, whose keys are text: `raw_to_train` as a list of pairs."""
+        return {**dataclasses.asdict(self), "raw_to_train": list(self.raw_to_train.items())}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Taxonomy:

@@ -67,6 +67,13 @@ class Analysis:
     ensemble: np.ndarray
     head: np.ndarray
 
+    def add(self, other: Analysis) -> None:
+        """Add the counts over other scans."""
+        self.evaluation += other.evaluation
+        self.points += other.points
+        self.ensemble += other.ensemble
+        self.head += other.head
+
     def sweep(self) -> list[Swept]:
         """Return AMVNet's figures for each tau from 0 to 0.98, with the head as it is."""
         sweep = []
@@ -97,7 +104,7 @@ def analyze(
 
     segmenter = segmenter.for_dataset(dataset)
     size = dataset.taxonomy.size + 1
-    analysis = Analysis(
+    total = Analysis(
         Evaluation(dataset.taxonomy),
         assertion.tau,
         points=np.zeros(BINS, dtype=np.int64),
@@ -105,40 +112,20 @@ def analyze(
         head=np.zeros((SWEPT, size, size), dtype=np.int64),
     )
 
-    def label(record: ScanRecord, scan: Scan) -> LabelledScan:
-        return _label(check_scan(scan), segmenter)
+    def analyze_one(record: ScanRecord, scan: Scan) -> Analysis:
+        return _analyze_scan(check_scan(scan), segmenter, assertion)
 
-    for labelled in stream_labelled(dataset, records, label, segmenter.at_once, progress):
-        _count(analysis, labelled)
-    return analysis
-
-
-@dataclass(frozen=True)
-class LabelledScan:
-    """A scan with N points and its labels.
-
-    Attributes:
-        scan: with ground truth.
-        ids: (N,) train ids by method.
-        head: (N,) train ids by the head, wherever a swept tau would ask it.
-        uncertain: (N,) bool, the uncertain points.
-        bins: (N,) bins of the cosine similarity of the two networks.
-    """
-
-    scan: Scan
-    ids: dict[str, np.ndarray]
-    head: np.ndarray
-    uncertain: np.ndarray
-    bins: np.ndarray
+    for analysis in stream_labelled(dataset, records, analyze_one, segmenter.at_once, progress):
+        total.add(analysis)
+    return total
 
 
 @torch.inference_mode()
-def _label(scan: Scan, segmenter: Segmenter) -> LabelledScan:
-    """Label a scan by every method, and by the head for every point that a tau would ask."""
-    own = segmenter.model.assertion
+def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> Analysis:
+    """Score a scan by every method, and by the head for every point that a tau would ask."""
 
     def is_asked(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
-        return (_bins(f, g) < SWEPT) | own(f, g, points)
+        return (_bins(f, g) < SWEPT) | assertion(f, g, points)
 
     model = copy.copy(segmenter.model)
     model.assertion = is_asked
@@ -152,12 +139,24 @@ def _label(scan: Scan, segmenter: Segmenter) -> LabelledScan:
     for name, ensemble in ENSEMBLES.items():
         ids[name] = expand_labels(ensemble(f, g), scan.valid)
     head = expand_labels(scores.merged, scan.valid)
-    uncertain = expand_to_scan(own(f, g, batch.points), scan.valid)
+    uncertain = expand_to_scan(assertion(f, g, batch.points), scan.valid)
     ids["amvnet"] = np.where(uncertain, head, ids["ensemble"])
 
     # Points that no network has seen count as agreed on, with id 0, whatever tau is.
     bins = np.where(scan.valid, expand_to_scan(_bins(f, g), scan.valid), BINS - 1)
-    return LabelledScan(scan, ids, head, uncertain, bins)
+
+    truth = scan.labels
+    assert truth is not None
+    evaluation = Evaluation(segmenter.taxonomy)
+    evaluation.add(scan.points, truth, ids, uncertain)
+    size = segmenter.taxonomy.size + 1
+    return Analysis(
+        evaluation,
+        assertion.tau,
+        points=np.bincount(bins, minlength=BINS),
+        ensemble=_confusions(bins, truth, ids["ensemble"], size),
+        head=_confusions(bins, truth, head, size)[:SWEPT],
+    )
 
 
 def _bins(f: Tensor, g: Tensor) -> Tensor:
@@ -165,27 +164,7 @@ def _bins(f: Tensor, g: Tensor) -> Tensor:
     return (cosine_similarity(f, g) * BINS).ceil().long().clamp(1, BINS) - 1
 
 
-def _count(analysis: Analysis, labelled: LabelledScan) -> None:
-    """Count the points of one scan."""
-    bins = labelled.bins
-    truth = labelled.scan.labels
-    assert truth is not None
-    analysis.evaluation.add(labelled.scan.points, truth, labelled.ids, labelled.uncertain)
-
-    size = len(analysis.ensemble[0])
-    analysis.points += np.bincount(bins, minlength=BINS)
-    ensemble_cells = _cells(bins, truth, labelled.ids["ensemble"], size)
-    analysis.ensemble += _confusions(ensemble_cells, BINS, size)
-    swept = bins < SWEPT
-    head_cells = _cells(bins[swept], truth[swept], labelled.head[swept], size)
-    analysis.head += _confusions(head_cells, SWEPT, size)
-
-
-def _cells(bins: np.ndarray, truth: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
-    """Return the flat index of each point's cell in the confusion matrix of its bin."""
-    return (bins * size + truth) * size + ids
-
-
-def _confusions(cells: np.ndarray, count: int, size: int) -> np.ndarray:
-    """Return (count, size, size) confusion matrices, given each point's cell."""
-    return np.bincount(cells, minlength=count * size * size).reshape(count, size, size)
+def _confusions(bins: np.ndarray, truth: np.ndarray, ids: np.ndarray, size: int) -> np.ndarray:
+    """Return the (BINS, size, size) confusion matrices of the points of each bin."""
+    cells = (bins * size + truth) * size + ids
+    return np.bincount(cells, minlength=BINS * size * size).reshape(BINS, size, size)

@@ -56,17 +56,11 @@ def write_sweep(
         used: the parameter's value in the weights.
         path: the files to write, without an ending.
     """
-    values = []
-    mious = []
-    shares = []
-    rows: list[Sequence[Cell]] = []
+    rows = []
     for result in swept:
-        miou = 100 * result.miou
-        share = 100 * result.uncertain
-        values.append(result.value)
-        mious.append(miou)
-        shares.append(share)
-        rows.append((result.value, share, miou, 100 * result.accuracy))
+        percents = (100 * result.uncertain, 100 * result.miou, 100 * result.accuracy)
+        rows.append((result.value, *percents))
+    values, shares, mious, _ = zip(*rows, strict=True)
 
     figure, axes = _figure(f"{name} on {dataset}")
     marker = "" if len(swept) > MOST_MARKED else "o"
@@ -96,7 +90,7 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
     for gru, weighted, network_metrics in rows:
         miou = _percent(network_metrics["miou"])
         accuracy = _percent(network_metrics["accuracy"])
-        table.append((_yes_or_no(gru), _yes_or_no(weighted), miou, accuracy))
+        table.append(("yes" if gru else "no", "yes" if weighted else "no", miou, accuracy))
 
     return _write(path, ("GRU", "class weights", "mIoU %", "accuracy %"), table)
 
@@ -176,10 +170,6 @@ def _write_methods(analysis: Analysis, path: Path) -> list[Path]:
 
     columns = ("method", "mIoU %", "mIoU % of the classes present", "accuracy %", "fwIoU %")
     return _write(path, columns, rows)
-
-
-def _yes_or_no(flag: bool) -> str:
-    return "yes" if flag else "no"
 
 
 def _percent(value: float | None) -> float | None:

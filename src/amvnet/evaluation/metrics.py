@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError
 
 # Metres; the distances of SemanticKITTI's evaluation by distance.
 EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
@@ -26,31 +25,10 @@ def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarra
 
     Returns:
         (K + 1, K + 1) int64; the row is the true id, the column the predicted one.
-
-    Raises:
-        InputError: if the two differ in length or an id is outside 0..K.
     """
-    truth = np.asarray(truth)
-    prediction = np.asarray(prediction)
-    if truth.shape != prediction.shape or truth.ndim != 1:
-        raise InputError(
-            "expected true and predicted ids of one shape (N,), "
-            f"found {truth.shape} and {prediction.shape}; give the prediction of this scan"
-        )
-    _check_ids(truth, "true", size)
-    _check_ids(prediction, "predicted", size)
-
     cells = truth.astype(np.int64) * (size + 1) + prediction
     counts = np.bincount(cells, minlength=(size + 1) ** 2)
     return counts.reshape(size + 1, size + 1)
-
-
-def _check_ids(ids: np.ndarray, kind: str, size: int) -> None:
-    if len(ids) and not 0 <= ids.min() <= ids.max() <= size:
-        raise InputError(
-            f"expected {kind} ids 0..{size}, found {ids.min()}..{ids.max()}; "
-            "map raw labels to train ids first"
-        )
 
 
 def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
@@ -133,16 +111,15 @@ class Evaluation:
             truth: (N,) train ids.
             predictions: method -> (N,) train ids.
             uncertain: (N,) bool, or None if it is not known which points are uncertain.
-
-        Raises:
-            InputError: if truth and prediction differ in shape or an id is outside 0..K. The scan
-                is then not counted at all.
         """
-        masks = self._masks(points)
-        counts = {}
+        size = self.taxonomy.size
+        distances = np.linalg.norm(points[:, :3], axis=1)
         for method, ids in predictions.items():
-            counts[method] = self._confusions(truth, ids, masks)
-        self._add_counts(counts)
+            matrices = [confusion(truth, ids, size)]
+            for near, far in pairwise(EDGES):
+                is_between = (near < distances) & (distances < far)
+                matrices.append(confusion(truth[is_between], ids[is_between], size))
+            self._add_counts(method, np.stack(matrices))
 
         self.scans += 1
         self.points += len(points)
@@ -155,7 +132,8 @@ class Evaluation:
         """Return an evaluation of the scans of both, which have the same classes."""
         total = Evaluation(self.taxonomy)
         for part in (self, other):
-            total._add_counts(part.matrices)
+            for method, matrices in part.matrices.items():
+                total._add_counts(method, matrices)
             total.scans += part.scans
             total.points += part.points
             total.uncertain += part.uncertain
@@ -188,22 +166,5 @@ class Evaluation:
 
         return {**metrics(matrices[0], self.taxonomy), "by_distance": bins}
 
-    def _masks(self, points: np.ndarray) -> list[np.ndarray]:
-        """Return one (N,) bool mask per bin: the points that are in it."""
-        distances = np.linalg.norm(points[:, :3], axis=1)
-        return [(near < distances) & (distances < far) for near, far in pairwise(EDGES)]
-
-    def _confusions(
-        self, truth: np.ndarray, ids: np.ndarray, masks: Sequence[np.ndarray]
-    ) -> np.ndarray:
-        """Return the (bins + 1, K + 1, K + 1) counts of all points and of each mask's points."""
-        size = self.taxonomy.size
-        matrices = [confusion(truth, ids, size)]
-        for mask in masks:
-            matrices.append(confusion(truth[mask], ids[mask], size))
-
-        return np.stack(matrices)
-
-    def _add_counts(self, counts: Mapping[str, np.ndarray]) -> None:
-        for method, matrices in counts.items():
-            self.matrices[method] = self.matrices.get(method, 0) + matrices
+    def _add_counts(self, method: str, matrices: np.ndarray) -> None:
+        self.matrices[method] = self.matrices.get(method, 0) + matrices

@@ -22,7 +22,6 @@ from amvnet.errors import InputError
 
 TEST_SCANS = 20_351  # of SemanticKITTI (KITTI odometry 11 to 21); its server requires all of them
 
-
 # What a method uses, as nuScenes' submission.json declares it.
 LIDAR_ALONE = {
     "use_camera": False,
@@ -38,7 +37,6 @@ class Rules:
     """What an archive must contain and what it may contain.
 
     Attributes:
-        description: of the scans, in words.
         points: the predictions that it must contain, by name, with the number of points of each.
         dtype: number type of the ids.
         unlabelled: whether points may have no class (train id 0).
@@ -48,7 +46,6 @@ class Rules:
     """
 
     taxonomy: Taxonomy
-    description: str
     points: Mapping[str, int]
     dtype: type[np.unsignedinteger]
     unlabelled: bool
@@ -109,7 +106,6 @@ def _semantickitti(dataset: SemanticKitti, split: str, sequences: Sequence[str] 
     is_whole_test = split == "test" and sequences is None
     return Rules(
         taxonomy=dataset.taxonomy,
-        description=_describe(split, sequences),
         points=_count_points(dataset, dataset.records(wanted)),
         dtype=np.uint32,
         unlabelled=True,
@@ -150,7 +146,6 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     (only_split,) = splits
     return Rules(
         taxonomy=dataset.taxonomy,
-        description=_describe(split, sequences),
         points=_count_points(dataset, records),
         dtype=np.uint8,
         unlabelled=False,
@@ -168,8 +163,3 @@ def _count_points(dataset: Dataset, records: Sequence[ScanRecord]) -> dict[str, 
     for record in records:
         points[record.prediction] = dataset.count_points(record)
     return points
-
-
-def _describe(split: str, sequences: Sequence[str] | None) -> str:
-    """Return the scans of an archive in words."""
-    return f"the {split} split" if sequences is None else ", ".join(sorted(set(sequences)))

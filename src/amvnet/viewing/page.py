@@ -11,7 +11,7 @@ import re
 import tempfile
 import webbrowser
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -59,17 +59,15 @@ class Packed:
         about: name, number of points and the like, for the page's JSON.
         planes: the values of its points as `pack` lays them out, deflated and in base64.
         present: ids of the classes that appear in its ground truth and labels.
-        height: (low, high) in metres; almost all points lie between.
+        heights: metres, of the lowest points, the ground and the highest points.
         intensity: in [0, 1]; almost no point has more.
-        ground: height of the ground in metres.
     """
 
     about: dict[str, Any]
     planes: str
-    present: frozenset[int]
-    height: tuple[float, float]
+    present: set[int]
+    heights: tuple[float, float, float]
     intensity: float
-    ground: float
 
 
 def show(result: Segmentation, path: Path | str | None = None, open_browser: bool = True) -> Path:
@@ -141,27 +139,36 @@ def pack(shown: ShownScan) -> Packed:
     for axis in steps.T:
         data += _differences(axis)
     planes = {}
+    present: set[int] = set()
     for name, values in _byte_planes(shown).items():
         planes[name] = values[indices]
         data += planes[name].tobytes()
+        if name == "truth" or name in shown.labels:
+            present.update(np.unique(planes[name]).tolist())
+
+    notes = []
+    if left_out:
+        notes.append(f"{left_out:,} without a position or beyond {REACH:g} m")
+    if stride > 1:
+        notes.append(f"one in {stride} of the scan")
 
     about = {
         "name": shown.name,
         "count": len(indices),
-        "note": _note(left_out, stride),
+        "note": "; ".join(notes),
         "center": center.tolist(),
         "step": step.tolist(),
         "planes": list(planes),
     }
-    height, ground = _heights(xyz[:, 2])
+    is_empty = not len(indices)
+    low, ground, high = (0, 0, 1) if is_empty else np.percentile(xyz[:, 2], (1, 10, 99)).tolist()
 
     return Packed(
         about=about,
         planes=base64.b64encode(zlib.compress(data, 9)).decode("ascii"),
-        present=_class_ids(planes, (*shown.labels, "truth")),
-        height=height,
-        intensity=_highest_intensity(planes["intensity"]),
-        ground=ground,
+        present=present,
+        heights=(low, ground, high),
+        intensity=1.0 if is_empty else float(np.percentile(planes["intensity"], 98)) / 255,
     )
 
 
@@ -203,8 +210,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
             method = title_of(name)
             sources.append({"key": name, "title": method[:1].upper() + method[1:]})
 
-    lowest = min(scan.height[0] for scan in packed)
-    highest = max(scan.height[1] for scan in packed)
+    lows, grounds, highs = zip(*(scan.heights for scan in packed), strict=True)
     brightest = max(scan.intensity for scan in packed)
 
     return {
@@ -217,7 +223,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
         "scans": [scan.about for scan in packed],
         "ranges": {
             "uncertainty": (0, 1),
-            "height": (lowest, highest),
+            "height": (min(lows), max(highs)),
             "intensity": (0, brightest),
         },
         "ramps": {
@@ -225,7 +231,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
             "height": _ramp(*RAMPS["height"]),
             "intensity": _ramp(*RAMPS["intensity"]),
         },
-        "ground": float(np.median([scan.ground for scan in packed])),
+        "ground": float(np.median(grounds)),
     }
 
 
@@ -267,40 +273,6 @@ def _differences(steps: np.ndarray) -> bytes:
     """
     changes = np.diff(steps.view(np.uint16), prepend=np.uint16(0)).astype("<u2")
     return changes.view(np.uint8).reshape(-1, 2).T.tobytes()
-
-
-def _heights(z: np.ndarray) -> tuple[tuple[float, float], float]:
-    """Return the range of most heights, and the approximate height of the ground, in metres."""
-    if not len(z):
-        return (0.0, 1.0), 0.0
-
-    low, high = np.percentile(z, (1, 99))
-    return (float(low), float(high)), float(np.percentile(z, 10))
-
-
-def _highest_intensity(intensity: np.ndarray) -> float:
-    """Return the intensity in [0, 1] that only a few points exceed, given (N,) bytes."""
-    return float(np.percentile(intensity, 98)) / 255 if len(intensity) else 1.0
-
-
-def _class_ids(planes: Mapping[str, np.ndarray], names: Sequence[str]) -> frozenset[int]:
-    """Return the class ids that appear in the planes with these names."""
-    ids: set[int] = set()
-    for name in names:
-        if name in planes:
-            ids.update(np.unique(planes[name]).tolist())
-    return frozenset(ids)
-
-
-def _note(left_out: int, stride: int) -> str:
-    """Say which points the page does not show; the text is empty if it shows all."""
-    notes = []
-    if left_out:
-        notes.append(f"{left_out:,} without a position or beyond {REACH:g} m")
-    if stride > 1:
-        notes.append(f"one in {stride} of the scan")
-
-    return "; ".join(notes)
 
 
 def _ramp(name: str, start: float, end: float) -> list[list[int]]:

@@ -43,7 +43,7 @@ def submit(
         count = pack.write(rules, predictions, out, use_external, step)
     packed = counted(count, "prediction")
     fit = "keeps" if count == 1 else "keep"
-    say(f"{out}: {packed} of {rules.description} {fit} to the rules of {rules.taxonomy.name}")
+    say(f"{out}: {packed} {fit} to the rules of {rules.taxonomy.name}")
     if rules.official is not None and count < rules.official:
         say(
             f"note: the benchmark has {rules.official} scans in this split; "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from functools import cache
 from pathlib import Path
@@ -40,10 +40,8 @@ class Bag:
             if ending == FOLDER:
                 _check_unpacked(path)
             with closing(_open_reader(path, ending)) as reader:
-                counts = _count_messages(reader)
-                topic = _choose_topic(counts, topic, path, _describe_others(reader))
+                topic, count = _choose_topic(reader.connections, topic, path)
 
-        count = counts[topic]
         if not 0 < count <= size_of(path) // MIN_MESSAGE:
             raise InputError(
                 f"{path}: expected scans under {topic}, found {count} messages; {ADVICE}"
@@ -83,7 +81,8 @@ class Bag:
 
     def _messages(self) -> Iterator[bytes]:
         with closing(_open_reader(self._path, self._ending)) as reader:
-            connections = [each for each in _with_scans(reader) if each.topic == self._topic]
+            scans = _with_scans(reader.connections)
+            connections = [each for each in scans if each.topic == self._topic]
             for _, _, data in reader.messages(connections=connections):
                 yield data
 
@@ -149,60 +148,38 @@ def types_of(is_ros1: bool) -> Any:
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
 
 
-def _count_messages(reader: Any) -> dict[str, int]:
-    """Return the number of messages of each topic with scans."""
-    counts: dict[str, int] = {}
-    for connection in _with_scans(reader):
-        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
-    return counts
-
-
-def _with_scans(reader: Any) -> list[Any]:
+def _with_scans(connections: Iterable[Any]) -> list[Any]:
     """Return the connections of a bag whose messages are scans."""
-    return [each for each in reader.connections if each.msgtype == CLOUD_TYPE]
+    return [connection for connection in connections if connection.msgtype == CLOUD_TYPE]
 
 
-def _describe_others(reader: Any) -> str:
-    """Return what else is in a bag, and how messages of sensors become scans."""
-    topics = []
-    for connection in reader.connections:
-        if connection.msgtype != CLOUD_TYPE:
-            topics.append(f"{connection.topic} ({connection.msgtype}, {connection.msgcount})")
-
-    listing = ", ".join(topics[:LISTED]) or "no topic"
-    if len(topics) > LISTED:
-        listing += f" and {len(topics) - LISTED} more"
-    return (
-        f"found {listing}; give a bag with scans, or play this one with the driver of the sensor "
-        "running, and record the PointCloud2 topic that it publishes"
-    )
-
-
-def _choose_topic(counts: dict[str, int], topic: str | None, path: Path, without_scans: str) -> str:
-    """Return the topic to read: the requested one, or the only one.
+def _choose_topic(connections: Iterable[Any], topic: str | None, path: Path) -> tuple[str, int]:
+    """Return the topic to read, and the number of its scans.
 
     Args:
-        counts: the number of scans of each topic.
-        without_scans: what else is in the bag, and what to do if it has no scans.
+        topic: None for the only one with scans.
 
     Raises:
         InputError: if it is missing, or there are several and none is requested.
     """
-    listing = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
+    counts: dict[str, int] = {}
+    for connection in _with_scans(connections):
+        counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
+    if topic is None and len(counts) == 1:
+        (topic,) = counts
+    if topic in counts:
+        return topic, counts[topic]
 
-    if not counts:
-        expected = "a topic" if topic is None else topic
-        raise InputError(f"{path}: expected {expected} with PointCloud2, {without_scans}")
-
-    if topic is not None:
-        if topic in counts:
-            return topic
+    expected = topic or "one topic"
+    if counts:
+        listing = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
         raise InputError(
-            f"{path}: expected PointCloud2 under {topic}, found {listing}; give another --topic"
+            f"{path}: expected {expected} with PointCloud2, found {listing}; choose one with "
+            "--topic"
         )
-
-    if len(counts) > 1:
-        raise InputError(
-            f"{path}: expected one topic with PointCloud2, found {listing}; choose one with --topic"
-        )
-    return next(iter(counts))
+    others = [f"{other.topic} ({other.msgtype})" for other in connections]
+    raise InputError(
+        f"{path}: expected {expected} with PointCloud2, found "
+        f"{', '.join(others[:LISTED]) or 'no topic'}; give a bag with scans, or play this one with "
+        "the driver of the sensor running, and record the PointCloud2 topic that it publishes"
+    )
