@@ -132,10 +132,8 @@ def _tilted_pose(
     left = np.array([-forward[1], forward[0]])
 
     # The slopes between the axles and the wheels, and the angles of car body and mounting.
-    half = WHEELBASE / 2
-    half_track = TRACK / 2
-    pitch = _slope(ground, place, forward * half) + rng.normal(scale=0.004)
-    roll = _slope(ground, place, left * half_track) + rng.normal(scale=0.006)
+    pitch = _slope(ground, place, forward * (WHEELBASE / 2)) + rng.normal(scale=0.004)
+    roll = _slope(ground, place, left * (TRACK / 2)) + rng.normal(scale=0.006)
     pitch += np.radians(sensor.pitch)
     roll += np.radians(sensor.roll)
 

@@ -2,7 +2,4 @@
 
 
 class SimulationError(ValueError):
-    """Streets that cannot be simulated or written.
-
-    The message is one line that says what was expected, what was found and what to do.
-    """
+    """Streets that cannot be simulated: what was expected, what was found and what to do."""

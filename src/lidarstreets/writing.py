@@ -90,10 +90,13 @@ def simulate(
     require_embree()
 
     out = Path(out)
-    numbers = range(first_sequence, first_sequence + sequences)
-    wanted = [Sequence(out, sensor, number, scans, seed) for number in numbers]
-    missing = [sequence for sequence in wanted if not _is_complete(sequence)]
-    done = scans * (len(wanted) - len(missing))
+    missing = []
+    for number in range(first_sequence, first_sequence + sequences):
+        sequence = Sequence(out, sensor, number, scans, seed)
+        if not _is_complete(sequence):
+            missing.append(sequence)
+
+    done = scans * (sequences - len(missing))
     for written in _write_sequences(missing, min(processes, len(missing))):
         done += written
         progress(done, scans * sequences)

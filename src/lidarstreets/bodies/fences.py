@@ -6,6 +6,7 @@ can be lined up along a boundary.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -14,43 +15,9 @@ from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, copies, leaning, loft, planks, prism, tube
+from lidarstreets.tables import read_table
 
-# Shares of the fences along a garden.
-GARDEN_KINDS = {
-    "boards": 0.17,
-    "slats": 0.07,
-    "pickets": 0.13,
-    "lattice": 0.04,
-    "mesh": 0.16,
-    "railing": 0.08,
-    "rails": 0.04,
-    "wall": 0.10,
-    "stone wall": 0.07,
-    "wall and railing": 0.06,
-    "panels": 0.04,
-    "screen": 0.04,
-}
-# Shares of the fences along fields, woods, railways and yards.
-OPEN_KINDS = {
-    "mesh": 0.34,
-    "rails": 0.20,
-    "wire": 0.12,
-    "pickets": 0.06,
-    "boards": 0.08,
-    "slats": 0.04,
-    "wall": 0.06,
-    "stone wall": 0.04,
-    "panels": 0.06,
-}
-# Shares of what stands along fast roads.
-ROADSIDE_KINDS = {
-    "guard rail": 0.56,
-    "double guard rail": 0.14,
-    "wire rope": 0.06,
-    "noise barrier": 0.12,
-    "glass barrier": 0.04,
-    "parapet": 0.08,
-}
+SHARES = read_table(Path(__file__).with_suffix(".toml"))
 FOOT = 0.5  # metres by which fences reach below the ground, so that a slope leaves no gap
 POROUS_THICKNESS = 0.04  # metres: of wire meshes and lattices
 # Section (y, z) of the beam of a guard rail, which has two waves, in metres; its height, and the
@@ -105,9 +72,9 @@ class Fence:
         return mesh
 
 
-def draw_fence(rng: np.random.Generator, kinds: dict[str, float] | None = None) -> Fence:
-    """Draw a kind of fence and its measures, by default with the shares of gardens."""
-    kind = weighted_choice(rng, GARDEN_KINDS if kinds is None else kinds)
+def draw_fence(rng: np.random.Generator, shares: dict[str, float]) -> Fence:
+    """Draw a kind of fence by the shares of the kinds, and its measures."""
+    kind = weighted_choice(rng, shares)
     surfaces = KINDS[kind].surfaces
     if surfaces is WOODEN:
         surface = Surface.WOOD if rng.random() < 0.85 else Surface.PLASTIC

@@ -4,31 +4,16 @@ Banks and rows of plants lie along x.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part
 from lidarstreets.solids import box, hull, leaning, loft, tube
+from lidarstreets.tables import read_table
 
-# Sections of hedges and banks of leaves: corners (y, z) for a width and a height of 1,
-# counter-clockwise seen from +x.
-SECTIONS = {
-    "box": ((0.5, 0), (0.5, 1), (-0.5, 1), (-0.5, 0)),
-    "dome": ((0.5, 0), (0.5, 0.6), (0.28, 0.97), (-0.28, 0.97), (-0.5, 0.6), (-0.5, 0)),
-    "cone": ((0.5, 0), (0.42, 0.35), (0.1, 1), (-0.1, 1), (-0.42, 0.35), (-0.5, 0)),
-    "wedge": ((0.5, 0), (0.36, 1), (-0.36, 1), (-0.5, 0)),
-    "bulge": (
-        (0.3, 0),
-        (0.5, 0.3),
-        (0.48, 0.65),
-        (0.2, 1),
-        (-0.2, 1),
-        (-0.48, 0.65),
-        (-0.5, 0.3),
-        (-0.3, 0),
-    ),
-}
+SECTIONS = read_table(Path(__file__).with_suffix(".toml"))["sections"]
 FOOT = 0.3  # metres by which plants reach below the ground, so that a slope leaves no gap
 
 

@@ -3,31 +3,17 @@
 import numpy as np
 
 from lidarstreets.bodies import clutter, trees
-from lidarstreets.bodies.vehicles import buses, cars, machines, people, trucks, two_wheelers
+from lidarstreets.bodies.vehicles import people, two_wheelers
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import part
 from lidarstreets.sites.crowd import put_rack
 from lidarstreets.sites.site import Plot, Site
-from lidarstreets.sites.traffic import car_with_trailer, length_of
+from lidarstreets.sites.traffic import car_with_trailer, choose_vehicle, length_of
 from lidarstreets.solids import box
 
 # Open areas per 100 m of street on each side.
 AREAS = {"urban": 0.24, "avenue": 0.24, "residential": 0.13, "living": 0.16, "rural": 0.10}
-LOT_VEHICLES = {
-    cars.car: 0.90,
-    machines.trailer: 0.03,
-    trucks.truck: 0.03,
-    two_wheelers.motorcycle: 0.03,
-    buses.bus: 0.01,
-}
-YARD_VEHICLES = {
-    trucks.truck: 0.50,
-    machines.trailer: 0.15,
-    machines.machine: 0.12,
-    buses.bus: 0.04,
-    cars.car: 0.19,
-}
 # Metres from the front of a car park to the middle of its aisle, and of its two rows from there.
 AISLE = 9.0
 ROW = 5.8
@@ -82,7 +68,7 @@ def add_lot(area: Plot, depth: float) -> None:
 
     for row in rows:
         for x in np.arange(area.x + 1.8, area.end - 1.5, pitch):
-            mesh = weighted_choice(rng, LOT_VEHICLES)(rng)
+            mesh = choose_vehicle(rng, "lot")(rng)
             distance = front + row + rng.normal(scale=0.2)
             yaw = angle + np.pi * (rng.random() < 0.5) + rng.normal(scale=0.03)
             if rng.random() < 0.07:
@@ -125,10 +111,8 @@ def _put_large(area: Plot, x: float, distance: float, heading: float) -> float:
         area.put(container, x + size[0] / 2, distance, yaw, margin=-np.inf)
         return size[0]
 
-    if rng.random() < 0.12:
-        bodies = car_with_trailer(rng)
-    else:
-        bodies = [weighted_choice(rng, YARD_VEHICLES)(rng)]
+    has_trailer = rng.random() < 0.12
+    bodies = car_with_trailer(rng) if has_trailer else [choose_vehicle(rng, "yard")(rng)]
     length = sum(length_of(body) for body in bodies)
     for body in bodies:
         area.put(body, x + length / 2, distance, yaw, thing=True, margin=-np.inf)

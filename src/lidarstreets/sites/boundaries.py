@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidarstreets.bodies.fences import Fence, draw_fence, gate
+from lidarstreets.bodies.fences import SHARES, Fence, draw_fence, gate
 from lidarstreets.bodies.plants import Hedge, draw_hedge
 from lidarstreets.sites.site import Plot
 
@@ -29,14 +29,14 @@ class Boundary:
     missing: float
 
 
-def draw_boundary(rng: np.random.Generator, kinds: dict[str, float] | None = None) -> Boundary:
-    """Draw a kind of boundary; only fences, if their shares are given as for `draw_fence`."""
+def draw_boundary(rng: np.random.Generator, where: str = "garden") -> Boundary:
+    """Draw a kind of boundary for a place in fences.toml; only gardens have hedges alone."""
     missing = float(rng.choice([0.0, 0.03, 0.2], p=[0.6, 0.3, 0.1]))
     hedge_height = float(rng.uniform(0.4, 1.4) if rng.random() < 0.4 else rng.uniform(1.2, 3.0))
-    if kinds is None and rng.random() < HEDGE:
+    if where == "garden" and rng.random() < HEDGE:
         return Boundary(((draw_hedge(rng, hedge_height), 0.0),), missing)
 
-    fence = draw_fence(rng, kinds)
+    fence = draw_fence(rng, SHARES[where])
     if rng.random() < FENCE_AND_HEDGE:
         hedge = draw_hedge(rng, hedge_height)
         offset = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.8))

@@ -1,6 +1,7 @@
 """People, riders and parked two-wheelers along a street."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -11,17 +12,9 @@ from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Maker, part
 from lidarstreets.sites.site import Site
 from lidarstreets.solids import box
+from lidarstreets.tables import read_table
 
-# What people do, and the share of the occasions.
-OCCASIONS = {
-    "ride": 0.16,
-    "walk": 0.36,
-    "stand": 0.13,
-    "meet": 0.14,
-    "cross": 0.09,
-    "sit": 0.06,
-    "stand by a car": 0.06,
-}
+OCCASIONS = read_table(Path(__file__).with_suffix(".toml"))["occasions"]
 # Occasions per person that `Style.people` counts, and parked two-wheelers per such person.
 PEOPLE_FACTOR = 0.9
 TWO_WHEELER_FACTOR = 0.6

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 
 from lidarstreets.bodies import buildings, clutter, furniture, plants, trees
-from lidarstreets.bodies.fences import OPEN_KINDS
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label
 from lidarstreets.sites.boundaries import draw_boundary, line_up
@@ -238,7 +237,7 @@ def _building_site(plot: Plot) -> None:
 
 def _fence_off(plot: Plot, distance: float) -> None:
     """Put a fence along a plot, at a distance from the middle line of the street."""
-    boundary = draw_boundary(plot.rng, OPEN_KINDS)
+    boundary = draw_boundary(plot.rng, "open")
     drift = plot.rng.normal(scale=0.4)
     line_up(plot, boundary, (plot.x, distance), (plot.end, distance + drift))
 

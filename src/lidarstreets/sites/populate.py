@@ -3,7 +3,6 @@
 import numpy as np
 
 from lidarstreets.bodies import clutter, furniture
-from lidarstreets.bodies.fences import OPEN_KINDS, ROADSIDE_KINDS
 from lidarstreets.bodies.vehicles import machines, people
 from lidarstreets.sites.areas import add_areas
 from lidarstreets.sites.background import close_ends, fill_background, line_side_road
@@ -98,7 +97,7 @@ def _add_long_barrier(site: Site, side: int) -> None:
     start = rng.uniform(0, site.ground.length - length)
     plot = Plot(site, side, start, length)
     is_fast = kind == "fast" or rng.random() < 0.3
-    boundary = draw_boundary(rng, ROADSIDE_KINDS if is_fast else OPEN_KINDS)
+    boundary = draw_boundary(rng, "roadside" if is_fast else "open")
 
     nearest = site.ground.style.road / 2 + site.ground.style.parking[int(side > 0)] + 0.6
     tallest = max(layer.height for layer, _ in boundary.layers)

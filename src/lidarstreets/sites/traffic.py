@@ -1,44 +1,38 @@
 """Vehicles along a street: parked at its sides, waiting in side roads, and driving."""
 
+from pathlib import Path
+
 import numpy as np
 
 from lidarstreets.bodies import clutter, furniture
 from lidarstreets.bodies.vehicles import buses, cars, machines, people, trucks, two_wheelers
 from lidarstreets.bodies.vehicles.cars import open_door
 from lidarstreets.chance import weighted_choice
-from lidarstreets.mesh import Mesh, join, place
+from lidarstreets.mesh import Maker, Mesh, join, place
 from lidarstreets.sites.site import Site
 from lidarstreets.streets.plans import SideRoad
+from lidarstreets.tables import read_table
 
-# Shares of the vehicles that park along the street, and of vehicles that drive.
-PARKED_VEHICLES = {
-    cars.car: 0.860,
-    trucks.truck: 0.048,
-    machines.trailer: 0.036,
-    machines.camper: 0.006,
-    two_wheelers.motorcycle: 0.042,
-    buses.bus: 0.004,
-    machines.machine: 0.004,
-}
-DRIVING_VEHICLES = {
-    cars.car: 0.880,
-    trucks.truck: 0.049,
-    machines.camper: 0.006,
-    buses.bus: 0.015,
-    two_wheelers.motorcyclist: 0.04,
-    machines.machine: 0.006,
-    buses.tram: 0.004,
-}
-MOTORWAY_VEHICLES = {
-    cars.car: 0.80,
-    trucks.truck: 0.16,
-    machines.camper: 0.01,
-    buses.bus: 0.02,
-    two_wheelers.motorcyclist: 0.01,
+SHARES = read_table(Path(__file__).with_suffix(".toml"))
+MAKERS: dict[str, Maker] = {
+    "car": cars.car,
+    "truck": trucks.truck,
+    "trailer": machines.trailer,
+    "camper": machines.camper,
+    "machine": machines.machine,
+    "bus": buses.bus,
+    "tram": buses.tram,
+    "motorcycle": two_wheelers.motorcycle,
+    "motorcyclist": two_wheelers.motorcyclist,
 }
 # Metres: smallest distance between two vehicles of one lane, bumper to bumper.
 BUMPER_GAP = 2.0
 LONGEST_ANGLED = 5.8  # longest vehicle that parks at an angle to the street, metres
+
+
+def choose_vehicle(rng: np.random.Generator, where: str) -> Maker:
+    """Return what draws a vehicle, chosen by the shares of a place in traffic.toml."""
+    return MAKERS[weighted_choice(rng, SHARES[where])]
 
 
 def length_of(mesh: Mesh) -> float:
@@ -68,7 +62,7 @@ def _fill_parallel(site: Site, side: int) -> None:
     x = rng.uniform(0, 6)
 
     while x < ground.length:
-        mesh = weighted_choice(rng, PARKED_VEHICLES)(rng)
+        mesh = choose_vehicle(rng, "parked")(rng)
         half = length_of(mesh) / 2 + rng.uniform(0.2, 1.0)
         middle = x + half
         if rng.random() < style.parked and _is_bay(site, middle, half):
@@ -88,7 +82,7 @@ def _fill_angled(site: Site, side: int, angle: float) -> None:
     pitch = rng.uniform(2.4, 2.9) / np.sin(angle)
 
     for x in np.arange(rng.uniform(0, 3), ground.length, pitch):
-        mesh = weighted_choice(rng, PARKED_VEHICLES)(rng)
+        mesh = choose_vehicle(rng, "parked")(rng)
         half = length_of(mesh) / 2
         is_taken = rng.random() < style.parked
         if is_taken and 2 * half < LONGEST_ANGLED and _is_bay(site, x, 1.0):
@@ -117,7 +111,7 @@ def park_anywhere(site: Site, side: int) -> None:
     for start in np.arange(0.0, ground.length, 100.0):
         x = start + rng.uniform(0, 30)
         for _ in range(rng.poisson(rate)):
-            mesh = weighted_choice(rng, PARKED_VEHICLES)(rng)
+            mesh = choose_vehicle(rng, "parked")(rng)
             half = length_of(mesh) / 2
             x += half + rng.uniform(0.5, 8.0)
             # From the edge of the road to the back of the sidewalk.
@@ -137,14 +131,14 @@ def fill_side_roads(site: Site) -> None:
     for road in site.ground.plan.crossings:
         distance = site.ground.style.road / 2 + rng.uniform(3.5, 12)
         for _ in range(rng.poisson(0.7)):
-            mesh = weighted_choice(rng, DRIVING_VEHICLES)(rng)
+            mesh = choose_vehicle(rng, "driving")(rng)
             half = length_of(mesh) / 2
             _put_on_side_road(site, road, mesh, distance + half, road.width / 4)
             distance += 2 * half + rng.uniform(1, 8)
 
         distance = site.ground.style.road / 2 + rng.uniform(8, 20)
         for _ in range(rng.poisson(0.8 * (road.width > 5.5))):
-            mesh = weighted_choice(rng, PARKED_VEHICLES)(rng)
+            mesh = choose_vehicle(rng, "parked")(rng)
             half = length_of(mesh) / 2
             across = -(road.width / 2 + rng.uniform(-1.0, 0.6))
             _put_on_side_road(site, road, mesh, distance + half, across)
@@ -171,7 +165,7 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
     rng = site.rng
     ground = site.ground
     style = ground.style
-    fleet = MOTORWAY_VEHICLES if style.kind == "motorway" else DRIVING_VEHICLES
+    where = "motorway" if style.kind == "motorway" else "driving"
     ego_x, ego_t = ego
 
     for lane, direction in style.lanes:
@@ -185,7 +179,7 @@ def add_traffic(site: Site, ego_speed: float, ego: tuple[float, float]) -> None:
         clearance = 4.5 if rng.random() < 0.15 else 11.0
         x = rng.uniform(5, 40)
         while True:
-            mesh = weighted_choice(rng, fleet)(rng)
+            mesh = choose_vehicle(rng, where)(rng)
             half = length_of(mesh) / 2
             x += half
             if x > ground.length - half - BUMPER_GAP:

@@ -3,20 +3,12 @@
 import numpy as np
 
 from lidarstreets.bodies import buildings, clutter, furniture, trees
-from lidarstreets.bodies.fences import OPEN_KINDS
-from lidarstreets.bodies.vehicles import cars, machines, trucks, two_wheelers
+from lidarstreets.bodies.vehicles import cars, trucks
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label
 from lidarstreets.sites.boundaries import draw_boundary, line_up
 from lidarstreets.sites.site import Plot
-
-# Shares of the vehicles in a car park.
-CAR_PARK_VEHICLES = {
-    cars.car: 0.90,
-    machines.trailer: 0.05,
-    trucks.truck: 0.02,
-    two_wheelers.motorcycle: 0.03,
-}
+from lidarstreets.sites.traffic import choose_vehicle
 
 
 def fill_yard(plot: Plot) -> None:
@@ -35,7 +27,7 @@ def _car_park(plot: Plot) -> None:
 
     for row in (4.0, 14.5):
         for x in np.arange(plot.x + 3, plot.end - 3, 2.8):
-            make = weighted_choice(rng, CAR_PARK_VEHICLES)
+            make = choose_vehicle(rng, "car park")
             is_taken = rng.random() < chance
             has_room = make is not trucks.truck or row > 10  # trucks are too long for the front
             if is_taken and has_room:
@@ -97,12 +89,12 @@ def _industrial_yard(plot: Plot) -> None:
         plot.put(thing, plot.random_x(), front + rng.uniform(1, 13), rng.uniform(0, 6))
 
     for _ in range(rng.poisson(1.5)):
-        make = weighted_choice(rng, CAR_PARK_VEHICLES)
+        make = choose_vehicle(rng, "car park")
         yaw = rng.choice([-1, 1]) * np.pi / 2
         plot.put(make(rng), plot.random_x(), front + 9, yaw, thing=True, margin=7.0)
     if rng.random() < 0.3:
         for x in plot.x + np.arange(3) * 1.5:
             plot.put(furniture.flag_pole(rng), x, front + 1.2)
     if rng.random() < 0.7:
-        boundary = draw_boundary(rng, OPEN_KINDS)
+        boundary = draw_boundary(rng, "open")
         line_up(plot, boundary, (plot.x, front + 0.5), (plot.end, front + 0.5))

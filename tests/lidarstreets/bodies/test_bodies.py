@@ -95,7 +95,7 @@ def test_a_fence_is_as_long_and_high_as_it_says(kind: str) -> None:
 
 def test_an_overgrown_fence_has_leaves() -> None:
     rng = np.random.default_rng(0)
-    fence = replace(fences.draw_fence(rng), overgrown=1.0)
+    fence = replace(fences.draw_fence(rng, fences.SHARES["garden"]), overgrown=1.0)
     assert set(fence.segment(rng, 2.5).label.tolist()) == {Label.FENCE, Label.VEGETATION}
 
 
