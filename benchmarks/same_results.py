@@ -128,7 +128,7 @@ analyze city64 --split all --weights sim-hdl64e --out figures/analysis
 
 # Two models' scores
 fuse city64 --scores-a labels/64/rv --scores-b labels/64/bev --out fused/ensemble
-fuse city64 --scores-a labels/64/amvnet --scores-b labels/64/amvnet --key-a rv --key-b bev \
+fuse city64 --scores-a labels/64/amvnet --scores-b labels/64/amvnet \
     --head sim-hdl64e --tau 0.7 --out fused/head
 rank city32 --weights sim-hdl32e --out rank/suspects.csv --pictures rank/suspects
 
@@ -146,7 +146,7 @@ train kitti.yaml --data city64 --out runs/tau --stage head --init runs/kitti \
     --train-sequences 00,01 --val-sequences 02 --training.head.class_weights true \
     --model.assertion.threshold 0.8
 train kitti.yaml --data city64 --out runs/scores --stage head --with-val \
-    --scores-a labels/64/amvnet --scores-b labels/64/amvnet --key-a rv --key-b bev
+    --scores-a labels/64/amvnet --scores-b labels/64/amvnet
 ablate nuscenes.yaml --data city32 --out runs/ablation --training.rv.epochs 1
 analyze city64 --sequences 02 --weights runs/kitti --out runs/analysis --neighbours 2 \
     --recipe kitti.yaml --train-sequences 00,01

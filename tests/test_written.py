@@ -56,7 +56,7 @@ class Case:
 
 
 WEIGHTS = "--weights {world}/w.safetensors"
-SCORES = "--scores-a {world}/predictions --key-a rv --scores-b {world}/predictions --key-b bev"
+SCORES = "--scores-a {world}/predictions --scores-b {world}/predictions"
 CASES = {
     "predict": Case(f"predict {{world}}/scans {WEIGHTS} --out {{out}}", "b.label"),
     "ply": Case(f"predict {{world}}/scans {WEIGHTS} --out {{out}} --format ply", "b.ply"),

@@ -75,3 +75,14 @@ class Scan:
         # Column by column: a reduction over rows of four takes ten times as long.
         x, y, z, intensity = np.abs(self.points.T)
         return (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST) & (intensity < np.inf)
+
+
+def check_scan(scan: Scan) -> Scan:
+    """Return a scan with at least one valid point; raise InputError if there is none."""
+    if not scan.valid.any():
+        problem = "none finite" if len(scan) else "none"
+        raise InputError(
+            f"{scan.name or 'scan'}: expected points to segment, found {problem}; "
+            "leave the scan out"
+        )
+    return scan

@@ -31,7 +31,6 @@ DOCS = Path(__file__).parents[2] / "docs"
 SCAN = "sequences/08/predictions/000000"
 NEXT_SCAN = "sequences/08/predictions/000001"
 KEYS = {"a": "rv", "b": "bev"}
-KEY_OPTIONS = ("--key-a", "rv", "--key-b", "bev")
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +91,7 @@ def write_scores(folder: Path, scores: Any, scan: str = SCAN) -> Path:
 @pytest.mark.parametrize("method", ["amvnet", "ensemble"])
 def test_the_scores_of_predict_give_its_labels(world: Path, tmp_path: Path, method: str) -> None:
     head = ("--head", world / "w.safetensors") if method == "amvnet" else ()
-    assert run_fuse(world, tmp_path, *KEY_OPTIONS, *head) == ""
+    assert run_fuse(world, tmp_path, *head) == ""
 
     assert (read_labels(tmp_path) == read_labels(world / method)).mean() >= 0.999
 
@@ -101,7 +100,7 @@ def test_the_scores_of_predict_give_its_labels(world: Path, tmp_path: Path, meth
 
 
 def test_the_head_and_tau_count(world: Path, tmp_path: Path) -> None:
-    options = (*KEY_OPTIONS, "--head", world / "w.safetensors", "--tau")
+    options = ("--head", world / "w.safetensors", "--tau")
     run_fuse(world, tmp_path / "none", *options, 0)
     run_fuse(world, tmp_path / "all", *options, 1)
 
@@ -189,7 +188,9 @@ def broken_scores(good: np.ndarray) -> dict[str, BrokenScores]:
         "a single number": BrokenScores(np.float32(1), ("()",)),
         "integers": BrokenScores(integers, ("uint8",)),
         "objects": BrokenScores(np.full((500, 19), None), ("broken",)),
-        "two arrays": BrokenScores({"one": good, "two": good}, ("one, two", "--key-b")),
+        "two arrays": BrokenScores(
+            {"one": good, "two": good}, ("one, two", "save the scores of one model")
+        ),
         "truncated": BrokenScores({"one": good}, ("broken",), cut=200),
         "no file": BrokenScores(None, ("000000.npz", "predict --scores")),
     }
@@ -210,7 +211,7 @@ def test_broken_scores_are_one_line_that_says_what_to_do(world: Path, tmp_path: 
             path = folder / f"{SCAN}.npz"
             path.write_bytes(path.read_bytes()[: -broken.cut])
 
-        scores = ("--scores-a", world / "amvnet", "--key-a", "rv", "--scores-b", folder)
+        scores = ("--scores-a", world / "amvnet", "--scores-b", folder)
         out = tmp_path / "out"
         code, error = run_cli("fuse", tmp_path / "data", *scores, "--out", out)
         assert (code, error.count("\n")) == (2, 1), kind
@@ -223,11 +224,9 @@ def test_wrong_options_of_fuse_are_one_line(world: Path, tmp_path: Path) -> None
     taxonomy = ("--taxonomy", "nuscenes")
     head = ("--head", world / "w.safetensors")
 
-    wrong_keys = ("--key-a", "nose", "--key-b", "bev")
-    assert "--key-a" in run_fuse(world, tmp_path, *wrong_keys)
-    assert "expected a folder" in run_fuse(world, tmp_path, *KEY_OPTIONS, a=tmp_path / "none")
-    assert "leave it out" in run_fuse(world, tmp_path, *KEY_OPTIONS, *head, *taxonomy)
-    assert "nuscenes" in run_fuse(world, tmp_path, *KEY_OPTIONS, *taxonomy)
+    assert "expected a folder" in run_fuse(world, tmp_path, a=tmp_path / "none")
+    assert "leave it out" in run_fuse(world, tmp_path, *head, *taxonomy)
+    assert "nuscenes" in run_fuse(world, tmp_path, *taxonomy)
     assert not files(tmp_path)
 
 
@@ -236,7 +235,7 @@ def test_wrong_scores_of_a_training_are_one_line(world: Path, tmp_path: Path) ->
     first = ("--scores-a", world / "amvnet")
     second = ("--scores-b", world / "amvnet")
     cases = {
-        "--stage head": (*first, *second, *KEY_OPTIONS),
+        "--stage head": (*first, *second),
         "--scores-b": (*first, "--stage", "head"),
     }
     for word, options in cases.items():
@@ -257,7 +256,7 @@ def train_head_arguments(world: Path, out: Path) -> list[Any]:
 
 def score_options(world: Path) -> list[Any]:
     scores = world / "amvnet"
-    return ["--scores-a", scores, "--scores-b", scores, *KEY_OPTIONS]
+    return ["--scores-a", scores, "--scores-b", scores]
 
 
 @pytest.fixture(scope="module")
@@ -294,7 +293,7 @@ def test_the_weights_hold_only_the_head_and_fuse_takes_them(
     assert weights.parts == ("point_head",)
     assert weights.model.assertion == fresh_weights().model.assertion
 
-    assert run_fuse(world, tmp_path, *KEY_OPTIONS, "--head", run) == ""
+    assert run_fuse(world, tmp_path, "--head", run) == ""
 
     points = np.fromfile(world / "data/sequences/08/velodyne/000000.bin", np.float32).reshape(-1, 4)
     f = read_probabilities(world, "rv")
@@ -313,8 +312,7 @@ def test_the_run_resumes_with_its_own_scores_only(world: Path, run: Path) -> Non
     assert run_cli(*arguments, *score_options(world)) == (0, "")
 
     scores = ["--scores-a", world / "amvnet", "--scores-b", world / "amvnet"]
-    swapped_keys = ["--key-a", "bev", "--key-b", "rv"]
-    code, error = run_cli(*arguments, *scores, *swapped_keys)
+    code, error = run_cli(*arguments, *scores, "--logits", "a")
     assert code == 2
     assert "scores" in error
 

@@ -47,9 +47,8 @@ def normalised(folder: Path) -> tuple[dict[str, Scan], dict[str, str], list[str]
     inputs, _ = list_inputs(
         [str(folder)], normaliser=normaliser_for(weights_for(), say=lines.append)
     )
-    loaded = {scan.name: scan.load() for scan in inputs}
-    scans = {name: item.scan for name, item in loaded.items()}
-    return scans, {name: item.sensor for name, item in loaded.items()}, lines
+    scans = {scan.name: scan.load().scan for scan in inputs}
+    return scans, {scan.name: scan.source for scan in inputs}, lines
 
 
 # ---- two sensors in one folder

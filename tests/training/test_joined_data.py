@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from amvnet.config.recipes import load_recipe
-from amvnet.data.datasets.joined import MixedRecord, Part, join, split_share
+from amvnet.data.datasets.joined import MixedRecord, Part, join
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.select import TrainingScans
@@ -125,15 +125,6 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
     assert record[SENSOR] == sensor_record(own[0], records[0])[SENSOR]
 
 
-def test_a_share_follows_the_last_at_sign(tmp_path: Path) -> None:
-    assert split_share("simulated-hdl64e:x@0.5") == ("simulated-hdl64e:x", 0.5)
-    assert split_share("nuscenes:x@v1.0-mini@0.25") == ("nuscenes:x@v1.0-mini", 0.25)
-    assert split_share("nuscenes:x@v1.0-mini") == ("nuscenes:x@v1.0-mini", None)
-    assert split_share("x") == ("x", None)
-    with pytest.raises(InputError, match="share"):
-        split_share("x@1.5")
-
-
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make two datasets, the second partly without labels, and weights to begin with."""
@@ -170,20 +161,13 @@ def test_the_mean_with_initial_weights_needs_their_classes() -> None:
     assert [line.split(":")[0] for line in lines] == ["rv", "bev"]
 
 
-def test_a_fine_tuning_can_be_tried(
-    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = [*arguments(world, tmp_path / "run", str(world / "a")), "--dry-run"]
-    assert run_cli(*command) == (0, "")
-    assert "bev: " in capsys.readouterr().out
-
-
 def test_a_fine_tuning_has_the_sizes_of_its_weights_and_can_be_repeated(
     world: Path, tmp_path: Path
 ) -> None:
     # Without the broken sequence, so that all have labels.
     make_streets(tmp_path / "b", ("00",), 3)
-    code, error = run_cli(*arguments(world, tmp_path / "run", f"{tmp_path / 'b'}@0.4"))
+    command = arguments(world, tmp_path / "run", str(tmp_path / "b"))
+    code, error = run_cli(*command, "--training.others", "0.4")
     assert code == 0, error
     start = load(world / "start.safetensors")
     trained = load(tmp_path / "run")

@@ -23,8 +23,9 @@ from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
+from amvnet.training import networks
 from amvnet.training import run as training_run
-from amvnet.training.callbacks import KeepWeights, Trial
+from amvnet.training.callbacks import KeepWeights
 from amvnet.training.loaders import count_classes
 from amvnet.training.networks import NetworkStage
 from amvnet.training.plan import Plan
@@ -735,57 +736,15 @@ def test_the_validation_scans_can_be_learnt_too(world: Path, tmp_path: Path) -> 
         assert not column(run, stage, "val/miou")
 
 
-def test_a_dry_run_measures_the_cost_of_a_training_and_leaves_nothing(
-    world: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "run"
-    batches = ("--training.rv.batch", 6, "--training.bev.accumulate", 2)  # for four scans
-    assert run_cli(*train_arguments(world, out), *batches, "--dry-run") == (0, "")
-
-    output = capsys.readouterr().out
-    rv, bev = (line for line in output.splitlines() if "epochs of" in line)
-    assert rv.startswith("rv:")
-    assert bev.startswith("bev:")
-    assert "steps of 6 scans" in rv
-    assert "steps of 2 scans" in bev
-    for line in (rv, bev):
-        assert "3 epochs of 4 scans: " in line
-        assert float(line.split(" GiB")[0].split()[-1]) > 0
-        assert float(line.split(" s a scan")[0].split()[-1]) > 0
-    assert not out.exists()
-
-
-def test_a_dry_run_has_two_steps_of_the_training_itself(
-    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trials: list[tuple[str, int, int]] = []
-
-    def note(plan: Plan, name: str, weights: Weights, trial: Trial) -> None:
-        train_network(plan, name, weights, trial)
-        trials.append((name, len(trial.ends), len(plan.scans.train)))
-
-    train_network = training_run.train_network
-    monkeypatch.setattr(training_run, "train_network", note)
-    batch = ("--training.rv.batch", 4, "--training.rv.accumulate", 2, "--stage", "rv")
-    arguments = train_arguments(world, tmp_path / "run")
-    assert run_cli(*arguments, *batch, "--dry-run") == (0, "")
-    assert trials == [("rv", 2, 8)]
-
-
-def test_a_dry_run_that_does_not_fit_into_the_memory_says_what_to_set(
+def test_a_step_that_does_not_fit_into_the_memory_says_what_to_set(
     world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fill_memory(*arguments: object) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory")
 
-    monkeypatch.setattr(training_run, "train_network", fill_memory)
-    error = fail(*train_arguments(world, tmp_path / "run"), "--dry-run")
+    monkeypatch.setattr(networks, "fit", fill_memory)
+    error = fail(*train_arguments(world, tmp_path / "run"), "--stage", "rv")
     assert "--training.rv.accumulate" in error
-
-
-def test_a_dry_run_of_the_head_is_refused(world: Path, tmp_path: Path) -> None:
-    error = fail(*train_arguments(world, tmp_path / "run"), "--stage", "head", "--dry-run")
-    assert "--stage rv, bev or all" in error
 
 
 @STAGES

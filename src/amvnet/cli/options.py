@@ -155,11 +155,8 @@ class ScoresChoice:
     """folder of one model's class probabilities, an .npz or .npy of shape (N, K) for each scan,
     where predict --scores writes its own."""
     scores_b: Path | None = None
-    """folder of the other model's."""
-    key_a: str | None = None
-    """which array of each .npz in --scores-a; not needed if there is one."""
-    key_b: str | None = None
-    """which array of each .npz in --scores-b."""
+    """folder of the other model's; of files of predict --scores with both networks, a is the range
+    view and b the bird's-eye view."""
     logits: Literal["a", "b", "both"] | None = None
     """which of the two are scores before softmax."""
 
@@ -177,7 +174,7 @@ class ScoresChoice:
             raise InputError(
                 "expected --scores-a and --scores-b, found not both; give two models' scores"
             )
-        return ScorePair.of(self.scores_a, self.scores_b, self.key_a, self.key_b, self.logits)
+        return ScorePair.of(self.scores_a, self.scores_b, self.logits)
 
 
 def join_processes(cuda: bool = False) -> Processes:

@@ -15,13 +15,12 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.evaluation.scoring import stream_labelled
-from amvnet.inference.reading import check_scan
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.models.methods import ENSEMBLES
 from amvnet.progress import Progress, no_progress
-from amvnet.scan import Scan
+from amvnet.scan import Scan, check_scan
 
 BINS = 100  # of the cosine similarity, which lies in [0, 1]
 SWEPT = 98  # lowest bins of points that the head settles: tau is swept up to 0.98

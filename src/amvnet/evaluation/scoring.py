@@ -21,7 +21,6 @@ from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import TopView, draw_scan
 from amvnet.files import inside
-from amvnet.inference.reading import check_scan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
@@ -29,7 +28,7 @@ from amvnet.models.amvnet import Scores
 from amvnet.models.methods import METHODS, PAPER_METHODS
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
-from amvnet.scan import Scan
+from amvnet.scan import Scan, check_scan
 
 Result = TypeVar("Result")
 # (N,) train ids by method, and (N,) bool: the uncertain points; None without two networks.

@@ -51,13 +51,11 @@ class LoadedScan:
 
     Attributes:
         scan: as the segmenter takes it.
-        sensor: what recorded it: the bag, folder or sequence.
         file_xyz: (N, 3) the coordinates as they are in the scan's file; None for a scan of a
             dataset.
     """
 
     scan: Scan
-    sensor: str = ""
     file_xyz: np.ndarray | None = None
 
 
@@ -70,7 +68,7 @@ class DatasetScan:
     Attributes:
         name: for messages, unique among the scans of one input.
         title: a short name for people who look at the scan.
-        source: the recording that it is from: a sequence.
+        source: the recording that it is from: a sequence, a bag or a folder.
         path: the file that the scan is read from.
         scores_path: of the `.npz` of its scores, relative to a folder of predictions.
         is_normalised: whether `ring` is the row of each point in the range image, for
@@ -100,7 +98,7 @@ class DatasetScan:
         Raises:
             InputError: if it cannot be read.
         """
-        return LoadedScan(self.dataset.read(self.record, labels=labels), self.source)
+        return LoadedScan(self.dataset.read(self.record, labels=labels))
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
         """Read the (N,) train ids of the scan's points from a folder of predictions.
@@ -149,13 +147,13 @@ class FileReader:
         """Read a scan; raise InputError if it cannot be read, or no point is usable."""
         if self.normaliser is None:
             cloud = scan.read()
-            return LoadedScan(cloud.to_scan(), scan.source, cloud.xyz)
+            return LoadedScan(cloud.to_scan(), cloud.xyz)
 
         if self.is_normalising:
             self.normaliser.measure(scan.source)
         kept = self._kept.pop((scan.source, scan.name), None)
         cloud = scan.read() if kept is None else kept
-        return LoadedScan(self.normaliser(cloud, scan.source), scan.source, cloud.xyz)
+        return LoadedScan(self.normaliser(cloud, scan.source), cloud.xyz)
 
     def _read_and_keep(self, scan: NamedScan) -> Cloud:
         """Read one of the first scans of a source, and forget those of others."""

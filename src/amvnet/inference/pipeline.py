@@ -307,7 +307,7 @@ class Pipeline:
 
         points = int(np.count_nonzero(loaded.scan.valid))
         uncertain = int(np.count_nonzero(result.uncertain))
-        return Entry(_key(scan), self._origins[_key(scan)], loaded.sensor, points, uncertain)
+        return Entry(_key(scan), self._origins[_key(scan)], scan.source, points, uncertain)
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:

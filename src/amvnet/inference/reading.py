@@ -62,27 +62,6 @@ def array_scan(
     return Scan(table, ring=cloud.ring)
 
 
-def check_scan(points: np.ndarray | Scan, trained: TrainedIntensity | None = None) -> Scan:
-    """Make a `Scan` of an array of points, and check that at least one point is valid.
-
-    Args:
-        points: a scan, or an array as `array_scan` takes it.
-        trained: the intensities of the training, for an array that has none.
-
-    Raises:
-        InputError: if there is no point, or none is valid.
-    """
-    scan = points if isinstance(points, Scan) else array_scan(points, trained=trained)
-    if not scan.valid.any():
-        problem = "none finite" if len(scan) else "none"
-        raise InputError(
-            f"{scan.name or 'scan'}: expected points to segment, found {problem}; "
-            "leave the scan out"
-        )
-
-    return scan
-
-
 def normaliser_for(
     weights: Weights, sensor: Sensor | None = None, say: Say = say_nothing
 ) -> Normaliser:

@@ -24,6 +24,7 @@ SURE = 1e-7
 ROUNDING = 0.02  # sums of rows are off 1 by up to this if rounded to float16 or two decimals
 
 ENDINGS = (".npz", ".npy")
+NETWORKS = {"a": "rv", "b": "bev"}  # array of each side in a file of `amvnet predict --scores`
 TAIL = 4096  # bytes at the end of a file: the checksums of an .npz, the last points of an .npy
 
 # What NumPy raises for files that are not its own, truncated or corrupt.
@@ -37,15 +38,14 @@ class ScoreFolder:
     """One model's scores of some scans, in one file per scan.
 
     Attributes:
-        side: "a" or "b", for messages.
+        side: "a" or "b". Of the two networks in a file of `amvnet predict --scores`, a is the range
+            view and b the bird's-eye view.
         folder: folder of the files, in the layout of `amvnet predict --scores`.
-        key: name of the array in an `.npz`; None if there is only one.
         logits: whether the scores are logits, not probabilities.
     """
 
     side: str
     folder: Path
-    key: str | None = None
     logits: bool = False
 
     def find(self, prediction: Path) -> Path:
@@ -111,20 +111,14 @@ class ScoreFolder:
                 return content
 
             with content:
-                return np.asarray(content[self._choose_key(path, content.files)])
-
-    def _choose_key(self, path: Path, keys: Sequence[str]) -> str:
-        """Return the name of the array to read, of those in an `.npz`."""
-        if self.key is None and len(keys) == 1:
-            return keys[0]
-        if self.key is not None and self.key in keys:
-            return self.key
-
-        expected = "one array" if self.key is None else f"the array {self.key}"
-        raise InputError(
-            f"{path}: expected {expected}, found {', '.join(keys) or 'none'}; "
-            f"choose one with --key-{self.side}"
-        )
+                names = content.files
+                name = names[0] if len(names) == 1 else NETWORKS[self.side]
+                if name not in names:
+                    raise InputError(
+                        f"{path}: expected one array, or {name} among several, found "
+                        f"{', '.join(names) or 'none'}; save the scores of one model"
+                    )
+                return np.asarray(content[name])
 
 
 @dataclass(frozen=True)
@@ -135,9 +129,7 @@ class ScorePair:
     b: ScoreFolder
 
     @classmethod
-    def of(
-        cls, a: Path, b: Path, key_a: str | None, key_b: str | None, logits: Which | None
-    ) -> ScorePair:
+    def of(cls, a: Path, b: Path, logits: Which | None = None) -> ScorePair:
         """Return the pair for the options of the command line.
 
         Raises:
@@ -150,8 +142,8 @@ class ScorePair:
                 )
 
         return cls(
-            ScoreFolder("a", a, key_a, logits in ("a", "both")),
-            ScoreFolder("b", b, key_b, logits in ("b", "both")),
+            ScoreFolder("a", a, logits in ("a", "both")),
+            ScoreFolder("b", b, logits in ("b", "both")),
         )
 
     def read(self, prediction: Path, scan: Scan, classes: int) -> tuple[np.ndarray, np.ndarray]:
@@ -201,7 +193,7 @@ def check_finite(values: np.ndarray, name: str) -> None:
 
 def _digest(scores: ScoreFolder, records: Sequence[ScanRecord]) -> str:
     """Return a digest of the scores of some scans, by the size and the end of each file."""
-    digest = hashlib.sha256(repr((scores.key, scores.logits)).encode())
+    digest = hashlib.sha256(repr((scores.side, scores.logits)).encode())
 
     for record in records:
         path = scores.find(Path(record.prediction))

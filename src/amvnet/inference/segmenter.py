@@ -16,7 +16,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import array_scan, check_scan, normaliser_for
+from amvnet.inference.reading import array_scan, normaliser_for
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.memory import available_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
@@ -29,7 +29,7 @@ from amvnet.models.precision import InPrecision, check_device, choose_device, ch
 from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import Voting
-from amvnet.scan import Scan
+from amvnet.scan import Scan, check_scan
 from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
 from amvnet.threads import survive_forks
 from amvnet.weights.file import Weights, load
@@ -164,7 +164,11 @@ class Segmenter:
         Raises:
             InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
-        checked = [check_scan(points, self.intensity) for points in scans]
+        checked = []
+        for points in scans:
+            if isinstance(points, np.ndarray):
+                points = array_scan(points, trained=self.intensity)
+            checked.append(check_scan(points))
         is_large = sum(map(len, checked)) >= LARGE
         memory = return_freed_memory() if is_large else nullcontext()
         with memory:

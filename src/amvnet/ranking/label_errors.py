@@ -18,13 +18,12 @@ from amvnet.data.datasets.open import check_classes
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
-from amvnet.inference.reading import check_scan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
-from amvnet.scan import Scan
+from amvnet.scan import Scan, check_scan
 
 # Metres: points nearer to the sensor than this belong to its vehicle and are never doubted.
 NEAR = 1.5

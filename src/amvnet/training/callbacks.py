@@ -176,25 +176,6 @@ class SeedBatches(Callback):
         torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
 
-class Trial(Callback):
-    """Ends a training after two steps.
-
-    Attributes:
-        ends: when each step ended, in seconds.
-    """
-
-    def __init__(self) -> None:
-        self.ends: list[float] = []
-
-    def on_train_batch_end(
-        self, trainer: L.Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        # A step may take several batches, whose gradients are accumulated.
-        if trainer.global_step > len(self.ends):
-            self.ends.append(time.perf_counter())
-        trainer.should_stop = len(self.ends) == 2
-
-
 class EpochLines(Callback):
     """Prints one line per epoch; used if there is no terminal for a progress bar."""
 

@@ -16,7 +16,7 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
-from amvnet.training.callbacks import KeepWeights, Trial
+from amvnet.training.callbacks import KeepWeights
 from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
@@ -165,13 +165,12 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
     return Scored(voxel_logits, voxel_labels, scan, scans)
 
 
-def train_network(plan: Plan, name: str, weights: Weights, trial: Trial | None = None) -> None:
+def train_network(plan: Plan, name: str, weights: Weights) -> None:
     """Train a network in the stage rv or bev, and write its weights after each epoch.
 
-    A trial ends the training after two steps instead.
-
     Raises:
-        InputError: if the weights do not fit the recipe, or a scan is broken.
+        InputError: if the weights do not fit the recipe, a scan is broken, or a GPU's memory does
+            not suffice.
     """
     config = getattr(plan.recipe.training, name)
     # Before the scans are read for the class weights.
@@ -185,7 +184,13 @@ def train_network(plan: Plan, name: str, weights: Weights, trial: Trial | None =
     intensity = _intensity(plan, weights)
     loaders = make_loaders(plan, config, intensity)
     stage = make_stage(plan, name, model, class_weights_of(plan) if config.class_weights else None)
-    fit(stage, plan, loaders, trial or KeepWeights(plan, name, weights, intensity))
+    try:
+        fit(stage, plan, loaders, KeepWeights(plan, name, weights, intensity))
+    except torch.OutOfMemoryError:
+        raise InputError(
+            f"{name}: expected steps that fit into the GPU's memory, found {config.batch} scans in "
+            f"{config.accumulate} parts; set --training.{name}.accumulate to more"
+        ) from None
 
 
 def make_stage(

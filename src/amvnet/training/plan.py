@@ -9,7 +9,7 @@ from pathlib import Path
 
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.datasets.joined import Part, split_share
+from amvnet.data.datasets.joined import Part
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, taxonomy_from_yaml
@@ -159,34 +159,15 @@ def open_parts(
 ) -> tuple[Dataset, list[Part]]:
     """Open the datasets of a training.
 
-    Args:
-        specs: each DATA, or, after the first, DATA@SHARE. The datasets that name no share have that
-            of the recipe, `training.others`; if it is 0, all of their scans are taken.
-
     Returns:
-        The first dataset, and those to mix in with their training scans.
-
-    Raises:
-        InputError: if a dataset cannot be opened, or the first has a share.
+        The first dataset, and those to mix in with their training scans. These share
+        `training.others` of each epoch equally; if it is 0, all of their scans are taken.
     """
-    opened = []
-    for spec in specs:
-        data, share = split_share(spec)
-        opened.append((open_for_training(data, taxonomy, recipe, out, init), share))
-    (first, first_share), *rest = opened
-    if first_share is not None:
-        raise InputError(
-            f"{specs[0]}: expected the first --data without a share, found {first_share:g}; "
-            "give the others shares"
-        )
-
-    without_share = sum(share is None for _, share in rest)
-    others = recipe.training.others
+    first, *others = [open_for_training(spec, taxonomy, recipe, out, init) for spec in specs]
+    share = recipe.training.others / len(others) if others else 0.0
     parts = []
-    for dataset, share in rest:
-        if share is None and others > 0:
-            share = others / without_share
-        parts.append(Part(dataset, training_records(dataset), share))
+    for dataset in others:
+        parts.append(Part(dataset, training_records(dataset), share or None))
     return first, parts
 
 

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
-from datetime import timedelta
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Literal
 
 import lightning as L
-import torch
 
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
-from amvnet.memory import peak_memory
-from amvnet.progress import counted, say_nothing
-from amvnet.training.callbacks import Trial
 from amvnet.training.head import train_head
 from amvnet.training.networks import train_network
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import (
+    DONE,
     PART_OF,
-    StageFolder,
     check_begun,
+    is_finished,
     stage_settings,
+    with_trained,
     write_record,
 )
 from amvnet.weights.file import Weights, save
@@ -67,9 +62,8 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
     Raises:
         InputError: if the weights to begin with do not fit the recipe, or a scan is broken.
     """
-    folder = StageFolder(plan, name)
-    if folder.done_path.is_file() and plan.resume:
-        return folder.finished(weights)
+    if plan.resume and is_finished(plan, name):
+        return with_trained(plan, name, weights)
 
     # The recipe decides the sizes of the part, whatever the weights have.
     L.seed_everything(plan.recipe.training.seed, verbose=False)
@@ -81,58 +75,10 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
 
     # The first process has written the weights; the others read them too.
     plan.processes.wait()
-    trained = folder.trained(weights)
+    trained = with_trained(plan, name, weights)
     if plan.processes.first:
-        folder.done_path.write_text("")
+        (plan.out / name / DONE).write_text("")
     return trained
-
-
-def try_out(plan: Plan, stage: StageName | Literal["all"], init: Weights | None = None) -> None:
-    """Take two steps of each network, and say what they and the training cost; leave no files.
-
-    Raises:
-        InputError: if the stage is the head, or a GPU's memory does not suffice.
-    """
-    if stage == "head":
-        raise InputError("expected --stage rv, bev or all for a dry run, found head; give one")
-
-    names = plan.recipe.stages if stage == "all" else (stage,)
-    weights = _first_weights(plan, init, names)
-    for name in names:
-        if name != "head":
-            plan.say(_try_out(plan, name, weights.resized(PART_OF[name], plan.recipe.model)))
-
-
-def _try_out(plan: Plan, name: str, weights: Weights) -> str:
-    """Take two steps of a network; return a line on them and the whole training."""
-    config = getattr(plan.recipe.training, name)
-    train = plan.scans.train
-    # Whole steps, even if there are fewer scans.
-    records = [train[index % len(train)] for index in range(2 * config.batch)]
-    scans = dataclasses.replace(plan.scans, train=records, val=())
-
-    trial = Trial()
-    with TemporaryDirectory() as folder:
-        short = dataclasses.replace(
-            plan, scans=scans, out=Path(folder), resume=False, say=say_nothing, bars=False
-        )
-        try:
-            train_network(short, name, weights, trial)
-        except torch.OutOfMemoryError:
-            raise InputError(
-                f"{name}: expected steps that fit into the GPU's memory, found {config.batch} "
-                f"scans in {config.accumulate} parts; set --training.{name}.accumulate to more"
-            ) from None
-
-    # The first step also sets things up, and is not timed.
-    seconds = (trial.ends[1] - trial.ends[0]) / config.batch
-    whole = timedelta(seconds=round(config.epochs * len(train) * seconds))
-    epochs = f"{counted(config.epochs, 'epoch')} of {counted(len(train), 'scan')}"
-    memory = torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0
-    return (
-        f"{name}: {seconds:.3g} s a scan in steps of {config.batch} scans, peak memory so far "
-        f"{(memory or peak_memory()) / 2**30:.1f} GiB; {epochs}: {whole} without validation"
-    )
 
 
 def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> Weights:
@@ -163,7 +109,8 @@ def _with_finished(plan: Plan, weights: Weights) -> Weights:
     Another process may have finished some of them while this one trained.
     """
     for name in _stages_of_folder(plan):
-        weights = StageFolder(plan, name).finished(weights)
+        if is_finished(plan, name):
+            weights = with_trained(plan, name, weights)
     return weights
 
 

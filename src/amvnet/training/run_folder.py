@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import platform
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,43 +23,21 @@ from amvnet.weights.file import SIZES, Weights, load
 # The stages in order, and the part of the weights that each trains.
 PART_OF = {"rv": "range_net", "bev": "polar_net", "head": "point_head"}
 LAST = "last.ckpt"  # in a stage's folder: what --resume continues from
+DONE = "done"  # in a stage's folder: an empty file once the stage is finished
 SETTINGS = "stage.yaml"  # in a stage's folder: the settings that it was begun with
 MOST_CHANGES = 6  # settings that a message names
 PACKAGES = ("amvnet", "torch", "lightning", "numpy")
 
 
-@dataclass(frozen=True)
-class StageFolder:
-    """The folder of a stage, which says how far the stage is."""
+def is_finished(plan: Plan, name: str) -> bool:
+    """Return whether a stage is finished in the folder of the run."""
+    return (plan.out / name / DONE).is_file()
 
-    plan: Plan
-    name: str
 
-    @property
-    def path(self) -> Path:
-        return self.plan.out / self.name
-
-    @property
-    def weights_path(self) -> Path:
-        """The weights file of the stage that is used in the end: the best or the last."""
-        return self.path / f"{self.plan.recipe.training.keep}.safetensors"
-
-    @property
-    def done_path(self) -> Path:
-        """The file whose existence marks the stage as finished."""
-        return self.path / "done"
-
-    @property
-    def is_finished(self) -> bool:
-        return self.weights_path.is_file() and self.done_path.is_file()
-
-    def finished(self, weights: Weights) -> Weights:
-        """Return weights with the part that this stage has trained, if it is finished."""
-        return self.trained(weights) if self.is_finished else weights
-
-    def trained(self, weights: Weights) -> Weights:
-        """Return weights with the part that this stage has trained."""
-        return weights.replace_part(PART_OF[self.name], load(self.weights_path))
+def with_trained(plan: Plan, name: str, weights: Weights) -> Weights:
+    """Return weights with the part that a stage has trained: the best or the last, as planned."""
+    path = plan.out / name / f"{plan.recipe.training.keep}.safetensors"
+    return weights.replace_part(PART_OF[name], load(path))
 
 
 def write_record(plan: Plan, stage: str, init: Weights | None) -> None:

@@ -32,7 +32,7 @@ from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.memory import keep_freed_memory
 from amvnet.models.sync_batch_norm import synchronise_batch_norms
 from amvnet.models.views.points import PointBatch
-from amvnet.training.callbacks import AverageWeights, EpochLines, SeedBatches
+from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
 from amvnet.training.loaders import count_classes
 from amvnet.training.losses import class_weights
 from amvnet.training.plan import Plan
@@ -177,12 +177,12 @@ def class_weights_of(plan: Plan) -> np.ndarray:
     return class_weights(count_classes(scans.dataset, scans.train, path, plan.processes, plan.say))
 
 
-def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: Callback) -> None:
+def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: KeepWeights) -> None:
     """Train a stage in its folder of the run.
 
     Args:
         keep_weights: writes weights at the end of each epoch, before the checkpoint, which
-            therefore never claims more than has been written; or ends a trial.
+            therefore never claims more than has been written.
 
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
@@ -241,7 +241,9 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: Callback) -> N
         raise InputError(line.removeprefix(f"{InputError.__module__}.InputError: ")) from None
 
 
-def _callbacks(stage: Stage, plan: Plan, keep_weights: Callback, has_bar: bool) -> list[Callback]:
+def _callbacks(
+    stage: Stage, plan: Plan, keep_weights: KeepWeights, has_bar: bool
+) -> list[Callback]:
     """Return the callbacks of a stage, those that write before the checkpoint."""
     folder = plan.out / stage.name
     callbacks: list[Callback] = [

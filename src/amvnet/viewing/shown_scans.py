@@ -14,13 +14,13 @@ from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, LoadedScan
-from amvnet.inference.reading import check_scan
 from amvnet.inference.scan_stream import stream_scans
 from amvnet.inference.segmentation import Origin, Segmentation, expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import cosine_similarity
 from amvnet.models.methods import geometric_mean
 from amvnet.progress import Progress, no_progress
+from amvnet.scan import check_scan
 
 # Colours for a dark background, RGB in 0..255. The official colour of points without a class is
 # black, which would hide them.

@@ -15,7 +15,6 @@ def simulate(
     sequences: int = 1,
     scans: int = 10,
     seed: int = 0,
-    first_sequence: int = 0,
     processes: int | None = None,
 ) -> None:
     """Write labelled scans of simulated streets; scans of an earlier call stay.
@@ -26,7 +25,6 @@ def simulate(
         sequences: number of sequences; each is another street.
         scans: number of scans in each sequence.
         seed: of all randomness; the same seed gives the same bytes.
-        first_sequence: number of the first sequence.
         processes: sequences that are simulated at the same time; default: one per processor.
     """
     from amvnet.data.datasets.simulated import simulate as simulate_streets
@@ -40,7 +38,6 @@ def simulate(
             sequences=sequences,
             scans=scans,
             seed=seed,
-            first_sequence=first_sequence,
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=step,
         )

@@ -20,7 +20,6 @@ def train(
     train_sequences: str | None = None,
     val_sequences: str | None = None,
     with_val: bool = False,
-    dry_run: bool = False,
     taxonomy: Path | None = None,
 ) -> None:
     """Train the two networks and the point head.
@@ -31,8 +30,8 @@ def train(
             a YAML file that describes scans and classes of your own (docs/own_data.md);
             simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
             the training, with their cache in the folder. If given several times, the first is split
-            and validated, and the training scans of the others are mixed in; DATA@0.5 makes half of
-            each epoch.
+            and validated, and the training scans of the others are mixed in: all of them, or as
+            many as --training.others says.
         out: folder of the run.
         models: with --stage head, two models to train a head for.
         stage: which part to train; `all` trains one after the other.
@@ -45,7 +44,6 @@ def train(
         val_sequences: sequences or scenes, separated by commas, to validate on; default: the
             official split.
         with_val: train on these too, as for a benchmark's server; then nothing is validated.
-        dry_run: only take two steps of each network, and say what the training costs.
         taxonomy: a semantic-kitti.yaml with other classes.
     """
     from amvnet.data.datasets.joined import join
@@ -53,7 +51,6 @@ def train(
     from amvnet.distributed import device_of
     from amvnet.training.plan import Plan, open_parts, sized_by_init, without_mean
     from amvnet.training.run import train as train_stages
-    from amvnet.training.run import try_out
     from amvnet.weights.file import load
 
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
@@ -77,7 +74,4 @@ def train(
         processes=processes,
         scores=models.parse(),
     )
-    if dry_run:
-        try_out(plan, stage, weights)
-        return
     say(f"weights in {train_stages(plan, stage, weights)}")

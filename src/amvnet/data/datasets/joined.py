@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 
@@ -173,24 +172,3 @@ def _places(first: int, parts: Sequence[Part]) -> list[int]:
         count = len(part.records) if part.share is None else round(part.share * epoch)
         places.append(max(count, 1))
     return places
-
-
-def split_share(spec: str) -> tuple[str, float | None]:
-    """Split DATA@0.5 into the dataset and its share of an epoch; None if it has none.
-
-    Raises:
-        InputError: if the share is not between 0 and 1.
-    """
-    data, at, text = spec.rpartition("@")
-    if not at or Path(spec).exists():
-        return spec, None
-    try:
-        share = float(text)
-    except ValueError:
-        return spec, None  # such as PATH@v1.0-mini
-
-    if not 0 < share < 1:
-        raise InputError(
-            f"{spec}: expected a share of an epoch above 0 and below 1, found {text}; correct it"
-        )
-    return data, share
