@@ -170,9 +170,8 @@ def plan(names: int) -> None:
     from amvnet.fleet import cluster
     from amvnet.fleet.actors import Labelling
     from amvnet.fleet.cluster import FleetRun
-    from amvnet.fleet.drives import describe_drive
     from amvnet.fleet.manifest import list_blocks
-    from amvnet.fleet.results import Results
+    from amvnet.fleet.results import Results, describe_drive
     from amvnet.fleet.storage import Place
     from amvnet.weights.file import load
 

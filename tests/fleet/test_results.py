@@ -16,9 +16,8 @@ from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.fleet import results as results_module
 from amvnet.fleet.actors import results_schema
-from amvnet.fleet.drives import describe_drive, parse_estimate
 from amvnet.fleet.manifest import list_blocks
-from amvnet.fleet.results import Results
+from amvnet.fleet.results import Results, describe_drive, parse_estimate
 from amvnet.fleet.storage import Place
 from amvnet.sensors.frame import Frame
 from amvnet.sensors.lasers import SensorGeometry

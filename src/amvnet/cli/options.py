@@ -14,8 +14,8 @@ from amvnet.models.methods import METHODS, EngineName, MethodName, Precision
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
-    from amvnet.data.class_maps import ClassMap
     from amvnet.data.datasets.base import Dataset, ScanRecord
+    from amvnet.data.datasets.select import TrainingScans
     from amvnet.distributed import Processes
     from amvnet.inference.listing import ScanOptions
     from amvnet.inference.scores import ScorePair
@@ -58,6 +58,40 @@ class ScanChoice:
 
         layout = parse_layout(self.columns, self.dtype)
         return ScanOptions(parse_names(self.sequences), self.split, self.topic, layout)
+
+
+@dataclass(frozen=True)
+class LabelledChoice:
+    """Which labelled scans of the dataset to use."""
+
+    split: Split | None = None
+    """the official split; default: val, and of rank: all."""
+    sequences: str | None = None
+    """sequences or scenes instead, separated by commas."""
+
+    def records(self, dataset: Dataset, default: Split = "val") -> Sequence[ScanRecord]:
+        """Return the scans; raise InputError if there are none."""
+        from amvnet.data.datasets.base import choose_records
+
+        names = parse_names(self.sequences)
+        return dataset.labelled(choose_records(dataset, names, self.split or default))
+
+
+@dataclass(frozen=True)
+class TrainingChoice:
+    """Which scans to train on and to validate with."""
+
+    train_sequences: str | None = None
+    """sequences or scenes, separated by commas, to train on; default: the official split."""
+    val_sequences: str | None = None
+    """sequences or scenes, separated by commas, to validate with; default: the official split."""
+
+    def scans(self, dataset: Dataset, with_val: bool = False) -> TrainingScans:
+        """Return the scans; `with_val` moves those to validate with to those to train on."""
+        from amvnet.data.datasets.select import split_records
+
+        names = parse_names(self.train_sequences)
+        return split_records(dataset, names, parse_names(self.val_sequences), with_val)
 
 
 @dataclass(frozen=True)
@@ -166,7 +200,7 @@ class ScoresChoice:
         Raises:
             InputError: if a folder is missing.
         """
-        from amvnet.inference.scores import ScorePair
+        from amvnet.inference.scores import ScoreFolder, ScorePair
 
         if self == ScoresChoice():
             return None
@@ -174,7 +208,10 @@ class ScoresChoice:
             raise InputError(
                 "expected --scores-a and --scores-b, found not both; give two models' scores"
             )
-        return ScorePair.of(self.scores_a, self.scores_b, self.logits)
+        return ScorePair(
+            ScoreFolder("a", self.scores_a, self.logits in ("a", "both")),
+            ScoreFolder("b", self.scores_b, self.logits in ("b", "both")),
+        )
 
 
 def join_processes(cuda: bool = False) -> Processes:
@@ -195,17 +232,6 @@ def open_data(data: str, taxonomy: Path | None = None) -> Dataset:
     return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
 
 
-def parse_classes(name: str | None) -> ClassMap | None:
-    """Return the map of classes with a name or of a YAML file; None if the option was left out.
-
-    Raises:
-        InputError: if there is no such map.
-    """
-    from amvnet.data.class_maps import class_map
-
-    return None if name is None else class_map(name)
-
-
 def describe_records(records: Sequence[ScanRecord]) -> str:
     """Return how many scans there are, and of which sequences."""
     if not records:
@@ -216,13 +242,6 @@ def describe_records(records: Sequence[ScanRecord]) -> str:
         text += f" and {len(names) - SHOWN} more"
 
     return f"{counted(len(records), 'scan')} of {text}"
-
-
-def labelled_scans(dataset: Dataset, sequences: str | None, split: Split) -> Sequence[ScanRecord]:
-    """Return the scans with labels of a split, or of sequences that are named instead."""
-    from amvnet.data.datasets.base import choose_records
-
-    return dataset.labelled(choose_records(dataset, parse_names(sequences), split))
 
 
 def parse_names(text: str | None) -> list[str] | None:
@@ -252,7 +271,6 @@ def parse_methods(text: str) -> list[str]:
             raise InputError(
                 f"expected methods of {', '.join(METHODS)}, found {name!r}; use some of them"
             )
-
     return names
 
 

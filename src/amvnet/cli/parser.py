@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import ast
 import dataclasses
 import functools
 import inspect
 import math
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
@@ -160,7 +157,7 @@ def make_parser(verb: str, command: Command) -> Parser:
             group = parser.add_argument_group(first_line(kind))
             kinds = get_type_hints(kind)
             for field in dataclasses.fields(kind):
-                text = " ".join(field_texts(kind)[field.name].split())
+                text = field_texts(kind)[field.name]
                 parser.kinds[flag_of(field.name)] = kinds[field.name]
                 _add_option(group, field.name, kinds[field.name], field.default, text)
         else:
@@ -226,17 +223,8 @@ def first_line(documented: Any) -> str:
     return (documented.__doc__ or "").strip().splitlines()[0].rstrip(".")
 
 
-def field_texts(cls: type) -> dict[str, str]:
-    """Return the line of documentation under each field of a dataclass."""
-    texts: dict[str, str] = {}
-    for field, text in pairwise(_class_bodies(cls.__module__)[cls.__name__]):
-        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-            texts[field.target.id] = text.value.value  # type: ignore[attr-defined,union-attr]
-    return texts
-
-
 @functools.cache
-def _class_bodies(module: str) -> dict[str, list[ast.stmt]]:
-    """Return the statements of each class of a module, by name."""
-    tree = ast.parse(inspect.getsource(sys.modules[module]))
-    return {node.name: node.body for node in tree.body if isinstance(node, ast.ClassDef)}
+def field_texts(cls: type) -> dict[str, str]:
+    """Return the documentation under each field of a dataclass, on one line."""
+    docs = docstring_parser.parse_from_object(cls)
+    return {field.arg_name: " ".join((field.description or "").split()) for field in docs.params}

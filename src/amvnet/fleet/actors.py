@@ -31,8 +31,8 @@ from amvnet.data.labels.writers import check_kind
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.export.engines import use_engine
-from amvnet.fleet.drives import describe_drive, parse_estimate
 from amvnet.fleet.manifest import split_name
+from amvnet.fleet.results import describe_drive, parse_estimate
 from amvnet.fleet.storage import Place
 from amvnet.inference.listing import FileReader, FileScan
 from amvnet.inference.pipeline import ExecutionOptions, Outcome, OutputOptions, Pipeline
@@ -43,7 +43,13 @@ from amvnet.inference.segmentation import Segmentation, uncertain_share
 from amvnet.inference.segmenter import Segmenter
 from amvnet.memory import keep_freed_memory
 from amvnet.models.assertion import Disagreement
-from amvnet.models.methods import METHODS, EngineName, MethodName, Precision, check_method
+from amvnet.models.methods import (
+    EngineName,
+    MethodName,
+    Precision,
+    check_method,
+    check_two_networks,
+)
 from amvnet.progress import Say, say_nothing
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights
@@ -98,22 +104,13 @@ class Labelling:
         check_method(self.method, self.weights.parts)
         if self.tau is not None:
             Disagreement(self.tau)
-        if self.uncertain and not METHODS[self.method].has_two_networks:
-            raise InputError(
-                f"expected a method of two networks for --uncertain, found {self.method}; "
-                "use amvnet"
-            )
+        if self.uncertain:
+            check_two_networks(self.method)
 
     @property
     def taxonomy(self) -> Taxonomy:
         """The classes that are written."""
         return self.weights.taxonomy if self.classes is None else self.classes.target
-
-    @property
-    def usual_uncertain(self) -> float | None:
-        """The share of uncertain points that is usual for the weights; None for another tau."""
-        is_usual = self.tau in (None, self.weights.model.assertion.threshold)
-        return self.weights.usual_uncertain if is_usual else None
 
     @cached_property
     def settings(self) -> dict[str, Any]:

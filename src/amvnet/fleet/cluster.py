@@ -15,9 +15,8 @@ import pyarrow.compute as pc
 from amvnet.data.datasets.open import is_dataset
 from amvnet.errors import InputError
 from amvnet.fleet.actors import Labelling, Row, results_schema
-from amvnet.fleet.drives import describe_drive
 from amvnet.fleet.manifest import NameSet, list_blocks
-from amvnet.fleet.results import DRIVES, Results
+from amvnet.fleet.results import DRIVES, Results, describe_drive
 from amvnet.fleet.storage import Place
 from amvnet.fleet.workers import QUEUED, Workers, check_address, connect
 from amvnet.inference.journal import Entry
@@ -240,6 +239,7 @@ class FleetRun:
         for sensor, points in self._points.items():
             entries.append(Entry("", "", sensor, points, self._uncertain[sensor]))
         if METHODS[self.labelling.method].has_two_networks:
-            report(entries, self.labelling.usual_uncertain, self._say)
+            usual = self.labelling.weights.usual_uncertain_at(self.labelling.tau)
+            report(entries, usual, self._say)
         check_faults(self._faults, len(self._names))
         return len(self._names)

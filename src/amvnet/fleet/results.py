@@ -1,28 +1,43 @@
-"""The table of results of a fleet: Parquet in parts, which are also the journal."""
+"""The tables of a fleet: results in parts, which are also the journal, and what drives are like."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import time
 from collections.abc import Mapping, Sequence
 from io import BytesIO
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet
 from pyarrow.fs import FileType
 
 from amvnet.errors import InputError
-from amvnet.fleet.drives import SCHEMA
 from amvnet.fleet.manifest import NameSet
 from amvnet.fleet.storage import Place, reaching
+from amvnet.sensors.frame import Frame
+from amvnet.sensors.lasers import SensorGeometry
+from amvnet.sensors.measure import Estimate
 
 FOLDER = "results"  # in the output folder
 SETTINGS = "run.json"
 DRIVES = "drives.parquet"
 PART_BYTES = 64 << 20
 PART_SECONDS = 60.0  # between two parts; what a killed driver loses
+
+DRIVES_SCHEMA = pa.schema(
+    {
+        "drive": pa.string(),
+        "assumed": pa.string(),
+        "height": pa.float64(),  # metres over the ground
+        "pitch": pa.float64(),  # degrees that turn the scans level
+        "roll": pa.float64(),
+        "estimates": pa.string(),  # JSON
+    }
+)
 
 
 class Results:
@@ -96,7 +111,8 @@ class Results:
         if not rows:
             return
         self.drives |= {row["drive"]: row for row in rows}
-        _replace(self.folder / DRIVES, pa.Table.from_pylist(list(self.drives.values()), SCHEMA))
+        table = pa.Table.from_pylist(list(self.drives.values()), DRIVES_SCHEMA)
+        _replace(self.folder / DRIVES, table)
 
     def add(self, rows: pa.Table) -> None:
         """Add rows, and write a part if it is time."""
@@ -169,3 +185,35 @@ def _write_settings(place: Place, settings: Mapping[str, Any]) -> None:
             f"{place.url}: expected a place to write to, found {error.strerror}; check the URL "
             "and the credentials"
         ) from None
+
+
+def describe_drive(drive: str, assumed: str, usual: Estimate | None) -> dict[str, Any]:
+    """Return the row of a drive, which is measured once, for all workers and later runs.
+
+    Args:
+        assumed: a line about the first scan.
+        usual: measured of the first scans; None if these could not be read, or are of several
+            sensors.
+    """
+    frame = Frame() if usual is None else usual.frame
+    values = None if usual is None else dataclasses.asdict(usual)
+    return {
+        "drive": drive,
+        "assumed": assumed,
+        "height": frame.height,
+        "pitch": frame.pitch,
+        "roll": frame.roll,
+        "estimates": json.dumps(values, default=np.ndarray.tolist),  # keeps all digits
+    }
+
+
+def parse_estimate(text: str) -> Estimate | None:
+    """Return the estimate in a row of a drive."""
+    values = json.loads(text)
+    if values is None:
+        return None
+    quantiles = values["quantiles"]
+    values["frame"] = Frame(**values["frame"])
+    values["lasers"] = SensorGeometry(**values["lasers"])
+    values["quantiles"] = None if quantiles is None else np.array(quantiles)
+    return Estimate(**values)

@@ -9,7 +9,6 @@ from itertools import groupby
 from typing import Any
 
 from amvnet.data.class_maps import ClassMap
-from amvnet.errors import InputError
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import (
@@ -22,7 +21,7 @@ from amvnet.inference.pipeline import (
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.methods import METHODS
+from amvnet.models.methods import METHODS, check_two_networks
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
@@ -64,12 +63,8 @@ def predict(
             write; at the end, if every scan is broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
-    method = METHODS[segmenter.method]
-    if output.uncertain and not method.has_two_networks:
-        raise InputError(
-            f"expected a method of two networks for --uncertain, found {segmenter.method}; "
-            "use amvnet"
-        )
+    if output.uncertain:
+        check_two_networks(segmenter.method)
 
     normaliser = normaliser_for(segmenter.weights, sensor, say)
     scans, taxonomy = list_inputs(inputs, options, segmenter.taxonomy, normaliser)
@@ -84,7 +79,7 @@ def predict(
     segment = segment_by(segmenter, classes)
     entries, faults = Pipeline(scans, segment, output, taxonomy, execution).run(settings, progress)
 
-    if method.has_two_networks:
+    if METHODS[segmenter.method].has_two_networks:
         report(entries, segmenter.usual_uncertain, say)
     check_faults(faults, len(scans))
     return len(scans)
@@ -123,10 +118,15 @@ def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
     if not points.total():
         return
 
-    verdicts = {sensor: Verdict(uncertain[sensor] / points[sensor], usual) for sensor in +points}
-    doubtful = {sensor: verdict for sensor, verdict in verdicts.items() if verdict.is_doubtful}
+    sensors = +points  # those with points
+    doubtful = {}
+    for sensor in sensors:
+        verdict = Verdict(uncertain[sensor] / points[sensor], usual)
+        if verdict.is_doubtful:
+            doubtful[sensor] = verdict
+
     verdict = Verdict(uncertain.total() / points.total(), usual)
-    if len(verdicts) == 1 or not doubtful:
+    if len(sensors) == 1 or not doubtful:
         say(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else verdict.shares)
         return
 

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -30,8 +30,6 @@ TAIL = 4096  # bytes at the end of a file: the checksums of an .npz, the last po
 # What NumPy raises for files that are not its own, truncated or corrupt.
 READ_ERRORS = (ValueError, EOFError, OSError, BadZipFile, zlib.error)
 
-Which = Literal["a", "b", "both"]
-
 
 @dataclass(frozen=True)
 class ScoreFolder:
@@ -42,11 +40,20 @@ class ScoreFolder:
             view and b the bird's-eye view.
         folder: folder of the files, in the layout of `amvnet predict --scores`.
         logits: whether the scores are logits, not probabilities.
+
+    Raises:
+        InputError: if there is no such folder.
     """
 
     side: str
     folder: Path
     logits: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.folder.is_dir():
+            raise InputError(
+                f"{self.folder}: expected a folder of scores, found none; check the path"
+            )
 
     def find(self, prediction: Path) -> Path:
         """Return the file of a scan's scores, which is named as its predicted labels are.
@@ -127,24 +134,6 @@ class ScorePair:
 
     a: ScoreFolder
     b: ScoreFolder
-
-    @classmethod
-    def of(cls, a: Path, b: Path, logits: Which | None = None) -> ScorePair:
-        """Return the pair for the options of the command line.
-
-        Raises:
-            InputError: if a folder is missing.
-        """
-        for folder in (a, b):
-            if not folder.is_dir():
-                raise InputError(
-                    f"{folder}: expected a folder of scores, found none; check the path"
-                )
-
-        return cls(
-            ScoreFolder("a", a, logits in ("a", "both")),
-            ScoreFolder("b", b, logits in ("b", "both")),
-        )
 
     def read(self, prediction: Path, scan: Scan, classes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the probabilities f and g of a scan, each as `ScoreFolder.read`."""

@@ -122,9 +122,7 @@ class Segmenter:
     @property
     def usual_uncertain(self) -> float | None:
         """The share of uncertain points in the scans of the validation; None for another tau."""
-        if self.tau not in (None, self.weights.model.assertion.threshold):
-            return None
-        return self.weights.usual_uncertain
+        return self.weights.usual_uncertain_at(self.tau)
 
     def __repr__(self) -> str:
         return f"<Segmenter {self.method} on {self.device}, {self.precision}: {self.weights!r}>"
@@ -165,10 +163,10 @@ class Segmenter:
             InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
         checked = []
-        for points in scans:
-            if isinstance(points, np.ndarray):
-                points = array_scan(points, trained=self.intensity)
-            checked.append(check_scan(points))
+        for values in scans:
+            if isinstance(values, np.ndarray):
+                values = array_scan(values, trained=self.intensity)
+            checked.append(check_scan(values))
         is_large = sum(map(len, checked)) >= LARGE
         memory = return_freed_memory() if is_large else nullcontext()
         with memory:

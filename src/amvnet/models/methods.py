@@ -95,6 +95,14 @@ def widest_method(parts: Collection[str]) -> MethodName:
     return names[-1] if names else "amvnet"
 
 
+def check_two_networks(method: MethodName) -> None:
+    """Check that a method knows uncertain points; raise InputError if it has one network."""
+    if not METHODS[method].has_two_networks:
+        raise InputError(
+            f"expected a method of two networks for --uncertain, found {method}; use amvnet"
+        )
+
+
 def check_method(method: MethodName, parts: Collection[str]) -> MethodName:
     """Return the method.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -210,8 +211,8 @@ class PointGatherer:
         augment = training.augment if views > 0 else None
         dataset = self.plan.scans.dataset
         scans = ScanSet(dataset, records, augment, training.seed, self.intensity)
-        keys = [(view, index) for view in range(max(views, 1)) for index in range(len(scans))]
-        least = max(2, self._processes.size)  # batch norm needs two, and each process one
+        keys = list(product(range(max(views, 1)), range(len(scans))))
+        least = max(2, self.plan.processes.size)  # batch norm needs two, and each process one
 
         assertion = Disagreement(self.weights.model.assertion.threshold)
         points = self._gather(scans, keys, folder, assertion, say)
@@ -254,7 +255,7 @@ class PointGatherer:
         self, scans: ScanSet, keys: Sequence[Key], folder: Path, assertion: Assertion, say: Say
     ) -> HeadPoints:
         """Gather the points that an assertion finds uncertain, of some views of scans."""
-        processes = self._processes
+        processes = self.plan.processes
         if processes.first:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir(parents=True)
@@ -283,16 +284,19 @@ class PointGatherer:
 
         # The points of all scans, in their order; the processes take the scans in turns.
         labels_by_rank = processes.gather(labels_of_scans)
-        turns = [divmod(index, processes.size) for index in range(len(keys))]
-        ordered = [labels_by_rank[rank][turn] for turn, rank in turns]
-        files = np.repeat([rank for _, rank in turns], [len(labels) for labels in ordered])
+        ordered = []
+        files = []
+        for index in range(len(keys)):
+            turn, rank = divmod(index, processes.size)
+            ordered.append(labels_by_rank[rank][turn])
+            files.append(np.full(len(ordered[-1]), rank))
 
         certain, uncertain = np.sum(processes.gather(matrices), axis=0)
         labelled = certain[1:].sum() + uncertain.sum()
         return HeadPoints(
             [folder / str(rank) for rank in range(processes.size)],
             self._dtype,
-            files,
+            np.concatenate(files),
             np.concatenate(ordered),
             certain=certain,
             uncertain_share=float(uncertain.sum() / max(labelled, 1)),
@@ -345,10 +349,6 @@ class PointGatherer:
         disturbed_f = disturb(f, points, rng) if rng.random() < chance else f
         disturbed_g = disturb(g, points, rng) if rng.random() < chance else g
         return disturbed_f, disturbed_g
-
-    @property
-    def _processes(self) -> Processes:
-        return self.plan.processes
 
     @property
     def _device(self) -> str:

@@ -106,7 +106,8 @@ def network_loss(
         The loss, (), float32, or float64 if the logits are. A scan without labels counts as 0.
     """
     labelled = (scored.labels > 0).nonzero()[:, 0]
-    logits = at_least_float32(scored.logits.index_select(0, labelled))
+    logits = scored.logits.index_select(0, labelled)
+    logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
     classes = scored.labels.index_select(0, labelled).long() - 1
     scan = scored.scan.index_select(0, labelled)
     targets = Targets.of(classes, scan, (scored.scans, logits.shape[1]))
@@ -232,8 +233,3 @@ def _jaccard_increases(is_true: Tensor, group: Tensor, counts: Tensor) -> Tensor
     total = counts[group]
     loss = 1 - (total - found).float() / (total + place - found)
     return loss - F.pad(loss, (1, 0))[:-1].where(place > 1, 0)
-
-
-def at_least_float32(x: Tensor) -> Tensor:
-    """Return half precision as float32, and float64 as it is."""
-    return x.to(torch.promote_types(x.dtype, torch.float32))

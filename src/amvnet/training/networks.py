@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from amvnet.config.schema import NetworkTraining
 from amvnet.data.datasets.simulated import SimulatedStreets
 from amvnet.errors import InputError
+from amvnet.evaluation.metrics import confusion
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
@@ -76,7 +77,8 @@ class NetworkStage(Stage):
     def validation_step(self, batch: Batch, index: int) -> None:
         points, labels = batch
         _, logits = self.logits(points, labels)
-        self.count(labels, logits.argmax(dim=1) + 1)
+        prediction = (logits.argmax(dim=1) + 1).cpu().numpy()
+        self.matrix += confusion(labels.cpu().numpy(), prediction, self.taxonomy.size)
 
     def share_of_step(self, count: int, index: int) -> float:
         """Return the factor that makes the gradient of a step the mean over its scans.

@@ -28,7 +28,7 @@ from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes, device_of, environment
 from amvnet.errors import InputError
-from amvnet.evaluation.metrics import confusion, metrics
+from amvnet.evaluation.metrics import metrics
 from amvnet.memory import keep_freed_memory
 from amvnet.models.sync_batch_norm import synchronise_batch_norms
 from amvnet.models.views.points import PointBatch
@@ -90,16 +90,6 @@ class Stage(L.LightningModule):
             raise InputError(
                 f"expected a finite loss, found {loss:g} {where}; lower {option}, or leave them out"
             )
-
-    def count(self, labels: Tensor, prediction: Tensor) -> None:
-        """Add points to the confusion matrix of the validation.
-
-        Args:
-            labels: (P,) train ids.
-            prediction: (P,) predicted train ids.
-        """
-        size = self.taxonomy.size
-        self.matrix += confusion(labels.cpu().numpy(), prediction.cpu().numpy(), size)
 
     def whole_matrix(self) -> np.ndarray:
         """Return the (K + 1, K + 1) confusion matrix of the validation, summed over processes."""

@@ -95,6 +95,10 @@ class Weights:
             return float(share)
         return USUAL_UNCERTAIN
 
+    def usual_uncertain_at(self, tau: float | None) -> float | None:
+        """Return `usual_uncertain` for the weights' own tau, or None for another one."""
+        return self.usual_uncertain if tau in (None, self.model.assertion.threshold) else None
+
     def part(self, name: str) -> dict[str, Tensor]:
         """Return the parameters of one part, named as in the part's own module."""
         prefix = f"{name}."

@@ -26,26 +26,11 @@ def fetch(name: str) -> Path:
             installed.
     """
     repository, _, revision = name.removeprefix(PREFIX).partition("@")
-    check_name(repository, name)
     hub = client()
 
-    with hub_errors(name, f"check the name and the network, and that {FILE} is there"):
+    with hub_errors(name, f"check OWNER/NAME and the network, and that {FILE} is there"):
         path = hub.hf_hub_download(repo_id=repository, filename=FILE, revision=revision or None)
         return Path(path)
-
-
-def check_name(repository: str, name: str) -> None:
-    """Check that a repository of the hub has the form OWNER/NAME.
-
-    Args:
-        repository: what must be OWNER/NAME.
-        name: what the user wrote, for the message.
-
-    Raises:
-        InputError: if it has another form.
-    """
-    if repository.count("/") != 1 or not all(repository.split("/")):
-        raise InputError(f"expected {PREFIX}OWNER/NAME, found {name!r}; name both")
 
 
 def client() -> Any:

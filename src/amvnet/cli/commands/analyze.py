@@ -7,8 +7,7 @@ from pathlib import Path
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
     ComputeChoice,
-    Split,
-    labelled_scans,
+    LabelledChoice,
     parse_counts,
     parse_names,
 )
@@ -20,9 +19,8 @@ def analyze(
     data: str,
     weights: str,
     out: Path,
+    choice: LabelledChoice,
     compute: ComputeChoice,
-    split: Split = "val",
-    sequences: str | None = None,
     neighbours: str | None = None,
     recipe: str | None = None,
     train_sequences: str | None = None,
@@ -33,9 +31,8 @@ def analyze(
         data: the dataset, with labels.
         weights: a weights file, or the name of a built-in one.
         out: folder for the figures (PNG), and the same figures as CSV.
+        choice: which scans to score.
         compute: where and how the networks are computed.
-        split: the official split to score.
-        sequences: sequences or scenes, separated by commas, to score instead.
         neighbours: also train a head for each of these numbers of neighbours, separated by commas
             (Fig. 8b); needs a recipe.
         recipe: how these heads are trained: a built-in recipe's name or a YAML file.
@@ -60,7 +57,7 @@ def analyze(
     loaded = load(weights)
     dataset = open_for_weights(data, loaded)
     segmenter = compute.segmenter(loaded, "amvnet")
-    records = labelled_scans(dataset, sequences, split)
+    records = choice.records(dataset)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
     counts: list[int] = []

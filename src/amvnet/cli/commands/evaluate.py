@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING
 from amvnet.cli.console import progress, show
 from amvnet.cli.options import (
     ComputeChoice,
-    Split,
+    LabelledChoice,
     join_processes,
-    labelled_scans,
     open_data,
-    parse_classes,
     parse_methods,
 )
 from amvnet.errors import InputError
@@ -25,11 +23,10 @@ if TYPE_CHECKING:
 
 def evaluate(
     data: str,
+    choice: LabelledChoice,
     compute: ComputeChoice,
     weights: str | None = None,
     predictions: Path | None = None,
-    split: Split = "val",
-    sequences: str | None = None,
     methods: str = "rv,bev,ensemble,amvnet",
     tau: float | None = None,
     json: Path | None = None,
@@ -41,11 +38,10 @@ def evaluate(
 
     Args:
         data: the dataset.
+        choice: which scans to score.
         compute: where and how the networks are computed.
         weights: a weights file, or the name of a built-in one: all methods are scored.
         predictions: a folder of predictions in the benchmark's layout, instead of weights.
-        split: the official split to score.
-        sequences: sequences or scenes, separated by commas, to score instead.
         methods: what to score of weights, separated by commas; rv-knn is rv with a vote of
             neighbours in the range image, arithmetic and maximum are the other ensembles.
         tau: points whose probabilities by the two networks have a cosine similarity of at most this
@@ -56,6 +52,7 @@ def evaluate(
         classes: score these classes instead, to which those of the data and of the weights are
             mapped: coarse, or a YAML file.
     """
+    from amvnet.data.class_maps import class_map
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.files import make_folder
@@ -63,24 +60,24 @@ def evaluate(
     from amvnet.weights.file import load
 
     processes = join_processes()
-    class_map = parse_classes(classes)
+    mapping = None if classes is None else class_map(classes)
     if weights is not None and predictions is None:
         loaded = load(weights)
-        has_own = taxonomy is not None or class_map is not None
+        has_own = taxonomy is not None or mapping is not None
         opened = open_data(data, taxonomy) if has_own else None
         dataset = open_for_weights(data, loaded, opened)
-        records = labelled_scans(dataset, sequences, split)
+        records = choice.records(dataset)
         method_names = parse_methods(methods)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in method_names]
         segmenter = compute.segmenter(loaded, widest_method(parts), tau, processes)
-        labeller = label_by_weights(dataset, segmenter, method_names, class_map)
+        labeller = label_by_weights(dataset, segmenter, method_names, mapping)
     elif predictions is not None and weights is None:
         if tau is not None:
             raise InputError("--tau: expected --weights, found --predictions; leave --tau out")
         dataset = open_data(data, taxonomy)
-        records = labelled_scans(dataset, sequences, split)
-        labeller = label_from_files(dataset, predictions, class_map)
+        records = choice.records(dataset)
+        labeller = label_from_files(dataset, predictions, mapping)
     else:
         raise InputError(
             "expected either --weights or --predictions, found both or neither; give one of them"

@@ -12,7 +12,6 @@ from amvnet.cli.options import (
     ComputeChoice,
     ScanChoice,
     SensorChoice,
-    parse_classes,
 )
 from amvnet.errors import InputError
 from amvnet.models.methods import MethodName
@@ -69,9 +68,10 @@ def predict(
             without an address, Ray starts on this machine.
         workers: of --ray, their number; default: one for each GPU, or for each 4 cores.
     """
+    from amvnet.data.class_maps import class_map
     from amvnet.weights.file import load
 
-    class_map = parse_classes(classes)
+    mapping = None if classes is None else class_map(classes)
     if ray:
         if workers is not None and workers < 1:
             raise InputError(f"--workers: expected a number from 1, found {workers}; give another")
@@ -87,7 +87,7 @@ def predict(
             batch=batch,
             sensor=known.parse(),
             layout=_layout(choice),
-            classes=class_map,
+            classes=mapping,
             **asdict(compute),
         )
         with progress("segmenting") as step:
@@ -119,7 +119,7 @@ def predict(
             options=choice.parse(),
             execution=ExecutionOptions(batch, resume=resume),
             sensor=sensor,
-            classes=class_map,
+            classes=mapping,
             progress=step,
             say=say,
         )

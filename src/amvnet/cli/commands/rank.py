@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import ComputeChoice, Split, labelled_scans
+from amvnet.cli.options import ComputeChoice, LabelledChoice
 from amvnet.progress import counted
 
 
@@ -13,9 +13,8 @@ def rank(
     data: str,
     weights: str,
     out: Path,
+    choice: LabelledChoice,
     compute: ComputeChoice,
-    split: Split = "all",
-    sequences: str | None = None,
     overwrite: bool = False,
 ) -> None:
     """Rank clusters of points whose labels both views contradict, to check them.
@@ -24,9 +23,8 @@ def rank(
         data: the dataset, with labels.
         weights: a weights file with both networks, or the name of a built-in one.
         out: the table of the clusters, FILE.csv.
+        choice: which scans to rank.
         compute: where and how the networks are computed.
-        split: the official split.
-        sequences: sequences or scenes instead, separated by commas.
         overwrite: replace files that amvnet did not write, too.
     """
     from amvnet.files import make_folder
@@ -41,7 +39,7 @@ def rank(
     with protecting([out], overwrite):
         loaded = load(weights)
         dataset = open_for_weights(data, loaded)
-        records = labelled_scans(dataset, sequences, split)
+        records = choice.records(dataset, "all")
         segmenter = compute.segmenter(loaded, "ensemble")
 
         with progress("scoring") as step:

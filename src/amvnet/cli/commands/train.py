@@ -6,19 +6,18 @@ from pathlib import Path
 from typing import Any, Literal
 
 from amvnet.cli.console import on_terminal, say
-from amvnet.cli.options import ScoresChoice, describe_records, join_processes, parse_names
+from amvnet.cli.options import ScoresChoice, TrainingChoice, describe_records, join_processes
 
 
 def train(
     recipe: Any,
     data: list[str],
     out: Path,
+    choice: TrainingChoice,
     models: ScoresChoice,
     stage: Literal["rv", "bev", "head", "all"] = "all",
     init: str | None = None,
     resume: bool = False,
-    train_sequences: str | None = None,
-    val_sequences: str | None = None,
     with_val: bool = False,
     taxonomy: Path | None = None,
 ) -> None:
@@ -33,21 +32,18 @@ def train(
             and validated, and the training scans of the others are mixed in: all of them, or as
             many as --training.others says.
         out: folder of the run.
+        choice: which scans to train on and to validate with.
         models: with --stage head, two models to train a head for.
         stage: which part to train; `all` trains one after the other.
         init: weights to begin with; parts that are not trained are taken from them. Of weights for
             other classes, all layers but the last ones are taken. Stages that the folder already
             has keep their own weights.
         resume: continue an earlier run in the folder.
-        train_sequences: sequences or scenes, separated by commas, to train on; default: the
-            official split.
-        val_sequences: sequences or scenes, separated by commas, to validate on; default: the
-            official split.
-        with_val: train on these too, as for a benchmark's server; then nothing is validated.
+        with_val: train on the scans to validate with, too, as for a benchmark's server; then
+            nothing is validated.
         taxonomy: a semantic-kitti.yaml with other classes.
     """
     from amvnet.data.datasets.joined import join
-    from amvnet.data.datasets.select import split_records
     from amvnet.distributed import device_of
     from amvnet.training.plan import Plan, open_parts, sized_by_init, without_mean
     from amvnet.training.run import train as train_stages
@@ -58,10 +54,7 @@ def train(
     recipe = sized_by_init(recipe, weights)
     dataset, parts = open_parts(data, taxonomy, recipe, out, weights)
     recipe = without_mean(recipe, weights, dataset.taxonomy, say)
-    scans = split_records(
-        dataset, parse_names(train_sequences), parse_names(val_sequences), with_val
-    )
-    scans = join(scans, parts)
+    scans = join(choice.scans(dataset, with_val), parts)
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
 
     plan = Plan(
