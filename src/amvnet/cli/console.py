@@ -25,11 +25,7 @@ MOST_LINES = 2000  # of one text
 
 
 class SafeStream:
-    """A standard stream on which nothing fails: what cannot be written is lost.
-
-    Args:
-        name: stdout or stderr.
-    """
+    """stdout or stderr, by name, on which nothing fails: what cannot be written is lost."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -151,11 +147,7 @@ def progress(title: str) -> Iterator[Progress]:
 
 
 class ProgressLines:
-    """Says in at most ten lines what is done, how fast, and how long the rest takes.
-
-    Args:
-        title: the beginning of each line.
-    """
+    """Says in at most ten lines what is done, how fast, and how long the rest takes."""
 
     def __init__(self, title: str) -> None:
         self.title = title

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import functools
 import inspect
 import math
 import re
@@ -156,10 +155,11 @@ def make_parser(verb: str, command: Command) -> Parser:
         elif _is_bundle(kind):
             group = parser.add_argument_group(first_line(kind))
             kinds = get_type_hints(kind)
+            field_docs = field_texts(kind)
             for field in dataclasses.fields(kind):
-                text = field_texts(kind)[field.name]
-                parser.kinds[flag_of(field.name)] = kinds[field.name]
-                _add_option(group, field.name, kinds[field.name], field.default, text)
+                field_kind = kinds[field.name]
+                parser.kinds[flag_of(field.name)] = field_kind
+                _add_option(group, field.name, field_kind, field.default, field_docs[field.name])
         else:
             parser.kinds[flag_of(name)] = kind
             _add_option(parser, name, kind, parameter.default, texts.get(name, ""))
@@ -195,7 +195,7 @@ def _add_option(target: Any, name: str, kind: Any, default: Any, text: str) -> N
         options["default"] = default
 
     if kind is bool:
-        options["action"] = argparse.BooleanOptionalAction if default else "store_true"
+        options["action"] = "store_true"
     elif get_origin(kind) is list:  # may be given several times
         options |= {"action": "append", "metavar": name.upper()}
     elif kind == str | bool:  # its value may be left out
@@ -223,7 +223,6 @@ def first_line(documented: Any) -> str:
     return (documented.__doc__ or "").strip().splitlines()[0].rstrip(".")
 
 
-@functools.cache
 def field_texts(cls: type) -> dict[str, str]:
     """Return the documentation under each field of a dataclass, on one line."""
     docs = docstring_parser.parse_from_object(cls)

@@ -18,13 +18,7 @@ HELP_ALL = "--help-all"
 
 
 def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
-    """Add the values of a recipe as options.
-
-    Args:
-        parser: where to add them.
-        recipe: has the values that the help shows.
-        shows_all: whether the help has them, one group for each part of the recipe.
-    """
+    """Add the values of a recipe as options; the help has them if `shows_all`, in groups."""
     parser.add_argument(
         HELP_ALL,
         action="help",
@@ -49,19 +43,14 @@ def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
 
 
 def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
-    """Return a recipe with the values of the options that the user gave.
-
-    Args:
-        recipe: the recipe.
-        values: all options of the verb by name; those of the recipe have dots and are removed.
+    """Return a recipe with the values of the options whose names have dots.
 
     Raises:
         InputError: if a value does not fit.
     """
     tree: dict[str, Any] = {}
-    for name in [name for name in values if "." in name]:
-        text = values.pop(name)
-        if text is None:
+    for name, text in values.items():
+        if "." not in name or text is None:
             continue
         *path, key = name.split(".")
         branch = tree

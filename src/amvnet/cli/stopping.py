@@ -90,12 +90,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 @contextmanager
 def stoppable(line: str, exits: bool) -> Iterator[Stop]:
-    """Yield what says whether a signal has asked the block to stop, by a KeyboardInterrupt in it.
-
-    Args:
-        line: what is said when the verb has stopped.
-        exits: whether the process ends with the verb.
-    """
+    """Yield a `Stop`, which raises a KeyboardInterrupt in the block at SIGINT and SIGTERM."""
     stop = Stop(line, exits)
     earlier = {}
     if threading.current_thread() is threading.main_thread():

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast, get_args, get_type_hints
 
-from amvnet.errors import InputError, did_you_mean, shown
+from amvnet.errors import InputError, did_you_mean, errors_of, shown
 
 T = TypeVar("T")
 
@@ -85,10 +85,8 @@ def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
 
         changes[key] = _convert(getattr(default, key), value, field_types[key], f"{where}: {key}")
 
-    try:
+    with errors_of(where):
         return dataclasses.replace(cast(Any, default), **changes)
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
 
 
 def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:

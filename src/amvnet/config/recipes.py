@@ -51,15 +51,11 @@ def _read_tree(name_or_path: str, dependents: tuple[str, ...]) -> dict[str, Any]
     tree = read_yaml(_find(name_or_path), "a recipe")
 
     # An empty file, perhaps of an interrupted download, would train at the paper's sizes.
-    if tree is None or tree == {}:
+    if not isinstance(tree, dict) or not tree:
+        found = shown(tree) if tree else "an empty file"
         raise InputError(
-            f"{name_or_path}: expected a recipe, found an empty file; write at least the line "
+            f"{name_or_path}: expected keys and values, found {found}; write at least the line "
             "base: semantickitti-compact"
-        )
-    if not isinstance(tree, dict):
-        kind = type(tree).__name__
-        raise InputError(
-            f"{name_or_path}: expected keys and values, found {kind}; correct the file"
         )
 
     base = tree.pop("base", None)

@@ -6,6 +6,7 @@ import dataclasses
 import json
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from io import BytesIO
 from typing import Any
 
@@ -48,7 +49,6 @@ class Results:
     one row.
 
     Args:
-        out: the output folder.
         settings: what the results depend on, as JSON types.
         resume: whether to go on with an earlier run.
         overwrite: whether the folder may hold other files.
@@ -162,10 +162,9 @@ def _check_empty(out: Place) -> None:
 
 def _check_same(place: Place, settings: Mapping[str, Any]) -> None:
     """Raise InputError if the settings in a file of an earlier run are others."""
-    try:
+    earlier = None
+    with suppress(UnicodeDecodeError, json.JSONDecodeError, RecursionError):
         earlier = json.loads(place.read())
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError):
-        earlier = {}
     known = earlier if isinstance(earlier, dict) else {}
     changed = [key for key in settings if known.get(key) != settings[key]]
     if changed:

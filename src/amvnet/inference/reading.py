@@ -10,7 +10,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_with_classes
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
-from amvnet.errors import InputError
+from amvnet.errors import InputError, errors_of
 from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
@@ -110,18 +110,12 @@ def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
         InputError: if the file describes an impossible sensor.
     """
     if dataset.description.sensor is not None and normaliser.sensor == Sensor():
-        normaliser = normaliser.for_sensor(_described_sensor(dataset))
+        with errors_of(f"{dataset.spec}: sensor"):
+            sensor = make_sensor(dataset.description.sensor)
+        normaliser = normaliser.for_sensor(sensor)
 
     for source, scans in dataset.recordings().items():
         for scan in scans:
             normaliser.expect(source, scan.read)
     is_normalised = normaliser.expected is not None
     return OwnScans(dataset.description, normaliser, is_normalised)
-
-
-def _described_sensor(dataset: OwnScans) -> Sensor:
-    """Return what the file of a dataset says of the sensor."""
-    try:
-        return make_sensor(dataset.description.sensor)
-    except InputError as error:
-        raise InputError(f"{dataset.spec}: sensor: {error}") from None

@@ -30,11 +30,7 @@ def side_by_side(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor
 
 
 class TwoStreams:
-    """Runs the range view's network on a stream of its own while the other one runs.
-
-    Args:
-        device: a CUDA device.
-    """
+    """Runs the range view's network on a stream of its own on a GPU while the other one runs."""
 
     def __init__(self, device: str | torch.device) -> None:
         self.device = torch.device(device)

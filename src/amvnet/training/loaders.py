@@ -217,13 +217,9 @@ def count_classes(
     processes: Processes = ALONE,
     say: Say = say_nothing,
 ) -> np.ndarray:
-    """Count the points of each class in some scans, or read the counts of an earlier call.
+    """Return the (K,) int64 numbers of points of each class in some scans.
 
-    Args:
-        path: an .npz file of counts; written unless it already has those of these scans.
-
-    Returns:
-        (K,) int64.
+    They are read from `path`, an .npz file, if it has those of these scans, else written to it.
     """
     source = {
         "scans": [record.name for record in records],

@@ -26,14 +26,9 @@ MIN_ERROR = 1e-3
 def class_weights(counts: np.ndarray) -> np.ndarray:
     """Return the square roots of the inverse class frequencies, scaled to a mean of 1.
 
-    A frequency below `FREQUENCY_FLOOR` is raised to it, also that of an absent class. Section 4.2
-    of the paper.
-
-    Args:
-        counts: (K,) numbers of points of each class in the training data.
-
-    Returns:
-        (K,) float32.
+    They are (K,) float32, given the (K,) numbers of points of each class in the training data. A
+    frequency below `FREQUENCY_FLOOR` is raised to it, also that of an absent class. Section 4.2 of
+    the paper.
     """
     frequency = np.maximum(counts / max(counts.sum(), 1), FREQUENCY_FLOOR)
     weights = 1 / np.sqrt(frequency)
@@ -148,12 +143,8 @@ def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> 
 def dice(probabilities: Tensor, targets: Targets) -> Tensor:
     """Return the soft Dice loss: 1 - 2 |p t| / (|p| + |t|), averaged over the classes present.
 
-    Args:
-        probabilities: (P, K), p.
-        targets: of P points; t is the one-hot encoding of their classes.
-
-    Returns:
-        The loss, (), the mean over the scans.
+    It is (), the mean over the scans, given probabilities p (P, K); t is the one-hot encoding of
+    the classes of the P points.
     """
     truth = F.one_hot(targets.classes, probabilities.shape[1]).to(probabilities)
     members = F.one_hot(targets.scan, len(targets.counts)).to(probabilities).T  # (B, P)
@@ -173,12 +164,8 @@ def lovasz_softmax(probabilities: Tensor, targets: Targets) -> Tensor:
     the Jaccard loss when its point joins the mispredicted ones (Berman et al., CVPR 2018). Errors
     up to `MIN_ERROR` are left out, which saves most of the sorting.
 
-    Args:
-        probabilities: (P, K), p.
-        targets: of P points; t is 1 for the points of the class, else 0.
-
-    Returns:
-        The loss, (), the mean over the scans.
+    It is (), the mean over the scans, given probabilities p (P, K); t is 1 for the points of the
+    class, else 0.
     """
     classes = probabilities.shape[1]
     with torch.no_grad():  # the order and the increases have no gradient

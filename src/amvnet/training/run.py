@@ -124,7 +124,7 @@ def _for_classes(plan: Plan, init: Weights, part: str) -> Weights:
     """Return initial weights whose last layers are new, for the classes of the dataset."""
     taxonomy = plan.scans.dataset.taxonomy
     weights, new = init.for_classes(taxonomy, plan.recipe.training.seed)
-    of_part = [name.removeprefix(f"{part}.") for name in new if name.startswith(f"{part}.")]
+    of_part = [name for name in new if name.startswith(f"{part}.")]
     plan.say(
         f"{part}: for the classes of {taxonomy.name}, all layers of the initial weights "
         f"({init.taxonomy.name}) but {', '.join(of_part)}, which are new"

@@ -251,10 +251,7 @@ def part_state(part: str, state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def save(weights: Weights, path: Path | str) -> Path:
-    """Write a weights file, whole or not at all.
-
-    Returns:
-        The path of the file.
+    """Write a weights file, whole or not at all, and return its path.
 
     Raises:
         InputError: if the file cannot be written.

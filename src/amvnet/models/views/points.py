@@ -63,9 +63,6 @@ class PointBatch:
         """Return the batch on another device, or with the points in another floating-point type.
 
         Copies from pinned memory to a GPU do not block.
-
-        Args:
-            where: the device or the type.
         """
         if isinstance(where, torch.dtype):
             return replace(self, points=self.points.to(where))
