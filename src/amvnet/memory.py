@@ -11,14 +11,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 # Options of glibc's mallopt, from malloc.h.
-M_TRIM_THRESHOLD = -1  # free bytes from which on they are returned to the system
+M_TRIM_THRESHOLD = -1  # free bytes above which they are returned to the system
 M_MMAP_MAX = -4  # blocks that may each have a mapping of their own
 M_ARENA_MAX = -8  # heaps that the process may have
-DEFAULTS = {M_MMAP_MAX: 65536, M_TRIM_THRESHOLD: 128 * 1024}  # of glibc
+DEFAULTS = {M_MMAP_MAX: 65536, M_TRIM_THRESHOLD: 128 * 1024}  # glibc's
 
 MEMINFO = Path("/proc/meminfo")
 CONTROL_GROUP = Path("/sys/fs/cgroup")  # of this process, in a container
-
 
 _is_kept = False  # by `keep_freed_memory`
 

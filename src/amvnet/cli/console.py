@@ -56,7 +56,11 @@ class SafeStream:
         """Drop this and all that follows if the stream is closed, its disk is full, or the like."""
         try:
             yield
-        except (OSError, ValueError, AttributeError) as error:  # AttributeError: None, as of >&-
+        except (
+            OSError,
+            ValueError,
+            AttributeError,
+        ) as error:  # None after >&-
             with suppress(OSError, ValueError, AttributeError), open(os.devnull, "w") as nothing:
                 os.dup2(nothing.fileno(), self._stream.fileno())
             if not isinstance(error, OSError) or self.name == "stderr":

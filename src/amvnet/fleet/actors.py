@@ -71,8 +71,8 @@ class Labelling:
         kind: the format of the labels, one of `writers.KINDS`.
         scores: whether to write the probabilities of both networks, too.
         uncertain: whether to write the uncertain points, too.
-        method, tau, device, precision: as of `Segmenter`.
-        engine: as of `use_engine`.
+        method, tau, device, precision: as `Segmenter` takes them.
+        engine: as `use_engine` takes it.
         batch: scans that go through the networks together.
         at_once: on a CPU, scans that are segmented at the same time; None means one for each core.
         sensor: what is known of the sensor of all scans.

@@ -27,7 +27,7 @@ from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.sensors.measure import MEASURED
 
 WINDOW = 4_000  # blocks that are planned together, up to 256,000 scans
-SAID = 10  # drives of which is said what was assumed
+SAID = 10  # drives whose assumptions are printed
 
 
 def label_fleet(
@@ -49,7 +49,7 @@ def label_fleet(
         most: number of workers, as `Workers` takes it.
         resume: go on with an earlier run into the same folder.
         overwrite: write into a folder that has other files.
-        say: is told what was assumed of the sensors, and at the end how sure the labels are.
+        say: takes lines about what was assumed of the sensors, and how sure the labels are.
 
     Returns:
         The number of scans with labels, with those of the run that is resumed.

@@ -55,7 +55,7 @@ class Results:
 
     Attributes:
         done: the names of the scans that an earlier run has done.
-        drives: what was measured of each drive, as of `describe_drive`.
+        drives: the row of each drive, from `describe_drive`.
 
     Raises:
         InputError: if the folder cannot be written, holds something else, or the earlier run had
@@ -156,7 +156,7 @@ def _check_empty(out: Place) -> None:
     if files or folders:
         raise InputError(
             f"{out.url}: expected a new folder, found {(files + folders)[0]} in it; change --out, "
-            "or say --overwrite to write beside it"
+            "or say --overwrite to keep it and write, too"
         )
 
 

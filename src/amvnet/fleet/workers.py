@@ -167,7 +167,7 @@ class Workers:
             self._starting[worker.__ray_ready__.remote()] = worker
 
     def _begin(self, reference: Any) -> None:
-        """Take note that a worker is ready, or has ended before.
+        """Add a worker to those that are ready, or count that it ended before.
 
         Raises:
             InputError: if the labelling does not fit its machine, or workers end again and again.

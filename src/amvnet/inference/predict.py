@@ -51,8 +51,8 @@ def predict(
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
         sensor: what is known of the sensor of scan files; the rest is measured.
         classes: maps the classes of the weights to those that are written; None writes these.
-        say: is told what was assumed of the sensor, and at the end how sure the labels are, if
-            there are two networks.
+        say: takes lines about what was assumed of the sensor, and at the end how sure the labels
+            are, if there are two networks.
 
     Returns:
         The number of label files of these scans, with those of the run that is resumed.

@@ -69,7 +69,7 @@ def normaliser_for(
 
     Args:
         sensor: what is known of the sensor; the rest is measured.
-        say: is told what was assumed of the sensor.
+        say: takes a line about what was assumed of the sensor.
     """
     expected = Expectation(
         weights.model.range_view,

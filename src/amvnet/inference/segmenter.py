@@ -35,7 +35,7 @@ from amvnet.threads import survive_forks
 from amvnet.weights.file import Weights, load
 
 EACH = 2**30  # bytes that a scan may take; one of 120,000 points takes half, at the paper's size
-LARGE = 1_000_000  # points, from which on freed memory is returned: it would not be used again
+LARGE = 1_000_000  # points; freed memory of so large scans is returned: it would not be used again
 
 
 class Segmenter:

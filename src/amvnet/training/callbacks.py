@@ -26,8 +26,8 @@ from amvnet.weights.file import Weights, part_state, save
 class AverageWeights(Callback):
     """Keeps an exponential moving average of the weights, which is validated and written.
 
-    The statistics of batch norms are averaged, too. The training itself goes on with the weights of
-    its own.
+    The statistics of batch norms are averaged, too. The training itself goes on with its own
+    weights.
 
     Args:
         decay: share of the average that a step keeps. Early steps keep less, so that the initial

@@ -37,7 +37,9 @@ def submit(
 
     rules = rules_for(open_data(data), split, parse_names(sequences))
     if use_external and rules.meta is None:
-        raise InputError("expected --use-external for nuScenes alone, found it; leave it out")
+        raise InputError(
+            f"--use-external: expected a dataset of nuScenes, found {rules.taxonomy.name}; leave it out"
+        )
 
     with protecting([out], overwrite), progress("packing") as step:
         count = pack.write(rules, predictions, out, use_external, step)
