@@ -44,7 +44,7 @@ from amvnet.config.schema import (
 )
 from amvnet.data.taxonomy import TAXONOMIES
 from amvnet.inference.segmenter import Segmenter
-from amvnet.inference.timing import STAGES, Job, run_once
+from amvnet.inference.timing import STAGES, run_once
 from amvnet.models.amvnet import build_amvnet
 from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.scan import Scan
@@ -211,9 +211,13 @@ def time_batch(segmenter: Segmenter, scans: Sequence[Scan], options: Options) ->
 
 def time_stages(segmenter: Segmenter, scan: Scan, options: Options) -> dict[str, float]:
     """Return the median milliseconds of each stage, one after the other."""
-    job = Job(segmenter, read=lambda: scan, write=lambda labels: None)
-    timings = [run_once(job) for _ in range(WARM_UP + options.runs)][WARM_UP:]
-    return {stage: median(timing.seconds[stage] for timing in timings) * 1e3 for stage in STAGES}
+    timings = []
+    for _ in range(WARM_UP + options.runs):
+        timings.append(run_once(segmenter, read=lambda: scan, write=lambda labels: None))
+    return {
+        stage: median(timing.seconds[stage] for timing in timings[WARM_UP:]) * 1e3
+        for stage in STAGES
+    }
 
 
 def count_waits(segmenter: Segmenter, scan: Scan) -> Counter[str]:

@@ -32,7 +32,7 @@ from amvnet import read as read_scan
 from amvnet.data.labels.ids import write_ids
 from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
 from amvnet.inference.segmenter import Segmenter
-from amvnet.inference.timing import FUSION, MEAN, STAGES, Job, run_once
+from amvnet.inference.timing import FUSION, MEAN, STAGES, run_once
 from amvnet.models.layers import upsample
 from amvnet.models.methods import ONNX_ENGINES
 from amvnet.models.point_head import PointHead, head_features, point_table
@@ -132,18 +132,17 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
     times: list[dict[str, float]] = []
     with TemporaryDirectory() as folder:
         target = Path(folder) / "labels.label"
-        job = Job(
-            segmenter,
-            read=lambda: read_scan(options.scan),
-            write=lambda ids: write_ids(target, ids),
-        )
         for _ in range(WARM_UP + options.runs):
             started = time.perf_counter()
             with torch.inference_mode():
                 salsanext(image)
             seconds = time.perf_counter() - started
 
-            run = run_once(job)
+            run = run_once(
+                segmenter,
+                read=lambda: read_scan(options.scan),
+                write=lambda ids: write_ids(target, ids),
+            )
             figures = {**run.seconds, "SalsaNext": seconds, "all": run.all}
             figures["points"] = run.points
             figures["uncertain"] = run.uncertain / run.points

@@ -23,7 +23,7 @@ from amvnet.evaluation.analysis import BINS, SWEPT, Analysis, analyze
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
-from amvnet.inference.timing import Job, run_once
+from amvnet.inference.timing import run_once
 from amvnet.models.methods import arithmetic_mean, maximum
 from amvnet.progress import Say, say_nothing
 from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES
@@ -169,7 +169,7 @@ def test_a_scan_is_timed_as_it_is_segmented(dataset: Dataset, weights: Weights) 
     scan = dataset.read(dataset.records(["08"])[0])
     written: list[np.ndarray] = []
     matched = Segmenter(with_matched_intensities(weights))
-    run_once(Job(matched, lambda: scan, written.append))
+    run_once(matched, lambda: scan, written.append)
 
     np.testing.assert_array_equal(written[0], matched(scan).labels)
     assert (written[0] != Segmenter(weights)(scan).labels).any()

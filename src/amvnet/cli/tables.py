@@ -58,7 +58,7 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 
 
 def timing_table(report: Mapping[str, Any]) -> Table:
-    """Return the table of a report of `time_job`: the time of each stage."""
+    """Return the table of a report of `time_runs`: the time of each stage."""
     points = report["points"]
     table = Table(
         title=f"{report['engine']} on {report['device']} in {report['precision']}, "

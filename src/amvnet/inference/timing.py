@@ -28,20 +28,8 @@ MEAN = "mean"  # what the ensemble does instead of the fusion
 WARM_UP = 2  # runs that do not count
 MEBIBYTE = 2**20
 
-
-@dataclass(frozen=True)
-class Job:
-    """What is timed: a segmenter, where its scan comes from and where its labels go.
-
-    Attributes:
-        segmenter: with all of AMVNet.
-        read: reads the scan.
-        write: writes its (P,) train ids.
-    """
-
-    segmenter: Segmenter
-    read: Callable[[], Scan]
-    write: Callable[[np.ndarray], object]
+Read = Callable[[], Scan]
+Write = Callable[[np.ndarray], object]
 
 
 @dataclass(frozen=True)
@@ -62,8 +50,10 @@ class Timing:
         return sum(self.seconds[stage] for stage in stages) / self.all
 
 
-def time_job(job: Job, runs: int, progress: Progress = no_progress) -> dict[str, Any]:
-    """Time a job some times, and return a report for JSON.
+def time_runs(
+    segmenter: Segmenter, read: Read, write: Write, runs: int, progress: Progress = no_progress
+) -> dict[str, Any]:
+    """Call `run_once` some times, and return a report for JSON.
 
     Raises:
         InputError: if there is no run to time.
@@ -73,32 +63,36 @@ def time_job(job: Job, runs: int, progress: Progress = no_progress) -> dict[str,
 
     timings = []
     for run in range(runs + WARM_UP):
-        timings.append(run_once(job))
+        timings.append(run_once(segmenter, read, write))
         progress(run + 1, runs + WARM_UP)
-    return _report(job, timings[WARM_UP:])
+    return _report(segmenter, timings[WARM_UP:])
 
 
 @torch.inference_mode()
-def run_once(job: Job) -> Timing:
-    """Time a job once, with a clock around each step of `AMVNet.forward`."""
-    device = job.segmenter.device
-    clock = _Clock(device)
+def run_once(segmenter: Segmenter, read: Read, write: Write) -> Timing:
+    """Read, segment and write a scan, with a clock around each step of `AMVNet.forward`.
 
-    model = copy.copy(job.segmenter.model)
+    Args:
+        segmenter: with all of AMVNet.
+        read: reads the scan.
+        write: writes its (P,) train ids.
+    """
+    clock = _Clock(segmenter.device)
+    model = copy.copy(segmenter.model)
     model.watch = clock
     model.arrange = one_after_the_other
 
     with clock("read"):
-        scan = job.read()
+        scan = read()
     with clock("project"):
-        batch = job.segmenter.batch([scan])
+        batch = segmenter.batch([scan])
 
     scores = model(batch)
 
     with clock("merge"):
         labels = label_ids(scores.merged).cpu().numpy()
     with clock("write"):
-        job.write(labels)
+        write(labels)
 
     with clock(MEAN):
         label_ids(geometric_mean(scores.rv, scores.bev)).cpu()
@@ -124,17 +118,17 @@ class _Clock:
         self.seconds[stage] += time.perf_counter() - start
 
 
-def _report(job: Job, timings: Sequence[Timing]) -> dict[str, Any]:
+def _report(segmenter: Segmenter, timings: Sequence[Timing]) -> dict[str, Any]:
     stages = {}
     for stage in (*STAGES, MEAN):
         stages[stage] = _spread([1e3 * timing.seconds[stage] for timing in timings])
 
-    device = job.segmenter.device
+    device = segmenter.device
     is_gpu = torch.device(device).type == "cuda"
     memory = torch.cuda.max_memory_allocated(device) if is_gpu else peak_memory()
     return {
-        "engine": job.segmenter.engine,
-        "precision": job.segmenter.precision,
+        "engine": segmenter.engine,
+        "precision": segmenter.precision,
         "device": device,
         "threads": torch.get_num_threads(),
         "runs": len(timings),

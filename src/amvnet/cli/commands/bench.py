@@ -34,7 +34,7 @@ def bench(
     from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
     from amvnet.files import atomic_write
-    from amvnet.inference.timing import Job, time_job
+    from amvnet.inference.timing import time_runs
     from amvnet.weights.file import load
 
     segmenter = compute.segmenter(load(weights), "amvnet", tau)
@@ -45,13 +45,14 @@ def bench(
             simulate(folder, scans=1)
             scan = folder / "sequences/00/velodyne/000000.bin"
 
-        job = Job(
-            segmenter,
-            read=lambda: read_cloud(scan).to_scan(),
-            write=lambda ids: write_ids(folder / "labels.label", ids),
-        )
         with progress("timing") as step:
-            report = time_job(job, runs, step)
+            report = time_runs(
+                segmenter,
+                read=lambda: read_cloud(scan).to_scan(),
+                write=lambda ids: write_ids(folder / "labels.label", ids),
+                runs=runs,
+                progress=step,
+            )
 
     show(timing_table(report))
     if json is not None:

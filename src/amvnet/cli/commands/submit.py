@@ -38,7 +38,7 @@ def submit(
     rules = rules_for(open_data(data), split, parse_names(sequences))
     if use_external and rules.meta is None:
         raise InputError(
-            f"--use-external: expected a dataset of nuScenes, found {rules.taxonomy.name}; leave it out"
+            f"--use-external: expected nuScenes, found {rules.taxonomy.name}; leave it out"
         )
 
     with protecting([out], overwrite), progress("packing") as step:
