@@ -146,7 +146,9 @@ def join(cuda: bool = False) -> Processes:
     atexit.register(dist.destroy_process_group)
 
     group = dist.new_group(backend="gloo", timeout=PATIENCE)
-    return Processes(rank, size, local_rank, _node_count(size), group)
+    return Processes(
+        rank=rank, size=size, local_rank=local_rank, nodes=_node_count(size), group=group
+    )
 
 
 def _node_count(size: int) -> int:

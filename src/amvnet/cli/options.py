@@ -173,7 +173,7 @@ class ComputeChoice:
             device = processes.device(device)
         if device == "cpu":
             keep_freed_memory()
-        segmenter = Segmenter(weights, device, method, self.precision, tau)
+        segmenter = Segmenter(weights, device, method, precision=self.precision, tau=tau)
         say(f"computing on {segmenter.hardware} in {segmenter.precision}")
         use_engine(segmenter, self.engine, say)
         if self.at_once is not None:

@@ -136,7 +136,13 @@ class Labelling:
         Raises:
             InputError: if the options do not fit the weights or the machine.
         """
-        segmenter = Segmenter(self.weights, self.device, self.method, self.precision, self.tau)
+        segmenter = Segmenter(
+            self.weights,
+            self.device,
+            method=self.method,
+            precision=self.precision,
+            tau=self.tau,
+        )
         if segmenter.device == "cpu":
             keep_freed_memory()
         if self.at_once is not None:
@@ -266,7 +272,10 @@ class LabelScans:
                 scans,
                 segment_by(self._segmenter, labelling.classes),
                 OutputOptions(
-                    self._out.local or folder, labelling.kind, labelling.scores, labelling.uncertain
+                    self._out.local or folder,
+                    labelling.kind,
+                    scores=labelling.scores,
+                    uncertain=labelling.uncertain,
                 ),
                 labelling.taxonomy,
                 ExecutionOptions(labelling.batch, self._segmenter.at_once),

@@ -307,7 +307,8 @@ class Pipeline:
 
         points = int(np.count_nonzero(loaded.scan.valid))
         uncertain = int(np.count_nonzero(result.uncertain))
-        return Entry(_key(scan), self._origins[_key(scan)], scan.source, points, uncertain)
+        key = _key(scan)
+        return Entry(key, self._origins[key], scan.source, points=points, uncertain=uncertain)
 
 
 def check_faults(faults: Sequence[str], total: int) -> None:

@@ -157,12 +157,15 @@ def _make_loaders(plan: Plan, train: HeadPoints, val: HeadPoints | None) -> Load
     seed = plan.recipe.training.seed
     labels = train.labels if config.balance else None
     draw = PointDraw(len(train), config.drawn, labels, config.balance)
-    train_loader = _loader(train, PointSampler(draw, config.batch, seed, True, plan.processes))
+    train_loader = _loader(
+        train, PointSampler(draw, config.batch, seed, shuffle=True, processes=plan.processes)
+    )
     if val is None:
         return train_loader, None
 
     batch = VAL_FACTOR * config.batch
-    sampler = PointSampler(PointDraw(len(val)), batch, seed, False, plan.processes)
+    points = PointDraw(len(val))
+    sampler = PointSampler(points, batch, seed, shuffle=False, processes=plan.processes)
     return train_loader, _loader(val, sampler)
 
 

@@ -115,7 +115,9 @@ def predict(
         written = predict_inputs(
             inputs,
             segmenter,
-            OutputOptions(Path(out), format, scores, uncertain, overwrite),
+            OutputOptions(
+                Path(out), format, scores=scores, uncertain=uncertain, overwrite=overwrite
+            ),
             options=choice.parse(),
             execution=ExecutionOptions(batch, resume=resume),
             sensor=sensor,
