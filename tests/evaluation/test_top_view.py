@@ -60,18 +60,14 @@ def test_picture_has_the_colours_of_its_classes(tmp_path: Path) -> None:
     assert [file.name for file in path.parent.iterdir()] == ["b.png"]
 
 
-@pytest.mark.parametrize("with_truth", [False, True])
 @pytest.mark.parametrize("with_uncertain", [False, True])
-def test_every_part_is_optional(tmp_path: Path, with_truth: bool, with_uncertain: bool) -> None:
+def test_points_that_are_lost_or_not_known_to_be_uncertain_are_left_out(
+    tmp_path: Path, with_uncertain: bool
+) -> None:
     points, ids = blocks([1, 0])
     points[0] = np.nan
-    truth = ids if with_truth else None
     uncertain = ids > 0 if with_uncertain else None
 
-    view = TopView(points, NUSCENES, {"p": ids}, truth, uncertain)
-    assert draw_scan(tmp_path / "a.png", view).is_file()
-
-
-def test_truth_alone_is_enough(tmp_path: Path) -> None:
-    points, ids = blocks([2])
-    assert draw_scan(tmp_path / "a.png", TopView(points, NUSCENES, {}, truth=ids)).is_file()
+    view = TopView(points, NUSCENES, {"p": ids}, ids, "title", uncertain)
+    image = imread(draw_scan(tmp_path / "a.png", view))
+    assert has_color(image, np.divide(UNCERTAIN, 255)) == with_uncertain

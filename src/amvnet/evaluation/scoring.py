@@ -90,7 +90,7 @@ def evaluate(
         evaluation.add(scan.points, truth, ids, uncertain)
         if pictures is not None and record.name in pictured:
             view = TopView(
-                scan.points, taxonomy, ids, truth, uncertain=uncertain, title=record.name
+                scan.points, taxonomy, ids, truth, title=record.name, uncertain=uncertain
             )
             draw_scan(inside(pictures, f"{record.name.replace('/', '_')}.png"), view)
 

@@ -51,18 +51,18 @@ class TopView:
     Attributes:
         points: (N, 3 or more) x, y, z in metres.
         taxonomy: names and colours of the classes.
-        predictions: (N,) train ids by title; may be empty if there is a truth.
-        truth: (N,) train ids, or None.
-        uncertain: (N,) bool, or None.
+        predictions: (N,) train ids by title.
+        truth: (N,) train ids.
         title: a line above all panels.
+        uncertain: (N,) bool, or None.
     """
 
     points: np.ndarray
     taxonomy: Taxonomy
     predictions: Mapping[str, np.ndarray]
-    truth: np.ndarray | None = None
+    truth: np.ndarray
+    title: str
     uncertain: np.ndarray | None = None
-    title: str = ""
 
 
 def draw_scan(path: Path | str, view: TopView) -> Path:
@@ -89,8 +89,7 @@ def draw_scan(path: Path | str, view: TopView) -> Path:
     for number, panel in enumerate(panels, start=1):
         if panel is not None:
             _draw_panel(figure.add_subplot(len(grid), columns, number), view.points, panel)
-    if view.title:
-        figure.suptitle(view.title, fontsize=13)
+    figure.suptitle(view.title, fontsize=13)
     _draw_legend(figure, entries, columns)
 
     path = Path(path)
@@ -102,33 +101,23 @@ def draw_scan(path: Path | str, view: TopView) -> Path:
 def _grid(view: TopView) -> list[list[_Panel | None]]:
     """Return the rows of panels; None leaves a cell of the grid empty.
 
-    With truth, its column is the first, and each prediction has a column of its own. Without
-    truth there is one row, and the uncertain points are its last panel.
+    The truth has the first column, and each prediction a column of its own.
     """
     palette = np.asarray(class_colors(view.taxonomy)) / 255.0
     palette[0] = IGNORED
-    truth = view.truth
+    labelled = view.truth > 0
 
-    predictions = []
-    for title, ids in view.predictions.items():
-        predictions.append(_Panel(title, palette[ids], ids > 0))
-    uncertainty = None
+    first_row: list[_Panel | None] = [_Panel("truth", palette[view.truth], labelled)]
+    second_row: list[_Panel | None] = [None]
     if view.uncertain is not None:
         total = len(view.uncertain)
-        uncertainty = _highlight("uncertain", view.uncertain, total, UNCERTAIN)
-    if truth is None:
-        return [[*predictions]] if uncertainty is None else [[*predictions, uncertainty]]
+        second_row = [_highlight("uncertain", view.uncertain, total, UNCERTAIN)]
 
-    labelled = truth > 0
-    errors = []
     for title, ids in view.predictions.items():
-        wrong = (ids != truth) & labelled
-        errors.append(_highlight(f"errors of {title}", wrong, labelled.sum(), WRONG))
-
-    first_row: list[_Panel | None] = [_Panel("truth", palette[truth], labelled), *predictions]
-    if uncertainty is None and not errors:
-        return [first_row]
-    return [first_row, [uncertainty, *errors]]
+        wrong = (ids != view.truth) & labelled
+        first_row.append(_Panel(title, palette[ids], ids > 0))
+        second_row.append(_highlight(f"errors of {title}", wrong, labelled.sum(), WRONG))
+    return [first_row, second_row]
 
 
 def _highlight(title: str, mask: np.ndarray, total: int, color: Sequence[int]) -> _Panel:
@@ -143,18 +132,14 @@ def _highlight(title: str, mask: np.ndarray, total: int, color: Sequence[int]) -
 
 def _legend_entries(view: TopView) -> list[tuple[str, Color]]:
     """Return (name, colour) of the classes that appear, and of wrong and uncertain points."""
-    arrays = list(view.predictions.values())
-    if view.truth is not None:
-        arrays.append(view.truth)
-    class_ids = np.unique(np.concatenate(arrays)).tolist()
+    class_ids = np.unique([view.truth, *view.predictions.values()]).tolist()
 
     colors = class_colors(view.taxonomy)
     entries: list[tuple[str, Sequence[int]]] = []
     for class_id in class_ids:
         if class_id > 0:
             entries.append((view.taxonomy.names[class_id], colors[class_id]))
-    if view.truth is not None and view.predictions:
-        entries.append(("wrong", WRONG))
+    entries.append(("wrong", WRONG))
     if view.uncertain is not None:
         entries.append(("uncertain", UNCERTAIN))
 

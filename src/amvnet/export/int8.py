@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -103,16 +105,15 @@ class _Recorder(OnnxSegmenter):
 
 
 def _read(text: str, segmenter: Segmenter) -> list[Scan]:
-    """Read up to `SCANS` scans, evenly spaced, as the networks take them in `predict`.
-
-    Raises:
-        InputError: if an input is missing or broken, or no scan has a finite point.
-    """
+    """Read up to `SCANS` scans, evenly spaced, as the networks take them in `predict`."""
     normaliser = normaliser_for(segmenter.weights)
     inputs, _ = list_inputs([text], taxonomy=segmenter.taxonomy, normaliser=normaliser)
-    loaded = [scan_input.load().scan for scan_input in evenly_spaced(inputs, SCANS)]
+    scans = []
+    for scan_input in evenly_spaced(inputs, SCANS):
+        scan = scan_input.load().scan
+        if scan.valid.any():
+            scans.append(match_scan(scan, segmenter.intensity))
 
-    scans = [match_scan(scan, segmenter.intensity) for scan in loaded if scan.valid.any()]
     if not scans:
         raise InputError(
             f"{text}: expected scans to calibrate with, found none with a finite point; name others"
@@ -155,7 +156,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
         quantize_static(
             ready,
             quantised,
-            _CalibrationInputs(inputs),
+            SimpleNamespace(get_next=partial(next, iter(inputs), None)),
             quant_format=QuantFormat.QDQ,
             activation_type=QuantType.QUInt8,
             weight_type=QuantType.QInt8,
@@ -180,13 +181,3 @@ def _first_layer(path: Path) -> list[str]:
         if node.op_type == "LeakyRelu":
             return names
     return []
-
-
-class _CalibrationInputs:
-    """Gives the inputs to ONNX Runtime's calibration: one by one, then None."""
-
-    def __init__(self, inputs: list[dict[str, np.ndarray]]) -> None:
-        self._iterator = iter(inputs)
-
-    def get_next(self) -> dict[str, np.ndarray] | None:
-        return next(self._iterator, None)

@@ -206,13 +206,8 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
             "neighbours": head.neighbours,
             "position_scale": head.position_scale,
         }
-    description |= {
-        "taxonomy": taxonomy.name,
-        "classes": classes,
-        "opset": OPSET,
-        "graphs": graphs,
-    }
-    return description
+    described = {"taxonomy": taxonomy.name, "classes": classes, "opset": OPSET, "graphs": graphs}
+    return description | described
 
 
 def _describe_intensity(trained: TrainedIntensity | None) -> dict[str, list[float]] | None:
@@ -304,6 +299,8 @@ def _shares(features: Tensor) -> Tensor:
 
 def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
     """Write one graph and compare it with torch; return its description."""
+    from onnxscript.optimizer import optimize
+
     expected = graph.module(*graph.inputs.values())
     axes = None
     if name in DYNAMIC:
@@ -322,7 +319,9 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
             verbose=False,
         )
         assert program is not None
-        _fold_weights(program.model)
+        # Compute weights that are sums of others (`models.upsampled_conv`) once and for all. By
+        # default, only small tensors count as constants.
+        optimize(program.model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
         program.save(path, external_data=False)
     strip(path)
 
@@ -341,14 +340,6 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
         "outputs": outputs,
         "difference": difference,
     }
-
-
-def _fold_weights(model: Any) -> None:
-    """Compute the weights that are sums of others (`models.upsampled_conv`) once and for all."""
-    from onnxscript.optimizer import optimize
-
-    # By default, only small tensors count as constants.
-    optimize(model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:

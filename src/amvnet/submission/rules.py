@@ -123,9 +123,6 @@ def _nuscenes(dataset: NuScenes, split: str, sequences: Sequence[str] | None) ->
     The official validator requires a file for every key frame that the tables list for the split,
     one byte per point with a value of 1..16, and in submission.json a "meta" with exactly the five
     keys of `LIDAR_ALONE`, all true or false.
-
-    Raises:
-        InputError: if there are no such scenes, or they belong to several splits.
     """
     scenes = dataset.scenes(split) if sequences is None else sequences
     if not scenes:

@@ -203,11 +203,7 @@ class NuScenes(Dataset):
         return rows
 
     def _category_lookup(self) -> np.ndarray:
-        """Return (256,) int16 train ids by index in category.json, UNKNOWN for unused indices.
-
-        Raises:
-            InputError: if a category has no index, or its name is not in the taxonomy.
-        """
+        """Return (256,) int16 train ids by index in category.json, UNKNOWN for unused indices."""
         path = self.root / self.version / "category.json"
         table = np.full(256, UNKNOWN, dtype=np.int16)
 
@@ -222,11 +218,7 @@ class NuScenes(Dataset):
         return table
 
     def _categories_to_train(self, indices: np.ndarray, path: Path) -> np.ndarray:
-        """Turn (N,) indices of category.json, from a file, into (N,) uint8 train ids.
-
-        Raises:
-            InputError: if an index is not in category.json.
-        """
+        """Turn (N,) indices of category.json, from a file, into (N,) uint8 train ids."""
         assert self._category_train_ids is not None  # no record has labels without this table
         train_ids = self._category_train_ids[indices]
 

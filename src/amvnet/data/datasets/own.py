@@ -11,8 +11,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
@@ -156,7 +154,12 @@ class OwnScans(Dataset):
         scan = cloud.to_scan() if self.normalise is None else self.normalise(cloud, named.source)
         self._counts[record.name] = len(scan)
 
-        ids = self._read_labels(record, len(scan)) if labels else None
+        ids = None
+        place = self.description.labels
+        path = record.labels_path
+        if labels and place is not None and path is not None:
+            layout = self.description.layout
+            ids = read_scan_labels(path, len(scan), self.taxonomy, place.field, layout)
         return dataclasses.replace(scan, labels=ids, name=record.name)
 
     def count_points(self, record: ScanRecord) -> int:
@@ -195,31 +198,31 @@ class OwnScans(Dataset):
 
         scans: dict[str, NamedScan] = {}
         for path in paths:
-            if path not in label_paths:
-                for scan in list_scans(path, layout=self.description.layout):
-                    self._add(scans, scan)
+            if path in label_paths:
+                continue
+            for scan in list_scans(path, layout=self.description.layout):
+                name = (scan.path.parent.relative_to(self.root) / scan.name).as_posix()
+                if name in scans:
+                    raise InputError(
+                        f"{self.spec}: expected one scan named {name}, found "
+                        f"{scans[name].path.name} and {scan.path.name}; make the pattern of the "
+                        "scans narrower"
+                    )
+                scans[name] = scan
         if not scans:
             raise InputError(
                 f"{self.root}: expected scan files {pattern}, found none; correct scans or root"
             )
         return scans
 
-    def _add(self, scans: dict[str, NamedScan], scan: NamedScan) -> None:
-        name = (scan.path.parent.relative_to(self.root) / scan.name).as_posix()
-        if name in scans:
-            raise InputError(
-                f"{self.spec}: expected one scan named {name}, found {scans[name].path.name} "
-                f"and {scan.path.name}; make the pattern of the scans narrower"
-            )
-        scans[name] = scan
-
     @cached_property
     def _listing(self) -> list[tuple[ScanRecord, str]]:
         """The records of all scans, each with its split ("" if it is in none)."""
-        splits = {name: self._split_of(name, scan.path) for name, scan in self._scans.items()}
+        splits: dict[str, str] = {}
         splits_of_folder: dict[str, set[str]] = {}
-        for name, split in splits.items():
-            splits_of_folder.setdefault(self._folder_of(name), set()).add(split)
+        for name, scan in self._scans.items():
+            splits[name] = self._split_of(name, scan.path)
+            splits_of_folder.setdefault(self._folder_of(name), set()).add(splits[name])
 
         listing = []
         for name, scan in self._scans.items():
@@ -249,11 +252,7 @@ class OwnScans(Dataset):
         return fixed.name or "all"
 
     def _split_of(self, name: str, path: Path) -> str:
-        """Return the split of a scan; "" if it is in none.
-
-        Raises:
-            InputError: if it is in two.
-        """
+        """Return the split of a scan; "" if it is in none."""
         folders = map(Path.as_posix, Path(name).parents)
         texts = {name, path.relative_to(self.root).as_posix(), self._folder_of(name), *folders}
         splits = []
@@ -267,14 +266,6 @@ class OwnScans(Dataset):
                 f"{' and '.join(splits)}; correct the split"
             )
         return splits[0] if splits else ""
-
-    def _read_labels(self, record: ScanRecord, count: int) -> np.ndarray | None:
-        place = self.description.labels
-        path = record.labels_path
-        if place is None or path is None:
-            return None
-        layout = self.description.layout
-        return read_scan_labels(path, count, self.taxonomy, place.field, layout)
 
 
 def _fixed_part(pattern: str) -> Path:

@@ -90,11 +90,7 @@ class SemanticKitti(Dataset):
         return tuple(sorted(names))
 
     def _records(self, sequence: str) -> list[ScanRecord]:
-        """Return the scans of one sequence, in order.
-
-        Raises:
-            InputError: if there are none.
-        """
+        """Return the scans of one sequence, in order."""
         folder = self._folder / sequence
 
         # If only some scans have labels, reading one without is an error.

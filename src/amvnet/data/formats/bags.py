@@ -158,9 +158,6 @@ def _choose_topic(connections: Iterable[Any], topic: str | None, path: Path) -> 
 
     Args:
         topic: None for the only one with scans.
-
-    Raises:
-        InputError: if it is missing, or there are several and none is requested.
     """
     counts: dict[str, int] = {}
     for connection in _with_scans(connections):

@@ -81,11 +81,7 @@ def _begins_as(beginning: bytes) -> str | None:
 
 
 def _guess_ending(path: Path, named: str | None) -> str:
-    """Return the ending that the values in a file tell, or else its name.
-
-    Raises:
-        InputError: if neither tells.
-    """
+    """Return the ending that the values in a file tell, or else its name."""
     if usual_layout(load(path)) is not None:
         return ".bin"
     if named is not None:

@@ -66,8 +66,11 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         names = member_names(path)
         arrays = find_columns(names)
         if {"x", "y", "z"} <= set(arrays):
-            columns = {key: read_array(path, names[index]).ravel() for key, index in arrays.items()}
-            lengths = {names[arrays[key]]: len(values) for key, values in columns.items()}
+            columns = {}
+            lengths = {}
+            for key, index in arrays.items():
+                columns[key] = read_array(path, names[index]).ravel()
+                lengths[names[index]] = len(columns[key])
 
             if len(set(lengths.values())) > 1:
                 raise InputError(

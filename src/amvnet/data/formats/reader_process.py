@@ -218,17 +218,18 @@ def _limit(kind: int, value: int) -> None:
 
 def _send(replies: BinaryIO, values: dict[str, Any]) -> None:
     """Write a line of JSON, followed by the bytes of the arrays."""
-    arrays = {}
+    arrays = []
+    shapes = {}
     others = {}
     for name, value in values.items():
         if isinstance(value, np.ndarray):
-            arrays[name] = np.ascontiguousarray(value)
+            arrays.append(np.ascontiguousarray(value))
+            shapes[name] = (value.dtype.str, value.shape)
         else:
             others[name] = value
 
-    shapes = {name: (array.dtype.str, array.shape) for name, array in arrays.items()}
     replies.write(json.dumps({**others, "arrays": shapes}).encode() + b"\n")
-    for array in arrays.values():
+    for array in arrays:
         if array.size:
             replies.write(array.data.cast("B"))
     replies.flush()
