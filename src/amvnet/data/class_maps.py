@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -79,7 +79,12 @@ def _parse(name: str, tree: Any) -> ClassMap:
     raw_ids = [0]
     raw_to_train: dict[int | str, int] = {0: 0}
     for train_id, (title, values) in enumerate(entries.items(), start=1):
-        for source in _names(title, values.get("from", [])):
+        names = values.get("from", [])
+        for source in names if isinstance(names, list) else [names]:
+            if not isinstance(source, str):
+                raise InputError(
+                    f"{title}: expected names of classes, found {shown(source)}; correct it"
+                )
             if source in sources:
                 raise InputError(f"expected each class once, found {source} twice; correct the map")
             sources[source] = train_id
@@ -87,11 +92,3 @@ def _parse(name: str, tree: Any) -> ClassMap:
         raw_to_train[raw_ids[-1]] = train_id
 
     return ClassMap(user_taxonomy(name, entries, raw_to_train, raw_ids), sources)
-
-
-def _names(title: Any, values: Any) -> Sequence[str]:
-    names = values if isinstance(values, list) else [values]
-    for name in names:
-        if not isinstance(name, str):
-            raise InputError(f"{title}: expected names of classes, found {shown(name)}; correct it")
-    return names

@@ -21,7 +21,7 @@ MOST_MARKED = 20  # longer sweeps are drawn without markers, which would overlap
 Cell = str | float | int | None  # None: no such number
 
 
-# Of the curves of the methods, in Matplotlib.
+# Styles of the methods' curves, in Matplotlib.
 STYLES = {
     "rv": {"marker": "o", "linestyle": ":"},
     "bev": {"marker": "s", "linestyle": "--"},

@@ -148,7 +148,11 @@ class Evaluation:
         """
         methods = {}
         for method, matrices in self.matrices.items():
-            methods[method] = self._method_report(matrices)
+            bins = []
+            for (near, far), matrix in zip(pairwise(EDGES), matrices[1:], strict=True):
+                extent = {"from_m": float(near), "to_m": float(far), "points": int(matrix.sum())}
+                bins.append({**extent, **metrics(matrix, self.taxonomy)})
+            methods[method] = {**metrics(matrices[0], self.taxonomy), "by_distance": bins}
 
         return {
             "dataset": dataset,
@@ -157,14 +161,6 @@ class Evaluation:
             "uncertain_fraction": _ratio(self.uncertain, self.asked),
             "methods": methods,
         }
-
-    def _method_report(self, matrices: np.ndarray) -> dict[str, Any]:
-        bins = []
-        for (near, far), matrix in zip(pairwise(EDGES), matrices[1:], strict=True):
-            extent = {"from_m": float(near), "to_m": float(far), "points": int(matrix.sum())}
-            bins.append({**extent, **metrics(matrix, self.taxonomy)})
-
-        return {**metrics(matrices[0], self.taxonomy), "by_distance": bins}
 
     def _add_counts(self, method: str, matrices: np.ndarray) -> None:
         self.matrices[method] = self.matrices.get(method, 0) + matrices

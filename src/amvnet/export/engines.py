@@ -39,7 +39,7 @@ def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> Non
 
     Args:
         engine: one of `ENGINES`.
-        say: told what takes long.
+        say: called with a line before work that takes long.
 
     Raises:
         InputError: if there is no such engine, it lacks a library or the device, or the sensor of

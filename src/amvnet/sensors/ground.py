@@ -18,11 +18,11 @@ MIN_CELLS = 30
 MIN_AGREEMENT = 0.25  # weighted share of the cells that must lie in the plane
 
 # Which side of the plane is up: the ground has things on it, and little below it
-OFF_PLANE = 0.3  # metres: points farther from the plane do not belong to it,
-CURVED = 0.02  # nor, for each metre of distance from the sensor, within this more
+OFF_PLANE = 0.3  # metres from the plane within which points belong to it, at the sensor
+CURVED = 0.02  # metres more for each metre of distance from the sensor
 MAX_BELOW = 0.1  # share of the points below the plane, if not even more are above it
-MIN_HEIGHT = -0.5  # metres of the origin over the plane; planes above it must be sure
-MAX_HEIGHT = 10.0  # metres of the origin over the plane: farther walls are seen than ground
+MIN_HEIGHT = -0.5  # metres of the origin over the plane; if it is lower, the plane must be sure
+MAX_HEIGHT = 10.0  # metres of the origin over the plane; if it is higher, the plane is a wall
 
 # Planes that are sure enough to turn a scan by. Over real scans in all orientations, the ground has
 # 0.3 to 0.7 of the points within `TOLERANCE` and 0.4 to 0.8 of the cells, a wall at most 0.15.

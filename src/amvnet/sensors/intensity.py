@@ -215,7 +215,7 @@ class IntensityMap:
     """How the intensities of a source become those that some weights know.
 
     Attributes:
-        text: says it to the user.
+        text: describes the map to the user.
         scale: the divisor of the intensities; None if they are matched or filled in.
         matched: quantiles of the source, increasing, and what they become; None if they are not
             matched.

@@ -95,8 +95,8 @@ class Sensor:
     def to_level(self, xyz: np.ndarray) -> np.ndarray:
         """Return the (N, 3) points of a file in metres and in the package's axes.
 
-        What is not known of the frame needs no change. If the points have to be scaled, turned
-        or moved, they are float64, and lost points, at the file's origin, become NaN.
+        An unknown unit, rotation or offset changes nothing. Points that are scaled, turned or moved
+        are float64, and lost points, at the file's origin, become NaN.
         """
         scale = UNITS[self.unit or "m"]
         turn = self.turn

@@ -65,7 +65,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     The row follows the elevation at which the sensor saw the point, before the move.
 
     Args:
-        sensor: what is known of it, which counts more.
+        sensor: what is known of it, and takes precedence over the estimate.
 
     Raises:
         InputError: if no point is usable.

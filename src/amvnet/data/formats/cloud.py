@@ -249,6 +249,18 @@ def require_columns(
     return columns
 
 
+def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
+    """Return the NumPy type of records; bytes that belong to no column are skipped.
+
+    Args:
+        columns: for each column, its NumPy type and its offset in a record, bytes.
+    """
+    formats, offsets = zip(*columns.values(), strict=True)
+    return np.dtype(
+        {"names": list(columns), "formats": formats, "offsets": offsets, "itemsize": size}
+    )
+
+
 def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
     """Return the cloud of the (N,) columns x, y, z and, if present, intensity and ring.
 

@@ -13,7 +13,7 @@ TEXT = (".xyz", ".txt", ".csv", ".asc", ".pts")
 BAGS = (".bag", ".mcap", ".db3")
 FOLDER = ""  # instead of an ending: the folder of a ROS 2 bag
 METADATA = "metadata.yaml"  # in the folder of a ROS 2 bag
-# Of files that are read; docs/own_scans.md says what is read of each kind.
+# The endings of all files that are read; docs/own_scans.md says what is read of each kind.
 ENDINGS = (
     *(NUSCENES_ENDING, ".bin", ".pcd", ".ply", ".npy", ".npz"),
     *TEXT,
@@ -71,7 +71,7 @@ def ending_of(path: Path) -> str:
 
 
 def _begins_as(beginning: bytes) -> str | None:
-    """Return the ending that the first bytes of a file tell; None if they do not."""
+    """Return the ending that belongs to the first bytes of a file; None if they are unknown."""
     without_comments = COMMENT_LINES.sub(b"", beginning, 1)
     for text in (beginning, without_comments):
         for known, ending in BEGINNINGS.items():

@@ -33,7 +33,7 @@ from amvnet.errors import InputError
 # Names of the array to read, if there are several.
 KEYS = ("points", "positions", "xyz", "scan", "arr_0")
 FEW = 10  # an array with as few rows and more columns is transposed
-MOST_COLUMNS = 200  # of an array without names, of which one can be chosen
+MOST_COLUMNS = 200  # of an array without names; one is chosen by its number
 METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # in which NumPy packs archives
 ADVICE = "save it again with np.save"
 ARCHIVE_ADVICE = "save it again with np.savez"

@@ -9,7 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.data.formats.cloud import Cloud, check_point_count, make_cloud, require_columns
+from amvnet.data.formats.cloud import (
+    Cloud,
+    check_point_count,
+    make_cloud,
+    record_dtype,
+    require_columns,
+)
 from amvnet.errors import InputError
 
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"  # in ROS 2; rosbags uses this name for ROS 1, too
@@ -37,15 +43,11 @@ def read_message(message: Any, name: str) -> Cloud:
     fields = list(message.fields)
     byte_order = ">" if message.is_bigendian else "<"
 
-    columns = require_columns([field.name for field in fields], name)
-    formats = []
-    offsets = []
-    for index in columns.values():
-        formats.append(byte_order + TYPES[fields[index].datatype])
-        offsets.append(fields[index].offset)
-    # Bytes that belong to no column are skipped.
-    layout = {"names": list(columns), "formats": formats, "offsets": offsets}
-    dtype = np.dtype({**layout, "itemsize": message.point_step})
+    columns = {}
+    for key, index in require_columns([field.name for field in fields], name).items():
+        field = fields[index]
+        columns[key] = (byte_order + TYPES[field.datatype], field.offset)
+    dtype = record_dtype(columns, message.point_step)
 
     # Rows can have padding, too. Some drivers leave out row_step.
     row_size = message.width * message.point_step

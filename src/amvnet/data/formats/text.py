@@ -65,10 +65,10 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     commas or semicolons.
 
     Args:
-        layout: what the user says; of it, the columns count.
+        layout: what the user says about the rows; only its columns are used.
 
     Raises:
-        InputError: if there are no lines of three numbers or more, or a later line is another.
+        InputError: if there are no lines of three or more numbers, or a later line has others.
     """
     with reading(path, EXPECTED, ADVICE):
         table = _require_table(path)
