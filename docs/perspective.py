@@ -26,7 +26,7 @@ GAP = 8  # pixels between panels
 OVERSAMPLE = 2
 LEGEND = 56  # pixels, height of a row
 MOST_COLUMNS = 10  # of the legend
-LEAST = 40  # points of a class in the legend
+LEAST = 40  # points of a class in the legend, of both upper panels
 
 BACKGROUND = np.array([13, 16, 22], np.float32)
 INK = (226, 230, 238)
@@ -210,7 +210,8 @@ def draw(
     ]
 
     width, height = PANEL
-    present = np.flatnonzero(np.bincount(truth, minlength=taxonomy.size + 1) >= LEAST)
+    counts = np.bincount(np.concatenate([truth, labels]), minlength=taxonomy.size + 1)
+    present = np.flatnonzero(counts >= LEAST)
     size = (2 * width + GAP, 2 * height + GAP + LEGEND * legend_rows(present))
     sheet = Image.new("RGB", size, tuple(int(c) for c in BACKGROUND * 2))
     pen = ImageDraw.Draw(sheet)

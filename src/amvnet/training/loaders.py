@@ -37,7 +37,7 @@ from amvnet.sensors.record import AS_IS, measure_sensor, normalised_record
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
-SAMPLED_SCANS = 20  # that are measured
+SAMPLED_SCANS = 60  # that are measured: the heights of simulated sensors differ by centimetres
 
 Key = tuple[int, int]  # epoch, index in the list of scans
 
