@@ -197,7 +197,7 @@ def weights() -> Weights:
 
 @pytest.fixture(scope="module")
 def description(weights: Weights) -> dict[str, Any]:
-    return {
+    fields = {
         "format": FORMAT,
         "model": to_dict(weights.model),
         "taxonomy": weights.taxonomy.to_dict(),
@@ -205,6 +205,7 @@ def description(weights: Weights) -> dict[str, Any]:
         "training": weights.training,
         "metrics": weights.metrics,
     }
+    return json.loads(json.dumps(fields))  # lists instead of tuples, as in a file
 
 
 def write_weights(path: Path, tensors: Mapping[str, torch.Tensor], text: str) -> Path:
