@@ -26,9 +26,14 @@ MIN_ERROR = 1e-3
 def class_weights(counts: np.ndarray) -> np.ndarray:
     """Return the square roots of the inverse class frequencies, scaled to a mean of 1.
 
-    They are (K,) float32, given the (K,) numbers of points of each class in the training data. A
-    frequency below `FREQUENCY_FLOOR` is raised to it, also that of an absent class. Section 4.2 of
-    the paper.
+    A frequency below `FREQUENCY_FLOOR` is raised to it, also that of an absent class. Section 4.2
+    of the paper.
+
+    Args:
+        counts: (K,) numbers of points of each class in the training data.
+
+    Returns:
+        (K,) float32.
     """
     frequency = np.maximum(counts / max(counts.sum(), 1), FREQUENCY_FLOOR)
     weights = 1 / np.sqrt(frequency)
@@ -143,8 +148,8 @@ def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> 
 def dice(probabilities: Tensor, targets: Targets) -> Tensor:
     """Return the soft Dice loss: 1 - 2 |p t| / (|p| + |t|), averaged over the classes present.
 
-    It is (), the mean over the scans, given probabilities p (P, K); t is the one-hot encoding of
-    the classes of the P points.
+    The probabilities p are (P, K), and t is the one-hot encoding of the classes of the P points.
+    The loss is a scalar, the mean over the scans.
     """
     truth = F.one_hot(targets.classes, probabilities.shape[1]).to(probabilities)
     members = F.one_hot(targets.scan, len(targets.counts)).to(probabilities).T  # (B, P)
@@ -164,8 +169,8 @@ def lovasz_softmax(probabilities: Tensor, targets: Targets) -> Tensor:
     the Jaccard loss when its point joins the mispredicted ones (Berman et al., CVPR 2018). Errors
     up to `MIN_ERROR` are left out, which saves most of the sorting.
 
-    It is (), the mean over the scans, given probabilities p (P, K); t is 1 for the points of the
-    class, else 0.
+    The probabilities p are (P, K), and t is 1 for the points of the class, else 0. The loss is a
+    scalar, the mean over the scans.
     """
     classes = probabilities.shape[1]
     with torch.no_grad():  # the order and the increases have no gradient

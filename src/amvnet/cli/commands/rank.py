@@ -45,5 +45,4 @@ def rank(
         with progress("scoring") as step:
             clusters = rank_records(dataset, records, segmenter, step)
         write_clusters(clusters, records, dataset.taxonomy, out)
-        found = counted(len(clusters), "cluster")
-        say(f"{found} of {counted(len(records), 'scan')} in {out}")
+        say(f"{counted(len(clusters), 'cluster')} of {counted(len(records), 'scan')} in {out}")
