@@ -21,7 +21,7 @@ MEASURED = 5  # scans of a recording that are measured; later ones get the media
 STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
 SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
 LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
-QUICK_STEP = 7  # of the points, one of so many tells most sensors; no number of lasers has it
+QUICK_STEP = 7  # every 7th point suffices for most sensors; 7 divides no usual number of lasers
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class Gauge:
         return Estimate(frame, lasers, quantiles_of(cloud.intensity))
 
     def recognises(self, cloud: Cloud, usual: Estimate) -> bool:
-        """Return whether a scan is from the sensor of an estimate, in the frame of that.
+        """Return whether a scan is of an estimate's sensor, in the estimate's frame.
 
-        Some of the points are enough for most scans.
+        For most scans, some of the points are enough.
         """
         for step in (QUICK_STEP, 1):
             part = dataclasses.replace(
