@@ -336,3 +336,11 @@ def test_an_error_of_the_disk_names_the_file_and_not_its_temporary_name(
         pass
     assert caught.value.filename == str(tmp_path / "a")
     assert not list(tmp_path.iterdir())
+
+
+def test_an_output_folder_that_is_a_file_is_called_one(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    path.write_bytes(PRECIOUS)
+    with pytest.raises(InputError, match="expected a folder to write to, found a file; give"):
+        files.make_folder(path)
+    assert path.read_bytes() == PRECIOUS

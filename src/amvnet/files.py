@@ -168,8 +168,9 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
+        problem = "a file" if isinstance(error, FileExistsError) else error.strerror
         raise InputError(
-            f"{path}: expected a folder to write to, found {error.strerror}; give another"
+            f"{path}: expected a folder to write to, found {problem}; give another"
         ) from None
 
 
