@@ -12,6 +12,7 @@ import pytest
 
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, Taxonomy
+from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation, confusion, metrics
 
 GOLDEN = Path(__file__).parents[1] / "golden"
@@ -225,3 +226,17 @@ def test_distance_bins_are_open_at_both_ends() -> None:
 
     bins = evaluation.report("x")["methods"]["rv"]["by_distance"]
     assert [extent["points"] for extent in bins] == [1, 1, 0, 0, 0]
+
+
+def test_what_does_not_fit_is_refused_and_not_counted() -> None:
+    with pytest.raises(InputError, match="of one shape"):
+        confusion(np.zeros(3, int), np.zeros(4, int), 16)
+    with pytest.raises(InputError, match=r"0\.\.16"):
+        confusion(np.zeros(1, int), np.full(1, 17), 16)
+
+    evaluation = Evaluation(NUSCENES)
+    ids = np.ones(1, int)
+    with pytest.raises(InputError, match=r"0\.\.16"):
+        evaluation.add(np.ones((1, 3)), ids, {"rv": ids, "bev": ids + 16})
+    assert evaluation.scans == 0
+    assert not evaluation.matrices

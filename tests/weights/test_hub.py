@@ -144,6 +144,8 @@ def test_a_name_that_cannot_be_loaded_is_one_line(hub: Hub) -> None:
 
 
 def test_a_push_that_fails_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    fails(lambda: amvnet.push(fresh_weights(), "streets"), "OWNER/NAME")
+
     def refuse(**arguments: object) -> object:
         raise RuntimeError("no way in")
 

@@ -56,11 +56,7 @@ class SafeStream:
         """Drop this and all that follows if the stream is closed, its disk is full, or the like."""
         try:
             yield
-        except (
-            OSError,
-            ValueError,
-            AttributeError,
-        ) as error:  # None after >&-
+        except (OSError, ValueError, AttributeError) as error:  # after >&- the stream is None
             with suppress(OSError, ValueError, AttributeError), open(os.devnull, "w") as nothing:
                 os.dup2(nothing.fileno(), self._stream.fileno())
             if not isinstance(error, OSError) or self.name == "stderr":

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.errors import InputError
 
 # Metres; the distances of SemanticKITTI's evaluation by distance.
 EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
@@ -25,10 +26,31 @@ def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarra
 
     Returns:
         (K + 1, K + 1) int64; the row is the true id, the column the predicted one.
+
+    Raises:
+        InputError: if the two differ in length or an id is outside 0..K.
     """
+    truth = np.asarray(truth)
+    prediction = np.asarray(prediction)
+    if truth.shape != prediction.shape or truth.ndim != 1:
+        raise InputError(
+            "expected true and predicted ids of one shape (N,), "
+            f"found {truth.shape} and {prediction.shape}; give the prediction of this scan"
+        )
+    _check_ids(truth, "true", size)
+    _check_ids(prediction, "predicted", size)
+
     cells = truth.astype(np.int64) * (size + 1) + prediction
     counts = np.bincount(cells, minlength=(size + 1) ** 2)
     return counts.reshape(size + 1, size + 1)
+
+
+def _check_ids(ids: np.ndarray, kind: str, size: int) -> None:
+    if len(ids) and not 0 <= ids.min() <= ids.max() <= size:
+        raise InputError(
+            f"expected {kind} ids 0..{size}, found {ids.min()}..{ids.max()}; "
+            "map raw labels to train ids first"
+        )
 
 
 def metrics(matrix: np.ndarray, taxonomy: Taxonomy) -> dict[str, Any]:
@@ -111,15 +133,20 @@ class Evaluation:
             truth: (N,) train ids.
             predictions: method -> (N,) train ids.
             uncertain: (N,) bool, or None if it is not known which points are uncertain.
+
+        Raises:
+            InputError: as `confusion`. The scan is then not counted at all.
         """
         size = self.taxonomy.size
         distances = np.linalg.norm(points[:, :3], axis=1)
+        counts = {}
         for method, ids in predictions.items():
             matrices = [confusion(truth, ids, size)]
             for near, far in pairwise(EDGES):
                 is_between = (near < distances) & (distances < far)
                 matrices.append(confusion(truth[is_between], ids[is_between], size))
-            self._add_counts(method, np.stack(matrices))
+            counts[method] = np.stack(matrices)
+        self._add_counts(counts)
 
         self.scans += 1
         self.points += len(points)
@@ -132,8 +159,7 @@ class Evaluation:
         """Return an evaluation of the scans of both, which have the same classes."""
         total = Evaluation(self.taxonomy)
         for part in (self, other):
-            for method, matrices in part.matrices.items():
-                total._add_counts(method, matrices)
+            total._add_counts(part.matrices)
             total.scans += part.scans
             total.points += part.points
             total.uncertain += part.uncertain
@@ -162,5 +188,6 @@ class Evaluation:
             "methods": methods,
         }
 
-    def _add_counts(self, method: str, matrices: np.ndarray) -> None:
-        self.matrices[method] = self.matrices.get(method, 0) + matrices
+    def _add_counts(self, counts: Mapping[str, np.ndarray]) -> None:
+        for method, matrices in counts.items():
+            self.matrices[method] = self.matrices.get(method, 0) + matrices

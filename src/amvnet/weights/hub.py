@@ -26,11 +26,18 @@ def fetch(name: str) -> Path:
             installed.
     """
     repository, _, revision = name.removeprefix(PREFIX).partition("@")
+    check_name(repository, name)
     hub = client()
 
-    with hub_errors(name, f"check OWNER/NAME and the network, and that {FILE} is there"):
+    with hub_errors(name, f"check the name and the network, and that {FILE} is there"):
         path = hub.hf_hub_download(repo_id=repository, filename=FILE, revision=revision or None)
         return Path(path)
+
+
+def check_name(repository: str, name: str) -> None:
+    """Check that a repository has the form OWNER/NAME; raise InputError with `name` if not."""
+    if repository.count("/") != 1 or not all(repository.split("/")):
+        raise InputError(f"expected {PREFIX}OWNER/NAME, found {name!r}; name both")
 
 
 def client() -> Any:

@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 from amvnet.weights.card import front_matter, model_card
 from amvnet.weights.file import Weights, load, save
-from amvnet.weights.hub import FILE, PREFIX, client, hub_errors
+from amvnet.weights.hub import FILE, PREFIX, check_name, client, hub_errors
 
 CARD = "README.md"
 
@@ -32,6 +32,7 @@ def push(
             installed.
     """
     name = name.removeprefix(PREFIX)
+    check_name(name, name)
     if not isinstance(weights, Weights):
         weights = load(weights)
     hub = client()
