@@ -34,6 +34,10 @@ WRONG_NAMES = {
 WRONG_VALUES = {
     PREDICT + " --height many": "--height: expected a number, found 'many'",
     PREDICT + " --batch 1.5": "--batch: expected a whole number, found '1.5'",
+    PREDICT + " --batch 0": "--batch: expected a number at least 1, found '0'",
+    PREDICT + " --at-once 0": "--at-once: expected a number at least 1, found '0'",
+    PREDICT + " --tau 1.2": "--tau: expected a number at least 0 and at most 1, found '1.2'",
+    "bench --runs 0": "--runs: expected a number at least 1, found '0'",
     TRAIN + " --training.rv.lr many": "--training.rv.lr: expected a value like",
     TRAIN + " --training.rv.lr=-1": "--training.rv.lr: expected a number",
     TRAIN + " --model.range_net.widths [16,16]": "--model.range_net: expected as many widths",

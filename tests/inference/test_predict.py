@@ -20,8 +20,7 @@ from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan
-from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
-from amvnet.inference.predict import predict as predict_scans
+from amvnet.inference.pipeline import AHEAD, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.segmenter import Segmentation, Segmenter
 from amvnet.scan import Scan
@@ -126,9 +125,8 @@ def test_a_broken_scan_of_a_batch_does_not_break_the_others(tmp_path: Path) -> N
         return list(map(no_segmentation, scans))
 
     scans = counted_scans(8, Counter())
-    execution = ExecutionOptions(batch=4)
-    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
-    outcomes = list(pipeline.stream(scans))
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, batch=4)
+    outcomes = list(pipeline.stream(scans, pipeline.write_or_explain))
     assert [outcome for outcome in outcomes if isinstance(outcome, str)] == ["3: broken"]
     assert sum(isinstance(outcome, Entry) for outcome in outcomes) == 7
 
@@ -149,9 +147,8 @@ def test_a_scan_that_takes_all_memory_is_a_broken_one(tmp_path: Path, error: Exc
         return list(map(no_segmentation, scans))
 
     scans = counted_scans(8, Counter())
-    execution = ExecutionOptions(batch=4)
-    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
-    outcomes = list(pipeline.stream(scans))
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, batch=4)
+    outcomes = list(pipeline.stream(scans, pipeline.write_or_explain))
     (line,) = [outcome for outcome in outcomes if isinstance(outcome, str)]
     assert line.startswith("3: expected enough memory")
     assert sum(isinstance(outcome, Entry) for outcome in outcomes) == 7
@@ -453,9 +450,10 @@ def test_few_scans_are_in_memory_however_many_there_are(
         segment_by(Segmenter(str(world / WEIGHTS))),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
-        ExecutionOptions(at_once=at_once),
+        at_once=at_once,
     )
-    done = [entry.scan for entry in pipeline.stream(scans) if isinstance(entry, Entry)]
+    outcomes = pipeline.stream(scans, pipeline.write_or_explain)
+    done = [entry.scan for entry in outcomes if isinstance(entry, Entry)]
     assert done == [f"{index}.npz" for index in range(30)]
     assert counter.most <= 2 * AHEAD + 2 * at_once
     assert not counter.in_memory
@@ -480,29 +478,23 @@ def test_scans_side_by_side_really_run_at_the_same_time(tmp_path: Path) -> None:
         return list(map(no_segmentation, scans))
 
     scans = counted_scans(2, Counter())
-    execution = ExecutionOptions(at_once=2)
-    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, execution)
-    first, second = pipeline.stream(scans)
+    pipeline = Pipeline(scans, segment, OutputOptions(tmp_path), SEMANTICKITTI, at_once=2)
+    first, second = pipeline.stream(scans, pipeline.write_or_explain)
     assert isinstance(first, Entry)
     assert isinstance(second, Entry)
 
 
-def test_the_scans_at_a_time_are_those_that_the_caller_asks_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("options", "expected"), [("", 2), ("--at-once 3", 3), ("--batch 2", 2)])
+def test_predict_segments_as_many_scans_at_a_time_as_asked_or_as_there_are_threads(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: str, expected: int
 ) -> None:
-    segmenter = Segmenter(fresh_weights())
-    segmenter.at_once = 1
-    points, _ = street(0)
-    points.tofile(tmp_path / "scan.bin")
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     seen = []
 
     def note(self: Pipeline, *arguments: object) -> tuple[list[Entry], list[str]]:
-        seen.append(self.execution.at_once)
+        seen.append(self.at_once)
         return [], []
 
     monkeypatch.setattr(Pipeline, "run", note)
-    for execution in (ExecutionOptions(at_once=3), ExecutionOptions()):
-        predict_scans(
-            [str(tmp_path / "scan.bin")], segmenter, OutputOptions(tmp_path), execution=execution
-        )
-    assert seen == [3, 1]
+    succeed(predict(world, tmp_path, options))
+    assert seen == [expected]

@@ -22,7 +22,7 @@ from amvnet import read as read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.journal import Entry, Journal
 from amvnet.inference.listing import ScanOptions
-from amvnet.inference.pipeline import AHEAD, ExecutionOptions, OutputOptions, Pipeline
+from amvnet.inference.pipeline import AHEAD, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.models import neighbours_gpu as block_search
 from amvnet.models.amvnet import LateFusion
@@ -538,9 +538,9 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
         segment_by(Segmenter(fresh_weights())),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
-        ExecutionOptions(batch=4),
+        batch=4,
     )
-    results = list(pipeline.stream(scans))
+    results = list(pipeline.stream(scans, pipeline.write_or_explain))
     done = [result.scan for result in results if isinstance(result, Entry)]
     assert done == [f"{seed}.npz" for seed in range(23)]
     assert sizes == [4, 4, 4, 4, 4, 3]

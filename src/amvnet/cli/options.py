@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import say, silence
-from amvnet.config.bounds import Range
+from amvnet.config.bounds import Count, Range
 from amvnet.errors import InputError, shown
 from amvnet.models.methods import METHODS, EngineName, MethodName, Precision
 from amvnet.progress import counted
@@ -139,7 +139,7 @@ class ComputeChoice:
     calibrated once; a few labels change)."""
     precision: Precision = "auto"
     """of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32."""
-    at_once: int | None = None
+    at_once: Count | None = None
     """scans that are segmented at the same time on a CPU; default: one per core, if the memory
     suffices."""
 
@@ -164,10 +164,6 @@ class ComputeChoice:
         from amvnet.memory import keep_freed_memory
         from amvnet.models.precision import choose_device
 
-        if self.at_once is not None and self.at_once < 1:
-            raise InputError(
-                f"expected one scan or more at a time, found {self.at_once}; set --at-once"
-            )
         device = choose_device(self.device, self.engine)
         if processes is not None:
             device = processes.device(device)

@@ -7,7 +7,7 @@ import dataclasses
 import inspect
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
@@ -15,6 +15,7 @@ from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 import docstring_parser
 
 from amvnet.cli.console import say_lines
+from amvnet.config.bounds import Range
 from amvnet.errors import InputError, did_you_mean, shown
 
 NUMBERS = {int: "a whole number", float: "a number"}
@@ -104,7 +105,11 @@ class Parser(argparse.ArgumentParser):
 
 
 def _convert(flag: str, text: str, kind: Any) -> Any:
-    """Convert the text of an option to its type; raise InputError if it does not fit."""
+    """Convert the text of an option to its type.
+
+    Raises:
+        InputError: if it does not fit, or a number is out of the `Range` of an `Annotated` type.
+    """
     choices = literals(kind)
     if choices and text not in choices:
         raise InputError(
@@ -112,7 +117,7 @@ def _convert(flag: str, text: str, kind: Any) -> Any:
             + did_you_mean(text, choices)
         )
 
-    kinds = (kind, *get_args(kind))
+    kinds = list(_parts_of(kind))
     for number, words in NUMBERS.items():
         if number in kinds:
             try:
@@ -121,8 +126,20 @@ def _convert(flag: str, text: str, kind: Any) -> Any:
                 value = math.nan
             if not math.isfinite(value):
                 raise InputError(f"{flag}: expected {words}, found {shown(text)}; correct it")
+            for allowed in kinds:
+                if isinstance(allowed, Range) and value not in allowed:
+                    raise InputError(
+                        f"{flag}: expected a number {allowed}, found {shown(text)}; correct it"
+                    )
             return value
     return Path(text) if Path in kinds else text
+
+
+def _parts_of(kind: Any) -> Iterator[Any]:
+    """Yield a type and what it is made of: of `Count | None` also int and `Range`."""
+    yield kind
+    for part in get_args(kind):
+        yield from _parts_of(part)
 
 
 def literals(kind: Any) -> tuple[str, ...]:
@@ -147,14 +164,14 @@ def make_parser(verb: str, command: Command) -> Parser:
         description=docs.short_description,
     )
 
-    hints = get_type_hints(run)
+    hints = get_type_hints(run, include_extras=True)
     for name, parameter in inspect.signature(run).parameters.items():
         kind = hints[name]
         if name in command.positional:
             parser.add_argument(name, help=texts[name], **command.positional[name])
         elif _is_bundle(kind):
             group = parser.add_argument_group(first_line(kind))
-            kinds = get_type_hints(kind)
+            kinds = get_type_hints(kind, include_extras=True)
             field_docs = field_texts(kind)
             for field in dataclasses.fields(kind):
                 field_kind = kinds[field.name]

@@ -6,10 +6,9 @@ import hashlib
 import os
 import socket
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import groupby
@@ -35,7 +34,7 @@ from amvnet.fleet.manifest import split_name
 from amvnet.fleet.results import describe_drive, parse_estimate
 from amvnet.fleet.storage import Place
 from amvnet.inference.listing import FileReader, FileScan
-from amvnet.inference.pipeline import ExecutionOptions, Outcome, OutputOptions, Pipeline
+from amvnet.inference.pipeline import Outcome, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.scan_stream import AHEAD
@@ -265,9 +264,7 @@ class LabelScans:
             assert reader.normaliser is not None
             reader.normaliser.recall(drive[0]["drive"], parse_estimate(drive[0]["estimates"]))
 
-        rows = []
-        writing = deque[Future[Row]]()
-        with self._fetch(drive, reader) as (scans, folder), ThreadPoolExecutor(AHEAD) as writer:
+        with self._fetch(drive, reader) as (scans, folder):
             pipeline = Pipeline(
                 scans,
                 segment_by(self._segmenter, labelling.classes),
@@ -278,23 +275,19 @@ class LabelScans:
                     uncertain=labelling.uncertain,
                 ),
                 labelling.taxonomy,
-                ExecutionOptions(labelling.batch, self._segmenter.at_once),
+                batch=labelling.batch,
+                at_once=self._segmenter.at_once,
             )
             row_of = {scan.name: row for scan, row in zip(scans, drive, strict=True)}
-            with closing(pipeline.results(scans)) as outcomes:
-                for outcome in outcomes:
-                    row = row_of[outcome[0].name]
-                    writing.append(writer.submit(self._write, pipeline, outcome, row))
-                    if len(writing) > AHEAD:
-                        rows.append(writing.popleft().result())
-            rows += [job.result() for job in writing]
+            rows = list(pipeline.stream(scans, partial(self._write, pipeline, row_of), AHEAD))
 
         seconds = (time.perf_counter() - start) / len(drive)
         return [row | {"seconds": seconds} for row in rows]
 
-    def _write(self, pipeline: Pipeline, outcome: Outcome, row: Row) -> Row:
+    def _write(self, pipeline: Pipeline, row_of: Mapping[str, Row], outcome: Outcome) -> Row:
         """Write the files of a scan, the labels last, and return its row of results."""
         scan, loaded, result = outcome
+        row = row_of[scan.name]
         if loaded is None or isinstance(result, InputError):
             return self._row(row, error=str(result).replace(str(scan.path), row["path"]))
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -45,6 +45,7 @@ class OutputOptions:
             `.npz`.
         uncertain: also write (N,) bool, the uncertain points, as `.uncertain.npy`.
         overwrite: replace files that this package did not write, too.
+        resume: leave out the scans that an earlier run into the same folder has done.
 
     Raises:
         InputError: if the format is unknown.
@@ -55,6 +56,7 @@ class OutputOptions:
     scores: bool = False
     uncertain: bool = False
     overwrite: bool = False
+    resume: bool = False
 
     def __post_init__(self) -> None:
         check_kind(self.kind)
@@ -69,34 +71,11 @@ class OutputOptions:
         return paths
 
 
-@dataclass(frozen=True)
-class ExecutionOptions:
-    """How many scans are computed at a time.
-
-    Attributes:
-        batch: scans that go through the networks together; the labels are the same up to rounding.
-        at_once: scans that are segmented at the same time, each with its share of the threads.
-        resume: leave out the scans that an earlier run into the same folder has done.
-
-    Raises:
-        InputError: if the batch is below 1.
-    """
-
-    batch: int = 1
-    at_once: int = 1
-    resume: bool = False
-
-    def __post_init__(self) -> None:
-        if self.batch < 1:
-            raise InputError(
-                f"expected one scan or more in a batch, found {self.batch}; set --batch"
-            )
-
-
 # Segments scans in memory, given where each is from; an InputError says that one is broken.
 Segment = Callable[[Sequence[InputScan], Sequence[Scan]], list[Segmentation]]
 # A scan that was read and segmented, or why it could not be.
 Outcome = tuple[InputScan, LoadedScan | None, Segmentation | InputError]
+Written = TypeVar("Written")
 
 
 @dataclass(frozen=True)
@@ -108,14 +87,16 @@ class Pipeline:
         segment: segments scans that have been read.
         output: what is written, and where.
         taxonomy: the classes of the labels.
-        execution: how many scans at a time.
+        batch: scans that go through the networks together; the labels are the same up to rounding.
+        at_once: batches that are segmented at the same time, each with its share of the threads.
     """
 
     scans: Sequence[InputScan]
     segment: Segment
     output: OutputOptions
     taxonomy: Taxonomy
-    execution: ExecutionOptions = ExecutionOptions()
+    batch: int = 1
+    at_once: int = 1
 
     def run(
         self, settings: Mapping[str, Any], progress: Progress = no_progress
@@ -142,7 +123,14 @@ class Pipeline:
         # Files are claimed before any is written.
         journal = Journal(self.output.folder, settings, done.values())
         written.claim(self._paths_of(remaining))
-        faults = self._process(remaining, journal, progress)
+        faults = []
+        for count, outcome in enumerate(self.stream(remaining, self.write_or_explain)):
+            progress(count, len(remaining))
+            if isinstance(outcome, Entry):
+                journal.add(outcome)
+            else:
+                faults.append(outcome)
+        progress(len(remaining), len(remaining))
 
         entries = journal.close()
         written.finish(self._paths_of(remaining))
@@ -176,7 +164,7 @@ class Pipeline:
         The files have to be there, as they were written, and the scan has to be the same, and
         normalised by the same first ones of its recording.
         """
-        if not self.execution.resume:
+        if not self.output.resume:
             return {}
         earlier = read_journals(self.output.folder, settings)
         done = dict(earlier)
@@ -207,60 +195,39 @@ class Pipeline:
             origins[_key(scan)] = digest[:DIGITS]
         return origins
 
-    def _process(
-        self, remaining: Sequence[InputScan], journal: Journal, progress: Progress
-    ) -> list[str]:
-        """Segment scans; return a line for each that is broken."""
-        faults = []
-        for count, outcome in enumerate(self.stream(remaining)):
-            progress(count, len(remaining))
-            if isinstance(outcome, Entry):
-                journal.add(outcome)
-            else:
-                faults.append(outcome)
-        progress(len(remaining), len(remaining))
-        return faults
-
     def _paths_of(self, scans: Sequence[InputScan]) -> list[Path]:
         """Return the paths of the files of scans, relative to the folder."""
         return list(chain.from_iterable(map(self.output.paths_of, scans)))
 
-    def stream(self, scans: Sequence[InputScan]) -> Iterator[Entry | str]:
+    def stream(
+        self, scans: Sequence[InputScan], write: Callable[[Outcome], Written], writers: int = 1
+    ) -> Iterator[Written]:
         """Read, segment and write scans, of which only a few are in memory at a time.
 
-        Yields:
-            The entry of each scan when its files are written, in order; or of a scan that is
-            broken, a line that says why, which may come before its turn.
-        """
-        writing = deque[Future[Entry]]()
-        # Reading, computing and writing go on at the same time, each on other scans.
-        with closing(self.results(scans)) as results, ThreadPoolExecutor(1) as writer:
-            for scan, loaded, result in results:
-                if loaded is None or isinstance(result, InputError):
-                    yield str(result)
-                    continue
-                writing.append(writer.submit(self.write, scan, loaded, result))
-                # Those that are written are yielded at once, so that the journal has them.
-                while writing and (len(writing) > AHEAD or writing[0].done()):
-                    yield writing.popleft().result()
-            while writing:
-                yield writing.popleft().result()
-
-    def results(self, scans: Sequence[InputScan]) -> Generator[Outcome]:
-        """Read and segment scans, of which only a few are in memory at a time.
+        Args:
+            write: takes each outcome, in order but for scans that cannot be read, which may come
+                before their turn; called in other threads, as many as `writers`.
 
         Yields:
-            Each scan with its result; a scan that cannot be read may come before its turn.
+            What `write` returns.
         """
         groups = stream_groups(
             scans,
             load=lambda scan: scan.load(),
             compute=self._segment_group,
-            batch=self.execution.batch,
-            at_once=self.execution.at_once,
+            batch=self.batch,
+            at_once=self.at_once,
         )
-        with closing(groups):
-            yield from chain.from_iterable(groups)
+        writing = deque[Future[Written]]()
+        # Reading, computing and writing go on at the same time, each on other scans.
+        with closing(groups), ThreadPoolExecutor(writers) as pool:
+            for outcome in chain.from_iterable(groups):
+                writing.append(pool.submit(write, outcome))
+                # Those that are written are yielded at once, so that the journal has them.
+                while writing and (len(writing) > AHEAD or writing[0].done()):
+                    yield writing.popleft().result()
+            while writing:
+                yield writing.popleft().result()
 
     def _segment_group(
         self, group: Sequence[tuple[InputScan, Future[LoadedScan]]]
@@ -293,6 +260,13 @@ class Pipeline:
             if len(loaded) == 1:
                 return [(loaded[0][0], None, error)]
         return list(chain.from_iterable(self._segment_loaded([pair]) for pair in loaded))
+
+    def write_or_explain(self, outcome: Outcome) -> Entry | str:
+        """Write the files of a scan; return its entry, or a line that says why it is broken."""
+        scan, loaded, result = outcome
+        if loaded is None or isinstance(result, InputError):
+            return str(result)
+        return self.write(scan, loaded, result)
 
     def write(self, scan: InputScan, loaded: LoadedScan, result: Segmentation) -> Entry:
         """Write the files of a scan, the labels last: where they are, the others are too."""

@@ -12,7 +12,6 @@ from amvnet.data.class_maps import ClassMap
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import (
-    ExecutionOptions,
     OutputOptions,
     Pipeline,
     Segment,
@@ -39,7 +38,7 @@ def predict(
     segmenter: Segmenter,
     output: OutputOptions,
     options: ScanOptions = ScanOptions(),
-    execution: ExecutionOptions = ExecutionOptions(),
+    batch: int = 1,
     sensor: Sensor | None = None,
     classes: ClassMap | None = None,
     progress: Progress = no_progress,
@@ -49,6 +48,7 @@ def predict(
 
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
+        batch: scans that go through the networks together.
         sensor: what is known of the sensor of scan files; the rest is measured.
         classes: maps the classes of the weights to those that are written; None writes these.
         say: takes lines about what was assumed of the sensor, and at the end how sure the labels
@@ -75,9 +75,9 @@ def predict(
                 scan.written = classes.target
         taxonomy = classes.target
 
-    execution = replace(execution, at_once=execution.at_once or segmenter.at_once)
     segment = segment_by(segmenter, classes)
-    entries, faults = Pipeline(scans, segment, output, taxonomy, execution).run(settings, progress)
+    pipeline = Pipeline(scans, segment, output, taxonomy, batch=batch, at_once=segmenter.at_once)
+    entries, faults = pipeline.run(settings, progress)
 
     if METHODS[segmenter.method].has_two_networks:
         report(entries, segmenter.usual_uncertain, say)

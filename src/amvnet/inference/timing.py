@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from amvnet.errors import InputError
 from amvnet.inference.segmentation import label_ids
 from amvnet.inference.segmenter import Segmenter
 from amvnet.memory import peak_memory
@@ -53,14 +52,7 @@ class Timing:
 def time_runs(
     segmenter: Segmenter, read: Read, write: Write, runs: int, progress: Progress = no_progress
 ) -> dict[str, Any]:
-    """Call `run_once` some times, and return a report for JSON.
-
-    Raises:
-        InputError: if there is no run to time.
-    """
-    if runs < 1:
-        raise InputError(f"expected one run or more, found {runs}; give a number from 1")
-
+    """Call `run_once` some times, at least once, and return a report for JSON."""
     timings = []
     for run in range(runs + WARM_UP):
         timings.append(run_once(segmenter, read, write))

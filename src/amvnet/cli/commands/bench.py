@@ -8,14 +8,15 @@ from tempfile import TemporaryDirectory
 
 from amvnet.cli.console import progress, show
 from amvnet.cli.options import WEIGHTS, ComputeChoice
+from amvnet.config.bounds import Count, Share
 
 
 def bench(
     compute: ComputeChoice,
     weights: str = WEIGHTS,
     scan: Path | None = None,
-    runs: int = 10,
-    tau: float | None = None,
+    runs: Count = 10,
+    tau: Share | None = None,
     json: Path | None = None,
 ) -> None:
     """Time each stage from a scan's file to its labels.

@@ -14,6 +14,7 @@ from amvnet.cli.options import (
     open_data,
     parse_methods,
 )
+from amvnet.config.bounds import Share
 from amvnet.errors import InputError
 from amvnet.models.methods import widest_method
 
@@ -28,7 +29,7 @@ def evaluate(
     weights: str | None = None,
     predictions: Path | None = None,
     methods: str = "rv,bev,ensemble,amvnet",
-    tau: float | None = None,
+    tau: Share | None = None,
     json: Path | None = None,
     pictures: Path | None = None,
     taxonomy: Path | None = None,

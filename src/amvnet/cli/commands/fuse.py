@@ -6,6 +6,7 @@ from pathlib import Path
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import ScanChoice, ScoresChoice
+from amvnet.config.bounds import Share
 from amvnet.errors import InputError
 from amvnet.progress import counted
 
@@ -16,7 +17,7 @@ def fuse(
     models: ScoresChoice,
     choice: ScanChoice,
     head: str | None = None,
-    tau: float | None = None,
+    tau: Share | None = None,
     taxonomy: str | None = None,
     overwrite: bool = False,
 ) -> None:

@@ -13,6 +13,7 @@ from amvnet.cli.options import (
     ScanChoice,
     SensorChoice,
 )
+from amvnet.config.bounds import Count, Share
 from amvnet.errors import InputError
 from amvnet.models.methods import MethodName
 from amvnet.progress import counted
@@ -31,16 +32,16 @@ def predict(
     known: SensorChoice,
     compute: ComputeChoice,
     method: MethodName = "amvnet",
-    tau: float | None = None,
+    tau: Share | None = None,
     scores: bool = False,
     resume: bool = False,
     format: FormatName = "label",
     uncertain: bool = False,
     classes: str | None = None,
-    batch: int = 1,
+    batch: Count = 1,
     overwrite: bool = False,
     ray: str | bool = False,
-    workers: int | None = None,
+    workers: Count | None = None,
 ) -> None:
     """Segment datasets, scans, bags, or folders of scans.
 
@@ -73,8 +74,6 @@ def predict(
 
     mapping = None if classes is None else class_map(classes)
     if ray:
-        if workers is not None and workers < 1:
-            raise InputError(f"--workers: expected a number from 1, found {workers}; give another")
         cluster = _import_cluster()
         labelling = cluster.Labelling(
             load(weights),
@@ -104,7 +103,7 @@ def predict(
         say(f"{counted(written, 'label file')} in {out}; the table of results is in {out}/results")
         return
 
-    from amvnet.inference.pipeline import ExecutionOptions, OutputOptions
+    from amvnet.inference.pipeline import OutputOptions
     from amvnet.inference.predict import predict as predict_inputs
 
     _refuse_urls([*inputs, out])
@@ -116,10 +115,15 @@ def predict(
             inputs,
             segmenter,
             OutputOptions(
-                Path(out), format, scores=scores, uncertain=uncertain, overwrite=overwrite
+                Path(out),
+                format,
+                scores=scores,
+                uncertain=uncertain,
+                overwrite=overwrite,
+                resume=resume,
             ),
             options=choice.parse(),
-            execution=ExecutionOptions(batch, resume=resume),
+            batch=batch,
             sensor=sensor,
             classes=mapping,
             progress=step,
