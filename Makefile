@@ -15,8 +15,8 @@ test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 measures w
 test-slow: .venv/installed .venv/fleet  ## the tests that take minutes, and those of fleets, too
 	$(SPREAD) $(BIN)/python -m pytest -n auto --dist loadfile -m "slow or not slow"
 
-bench: .venv/installed  ## the tables of docs/performance.md, half an hour; SCAN="--scan FILE" for a scan of yours
-	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8,compile
+bench: .venv/installed  ## the time of a scan, and what each optimisation gives: half an hour; SCAN="--scan FILE" for a scan of yours
+	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8
 
 docs: .venv/docs  ## the site of docs/, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

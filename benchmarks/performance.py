@@ -190,7 +190,7 @@ def main() -> None:
 
 
 def compare(options: argparse.Namespace, scan: Path) -> None:
-    """Measure every variant of each engine and print the tables of docs/performance.md.
+    """Measure every variant of each engine and print a table of their times.
 
     Each measurement is a process of its own. The variants take turns, round by round.
     """
