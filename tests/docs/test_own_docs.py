@@ -131,6 +131,6 @@ def test_the_table_of_formats_is_that_of_the_code() -> None:
 
 
 def test_the_names_of_sensors_are_those_that_are_known() -> None:
-    pattern = r"(?s)which states lasers and field of view: (.*?)\. Where"
+    pattern = r"(?s)which states lasers and field of view: (.*?)\. "
     names = re.findall(pattern, read_page("own_sensor.md"))[0]
     assert re.findall(r"`([\w-]+)`", names) == list(SENSORS)
