@@ -6,7 +6,7 @@ import errno
 import os
 import re
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -85,6 +85,30 @@ def publish(part: Path, path: Path) -> None:
             os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def check_free(paths: Iterable[Path], overwrite: bool = False) -> None:
+    """Check that a command replaces no file that it is not told to replace.
+
+    Args:
+        paths: the files that it writes.
+        overwrite: whether it may replace them.
+
+    Raises:
+        InputError: if it may not and one of them exists, or is a folder.
+    """
+    existing = [path for path in paths if not overwrite and os.path.lexists(path)]
+    for path in existing:
+        if path.is_dir():
+            raise InputError(
+                f"{path}: expected a file to write, found a folder; give the name of a file in it"
+            )
+    if existing:
+        more = f" (and {len(existing) - 1} more)" if len(existing) > 1 else ""
+        raise InputError(
+            f"{existing[0]}{more}: expected no file, found one; change --out, or say --overwrite "
+            "to replace it"
+        )
 
 
 def inside(folder: Path | str, name: Path | str) -> Path:

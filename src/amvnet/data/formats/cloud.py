@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -193,20 +192,6 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
     with one_line_errors(message):
         yield
-
-
-def require(source: Path | str, packages: Sequence[str]) -> None:
-    """Check that packages of the extra `formats` are installed, by the names of their modules.
-
-    Raises:
-        InputError: if one is missing.
-    """
-    missing = [package for package in packages if find_spec(package) is None]
-    if missing:
-        raise InputError(
-            f"{source}: expected the package {' and '.join(missing)}, found none; "
-            'run pip install "amvnet[formats]"'
-        )
 
 
 def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str, int]:
