@@ -88,15 +88,7 @@ def publish(part: Path, path: Path) -> None:
 
 
 def check_free(paths: Iterable[Path], overwrite: bool = False) -> None:
-    """Check that a command replaces no file that it is not told to replace.
-
-    Args:
-        paths: the files that it writes.
-        overwrite: whether it may replace them.
-
-    Raises:
-        InputError: if it may not and one of them exists, or is a folder.
-    """
+    """Raise InputError if a command would replace a file, unless it is told to."""
     existing = [path for path in paths if not overwrite and os.path.lexists(path)]
     for path in existing:
         if path.is_dir():
@@ -139,11 +131,7 @@ def inside(folder: Path | str, name: Path | str) -> Path:
 
 
 def check_no_links(folder: Path) -> None:
-    """Check that the first levels of an output folder, which another library fills, have no links.
-
-    Raises:
-        InputError: if one of its folders is a link.
-    """
+    """Check that no folder in an output folder, which another library fills, is a link."""
     for pattern in ("*", "*/*", "*/*/*"):
         for path in folder.glob(pattern):
             if path.is_dir():
@@ -172,11 +160,7 @@ def _fault_of(name: Path) -> str | None:
 
 
 def checked_token(text: Any) -> str:
-    """Return a token of a table that becomes the name of a file.
-
-    Raises:
-        InputError: if it is not one plain name.
-    """
+    """Return a token that becomes the name of a file; raise InputError if it is no plain name."""
     is_name = isinstance(text, str) and text.isprintable() and text not in ("", ".", "..")
     if not is_name or set(text) & set("/\\"):
         raise InputError(

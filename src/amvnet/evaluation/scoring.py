@@ -114,11 +114,7 @@ def stream_labelled(
     at_once: int,
     progress: Progress,
 ) -> Iterator[Result]:
-    """Yield the results of scans as `stream_scans` does; each must have ground truth.
-
-    Raises:
-        InputError: at the first scan that has no ground truth.
-    """
+    """Yield results as `stream_scans` does; raise InputError if a scan has no ground truth."""
 
     def read(record: ScanRecord) -> Scan:
         scan = dataset.read(record)
@@ -137,11 +133,7 @@ def label_by_weights(
     methods: Sequence[str] = PAPER_METHODS,
     classes: ClassMap | None = None,
 ) -> Labeller:
-    """Return what labels scans by several methods.
-
-    Args:
-        classes: as for `Labeller`.
-    """
+    """Return what labels scans by several methods."""
     segmenter = segmenter.for_dataset(dataset)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
@@ -193,14 +185,7 @@ def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatc
 
 
 def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = None) -> Labeller:
-    """Return what reads the labels of scans from a folder of predictions.
-
-    Args:
-        classes: as for `Labeller`.
-
-    Raises:
-        InputError: if there is no such folder.
-    """
+    """Return what reads labels from a folder; raise InputError if there is no such folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 

@@ -87,11 +87,7 @@ def cache_folder() -> Path:
 
 
 def exported(segmenter: Segmenter, int8: str | None = None, say: Say = say_nothing) -> Path:
-    """Return the folder of a segmenter's exported networks, which are exported if necessary.
-
-    Args:
-        int8: as for `export`.
-    """
+    """Return the folder of a segmenter's exported networks, which are exported if necessary."""
     check_libraries()
     weights = segmenter.weights
     digests = [weights.digest(part) for part in weights.parts]

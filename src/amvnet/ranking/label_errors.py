@@ -114,11 +114,7 @@ def rank(
 
 
 def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
-    """Return how doubtful the label of each point of a scan is.
-
-    Raises:
-        InputError: if the scan has no labels.
-    """
+    """Return how doubtful each label of a scan is; raise InputError if it has no labels."""
     label = scan.labels
     if label is None:
         raise InputError(

@@ -76,11 +76,7 @@ class Recording:
         self._is_learnt = True
 
     def learn(self, first: Sequence[Callable[[], Cloud]]) -> None:
-        """Measure the first scans; later ones add nothing.
-
-        Args:
-            first: functions that read these scans; broken scans are left out.
-        """
+        """Measure the first scans, given what reads them; later ones add nothing."""
         for read in first:
             if not self._is_learnt:
                 with suppress(InputError):
@@ -89,11 +85,7 @@ class Recording:
         self._is_learnt = bool(self._first)
 
     def estimate(self, cloud: Cloud) -> tuple[Estimate, bool]:
-        """Return what to assume of the sensor of a scan, and whether it is that of the first scans.
-
-        Raises:
-            InputError: if the unit of the coordinates is in doubt, or no point is usable.
-        """
+        """Return what to assume of a scan, and whether its sensor is that of the first scans."""
         if self._is_learnt and self.usual is not None and self.usual.is_steady:
             if self._recognises(cloud, self.usual):
                 return self.usual, True
@@ -178,15 +170,7 @@ def _are_steady(frames: Sequence[Frame]) -> bool:
 
 
 def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:
-    """Return a scan in the package's axes.
-
-    Args:
-        sensor: with everything about its frame known.
-        intensity: (N,) in [0, 1]; None means zeros.
-
-    Raises:
-        InputError: if no point is usable.
-    """
+    """Return a scan in the package's axes, with (N,) intensities in [0, 1] or else zeros."""
     xyz = sensor.to_level(cloud.xyz)
     return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 

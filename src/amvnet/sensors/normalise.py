@@ -233,11 +233,7 @@ class Normaliser:
 def _intensity_map(
     cloud: Cloud, quantiles: np.ndarray | None, sensor: Sensor, expected: Expectation
 ) -> IntensityMap:
-    """Return how the intensities of a scan become those of the training.
-
-    Args:
-        quantiles: of the intensities of the recording; None if it has none.
-    """
+    """Return how the intensities of a scan become those of the training."""
     known_scale = sensor.intensity_scale
     scale = known_scale or cloud.full or 1.0
     if known_scale is None and cloud.full is None and quantiles is not None:

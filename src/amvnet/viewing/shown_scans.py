@@ -53,11 +53,7 @@ class ShownScan:
 
 
 def check_labels(labels: Path, count: int) -> None:
-    """Check a folder of labels, or the label file of the only one of `count` scans.
-
-    Raises:
-        InputError: if the labels do not exist, or a file is named for several scans.
-    """
+    """Raise InputError if labels do not exist, or one file is named for several scans."""
     if not labels.exists():
         raise InputError(
             f"{labels}: expected a file or a folder of labels, found none; check the path"

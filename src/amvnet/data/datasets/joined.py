@@ -148,11 +148,7 @@ def _order(member: int, count: int) -> np.ndarray:
 
 
 def _places(first: int, others: Sequence[TrainingScans], share: float) -> list[int]:
-    """Return how many scans of an epoch each of the other datasets has, at least one.
-
-    Args:
-        first: scans of the first dataset.
-    """
+    """Return how many scans of an epoch each other dataset has, next to `first` scans."""
     if not share:
         return [max(len(other.train), 1) for other in others]
     if share >= 1:

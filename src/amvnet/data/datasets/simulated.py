@@ -135,12 +135,7 @@ class SimulatedStreets(Dataset):
         )
 
     def _load(self, record: ScanRecord, labels: bool) -> Scan:
-        """Read a scan from the cache.
-
-        Raises:
-            FileNotFoundError: if it is not there.
-            InputError: if a file is broken.
-        """
+        """Read a scan from the cache; raise FileNotFoundError if it is not there."""
         folder = record.points_path
 
         try:
@@ -224,12 +219,7 @@ def _put(part: Path, street: Path) -> None:
 
 
 def _make_room(root: Path, latest: Path) -> None:
-    """Remove the streets that were read the longest time ago until the cache is small enough.
-
-    Args:
-        root: the folder of the cache.
-        latest: a street that stays.
-    """
+    """Remove the streets that were read the longest time ago, but not the latest, to make room."""
     for part in root.glob("streets-*/.*.part"):
         with suppress(FileNotFoundError):  # another process may be removing it
             if time.time() - part.stat().st_mtime > ABANDONED:

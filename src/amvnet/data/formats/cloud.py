@@ -120,11 +120,7 @@ def usual_scale(largest: float, is_integer: bool) -> float:
 
 
 def check_usable(points: np.ndarray, source: Path | str) -> np.ndarray:
-    """Return the (N, 4) points of a scan.
-
-    Raises:
-        InputError: if none of them is valid.
-    """
+    """Return the (N, 4) points of a scan; raise InputError if none of them is valid."""
     if not Scan(points).valid.any():
         raise InputError(f"{source}: {_why_unusable(points[:, :3])}")
     return points
@@ -195,11 +191,7 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
 
 
 def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str, int]:
-    """Return the index of each wanted column that a file has, by its key.
-
-    Args:
-        names: of the columns of the file; upper and lower case do not matter.
-    """
+    """Return the index of each wanted column that a file has, by its key; case does not matter."""
     lower_names = list(map(str.lower, names))
 
     columns = {}
@@ -214,11 +206,7 @@ def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str
 def require_columns(
     names: Sequence[str], path: Path | str, wanted: Names = COLUMN_NAMES
 ) -> dict[str, int]:
-    """Find columns as `find_columns` does, and check that those not `OPTIONAL` are among them.
-
-    Raises:
-        InputError: if one is missing.
-    """
+    """Find columns as `find_columns` does; raise InputError if one that is needed is missing."""
     columns = find_columns(names, wanted)
     expected = []
     for key, aliases in wanted.items():
@@ -265,9 +253,7 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
 def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
     """Return (N,) values as int64 ring indices, 0 for those that are not finite.
 
-    Returns:
-        (N,) int64; None if there are no values, all are the same, or one is negative, too large or
-        not a whole number.
+    None if there are no values, all are the same, or one is negative, too large or not whole.
     """
     if values is None or not len(values):
         return None

@@ -71,10 +71,7 @@ def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
 
 
 def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
-    """Read a file of rows of `columns` values each, with nothing else in it.
-
-    Returns:
-        (N, columns) of `dtype`.
+    """Read a file of nothing but rows of values, as (N, columns) of `dtype`.
 
     Raises:
         InputError: if the file is missing, or its size is not a whole number of rows.
@@ -84,11 +81,7 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
 
 
 def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
-    """Return the number of rows of such a file from its size alone.
-
-    Raises:
-        InputError: as `read_table`.
-    """
+    """Return the number of rows of such a file from its size; raise the errors of `read_table`."""
     if not path.is_file():
         raise InputError(
             f"{path}: expected a file, found none; check the path or complete the dataset"
@@ -129,10 +122,7 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     """Return whether (N, 5) values can be x, y, z, intensity and ring.
 
     The ring holds whole numbers, at least two different ones, and the coordinates do not.
-    Intensities are never negative.
-
-    Args:
-        is_named: whether the name says it, so that the last column is no label.
+    Intensities are never negative. If the name of the file says it, the last column is no label.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]

@@ -117,11 +117,7 @@ class _Process:
         self._replies = os.fdopen(os.dup(cast(BinaryIO, self._popen.stdout).fileno()), "rb")
 
     def exchange(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Send a request and return the reply.
-
-        Raises:
-            EOFError, OSError: if the process has ended.
-        """
+        """Send a request; return the reply. Raise EOFError or OSError if the process has ended."""
         cast(BinaryIO, self._popen.stdin).write(json.dumps(request).encode() + b"\n")
         line = self._replies.readline()
         if not line.endswith(b"\n"):

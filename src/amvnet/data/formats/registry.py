@@ -62,13 +62,10 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
 
 
 def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
-    """Read some columns of a file of points, such as their labels.
+    """Read some columns of a file of points: by key, a number for each point, in any shape.
 
     Args:
         ending: one of `COLUMN_READERS`.
-
-    Returns:
-        A number for each point, in any shape, by key.
 
     Raises:
         InputError: if the file is broken, lacks a column, or needs a package that is missing.

@@ -82,11 +82,7 @@ UNKNOWN = RowLayout()
 
 
 def parse_layout(columns: str | None, dtype: str | None) -> RowLayout:
-    """Return the layout that the options --columns and --dtype describe.
-
-    Raises:
-        InputError: as `RowLayout`.
-    """
+    """Return the layout that the options --columns and --dtype describe."""
     return RowLayout(_split(columns), _split(dtype or USUAL_TYPE))
 
 
