@@ -78,7 +78,7 @@ def analyze(
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> Analysis:
-    """Score labelled scans by every method, and by the head for every point that a tau would ask.
+    """Score labelled scans by every method, and by the head wherever some tau asks it.
 
     Raises:
         InputError: if the weights lack a part, or a scan has no ground truth.
@@ -110,7 +110,7 @@ def analyze(
 
 @torch.inference_mode()
 def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> Analysis:
-    """Score a scan by every method, and by the head for every point that a tau would ask."""
+    """Score a scan by every method, and by the head wherever some tau asks it."""
 
     def is_asked(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
         return (_bins(f, g) < SWEPT) | assertion(f, g, points)

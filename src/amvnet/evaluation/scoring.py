@@ -97,6 +97,7 @@ def evaluate(
         truth = true_table[scan.labels]
         labels_by_name, uncertain = labels
         ids = {name: table[values] for name, values in labels_by_name.items()}
+
         evaluation.add(scan.points, truth, ids, uncertain)
         if pictures is not None and record.name in pictured:
             view = TopView(

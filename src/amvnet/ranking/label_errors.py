@@ -101,7 +101,7 @@ def rank(
     def rank_scan(record: ScanRecord, scan: Scan) -> np.ndarray:
         return find_clusters(find_doubts(check_scan(scan), segmenter))
 
-    rows_by_scan = [np.zeros(0, dtype=ROW)]  # so that there may be no scans
+    rows_by_scan = [np.zeros(0, dtype=ROW)]  # in case there are no scans
     for rows in stream_scans(records, dataset.read, rank_scan, segmenter.at_once, progress):
         rows["scan"] = len(rows_by_scan) - 1
         rows_by_scan.append(rows)
@@ -139,7 +139,7 @@ def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
     # One number for each pair of train ids.
     kind = label.astype(np.int64) * 256 + expand_to_scan(agreed_ids, valid)
     whole = _thing_sizes(xyz, label, valid)
-    return Doubts(xyz, doubt, rv, bev, label, kind=kind, whole=whole)
+    return Doubts(xyz, doubt, rv=rv, bev=bev, label=label, kind=kind, whole=whole)
 
 
 def _contradiction(
@@ -226,6 +226,7 @@ def write_clusters(
     with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
+
         for position, row in enumerate(clusters, start=1):
             x, y, z = row["xyz"]
             values = [

@@ -50,7 +50,7 @@ class Frame:
     def complete(self, sensor: Sensor) -> Sensor:
         """Return the sensor with everything about its frame known.
 
-        What the user described is done first: the rest turns the scan about the sensor.
+        What the user described is applied first; the rest turns the scan about the sensor.
         """
         if sensor.rotate is not None:
             return dataclasses.replace(sensor, unit=self.unit)

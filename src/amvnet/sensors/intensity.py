@@ -134,7 +134,7 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
 def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Return the quantiles of a source, increasing, and what they become; linear in between.
 
-    Equal quantiles of the source, such as many zeros, become the mean of the training's quantiles.
+    Equal quantiles of the source, such as many zeros, become the mean of those of the training.
     """
     levels, index = np.unique(quantiles, return_inverse=True)
     becomes = np.bincount(index, weights=trained) / np.bincount(index)

@@ -94,9 +94,10 @@ def show_scans(
             assert result.origin is not None
             return replace(shown_scan(result, result.origin), name=scan_input.title)
 
-        shown = ShownScan(scan_input.title, scan.points, scan.valid, scan.labels)
+        shown = ShownScan(scan_input.title, scan.points, scan.valid, truth=scan.labels)
         if labels is None:
             return shown
+
         ids = scan_input.read_labels(labels, len(scan), taxonomy)
         return replace(shown, labels={"labels": ids})
 
@@ -121,7 +122,8 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
 
     labels = {name: expand_labels(values, scan.valid) for name, values in probabilities.items()}
     labels[origin.method] = result.labels
-    shown = ShownScan(Path(scan.name).name or "scan", scan.points, scan.valid, scan.labels, labels)
+    name = Path(scan.name).name or "scan"
+    shown = ShownScan(name, scan.points, scan.valid, truth=scan.labels, labels=labels)
     if not has_two:
         return shown
 

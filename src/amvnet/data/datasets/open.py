@@ -63,7 +63,7 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
 
 def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
     """Open a dataset; raise InputError if it does not have the classes of some weights."""
-    # A benchmark brings its own classes; a user's own ones, it must be read with.
+    # A benchmark has its own classes, but for weights with a user's classes it is read with these.
     is_custom = taxonomy.name not in TAXONOMIES and not is_own(spec)
     dataset = open_dataset(spec, taxonomy if is_custom else None)
     check_classes(dataset, taxonomy)

@@ -33,8 +33,8 @@ VAL_STREETS = 6
 FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
-# An epoch of a training takes the streets whose numbers are this much higher than those of the one
-# before: other streets help, more scans of the same streets do not (docs/log/training.md).
+# Each epoch of a training takes other streets, whose numbers are higher by this: they help, while
+# more scans of the same streets do not (docs/log/training.md).
 STREET_STEP = 1000
 
 SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
@@ -81,10 +81,7 @@ class SimulatedStreets(Dataset):
         return records
 
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the same scan of the street that takes the place of its street in an epoch.
-
-        Streets to validate with stay.
-        """
+        """Return the same scan of an epoch's street; streets to validate with stay."""
         number = int(record.sequence)
         if number >= FIRST_VAL_STREET:
             return record
@@ -165,7 +162,7 @@ class SimulatedStreets(Dataset):
         _make_room(self.root, street)
 
     def _drive(self, number: int) -> Iterator[Scan]:
-        """Yield the scans of a street as reading the files of `amvnet simulate` returns them."""
+        """Yield the scans of a street, as they are read from files of `amvnet simulate`."""
         seed = np.random.SeedSequence((SEED, number))
         with one_line_errors(str, only=(SimulationError,)):
             for scan in drive_street(self.sensor, SCANS, seed):

@@ -166,6 +166,7 @@ def _choose_topic(connections: Iterable[Any], topic: str | None, path: Path) -> 
             f"{path}: expected {expected} with PointCloud2, found {listing}; choose one with "
             "--topic"
         )
+
     others = [f"{other.topic} ({other.msgtype})" for other in connections]
     raise InputError(
         f"{path}: expected {expected} with PointCloud2, found "

@@ -122,7 +122,7 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     """Return whether (N, 5) values can be x, y, z, intensity and ring.
 
     The ring holds whole numbers, at least two different ones, and the coordinates do not.
-    Intensities are never negative. If the name of the file says it, the last column is no label.
+    Intensities are never negative. Without the name, the ring must not look like labels, either.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]

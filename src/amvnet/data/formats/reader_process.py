@@ -71,7 +71,7 @@ def call(function: str, path: Path, *arguments: Any) -> dict[str, Any]:
 
         try:
             values = _process.exchange(request)
-        except BaseException as error:  # an interruption, too: the reply would be that of the next
+        except BaseException as error:  # an interruption, too: its reply would go to the next call
             reason = _process.stop()
             _process = None
             if not isinstance(error, (OSError, EOFError)):
@@ -152,7 +152,7 @@ _lock = Lock()
 
 
 def _forget() -> None:
-    """Leave the process to the one that forked this one."""
+    """Forget the process: it belongs to the process that forked this one."""
     global _process, _lock
     _process = None
     _lock = Lock()
@@ -180,7 +180,7 @@ def serve() -> None:
 
     for line in sys.stdin.buffer:
         request = json.loads(line)
-        os.chdir(request["folder"])  # of the other process, which may have changed since the last
+        os.chdir(request["folder"])  # of the caller, which may have changed it
         _set_limits(request["size"])
 
         module, _, function = request["function"].partition(":")
