@@ -8,14 +8,17 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
+from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.distributed import Processes
 from amvnet.models.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
-from amvnet.training.loaders import EpochSampler
+from amvnet.training.loaders import EpochSampler, ScanSet, make_loader
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.worlds import files, make_streets, run_cli, without, write_recipe
@@ -26,7 +29,7 @@ MODEL = {"polar_net": {"dropblock": 0.0}}
 TRAINING = {
     "rv": {"batch": 4},
     "bev": {"batch": 4},
-    "head": {"points": 800, "batch": 64, "class_weights": True},
+    "head": {"points": 800, "batch": 64},
     "precision": "64-true",
 }
 
@@ -172,11 +175,8 @@ def test_the_processes_parts_of_the_batches_make_up_those_of_one_process(
     size: int, count: int
 ) -> None:
     """All processes draw equally many scans, however many there are; only the first repeat."""
-    alone = list(EpochSampler(size, 3, shuffle=True))
-    parts = [
-        list(EpochSampler(size, 3, shuffle=True, processes=Processes(rank, count)))
-        for rank in range(count)
-    ]
+    alone = list(EpochSampler(size, 3))
+    parts = [list(EpochSampler(size, 3, processes=Processes(rank, count))) for rank in range(count)]
     assert len({len(part) for part in parts}) == 1
 
     together: list[tuple[int, int]] = []
@@ -189,9 +189,13 @@ def test_the_processes_parts_of_the_batches_make_up_those_of_one_process(
 
 @pytest.mark.parametrize(("size", "count"), [(10, 2), (11, 2), (7, 3), (2, 4)])
 def test_processes_validate_every_scan_once(size: int, count: int) -> None:
+    dataset: Any = SimpleNamespace(taxonomy=SEMANTICKITTI)
+    records: Any = [None] * size
+    scans = ScanSet(dataset, records)
     keys: list[tuple[int, int]] = []
     for rank in range(count):
-        keys += EpochSampler(size, 3, shuffle=False, processes=Processes(rank, count))
+        loader = make_loader(scans, 1, 0, shuffle=False, processes=Processes(rank, count))
+        keys += loader.sampler
     assert sorted(keys) == [(0, index) for index in range(size)]
 
 

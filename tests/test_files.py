@@ -173,8 +173,10 @@ def test_tokens_write_nothing_elsewhere(token: str, link: str, is_mapped: bool) 
     with surroundings(link, make=with_token(token)) as base, suppress(InputError):
         dataset = open_dataset(f"nuscenes:{base}/data")
         written = class_map("coarse").target if is_mapped else None
-        records = dataset.records(dataset.sequences("all"))
-        write(base, [DatasetScan(dataset, record, written) for record in records])
+        scans = [DatasetScan(dataset, each) for each in dataset.records(dataset.sequences("all"))]
+        for scan in scans:
+            scan.written = written
+        write(base, scans)
 
 
 @settings(deadline=None, max_examples=100)
@@ -272,7 +274,7 @@ def test_every_file_has_the_mode_of_the_umask(umask: int, tmp_path: Path) -> Non
     assert (code, error) == (0, "")
 
     paths = [path for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(paths) == 6
+    assert len(paths) == 7
     assert {stat.S_IMODE(path.stat().st_mode) for path in paths} == {0o666 & ~umask}
 
 

@@ -15,33 +15,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from amvnet import onnx_runner as onnx_runner
     from amvnet import weights as weights
-    from amvnet.data.datasets.simulated import simulate
-    from amvnet.errors import InputError
-    from amvnet.inference.fuse import fuse
-    from amvnet.inference.listing import read, read_all
-    from amvnet.inference.segmentation import Segmentation
-    from amvnet.inference.segmenter import Segmenter
+    from amvnet.data.datasets.simulated import simulate as simulate
+    from amvnet.errors import InputError as InputError
+    from amvnet.inference.fuse import fuse as fuse
+    from amvnet.inference.listing import read as read
+    from amvnet.inference.listing import read_all as read_all
+    from amvnet.inference.segmentation import Segmentation as Segmentation
+    from amvnet.inference.segmenter import Segmenter as Segmenter
     from amvnet.models.methods import MethodName, Precision
-    from amvnet.scan import Scan
-    from amvnet.viewing.page import show
-    from amvnet.weights.file import Weights
-    from amvnet.weights.push import push
-
-__all__ = [
-    "InputError",
-    "Scan",
-    "Segmentation",
-    "Segmenter",
-    "Weights",
-    "fuse",
-    "load",
-    "push",
-    "read",
-    "read_all",
-    "show",
-    "simulate",
-]
-__version__ = version("amvnet")
+    from amvnet.scan import Scan as Scan
+    from amvnet.viewing.page import show as show
+    from amvnet.weights.file import Weights as Weights
+    from amvnet.weights.push import push as push
 
 _MODULES = {
     "InputError": "amvnet.errors",
@@ -56,6 +41,9 @@ _MODULES = {
     "show": "amvnet.viewing.page",
     "simulate": "amvnet.data.datasets.simulated",
 }
+__all__ = ["load", *_MODULES]
+__version__ = version("amvnet")
+
 _SUBMODULES = ("onnx_runner", "weights")
 
 

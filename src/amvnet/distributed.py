@@ -48,11 +48,6 @@ class Processes:
         """Whether this is the process that prints, and writes what only one should write."""
         return self.rank == 0
 
-    @property
-    def here(self) -> int:
-        """Number of processes on each machine."""
-        return self.size // self.nodes
-
     def share(self, items: Sequence[T]) -> Sequence[T]:
         """Return this process's share of the items: every `size`-th, from `rank` on."""
         return items[self.rank :: self.size]

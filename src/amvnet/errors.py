@@ -7,6 +7,8 @@ import re
 import reprlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
 
 
 class InputError(ValueError):
@@ -82,6 +84,20 @@ def one_line_errors(
         raise InputError(message(error)) from error
 
 
+def import_optional(module: str, extra: str) -> Any:
+    """Import a module that needs the packages of one of this package's extras.
+
+    Raises:
+        InputError: if one of them is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise InputError(
+            f"expected the package {error.name}, found none; run pip install 'amvnet[{extra}]'"
+        ) from None
+
+
 @contextmanager
 def errors_of(source: object) -> Iterator[None]:
     """Begin the messages of errors of the input in this block with the file that they are about."""
@@ -98,11 +114,6 @@ NO_MEMORY = re.compile(
 )
 
 
-def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error says that there is no memory left, of the CPU or a GPU."""
-    return isinstance(error, MemoryError) or bool(NO_MEMORY.search(str(error)))
-
-
 @contextmanager
 def memory_for(content: str) -> Iterator[None]:
     """Turn an error that says that there is no memory left into an `InputError`.
@@ -116,7 +127,7 @@ def memory_for(content: str) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError, ImportError, OSError) as error:
-        if not is_out_of_memory(error):
+        if not isinstance(error, MemoryError) and not NO_MEMORY.search(str(error)):
             raise
         raise InputError(
             f"{content}: expected enough memory, found none left; close other programs, or take "

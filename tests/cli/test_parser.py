@@ -10,7 +10,7 @@ import pytest
 
 from amvnet.cli.main import VERBS, main
 from amvnet.cli.options import ScanChoice
-from amvnet.cli.parser import Command, field_texts, make_parser, run_with
+from amvnet.cli.parser import field_texts, make_parser, run_with
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
 from amvnet.config.schema import ModelConfig, Recipe
 
@@ -166,7 +166,7 @@ def test_fields_of_a_dataclass_are_options_and_reach_the_verb_in_it() -> None:
         """
         calls.append((count, choice))
 
-    parser = make_parser("verb", Command(verb, {}))
+    parser = make_parser("verb", verb)
     values = parser.values(["--count", "3", "--split", "val", "--topic", "/a"])
     run_with(verb, values)
     assert calls == [(3, ScanChoice(split="val", topic="/a"))]

@@ -242,7 +242,6 @@ def test_merging_trees_leaves_both_as_they_were() -> None:
         "training: {bev: {lr: 0}}",
         "training: {head: {warmup: 1}}",
         "training: {rv: {accumulate: 3}}",
-        "training: {rv: {loss_over: voxels}}",
         "training: {seed: -1}",
         "training: {augment: {flip: 1.5}}",
         "training: {augment: {tilt: -1}}",
@@ -273,9 +272,10 @@ def test_what_earlier_versions_wrote_is_read_if_it_asks_for_nothing_else() -> No
             "point_head": {"pooling": "max", "heads": 1},
         },
         "training": {
-            "head": {"folds": 1},
+            "head": {"folds": 1, "class_weights": False},
             "joint": {"batch": 2, "ema": 0.99},
             "adapt": {"rounds": 1},
+            "compile": False,
             "augment": {"far_drop": 0.0, "intensity_noise": 0.0},
         },
     }

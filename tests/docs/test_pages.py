@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from amvnet.cli.main import VERBS
+from amvnet.cli.main import VERBS, WITH_RECIPE
 from amvnet.cli.parser import make_parser
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
@@ -27,7 +27,7 @@ def test_every_command_can_be_parsed(page: str) -> None:
         if verb.startswith("--") or arguments[-1:] in (["--help"], [HELP_ALL]):
             continue
         parser = make_parser(verb, VERBS[verb])
-        if VERBS[verb].takes_recipe:
+        if verb in WITH_RECIPE:
             add_recipe(parser, Recipe())
         parser.values(arguments)
 

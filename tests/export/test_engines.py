@@ -261,7 +261,7 @@ def label_plainly(weights: Weights, scan: Scan) -> np.ndarray:
     model = weights.build()
     intensity = trained_intensity(weights.training, weights.sensor)
     batch = PointBatch.of([match_scan(scan, intensity)])
-    f = model.score_range_view(batch)
+    f = model.score_range(model.range_view.project(batch))
 
     net = model.polar_net
     assert isinstance(net, PolarNet)

@@ -186,6 +186,7 @@ def test_wrong_options_are_refused_before_any_work(labelling: Labelling) -> None
     fails(lambda: replace(labelling, kind="mcap"), "mcap")
     fails(lambda: replace(labelling, method="rv", uncertain=True), "--uncertain")
     fails(lambda: replace(labelling, tau=2.0), "tau")
+    fails(lambda: replace(labelling, batch=0), "batch", "at least 1")
 
 
 def test_files_of_any_storage_of_fsspec_are_read_and_written() -> None:

@@ -181,7 +181,7 @@ def test_wrong_input_is_one_line_before_a_cluster_is_started(fleet: Path, bucket
             ("another weights;",),
         ),
         (f"{fleet}/scans {weights} --out {fleet}/scans/x --format ply --ray", ("--out",)),
-        (f"{fleet}/scans {weights} --out x --ray scans", ("address", "scans")),
+        (f"{fleet}/scans {weights} --out x --ray scans", ("address", "scans", "before --ray")),
         (f"{fleet}/scans {weights} --out x --ray --workers 0", ("--workers", "found 0")),
         (f"{fleet}/scans {weights} --out x --ray --topic points", ("--topic",)),
         (f"simulated-hdl64e:{fleet} {weights} --out x --ray", ("dataset", "without --ray")),
@@ -231,7 +231,7 @@ class Mortal:
         names = batch["name"].to_pylist()
         if "poison" in names:
             os.kill(os.getpid(), signal.SIGKILL)
-        values = {"points": 1, "uncertain": 0.0, "sensor": "s", "is_fatal": "full" in names}
+        values = {"points": 1, "uncertain": 0.0, "is_fatal": "full" in names}
         error = "/full/disk: No space left" if "full" in names else None
         rows = [{"scan": name, "error": error, **values} for name in names]
         return pa.Table.from_pylist(rows, self.schema)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from amvnet.config.schema import RangeViewConfig
+from amvnet.models import voting
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
-from amvnet.models.voting import Voting
 from amvnet.scan import Scan
 
 RandomScan = Callable[..., Scan]
@@ -21,7 +21,6 @@ RandomScan = Callable[..., Scan]
 K = 4
 VIEW = RangeViewConfig(height=8, width=16, fov_up=20.0, fov_down=-20.0)
 NO_BODY = RangeViewConfig(height=8, width=32, fov_up=60.0, fov_down=-60.0, nearest=9.0)
-PUBLISHED = Voting()
 
 
 def at_pixel(row: int, column: float, distance: float) -> list[float]:
@@ -50,21 +49,16 @@ def scores_of(labels: list[int]) -> Tensor:
     return torch.eye(K)[torch.tensor(labels)] * 0.6 + 0.1
 
 
-def vote(
-    batch: PointBatch,
-    f: Tensor,
-    voting: Voting = PUBLISHED,
-    view: RangeViewConfig = VIEW,
-) -> Tensor:
-    return voting(f, batch, RangeView(view).project(batch))
+def vote(batch: PointBatch, f: Tensor, view: RangeViewConfig = VIEW) -> Tensor:
+    return voting.vote(f, batch, RangeView(view).project(batch))
 
 
-def vote_by_loop(batch: PointBatch, f: Tensor, voting: Voting, view: RangeViewConfig) -> list[int]:
+def vote_by_loop(batch: PointBatch, f: Tensor, view: RangeViewConfig) -> list[int]:
     """Return what each point is labelled by plain loops, with scans as they are and in order."""
-    half = voting.window // 2
+    half = voting.WINDOW // 2
     offsets = range(-half, half + 1)
     kernel = {
-        (dy, dx): math.exp(-(dx * dx + dy * dy) / (2 * voting.sigma**2))
+        (dy, dx): math.exp(-(dx * dx + dy * dy) / (2 * voting.SIGMA**2))
         for dy in offsets
         for dx in offsets
     }
@@ -92,28 +86,33 @@ def vote_by_loop(batch: PointBatch, f: Tensor, voting: Voting, view: RangeViewCo
                 weight = 1 - gaussian / total
                 votes.append((weight * abs(ranges[voter] - ranges[point]), labels[voter]))
 
-        votes = sorted(votes)[: voting.neighbours]
-        chosen = [label for difference, label in votes if difference <= voting.cutoff]
+        votes = sorted(votes)[: voting.NEIGHBOURS]
+        chosen = [label for difference, label in votes if difference <= voting.CUTOFF]
         # The first of those with the most votes: Python's max and list.index keep the order.
         voted.append(max(chosen, key=chosen.count))
     return voted
 
 
 @pytest.mark.parametrize(
-    "voting",
-    [PUBLISHED, Voting(neighbours=9, cutoff=4.0), Voting(window=3, neighbours=3, sigma=0.5)],
+    "numbers",
+    [{}, {"NEIGHBOURS": 9, "CUTOFF": 4.0}, {"WINDOW": 3, "NEIGHBOURS": 3, "SIGMA": 0.5}],
     ids=["as published", "more and farther", "smaller window"],
 )
 @pytest.mark.parametrize("view", [VIEW, NO_BODY], ids=["all points", "without the car's own body"])
 def test_a_vote_equals_a_loop_over_the_points(
-    random_scan: RandomScan, voting: Voting, view: RangeViewConfig
+    random_scan: RandomScan,
+    monkeypatch: pytest.MonkeyPatch,
+    numbers: dict[str, float],
+    view: RangeViewConfig,
 ) -> None:
+    for name, number in numbers.items():
+        monkeypatch.setattr(voting, name, number)
     batch = PointBatch.of([crowded(random_scan(500), 1), crowded(random_scan(300), 2)])
     f = torch.rand(len(batch.points), K, generator=torch.Generator().manual_seed(0))
 
-    shares = vote(batch, f, voting, view)
+    shares = vote(batch, f, view)
 
-    assert shares.argmax(dim=1).tolist() == vote_by_loop(batch, f, voting, view)
+    assert shares.argmax(dim=1).tolist() == vote_by_loop(batch, f, view)
     assert torch.allclose(shares.sum(dim=1), torch.ones(len(f)))
     changed = (shares.argmax(dim=1) != f.argmax(dim=1)).float().mean()
     assert 0.05 < changed < 0.95  # else the test would not say much
@@ -139,23 +138,29 @@ def test_a_scan_without_occlusion_keeps_labels_that_change_with_the_distance() -
     assert vote(batch_of(points), scores_of(flat)).argmax(dim=1).tolist() == flat
 
 
-def test_a_point_without_others_at_its_distance_keeps_its_label() -> None:
+def test_a_point_without_others_at_its_distance_keeps_its_label(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     far_ones = [at_pixel(4, column, 10) for column in (5, 6, 8, 9)]
     lone = at_pixel(4, 7, 12)
     f = scores_of([2, 2, 2, 2, 1])
     assert vote(batch_of([*far_ones, lone]), f)[-1].argmax() == 1
-    wider = Voting(cutoff=2.5)
-    assert vote(batch_of([*far_ones, lone]), f, wider)[-1].argmax() == 2
+    monkeypatch.setattr(voting, "CUTOFF", 2.5)
+    assert vote(batch_of([*far_ones, lone]), f)[-1].argmax() == 2
 
 
-def test_of_equally_many_votes_those_with_the_least_difference_count() -> None:
+def test_of_equally_many_votes_those_with_the_least_difference_count(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     row = [at_pixel(4, column, distance) for column, distance in ((5, 10.4), (6, 10), (7, 10.6))]
     f = scores_of([1, 3, 2])
-    shares = vote(batch_of(row), f, Voting(neighbours=3))
+    monkeypatch.setattr(voting, "NEIGHBOURS", 3)
+    shares = vote(batch_of(row), f)
     assert shares[1].argmax() == 3  # its own vote
     # With another point at its own distance there are two votes of class 1.
     more = [*row, at_pixel(4, 8, 10.5)]
-    assert vote(batch_of(more), scores_of([1, 3, 2, 1]), Voting(neighbours=4))[1].argmax() == 1
+    monkeypatch.setattr(voting, "NEIGHBOURS", 4)
+    assert vote(batch_of(more), scores_of([1, 3, 2, 1]))[1].argmax() == 1
 
 
 def test_the_window_goes_around_the_sensor() -> None:
@@ -176,11 +181,12 @@ def test_the_window_goes_around_the_sensor() -> None:
         assert torch.allclose(vote(PointBatch.of([Scan(turned)]), f), expected)
 
 
-def test_a_point_exactly_at_the_cutoff_votes() -> None:
+def test_a_point_exactly_at_the_cutoff_votes(monkeypatch: pytest.MonkeyPatch) -> None:
     batch = batch_of([at_pixel(4, 7, 10), at_pixel(4, 8, 12)])
     distance = batch.points[:, :3].norm(dim=1)
-    next_to_it = PUBLISHED.weights()[13]  # to the right of the middle of a 5 x 5 window
+    next_to_it = voting.window_weights()[13]  # to the right of the middle of a 5 x 5 window
     difference = ((distance[1] - distance[0]) * next_to_it).numpy()
     for cutoff, does_vote in ((difference, True), (np.nextafter(difference, 0), False)):
-        shares = vote(batch, scores_of([1, 2]), Voting(cutoff=float(cutoff)))
+        monkeypatch.setattr(voting, "CUTOFF", float(cutoff))
+        shares = vote(batch, scores_of([1, 2]))
         assert (shares[0, 2] > 0) == does_vote

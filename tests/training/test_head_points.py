@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from amvnet.distributed import Processes
-from amvnet.training.head_points import PointDraw, PointSampler
+from amvnet.config.schema import HeadTraining
+from amvnet.distributed import ALONE, Processes
+from amvnet.training.head_points import PointSampler
+
+ONE_CLASS = np.ones(1000, dtype=np.uint8)
+
+
+def sampler_of(
+    config: HeadTraining, labels: np.ndarray = ONE_CLASS, processes: Processes = ALONE
+) -> PointSampler:
+    return PointSampler(labels, config, 0, processes)
 
 
 def epoch(sampler: PointSampler, number: int) -> list[int]:
@@ -14,12 +25,12 @@ def epoch(sampler: PointSampler, number: int) -> list[int]:
 
 
 def test_an_epoch_has_all_points_once_unless_fewer_are_drawn() -> None:
-    sampler = PointSampler(PointDraw(1000), batch=100, seed=0, shuffle=True)
+    sampler = sampler_of(HeadTraining(batch=100))
     assert sorted(epoch(sampler, 0)) == list(range(1000))
 
 
 def test_each_epoch_draws_other_points_each_once() -> None:
-    sampler = PointSampler(PointDraw(1000, drawn=200), batch=50, seed=0, shuffle=True)
+    sampler = sampler_of(HeadTraining(batch=50, drawn=200))
     assert len(sampler) == 4
     epochs = [epoch(sampler, number) for number in range(20)]
     for points in epochs:
@@ -29,21 +40,24 @@ def test_each_epoch_draws_other_points_each_once() -> None:
     assert len(set(np.concatenate(epochs).tolist())) > 950  # almost all are seen
 
 
+def test_a_smaller_last_batch_is_left_out_unless_it_is_the_only_one() -> None:
+    for batch, sizes in ((300, [300, 300, 300]), (5000, [1000])):
+        assert [len(points) for points in sampler_of(HeadTraining(batch=batch))] == sizes
+
+
 def test_balanced_draws_have_all_classes_equally_often() -> None:
     labels = np.repeat([1, 2, 5], [9000, 900, 100])
-    rng = np.random.default_rng(0)
     square_roots = [94.87 / 134.87, 30 / 134.87, 10 / 134.87]
     for balance, expected in ((1.0, [1 / 3] * 3), (0.5, square_roots)):
-        draw = PointDraw(len(labels), 6000, labels, balance)
-        counts = np.bincount(labels[draw(rng)], minlength=6)[[1, 2, 5]]
+        config = HeadTraining(batch=6000, drawn=6000, balance=balance)
+        counts = np.bincount(labels[epoch(sampler_of(config, labels), 0)], minlength=6)[[1, 2, 5]]
         np.testing.assert_allclose(counts / 6000, expected, atol=0.03)
 
 
 def test_processes_share_each_batch_of_the_drawn_points() -> None:
-    draw = PointDraw(1000, drawn=200)
-    alone = PointSampler(draw, batch=50, seed=0, shuffle=True)
-    shares = []
+    config = HeadTraining(batch=50, drawn=200)
+    shares: list[Iterator[np.ndarray]] = []
     for rank in range(2):
-        shares.append(PointSampler(draw, 50, 0, True, Processes(rank, 2)))
-    for whole, first, second in zip(alone, *shares, strict=True):
+        shares.append(iter(sampler_of(config, processes=Processes(rank, 2))))
+    for whole, first, second in zip(sampler_of(config), *shares, strict=True):
         assert sorted(whole) == sorted([*first, *second])

@@ -768,25 +768,6 @@ def test_the_share_of_uncertain_points_is_that_of_the_networks(
     assert column(run, "head", "val/uncertain")[0] == pytest.approx(share, abs=0.02)
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler on a CPU")
-@pytest.mark.parametrize("stage", ["rv", "bev"])
-@pytest.mark.slow
-def test_a_compiled_training_is_the_same_within_rounding(
-    world: Path, run: Path, tmp_path: Path, stage: str
-) -> None:
-    """Compare the first step, as later ones amplify differences of rounding."""
-    one_step = (f"--training.{stage}.epochs", 1, f"--training.{stage}.batch", 4)
-    no_dropblock = ("--model.polar_net.dropblock", 0)  # a compiled network draws other blocks
-    options = ("--stage", stage, *one_step, *no_dropblock)
-    plain = train(world, tmp_path / "plain", *options)
-    compiled = train(world, tmp_path / "compiled", *options, "--training.compile", "true")
-
-    loss = column(tmp_path / "plain", stage, "train/loss")[0]
-    compiled_loss = column(tmp_path / "compiled", stage, "train/loss")[0]
-    assert loss == pytest.approx(compiled_loss, rel=1e-3)
-    assert plain.parts == compiled.parts
-
-
 def test_networks_with_few_channels_train_without_a_crash() -> None:
     """PyTorch 2.13 corrupts the heap in the backward pass of some strided 1 x 1 convolutions.
 

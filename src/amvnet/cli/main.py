@@ -6,7 +6,6 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from amvnet import __version__
@@ -25,40 +24,28 @@ from amvnet.cli.commands.submit import submit
 from amvnet.cli.commands.train import train
 from amvnet.cli.commands.view import view
 from amvnet.cli.console import complain, say, say_lines, stdout
-from amvnet.cli.parser import Command, first_line, make_parser, run_with
+from amvnet.cli.parser import first_line, make_parser, run_with
 from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.threads import wait_passively
+
+VERBS = {
+    run.__name__: run
+    for run in (
+        *(demo, simulate, train, predict, evaluate, submit, fuse),
+        *(rank, analyze, ablate, export, view, bench, info),
+    )
+}
+RESUMED = ("train", "predict")  # verbs with --resume
+GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done
+SHARED = ("train", "evaluate", "ablate")  # verbs whose work several processes can share
+WITH_RECIPE = ("train", "ablate")  # verbs whose options are also the values of a recipe
 
 # Exit codes.
 DONE = 0
 FAILED = 1
 WRONG_INPUT = 2
 SOME_BROKEN = 3
-
-GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done
-SHARED = ("train", "evaluate", "ablate")  # verbs whose work several processes can share
-
-_DATA = {"data": {"metavar": "DATA"}}
-_INPUTS = {"inputs": {"metavar": "INPUT", "nargs": "+"}}
-_RECIPE = {"recipe": {"metavar": "RECIPE"}}
-
-VERBS: dict[str, Command] = {
-    "demo": Command(demo, {}),
-    "simulate": Command(simulate, {"out": {"metavar": "OUT", "type": Path}}),
-    "train": Command(train, _RECIPE),
-    "predict": Command(predict, _INPUTS),
-    "evaluate": Command(evaluate, _DATA),
-    "submit": Command(submit, _DATA),
-    "fuse": Command(fuse, _INPUTS),
-    "rank": Command(rank, _DATA),
-    "analyze": Command(analyze, _DATA),
-    "ablate": Command(ablate, _RECIPE),
-    "export": Command(export, {}),
-    "view": Command(view, _INPUTS),
-    "bench": Command(bench, {}),
-    "info": Command(info, {"weights": {"metavar": "W", "nargs": "?"}}),
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -91,15 +78,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _usage() -> str:
     """Return the help of `amvnet`: what each verb does."""
     lines = ["usage: amvnet VERB ...", ""]
-    for verb, command in VERBS.items():
-        lines.append(f"  {verb:<10} {first_line(command.run)}")
+    for verb, run_verb in VERBS.items():
+        lines.append(f"  {verb:<10} {first_line(run_verb)}")
     return "\n".join([*lines, "", f"`amvnet VERB --help` says more. Version {__version__}."])
 
 
 def _last_words(arguments: Sequence[str]) -> str:
     """Return what is said if the verb is stopped: whether it can go on."""
     verb = arguments[0] if arguments else ""
-    if verb in VERBS and VERBS[verb].can_resume:
+    if verb in RESUMED:
         return "stopped; go on with --resume"
     if verb in GOES_ON:
         return "stopped; start it again to go on"
@@ -153,11 +140,11 @@ def run(verb: str, arguments: Sequence[str]) -> None:
         )
 
     _suppress_library_warnings()
-    if VERBS[verb].takes_recipe:
+    if verb in WITH_RECIPE:
         values = _parse_with_recipe(verb, arguments)
     else:
         values = make_parser(verb, VERBS[verb]).values(arguments)
-    run_with(VERBS[verb].run, values)
+    run_with(VERBS[verb], values)
 
 
 def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from amvnet.cli.console import say, silence
-from amvnet.config.bounds import Count, Range
+from amvnet.cli.console import silence
+from amvnet.config.bounds import Range
 from amvnet.errors import InputError, shown
-from amvnet.models.methods import METHODS, EngineName, MethodName, Precision
+from amvnet.models.methods import METHODS
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
@@ -19,9 +19,7 @@ if TYPE_CHECKING:
     from amvnet.distributed import Processes
     from amvnet.inference.listing import ScanOptions
     from amvnet.inference.scores import ScorePair
-    from amvnet.inference.segmenter import Segmenter
     from amvnet.sensors.lidars import Sensor
-    from amvnet.weights.file import Weights
 
 Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]  # the last two: nuScenes
 
@@ -126,55 +124,6 @@ class SensorChoice:
         from amvnet.sensors.lidars import make_sensor
 
         return make_sensor(**asdict(self))
-
-
-@dataclass(frozen=True)
-class ComputeChoice:
-    """Where and how the networks are computed."""
-
-    device: str = "auto"
-    """cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU."""
-    engine: EngineName = "torch"
-    """what runs the networks: torch, onnx (ONNX Runtime), or int8 (the same in 8-bit integers,
-    calibrated once; a few labels change)."""
-    precision: Precision = "auto"
-    """of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32."""
-    at_once: Count | None = None
-    """scans that are segmented at the same time on a CPU; default: one per core, if the memory
-    suffices."""
-
-    def segmenter(
-        self,
-        weights: Weights,
-        method: MethodName,
-        tau: float | None = None,
-        processes: Processes | None = None,
-    ) -> Segmenter:
-        """Return the segmenter of a verb.
-
-        Args:
-            tau: as for --tau.
-            processes: those that share the scans, each on a GPU of its own if there are several.
-
-        Raises:
-            InputError: if one of the options does not fit the weights or this machine.
-        """
-        from amvnet.export.engines import use_engine
-        from amvnet.inference.segmenter import Segmenter
-        from amvnet.memory import keep_freed_memory
-        from amvnet.models.precision import choose_device
-
-        device = choose_device(self.device, self.engine)
-        if processes is not None:
-            device = processes.device(device)
-        if device == "cpu":
-            keep_freed_memory()
-        segmenter = Segmenter(weights, device, method, precision=self.precision, tau=tau)
-        say(f"computing on {segmenter.hardware} in {segmenter.precision}")
-        use_engine(segmenter, self.engine, say)
-        if self.at_once is not None:
-            segmenter.at_once = self.at_once
-        return segmenter
 
 
 @dataclass(frozen=True)

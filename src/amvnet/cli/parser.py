@@ -8,7 +8,6 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
@@ -19,32 +18,7 @@ from amvnet.config.bounds import Range
 from amvnet.errors import InputError, did_you_mean, shown
 
 NUMBERS = {int: "a whole number", float: "a number"}
-
-
-@dataclass(frozen=True)
-class Command:
-    """One verb of the command line.
-
-    Attributes:
-        run: does the work; its signature and docstring define the options. A parameter that is a
-            dataclass stands for a group of options, one for each field, with the line under the
-            field as its help.
-        positional: the parameters that are positional on the command line, and for each the
-            keyword arguments of argparse's `add_argument`.
-    """
-
-    run: Callable[..., None]
-    positional: Mapping[str, dict[str, Any]]
-
-    @property
-    def takes_recipe(self) -> bool:
-        """Whether a recipe is an argument, and each of its values an option."""
-        return "recipe" in self.positional
-
-    @property
-    def can_resume(self) -> bool:
-        """Whether it has the option --resume."""
-        return "resume" in inspect.signature(self.run).parameters
+METAVARS = {"inputs": "INPUT", "weights": "W"}  # of arguments; that of others is their name
 
 
 class HelpFormatter(argparse.HelpFormatter):
@@ -67,7 +41,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(formatter_class=HelpFormatter, allow_abbrev=False, **kwargs)
         self._negative_number_matcher = re.compile(r"-\.?\d")  # also -1,0,0 is no option
-        self.kinds: dict[str, Any] = {}  # types of the options' values, by flag
+        self.kinds: dict[str, Any] = {}  # types of the values, by name
 
     def error(self, message: str) -> NoReturn:
         line = " ".join(message.split())
@@ -89,10 +63,9 @@ class Parser(argparse.ArgumentParser):
             InputError: if an argument is missing or unknown, or a value is not of its type.
         """
         values = vars(self.parse_args(arguments))
-        for flag, kind in self.kinds.items():
-            name = flag[2:].replace("-", "_")
+        for name, kind in self.kinds.items():
             if isinstance(values[name], str):
-                values[name] = _convert(flag, values[name], kind)
+                values[name] = _convert(flag_of(name), values[name], kind)
         return values
 
     def _unknown(self, words: str) -> str:
@@ -152,54 +125,70 @@ def literals(kind: Any) -> tuple[str, ...]:
     return ()
 
 
-def make_parser(verb: str, command: Command) -> Parser:
-    """Return the parser of a verb, without the values of a recipe."""
-    run = command.run
+def make_parser(verb: str, run: Callable[..., None]) -> Parser:
+    """Return the parser of a verb, without the values of a recipe.
+
+    Args:
+        run: does the work; its signature and docstring define the arguments and options.
+            Positional-only parameters are arguments. A parameter that is a dataclass stands for a
+            group of options, one for each field, with the line under the field as its help.
+    """
     docs = docstring_parser.parse(run.__doc__ or "")
     texts = {param.arg_name: param.description or "" for param in docs.params}
-    metavars = [str(options["metavar"]) for options in command.positional.values()]
-    parser = Parser(
-        prog=f"amvnet {verb}",
-        usage=" ".join(["amvnet", verb, *metavars, "[options]"]),
-        description=docs.short_description,
-    )
+    parser = Parser(prog=f"amvnet {verb}", description=docs.short_description)
 
+    metavars = []
     hints = get_type_hints(run, include_extras=True)
     for name, parameter in inspect.signature(run).parameters.items():
         kind = hints[name]
-        if name in command.positional:
-            parser.add_argument(name, help=texts[name], **command.positional[name])
+        if parameter.kind is parameter.POSITIONAL_ONLY:
+            metavars.append(METAVARS.get(name, name.upper()))
+            parser.kinds[name] = kind
+            _add_argument(parser, name, kind, metavars[-1], texts[name])
         elif _is_bundle(kind):
             group = parser.add_argument_group(first_line(kind))
             kinds = get_type_hints(kind, include_extras=True)
             field_docs = field_texts(kind)
             for field in dataclasses.fields(kind):
-                field_kind = kinds[field.name]
-                parser.kinds[flag_of(field.name)] = field_kind
-                _add_option(group, field.name, field_kind, field.default, field_docs[field.name])
+                parser.kinds[field.name] = kinds[field.name]
+                _add_option(
+                    group, field.name, kinds[field.name], field.default, field_docs[field.name]
+                )
         else:
-            parser.kinds[flag_of(name)] = kind
+            parser.kinds[name] = kind
             _add_option(parser, name, kind, parameter.default, texts.get(name, ""))
+
+    parser.usage = " ".join(["amvnet", verb, *metavars, "[options]"])
     return parser
 
 
 def run_with(run: Callable[..., None], values: Mapping[str, Any]) -> None:
     """Run a verb with the values of its options, some of which are fields of dataclasses."""
     hints = get_type_hints(run)
-    arguments = {}
+    arguments = []
     for name in inspect.signature(run).parameters:
         kind = hints[name]
         if _is_bundle(kind):
             own = {field.name: values[field.name] for field in dataclasses.fields(kind)}
-            arguments[name] = kind(**own)
+            arguments.append(kind(**own))
         else:
-            arguments[name] = values[name]
-    run(**arguments)
+            arguments.append(values[name])
+    run(*arguments)
 
 
 def _is_bundle(kind: Any) -> bool:
     """Return whether a type is a dataclass, whose fields are options."""
     return isinstance(kind, type) and dataclasses.is_dataclass(kind)
+
+
+def _add_argument(parser: Parser, name: str, kind: Any, metavar: str, text: str) -> None:
+    """Add a positional-only parameter of a verb to the parser."""
+    nargs = None
+    if get_origin(kind) is list:
+        nargs = "+"
+    elif type(None) in get_args(kind):  # may be left out
+        nargs = "?"
+    parser.add_argument(name, nargs=nargs, metavar=metavar, help=text)
 
 
 def _add_option(target: Any, name: str, kind: Any, default: Any, text: str) -> None:

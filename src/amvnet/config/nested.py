@@ -95,14 +95,17 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
     Raises:
         InputError: if the value does not fit the type.
     """
+    wrong_type = InputError(
+        f"{where}: expected a value like {default!r}, found {shown(value)}; correct the value"
+    )
     if dataclasses.is_dataclass(default):
         if not isinstance(value, Mapping):
-            raise _wrong_type(default, value, where)
+            raise wrong_type
         return replace_values(default, value, where)
 
     if isinstance(default, tuple):
         if not isinstance(value, list | tuple):
-            raise _wrong_type(default, value, where)
+            raise wrong_type
         item_kind = get_args(kind)[0]
         example = default[0] if default else _example(item_kind)
         return tuple(_convert(example, item, item_kind, where) for item in value)
@@ -117,11 +120,14 @@ def _convert(default: Any, value: Any, kind: Any, where: str) -> Any:
 
         return value
 
-    if isinstance(default, float):
-        return _convert_float(default, value, where)
+    if isinstance(default, float) and type(value) in (int, float, str):
+        try:
+            return float(value)  # YAML reads 2e-3, without a dot, as text
+        except (ValueError, OverflowError):
+            raise wrong_type from None
 
     if type(value) is not type(default):
-        raise _wrong_type(default, value, where)
+        raise wrong_type
     return value
 
 
@@ -129,21 +135,3 @@ def _example(kind: Any) -> Any:
     """Return a value of the type of the items of a tuple, which may be a Literal."""
     choices = get_args(kind)
     return choices[0] if choices else kind()
-
-
-def _convert_float(default: float, value: Any, where: str) -> float:
-    """Convert a number to a float; accept text, because YAML reads 2e-3 (no dot) as text."""
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number and not isinstance(value, str):
-        raise _wrong_type(default, value, where)
-
-    try:
-        return float(value)
-    except (ValueError, OverflowError):
-        raise _wrong_type(default, value, where) from None
-
-
-def _wrong_type(default: Any, value: Any, where: str) -> InputError:
-    return InputError(
-        f"{where}: expected a value like {default!r}, found {shown(value)}; correct the value"
-    )

@@ -278,8 +278,6 @@ class NetworkTraining(Checked):
     """Weight of the region loss (Dice or Lovász-softmax) relative to cross-entropy (open)."""
     region_loss: Literal["default", "dice", "lovasz"] = "default"
     """The region loss; by default the paper's: Dice for rv, Lovász-softmax for bev."""
-    loss_over: Literal["points", "voxels"] = "points"
-    """What the loss of bev is over; a voxel has the label of most of its points (PolarNet)."""
     class_weights: bool = True
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
     clip: Positive = 5.0
@@ -322,8 +320,6 @@ class HeadTraining(Checked):
     """SGD's weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the learning rate's peak (open)."""
-    class_weights: bool = False
-    """Weight the classes as in the networks' losses (section 3.3: plain cross-entropy)."""
     views: Annotated[int, Range(0)] = 0
     """Augmented copies of each training scan to score for the head; 0: the scan itself."""
     disturb: Share = 0.0
@@ -335,7 +331,7 @@ class HeadTraining(Checked):
     balance: Share = 0.0
     """How far draws even out the classes: 0 draws points alike, 1 classes equally often (open)."""
 
-    obsolete: ClassVar[Obsolete] = {"folds": (1,)}
+    obsolete: ClassVar[Obsolete] = {"folds": (1,), "class_weights": (False,)}
 
 
 @dataclass(frozen=True)
@@ -344,7 +340,7 @@ class TrainingConfig(Checked):
 
     rv: NetworkTraining = NetworkTraining(epochs=160, batch=32, lr=4e-3)
     """The range-view network."""
-    bev: NetworkTraining = NetworkTraining(epochs=40, batch=8, lr=2e-3, loss_over="voxels")
+    bev: NetworkTraining = NetworkTraining(epochs=40, batch=8, lr=2e-3)
     """The bird's-eye-view network."""
     head: HeadTraining = HeadTraining()
     """The point head."""
@@ -363,19 +359,8 @@ class TrainingConfig(Checked):
     bfloat16 arithmetic, 32-true on others; 64 to compare trainings."""
     accelerator: str = "auto"
     """Lightning's accelerator: auto, cpu, gpu."""
-    compile: bool = False
-    """Compile the network with torch.compile: a slow start, then faster steps."""
 
-    obsolete: ClassVar[Obsolete] = {"joint": None, "adapt": None}
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-
-        self.check(
-            holds=self.rv.loss_over == "points",
-            expected="rv.loss_over: points, as the range view has no voxels",
-            found=self.rv.loss_over,
-        )
+    obsolete: ClassVar[Obsolete] = {"joint": None, "adapt": None, "compile": (False,)}
 
 
 @dataclass(frozen=True)

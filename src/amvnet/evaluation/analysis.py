@@ -18,7 +18,7 @@ from amvnet.evaluation.scoring import stream_labelled
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.assertion import Disagreement, cosine_similarity
-from amvnet.models.methods import ENSEMBLES
+from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan
 
@@ -26,9 +26,26 @@ BINS = 100  # of the cosine similarity, which lies in [0, 1]
 SWEPT = 98  # lowest bins of points that the head settles: tau is swept up to 0.98
 
 
-# AMVNet with one value of a parameter: the value, and in percent the uncertain points, the mIoU and
-# the accuracy.
-SweptRow = tuple[float, float, float, float]
+@dataclass(frozen=True)
+class Swept:
+    """AMVNet with one value of a swept parameter.
+
+    Attributes:
+        value: of the parameter.
+        uncertain: share of the points that are uncertain.
+        miou, accuracy: fractions.
+    """
+
+    value: float
+    uncertain: float
+    miou: float
+    accuracy: float
+
+    @classmethod
+    def of(cls, value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxonomy) -> Swept:
+        """Return the figures of a (K + 1, K + 1) confusion matrix."""
+        figures = metrics(matrix, taxonomy)
+        return cls(value, uncertain, figures["miou"] or 0.0, figures["accuracy"] or 0.0)
 
 
 @dataclass
@@ -56,20 +73,14 @@ class Analysis:
         self.ensemble += other.ensemble
         self.head += other.head
 
-    def sweep(self) -> list[SweptRow]:
+    def sweep(self) -> list[Swept]:
         """Return AMVNet's figures for each tau from 0 to 0.98, with the head as it is."""
         sweep = []
         for bins in range(SWEPT + 1):
             matrix = self.head[:bins].sum(axis=0) + self.ensemble[bins:].sum(axis=0)
             share = float(self.points[:bins].sum() / max(self.points.sum(), 1))
-            sweep.append(swept_row(bins / BINS, share, matrix, self.evaluation.taxonomy))
+            sweep.append(Swept.of(bins / BINS, share, matrix, self.evaluation.taxonomy))
         return sweep
-
-
-def swept_row(value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxonomy) -> SweptRow:
-    """Return the row of a value, given the share of uncertain points and a confusion matrix."""
-    figures = metrics(matrix, taxonomy)
-    return value, 100 * uncertain, 100 * (figures["miou"] or 0), 100 * (figures["accuracy"] or 0)
 
 
 def analyze(
@@ -78,7 +89,7 @@ def analyze(
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> Analysis:
-    """Score labelled scans by every method, and by the head wherever some tau asks it.
+    """Score labelled scans by every method, and by the head for every point that a tau would ask.
 
     Raises:
         InputError: if the weights lack a part, or a scan has no ground truth.
@@ -110,7 +121,7 @@ def analyze(
 
 @torch.inference_mode()
 def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> Analysis:
-    """Score a scan by every method, and by the head wherever some tau asks it."""
+    """Score a scan by every method, and by the head for every point that a tau would ask."""
 
     def is_asked(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
         return (_bins(f, g) < SWEPT) | assertion(f, g, points)
@@ -124,8 +135,9 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
     f = scores.rv
     g = scores.bev
     ids = {"rv": expand_labels(f, scan.valid), "bev": expand_labels(g, scan.valid)}
-    for name, ensemble in ENSEMBLES.items():
-        ids[name] = expand_labels(ensemble(f, g), scan.valid)
+    for name, method in METHODS.items():
+        if method.ensemble is not None:
+            ids[name] = expand_labels(method.ensemble(f, g), scan.valid)
     head = expand_labels(scores.merged, scan.valid)
     uncertain = expand_to_scan(assertion(f, g, batch.points), scan.valid)
     ids["amvnet"] = np.where(uncertain, head, ids["ensemble"])

@@ -20,7 +20,8 @@ def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarra
     """Count how often each true class was predicted as each class.
 
     Args:
-        truth, prediction: (N,) train ids in 0..K.
+        truth: (N,) train ids in 0..K.
+        prediction: (N,) train ids in 0..K.
         size: K, the number of classes.
 
     Returns:
@@ -166,7 +167,11 @@ class Evaluation:
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
-        """Return all metrics of a dataset, of all points and by distance, as JSON types."""
+        """Return all metrics, of all points and by distance, as JSON types.
+
+        Args:
+            dataset: the dataset, as the user named it.
+        """
         methods = {}
         for method, matrices in self.matrices.items():
             bins = []

@@ -17,10 +17,13 @@ from amvnet.errors import InputError
 from amvnet.export.int8 import SIMULATED
 from amvnet.export.onnx import OPSET, check_libraries, export
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.methods import METHODS, EngineName
+from amvnet.memory import keep_freed_memory
+from amvnet.models.methods import METHODS, Compute, EngineName, MethodName
 from amvnet.models.polar_net import PolarNet
+from amvnet.models.precision import choose_device
 from amvnet.onnx_runner import DESCRIPTION
 from amvnet.progress import Say, say_nothing
+from amvnet.weights.file import Weights
 
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 # ONNX Runtime's execution providers, the fastest first
@@ -28,13 +31,43 @@ PROVIDERS = ("TensorrtExecutionProvider", "CUDAExecutionProvider", "CPUExecution
 CACHE = "AMVNET_CACHE"  # the environment variable with the folder of exported networks
 
 
+def make_segmenter(
+    weights: Weights,
+    method: MethodName,
+    compute: Compute,
+    tau: float | None = None,
+    say: Say = say_nothing,
+) -> Segmenter:
+    """Return a segmenter with an engine, for a process that does nothing else.
+
+    On a CPU, the process keeps the memory that it frees.
+
+    Args:
+        tau: as for `Segmenter`.
+        say: takes lines about the device, and about work that takes long.
+
+    Raises:
+        InputError: as `Segmenter` and `use_engine`.
+    """
+    device = choose_device(compute.device, compute.engine)
+    if device == "cpu":
+        keep_freed_memory()
+    segmenter = Segmenter(weights, device, method, precision=compute.precision, tau=tau)
+    say(f"computing on {segmenter.hardware} in {segmenter.precision}")
+    use_engine(segmenter, compute.engine, say)
+    if compute.at_once is not None:
+        segmenter.at_once = compute.at_once
+    return segmenter
+
+
 def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> None:
     """Let an engine run the networks of a segmenter, which were set up for torch.
 
     Everything around the networks stays with torch. `onnx` exports the networks once, in half a
-    minute, and keeps them in `cache_folder`. It takes scans one by one, and computes on a GPU if
-    the installed ONNX Runtime can. `int8` does the same on the CPU with convolutions in 8-bit
-    integers, which it calibrates once, in a few minutes, on simulated scans of the weights' sensor.
+    minute, and keeps them in `cache_folder`; it takes scans one by one, and computes on a GPU if
+    the installed ONNX Runtime can. So does `int8`, which stays on the CPU and also converts the
+    convolutions to 8-bit integers; it calibrates them once, in a few minutes, on simulated scans of
+    the weights' sensor.
 
     Args:
         engine: one of `ENGINES`.
@@ -86,7 +119,11 @@ def cache_folder() -> Path:
 
 
 def exported(segmenter: Segmenter, int8: str | None = None, say: Say = say_nothing) -> Path:
-    """Return the folder of a segmenter's exported networks, which are exported if necessary."""
+    """Return the folder of a segmenter's exported networks, which are exported if necessary.
+
+    Args:
+        int8: as for `export`.
+    """
     check_libraries()
     weights = segmenter.weights
     digests = [weights.digest(part) for part in weights.parts]

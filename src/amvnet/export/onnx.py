@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import shutil
 import uuid
@@ -17,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config.nested import to_dict
-from amvnet.errors import InputError
+from amvnet.errors import InputError, import_optional
 from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, strip
 from amvnet.files import atomic_write, make_folder, publish
@@ -160,12 +159,7 @@ def _save(description: dict[str, Any], path: Path) -> None:
 def check_libraries() -> None:
     """Raise InputError if a library of the extra `export` is not installed."""
     for name in EXTRA:
-        try:
-            importlib.import_module(name)
-        except ImportError:
-            raise InputError(
-                f"expected {name} to export, found none; pip install 'amvnet[export]'"
-            ) from None
+        import_optional(name, "export")
 
 
 def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, Any]:
@@ -206,7 +200,6 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
             "neighbours": head.neighbours,
             "position_scale": head.position_scale,
         }
-
     described = {"taxonomy": taxonomy.name, "classes": classes, "opset": OPSET, "graphs": graphs}
     return description | described
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from amvnet.config.bounds import Checked, Count
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.detect import ending_of
@@ -29,7 +30,7 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.export.engines import use_engine
+from amvnet.export.engines import make_segmenter
 from amvnet.fleet.manifest import split_name
 from amvnet.fleet.results import describe_drive, parse_estimate
 from amvnet.fleet.storage import Place
@@ -39,16 +40,8 @@ from amvnet.inference.predict import segment_by
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.scan_stream import AHEAD
 from amvnet.inference.segmentation import Segmentation, uncertain_share
-from amvnet.inference.segmenter import Segmenter
-from amvnet.memory import keep_freed_memory
 from amvnet.models.assertion import Disagreement
-from amvnet.models.methods import (
-    EngineName,
-    MethodName,
-    Precision,
-    check_method,
-    check_two_networks,
-)
+from amvnet.models.methods import Compute, MethodName, check_method, check_two_networks
 from amvnet.progress import Say, say_nothing
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights
@@ -56,12 +49,13 @@ from amvnet.weights.file import Weights
 TRANSFERS = 8  # files that are read from, or written to, object storage at the same time
 
 UNKNOWN_SENSOR = Sensor()
+DEFAULTS = Compute()
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Labelling:
+class Labelling(Checked):
     """How the scans of a fleet are labelled, and what is written: the same on every worker.
 
     Attributes:
@@ -70,16 +64,16 @@ class Labelling:
         kind: the format of the labels, one of `writers.KINDS`.
         scores: whether to write the probabilities of both networks, too.
         uncertain: whether to write the uncertain points, too.
-        method, tau, device, precision: as `Segmenter` takes them.
-        engine: as `use_engine` takes it.
+        method, tau: as `Segmenter` takes them.
+        compute: where and how the networks are computed.
         batch: scans that go through the networks together.
-        at_once: on a CPU, scans that are segmented at the same time; None means one for each core.
         sensor: what is known of the sensor of all scans.
         layout: of rows of numbers without names, what they hold.
         classes: maps the classes of the weights to those that are written; None writes these.
 
     Raises:
-        InputError: if the format is unknown, or the method has no uncertain points to write.
+        InputError: if the format is unknown, the method has no uncertain points to write, or a
+            number is out of its range.
     """
 
     weights: Weights
@@ -89,16 +83,14 @@ class Labelling:
     uncertain: bool = False
     method: MethodName = "amvnet"
     tau: float | None = None
-    device: str = "auto"
-    precision: Precision = "auto"
-    engine: EngineName = "torch"
-    batch: int = 1
-    at_once: int | None = None
+    compute: Compute = DEFAULTS
+    batch: Count = 1
     sensor: Sensor = UNKNOWN_SENSOR
     layout: RowLayout = UNKNOWN
     classes: ClassMap | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_kind(self.kind)
         check_method(self.method, self.weights.parts)
         if self.tau is not None:
@@ -114,13 +106,13 @@ class Labelling:
     @cached_property
     def settings(self) -> dict[str, Any]:
         """What the written files depend on, as JSON types."""
-        weights = self.weights
         return {
-            "weights": {part: weights.digest(part) for part in weights.parts},
+            "weights": self.weights.digests(),
             "method": self.method,
             "tau": self.tau,
-            "precision": self.precision,
-            "engine": "int8" if self.engine == "int8" else "",  # no other engine changes labels
+            "precision": self.compute.precision,
+            # No other engine changes labels.
+            "engine": "int8" if self.compute.engine == "int8" else "",
             "format": self.kind,
             "scores": self.scores,
             "uncertain": self.uncertain,
@@ -128,26 +120,6 @@ class Labelling:
             "layout": repr(self.layout),
             "classes": "" if self.classes is None else repr(self.classes),
         }
-
-    def make_segmenter(self) -> Segmenter:
-        """Return the segmenter of a worker.
-
-        Raises:
-            InputError: if the options do not fit the weights or the machine.
-        """
-        segmenter = Segmenter(
-            self.weights,
-            self.device,
-            method=self.method,
-            precision=self.precision,
-            tau=self.tau,
-        )
-        if segmenter.device == "cpu":
-            keep_freed_memory()
-        if self.at_once is not None:
-            segmenter.at_once = self.at_once
-        use_engine(segmenter, self.engine)
-        return segmenter
 
     def make_reader(self, say: Say = say_nothing) -> FileReader:
         """Return what reads the scans of a drive."""
@@ -169,7 +141,6 @@ def results_schema(taxonomy: Taxonomy) -> pa.Schema:
             "class_points": counts,
             "class_uncertain": counts,
             "class_confidence": means,  # of the largest score of each point
-            "sensor": pa.string(),
             "seconds": pa.float32(),  # of the worker
             "worker": pa.string(),
             "weights": pa.string(),  # digest
@@ -190,7 +161,9 @@ class LabelScans:
 
     def __init__(self, labelling: Labelling) -> None:
         self.labelling = labelling
-        self._segmenter = labelling.make_segmenter()
+        self._segmenter = make_segmenter(
+            labelling.weights, labelling.method, labelling.compute, labelling.tau
+        )
         self._schema = results_schema(labelling.taxonomy)
         self._out = Place.of(labelling.out)
         self._worker = f"{socket.gethostname()}:{os.getpid()}"
@@ -306,7 +279,7 @@ class LabelScans:
 
         labels = (self._out / paths[0].as_posix()).url
         counts = statistics(result, self.labelling.taxonomy)
-        return self._row(row, labels=labels, points=entry.points, sensor=entry.sensor, **counts)
+        return self._row(row, labels=labels, points=entry.points, **counts)
 
     def _row(self, row: Row, **values: Any) -> Row:
         """Return a row of results: what is known of the scan, and some values."""

@@ -18,7 +18,7 @@ from amvnet.fleet.actors import Labelling, Row, results_schema
 from amvnet.fleet.manifest import NameSet, list_blocks
 from amvnet.fleet.results import DRIVES, Results, describe_drive
 from amvnet.fleet.storage import Place
-from amvnet.fleet.workers import QUEUED, Workers, check_address, connect
+from amvnet.fleet.workers import QUEUED, Workers, connect
 from amvnet.inference.journal import Entry
 from amvnet.inference.pipeline import check_faults
 from amvnet.inference.predict import report
@@ -63,12 +63,11 @@ def label_fleet(
     """
     out = Place.of(labelling.out)
     _check_inputs(inputs, out, labelling)
-    check_address(address)
     listing = list_blocks(inputs)
     first = next(listing)  # raises if there is no scan
+    connect(address)
     results = Results(out, labelling.settings, resume, overwrite)
 
-    connect(address)
     with closing(Workers(labelling, most)) as workers:
         run = FleetRun(labelling, results, workers, progress, say)
         blocks = chain([first], listing)
@@ -128,7 +127,7 @@ class FleetRun:
         self._planned = 0
         self._labelled = 0
         self._faults: list[str] = []
-        self._points: Counter[str] = Counter()  # by sensor
+        self._points: Counter[str] = Counter()  # by drive
         self._uncertain: Counter[str] = Counter()
 
     def plan(self, window: Sequence[pa.Table]) -> list[pa.Table]:
@@ -212,13 +211,13 @@ class FleetRun:
             place, _, reason = line.rpartition(": ")
             raise OSError(errno.EIO, reason, place)
 
-        for row in rows.select(["error", "sensor", "points", "uncertain"]).to_pylist():
+        for row in rows.select(["error", "drive", "points", "uncertain"]).to_pylist():
             if row["error"] is not None:
                 self._faults.append(row["error"])
                 continue
             self._labelled += 1
-            self._points[row["sensor"]] += row["points"]
-            self._uncertain[row["sensor"]] += round(row["uncertain"] * row["points"])
+            self._points[row["drive"]] += row["points"]
+            self._uncertain[row["drive"]] += round(row["uncertain"] * row["points"])
         self._progress(self._labelled + len(self._faults), self._planned)
 
     def _given_up(self, scan: Row) -> pa.Table:
@@ -236,8 +235,8 @@ class FleetRun:
             SomeBroken: if some are.
         """
         entries = []
-        for sensor, points in self._points.items():
-            entries.append(Entry("", "", sensor, points, self._uncertain[sensor]))
+        for drive, points in self._points.items():
+            entries.append(Entry("", "", drive, points, self._uncertain[drive]))
         if METHODS[self.labelling.method].has_two_networks:
             usual = self.labelling.weights.usual_uncertain_at(self.labelling.tau)
             report(entries, usual, self._say)

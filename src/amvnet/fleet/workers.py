@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 import signal
 import threading
 import warnings
@@ -28,16 +27,6 @@ CORES = 4  # of a worker without a GPU, if the machine has them
 RETRIES = 2  # of a table whose worker ends, and of workers that end before they are ready
 QUEUED = 2  # tables that a worker has at a time, so that it need not wait for the next
 PATIENCE = 1.0  # seconds between two looks at signals
-ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-\[\]]+:\d+")
-
-
-def check_address(address: str | None) -> None:
-    """Raise InputError if a text is no address: it may be an input that follows --ray."""
-    if address is not None and not ADDRESS.fullmatch(address):
-        raise InputError(
-            f"--ray: expected an address such as auto or ray://HOST:10001, found {address!r}; "
-            "name the inputs before --ray"
-        )
 
 
 def connect(address: str | None = None) -> None:
@@ -63,7 +52,7 @@ def connect(address: str | None = None) -> None:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
             f"--ray {address or ''}: expected a Ray cluster, found {reason}; start one with "
-            "ray start --head, or leave the address out"
+            "ray start --head, leave the address out, or name the inputs before --ray"
         ) from None
 
 
@@ -92,7 +81,7 @@ class Workers:
     """
 
     def __init__(self, labelling: Labelling, most: int | None = None) -> None:
-        self._most, resources = _share_cluster(labelling.device, most)
+        self._most, resources = _share_cluster(labelling.compute.device, most)
         self._labelling = ray.put(labelling)
         self._class: Any = ray.remote(**resources)(LabelScans)
         self._starting: dict[Any, Any] = {}  # by the reference that is ready when they are

@@ -169,7 +169,7 @@ def fuse_files(
         return results
 
     pipeline = Pipeline(scans, segment, output, taxonomy)
-    entries, faults = pipeline.run({"fused": pair.to_dict()}, progress)
+    entries, faults = pipeline.run({"fused": repr(pair)}, progress)
     check_faults(faults, len(scans))
 
     points = 0

@@ -62,10 +62,8 @@ class LoadedScan:
 class DatasetScan:
     """A scan of a dataset, not read yet; its labels are in the dataset's format and classes.
 
-    Args:
-        written: the classes of the labels that are written; None means those of the dataset.
-
     Attributes:
+        written: the classes of the labels that are written; None means those of the dataset.
         name: for messages, unique among the scans of one input.
         title: a short name for people who look at the scan.
         source: the recording that it is from: a sequence, a bag or a folder.
@@ -75,12 +73,10 @@ class DatasetScan:
             `Segmenter.by_ring`.
     """
 
-    def __init__(
-        self, dataset: Dataset, record: ScanRecord, written: Taxonomy | None = None
-    ) -> None:
+    def __init__(self, dataset: Dataset, record: ScanRecord) -> None:
         self.dataset = dataset
         self.record = record
-        self.written = written
+        self.written: Taxonomy | None = None
         self.name = record.name
         self.title = _title_of(record)
         self.source = record.sequence

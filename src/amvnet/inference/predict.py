@@ -145,9 +145,8 @@ def _settings(
     classes: ClassMap | None,
 ) -> dict[str, Any]:
     """Return what the written files depend on, as JSON types."""
-    weights = segmenter.weights
     return {
-        "weights": {part: weights.digest(part) for part in weights.parts},
+        "weights": segmenter.weights.digests(),
         "method": segmenter.method,
         "precision": segmenter.precision,
         "engine": "int8" if segmenter.engine == "int8" else None,  # no other one changes labels

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -138,14 +137,6 @@ class ScorePair:
     def read(self, prediction: Path, scan: Scan, classes: int) -> tuple[np.ndarray, np.ndarray]:
         """Return the probabilities f and g of a scan, each as `ScoreFolder.read`."""
         return self.a.read(prediction, scan, classes), self.b.read(prediction, scan, classes)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the settings of both folders, as JSON types."""
-        settings = {}
-        for scores in (self.a, self.b):
-            settings[scores.side] = {**asdict(scores), "folder": str(scores.folder)}
-
-        return settings
 
     def digests(self, records: Sequence[ScanRecord]) -> dict[str, str]:
         """Return a digest of each model's scores of some scans, the same wherever the files lie."""

@@ -28,7 +28,7 @@ from amvnet.models.polar_net import PolarNet
 from amvnet.models.precision import InPrecision, check_device, choose_device, choose_precision
 from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
-from amvnet.models.voting import Voting
+from amvnet.models.voting import vote
 from amvnet.scan import Scan, check_scan
 from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
 from amvnet.threads import survive_forks
@@ -243,16 +243,13 @@ class Segmenter:
         if METHODS[self.method].has_two_networks:
             return model(batch)
         if self.method == "bev":
-            g = model.score_polar_view(batch)
+            g = model.score_polar(model.polar_view.project(batch))
             return Scores(g, _nowhere(g), rv=None, bev=g)
 
-        f = model.score_range_view(batch)
-        y = self.vote(f, batch) if self.method == "rv-knn" else f
+        image = model.range_view.project(batch)
+        f = model.score_range(image)
+        y = vote(f, batch, image) if self.method == "rv-knn" else f
         return Scores(y, _nowhere(y), rv=f, bev=None)
-
-    def vote(self, f: Tensor, batch: PointBatch) -> Tensor:
-        """Return the shares of votes (P, K) of neighbours in the range image."""
-        return Voting()(f, batch, self.model.range_view.project(batch))
 
     def batch(self, scans: Sequence[Scan]) -> PointBatch:
         """Return the valid points of some scans on the device, as the networks take them.

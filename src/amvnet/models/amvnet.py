@@ -145,14 +145,6 @@ class AMVNet(LateFusion):
         with self.watch("BEV"):
             return grid.to_points(self.polar_net(grid)).float().softmax(dim=1)
 
-    def score_range_view(self, batch: PointBatch) -> Tensor:
-        """Return f: (P, K) class probabilities by the range view alone."""
-        return self.score_range(self.range_view.project(batch))
-
-    def score_polar_view(self, batch: PointBatch) -> Tensor:
-        """Return g: (P, K) class probabilities by the bird's-eye view alone."""
-        return self.score_polar(self.polar_view.project(batch))
-
 
 def replace_uncertain(y: Tensor, uncertain: Tensor, h: Tensor) -> Tensor:
     """Return y (P, K) with the rows h (U, K) of the U uncertain points; on a CPU y is changed."""

@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
+from amvnet.config.bounds import Count
 from amvnet.errors import InputError
 
 if TYPE_CHECKING:
@@ -18,6 +19,23 @@ MethodName = Literal["rv", "rv-knn", "bev", "arithmetic", "maximum", "ensemble",
 Precision = Literal["auto", "float32", "bfloat16", "float16"]  # of the two networks
 EngineName = Literal["torch", "onnx", "int8"]  # what runs the two networks
 Ensemble = Callable[["Tensor", "Tensor"], "Tensor"]  # f, g: (P, K) -> (P, K)
+
+
+@dataclass(frozen=True)
+class Compute:
+    """Where and how the networks are computed."""
+
+    device: str = "auto"
+    """cpu, cuda, cuda:1, ..., or auto: cuda if there is a GPU."""
+    engine: EngineName = "torch"
+    """what runs the networks: torch, onnx (ONNX Runtime), or int8 (the same in 8-bit integers,
+    calibrated once; a few labels change)."""
+    precision: Precision = "auto"
+    """of the networks; float16 on a GPU only; auto: bfloat16 on a GPU, else float32."""
+    at_once: Count | None = None
+    """scans that are segmented at the same time on a CPU; default: one per core, if the memory
+    suffices."""
+
 
 ONNX_ENGINES = frozenset({"onnx", "int8"})  # both are ONNX Runtime
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
@@ -44,14 +62,12 @@ class Method:
     """One way to label points.
 
     Attributes:
-        name: as users write it.
         title: in tables and figures.
         parts: the parts of a weights file that the method needs.
         ensemble: combines the class probabilities f and g of the two networks; None if the method
             is no ensemble.
     """
 
-    name: MethodName
     title: str
     parts: tuple[str, ...]
     ensemble: Ensemble | None = None
@@ -64,19 +80,13 @@ class Method:
 
 # In the order of the paper's tables.
 METHODS: dict[str, Method] = {
-    method.name: method
-    for method in (
-        Method("rv", "RV", ("range_net",)),
-        Method("rv-knn", "RV + kNN", ("range_net",)),
-        Method("bev", "BEV", ("polar_net",)),
-        Method("arithmetic", "arithmetic mean", BOTH_NETWORKS, arithmetic_mean),
-        Method("maximum", "maximum", BOTH_NETWORKS, maximum),
-        Method("ensemble", "ensemble", BOTH_NETWORKS, geometric_mean),
-        Method("amvnet", "AMVNet", (*BOTH_NETWORKS, "point_head")),
-    )
-}
-ENSEMBLES: dict[str, Ensemble] = {
-    name: method.ensemble for name, method in METHODS.items() if method.ensemble is not None
+    "rv": Method("RV", ("range_net",)),
+    "rv-knn": Method("RV + kNN", ("range_net",)),
+    "bev": Method("BEV", ("polar_net",)),
+    "arithmetic": Method("arithmetic mean", BOTH_NETWORKS, arithmetic_mean),
+    "maximum": Method("maximum", BOTH_NETWORKS, maximum),
+    "ensemble": Method("ensemble", BOTH_NETWORKS, geometric_mean),
+    "amvnet": Method("AMVNet", (*BOTH_NETWORKS, "point_head")),
 }
 PAPER_METHODS: tuple[MethodName, ...] = ("rv", "bev", "ensemble", "amvnet")  # Tables 3 and 4
 

@@ -16,16 +16,9 @@ from amvnet.errors import InputError
 from amvnet.models.methods import BOTH_NETWORKS
 from amvnet.models.point_head import PointHead
 from amvnet.sensors.intensity import trained_intensity
-from amvnet.training.callbacks import KeepWeights
-from amvnet.training.head_points import (
-    HeadBatch,
-    HeadPoints,
-    PointDraw,
-    PointGatherer,
-    PointSampler,
-)
+from amvnet.training.head_points import HeadBatch, HeadPoints, PointGatherer, PointSampler
 from amvnet.training.plan import Plan
-from amvnet.training.stage import Loaders, Stage, class_weights_of, fit
+from amvnet.training.stage import Loaders, Stage, fit
 from amvnet.weights.file import UNCERTAIN, Weights
 
 VAL_FACTOR = 64  # a validation batch is as large as this many training batches
@@ -56,7 +49,12 @@ class HeadStage(Stage):
 
     def training_step(self, batch: HeadBatch, index: int) -> Tensor:
         point, rows, labels, _ = batch
-        loss = self._loss(point, rows, labels)
+        total_loss = F.cross_entropy(self.trained(point, rows), labels - 1, reduction="sum")
+
+        # The mean is over the batch of all processes; Lightning averages the processes' gradients.
+        count = labels.new_tensor(len(labels)).float()
+        total_count = self.trainer.strategy.reduce(count, reduce_op="sum")
+        loss = total_loss * self.processes.size / total_count
 
         self.check_finite(loss, "at points of the head")
         self.log("train/loss", loss, prog_bar=True, batch_size=len(labels))
@@ -92,20 +90,6 @@ class HeadStage(Stage):
         )
         return self.one_cycle(optimizer, self.config.momentum)
 
-    def _loss(self, point: Tensor, rows: Tensor, labels: Tensor) -> Tensor:
-        logits = self.trained(point, rows)
-        loss = F.cross_entropy(logits, labels - 1, self.class_weights, reduction="sum")
-
-        # The mean is over the batch of all processes; Lightning averages the processes' gradients.
-        total = self.trainer.strategy.reduce(self._weight(labels), reduce_op="sum")
-        return loss * self.processes.size / total
-
-    def _weight(self, labels: Tensor) -> Tensor:
-        """Return the sum of the points' class weights, in float32."""
-        if self.class_weights is None:
-            return labels.new_tensor(len(labels)).float()
-        return self.class_weights[labels - 1].sum().float()
-
 
 def train_head(plan: Plan, weights: Weights) -> None:
     """Train the point head on scores of frozen networks, and write its weights after each epoch.
@@ -139,11 +123,9 @@ def train_head(plan: Plan, weights: Weights) -> None:
         val,
         config=config,
         taxonomy=plan.scans.dataset.taxonomy,
-        weights=class_weights_of(plan) if config.class_weights else None,
         processes=plan.processes,
     )
-    keep_weights = KeepWeights(plan, "head", weights, intensity)
-    fit(stage, plan, _make_loaders(plan, train, val), keep_weights)
+    fit(stage, plan, _make_loaders(plan, train, val), weights, intensity)
 
     # The gathered points take much space, and no process needs them any more.
     plan.processes.wait()
@@ -153,22 +135,20 @@ def train_head(plan: Plan, weights: Weights) -> None:
 
 
 def _make_loaders(plan: Plan, train: HeadPoints, val: HeadPoints | None) -> Loaders:
-    config = plan.recipe.training.head
-    seed = plan.recipe.training.seed
-    labels = train.labels if config.balance else None
-    draw = PointDraw(len(train), config.drawn, labels, config.balance)
-    train_loader = _loader(
-        train, PointSampler(draw, config.batch, seed, shuffle=True, processes=plan.processes)
-    )
+    """Return this process's parts of the batches."""
+    training = plan.recipe.training
+    sampler = PointSampler(train.labels, training.head, training.seed, plan.processes)
+    train_loader = _loader(train, sampler)
     if val is None:
         return train_loader, None
 
-    batch = VAL_FACTOR * config.batch
-    points = PointDraw(len(val))
-    sampler = PointSampler(points, batch, seed, shuffle=False, processes=plan.processes)
-    return train_loader, _loader(val, sampler)
+    size = VAL_FACTOR * training.head.batch
+    batches = []
+    for start in range(0, len(val), size):
+        stop = min(start + size, len(val))
+        batches.append(np.arange(start + plan.processes.rank, stop, plan.processes.size))
+    return train_loader, _loader(val, batches)
 
 
-def _loader(points: HeadPoints, sampler: PointSampler) -> DataLoader[HeadBatch]:
-    """Return a loader of this process's parts of the batches."""
+def _loader(points: HeadPoints, sampler: PointSampler | list[np.ndarray]) -> DataLoader[HeadBatch]:
     return DataLoader(points, batch_size=None, sampler=sampler)  # type: ignore[arg-type]

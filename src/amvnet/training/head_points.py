@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from amvnet.config.schema import HeadTraining
 from amvnet.data.datasets.base import ScanRecord
 from amvnet.distributed import ALONE, Processes, device_of
 from amvnet.errors import InputError
@@ -105,72 +106,46 @@ class HeadPoints:
         return point.float(), rows.float(), labels.long(), stands_for
 
 
-class PointDraw:
-    """Draws the points of an epoch from those on disk, other ones in each epoch.
+class PointSampler(EpochOrder):
+    """Draws the batches of an epoch from the points on disk, other points in each epoch.
+
+    With several processes, each takes its part of every batch. A smaller last batch is left out, as
+    batch norm learns nothing good from a few points.
 
     Args:
-        size: number of points on disk.
-        drawn: points of an epoch; 0 for all.
-        labels: (U,) train ids, to balance the classes; None to draw all points alike.
-        balance: in [0, 1]. A point of a class with n points is drawn in proportion to
-            n ** -balance, and may be drawn several times.
+        labels: (U,) train ids of the points.
+        config: the points of a batch and of an epoch. To balance the classes, a point of a class
+            with n points is drawn in proportion to n ** -balance, and may be drawn several times.
     """
 
     def __init__(
-        self,
-        size: int,
-        drawn: int = 0,
-        labels: np.ndarray | None = None,
-        balance: float = 0.0,
+        self, labels: np.ndarray, config: HeadTraining, seed: int, processes: Processes = ALONE
     ) -> None:
-        self.size = size
-        self.drawn = min(drawn, size) if drawn else size
+        super().__init__(seed, processes)
+        self.size = len(labels)
+        self.drawn = min(config.drawn or self.size, self.size)
+        self.batch = config.batch
         self.cumulative: np.ndarray | None = None
-        if labels is not None and balance > 0:
-            counts = np.bincount(labels)
-            weights = counts[labels] ** -balance
+        if config.balance > 0:
+            weights = np.bincount(labels)[labels] ** -config.balance
             self.cumulative = np.cumsum(weights / weights.sum())
 
     def __len__(self) -> int:
-        return self.drawn
+        return max(self.drawn // self.batch, 1)
 
-    def __call__(self, rng: np.random.Generator) -> np.ndarray:
+    def __iter__(self) -> Iterator[np.ndarray]:
+        order = self._draw(self.rng())
+        for number in range(len(self)):
+            batch = order[number * self.batch : (number + 1) * self.batch]
+            yield batch[self.processes.rank :: self.processes.size]
+
+    def _draw(self, rng: np.random.Generator) -> np.ndarray:
         """Return the indices of an epoch's points, in a random order."""
         if self.cumulative is None:
             return rng.permutation(self.size)[: self.drawn]
 
         index = np.searchsorted(self.cumulative, rng.random(self.drawn), side="right")
         return np.minimum(index, self.size - 1)
-
-
-class PointSampler(EpochOrder):
-    """Draws batches of indices; with several processes, each takes its part of every batch.
-
-    Args:
-        batch: points in a batch of all processes.
-        shuffle: whether to shuffle the points, as in training. A smaller last batch is then left
-            out, as batch norm learns nothing good from a few points.
-    """
-
-    def __init__(
-        self, draw: PointDraw, batch: int, seed: int, shuffle: bool, processes: Processes = ALONE
-    ) -> None:
-        super().__init__(seed, shuffle, processes)
-        self.draw = draw
-        self.batch = batch
-
-    def __len__(self) -> int:
-        if self.shuffle:
-            return max(len(self.draw) // self.batch, 1)
-        return -(-self.draw.size // self.batch)  # rounded up
-
-    def __iter__(self) -> Iterator[np.ndarray]:
-        order = np.arange(self.draw.size)
-        if self.shuffle:
-            order = self.draw(self.rng())
-        for number in range(len(self)):
-            batch = order[number * self.batch : (number + 1) * self.batch]
-            yield batch[self.processes.rank :: self.processes.size]
 
 
 @dataclass(frozen=True)

@@ -139,11 +139,10 @@ class ScanSet(data.Dataset[Scan]):
 
 
 class EpochOrder(data.Sampler[Any]):
-    """The base of samplers whose order depends on seed and epoch, if `shuffle`."""
+    """The base of samplers whose random order depends on seed and epoch."""
 
-    def __init__(self, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
+    def __init__(self, seed: int, processes: Processes = ALONE) -> None:
         self.seed = seed
-        self.shuffle = shuffle
         self.processes = processes
         self.epoch = 0
 
@@ -157,31 +156,24 @@ class EpochOrder(data.Sampler[Any]):
 
 
 class EpochSampler(EpochOrder):
-    """Draws every scan once per epoch.
+    """Draws every scan once per epoch, in a random order.
 
-    With several processes, each takes its part of every batch. In training all processes draw
-    equally many scans: if the scans cannot be shared equally, the first ones are drawn again.
+    With several processes, each takes its part of every batch. All processes draw equally many
+    scans: if the scans cannot be shared equally, the first ones are drawn again.
     """
 
-    def __init__(self, size: int, seed: int, shuffle: bool, processes: Processes = ALONE) -> None:
-        super().__init__(seed, shuffle, processes)
+    def __init__(self, size: int, seed: int, processes: Processes = ALONE) -> None:
+        super().__init__(seed, processes)
         self.size = size
 
     def __len__(self) -> int:
-        return len(self._indices())
+        return -(-self.size // self.processes.size)  # rounded up
 
     def __iter__(self) -> Iterator[Key]:
-        return iter([(self.epoch, index) for index in self._indices()])
-
-    def _indices(self) -> Sequence[int]:
-        """Return this process's part of the epoch's scans."""
-        if self.shuffle:
-            scans_per_process = -(-self.size // self.processes.size)  # rounded up
-            total = scans_per_process * self.processes.size
-            order = np.resize(self.rng().permutation(self.size), total)  # repeats the first ones
-        else:
-            order = np.arange(self.size)
-        return self.processes.share(order.tolist())
+        total = len(self) * self.processes.size
+        order = np.resize(self.rng().permutation(self.size), total)  # repeats the first ones
+        for index in self.processes.share(order.tolist()):
+            yield self.epoch, index
 
 
 def collate(scans: Sequence[Scan]) -> tuple[PointBatch, Tensor]:
@@ -198,11 +190,15 @@ def make_loader(
     Args:
         batch: scans in a batch of one process.
         workers: processes that read scans; 0 to read in this one.
+        shuffle: draw the scans of each epoch by an `EpochSampler`, as in training.
     """
+    sampler: data.Sampler[Any] | list[Key] = EpochSampler(len(scans), scans.seed, processes)
+    if not shuffle:
+        sampler = [(0, index) for index in processes.share(range(len(scans)))]
     return data.DataLoader(
         scans,  # type: ignore[arg-type]  # the sampler gives keys, not indices
         batch_size=batch,
-        sampler=EpochSampler(len(scans), scans.seed, shuffle, processes),
+        sampler=sampler,
         num_workers=workers,
         collate_fn=collate,
         persistent_workers=workers > 0,

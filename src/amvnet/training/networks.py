@@ -17,11 +17,11 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
-from amvnet.training.callbacks import KeepWeights
-from amvnet.training.loaders import ScanSet, make_loader
+from amvnet.training.loaders import ScanSet, count_classes, make_loader
 from amvnet.training.losses import (
     RegionLoss,
     Scored,
+    class_weights,
     dice,
     lovasz_softmax,
     majority_labels,
@@ -29,7 +29,7 @@ from amvnet.training.losses import (
 )
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import PART_OF
-from amvnet.training.stage import Loaders, Stage, class_weights_of, fit
+from amvnet.training.stage import Loaders, Stage, fit
 from amvnet.weights.file import Weights
 
 Batch = tuple[PointBatch, Tensor]  # points, and their (P,) train ids
@@ -40,16 +40,28 @@ class NetworkStage(Stage):
     """The base of the two networks' stages, which learn from batches of scans by AdamW.
 
     A subclass defines `logits`. The other arguments are those of `Stage`.
+
+    Args:
+        weights: (K,) class weights of the loss, or None for equal weights.
     """
 
     config: NetworkTraining
     view: RangeView | PolarView
     default_region_loss: RegionLoss  # the paper's
 
-    def __init__(self, view: RangeView | PolarView, net: nn.Module, **shared: Any) -> None:
+    def __init__(
+        self,
+        view: RangeView | PolarView,
+        net: nn.Module,
+        weights: np.ndarray | None,
+        **shared: Any,
+    ) -> None:
         super().__init__(**shared)
         self.view = view
         self.trained = net
+        self.class_weights: Tensor | None
+        tensor = None if weights is None else torch.from_numpy(weights)
+        self.register_buffer("class_weights", tensor, persistent=False)
 
     def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
         """Return what the loss is computed on, and the (P, K) logits of all points.
@@ -134,7 +146,7 @@ class RangeStage(NetworkStage):
 
 
 class PolarStage(NetworkStage):
-    """Stage `bev`: the loss is over points, each with the logits of its voxel, or over voxels."""
+    """Stage `bev`: the loss is over voxels, each with the label of most of its points."""
 
     name = "bev"
     view: PolarView
@@ -143,10 +155,7 @@ class PolarStage(NetworkStage):
     def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
         view = self.view.project(batch)
         scores = self.trained(view)  # (M, Z * K)
-        points = view.to_points(scores)  # (P, K)
-        if self.config.loss_over == "voxels":
-            return _score_voxels(view, scores, labels), points
-        return Scored(points, labels, batch.scan, batch.count), points
+        return _score_voxels(view, scores, labels), view.to_points(scores)
 
 
 def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
@@ -185,9 +194,9 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     model = plan.build(weights)
     intensity = _intensity(plan, weights)
     loaders = make_loaders(plan, config, intensity)
-    stage = make_stage(plan, name, model, class_weights_of(plan) if config.class_weights else None)
+    stage = make_stage(plan, name, model, _class_weights(plan) if config.class_weights else None)
     try:
-        fit(stage, plan, loaders, KeepWeights(plan, name, weights, intensity))
+        fit(stage, plan, loaders, weights, intensity)
     except torch.OutOfMemoryError:
         raise InputError(
             f"{name}: expected steps that fit into the GPU's memory, found {config.batch} scans in "
@@ -227,6 +236,13 @@ def make_loaders(
         return train, None
     val_set = ScanSet(scans.dataset, scans.val, intensity=intensity)
     return train, make_loader(val_set, 1, shuffle=False, **shared)
+
+
+def _class_weights(plan: Plan) -> np.ndarray:
+    """Return the (K,) weights of the classes in the loss (section 4.2 of the paper)."""
+    path = plan.out / "class_counts.npz"
+    scans = plan.scans
+    return class_weights(count_classes(scans.dataset, scans.train, path, plan.processes, plan.say))
 
 
 def _intensity(plan: Plan, weights: Weights) -> TrainedIntensity | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
+from amvnet.data.datasets.joined import Part
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, taxonomy_from_yaml
@@ -149,24 +150,28 @@ def open_for_training(
     """
     classes = None if taxonomy is None else taxonomy_from_yaml(taxonomy)
     dataset = open_dataset(data, classes)
+    weights = Weights(recipe.model, dataset.taxonomy, recipe.sensor)
     earlier = init or _earlier_weights(out)
-    return open_for_weights(data, _frame(recipe, dataset.taxonomy, earlier), dataset)
+    if earlier is not None:
+        weights = dataclasses.replace(weights, training=earlier.training)
+    return open_for_weights(data, weights, dataset)
 
 
 def open_parts(
     specs: Sequence[str], taxonomy: Path | None, recipe: Recipe, out: Path, init: Weights | None
-) -> tuple[Dataset, list[TrainingScans]]:
-    """Open the datasets of a training; return the first, and those to mix in with their scans."""
+) -> tuple[Dataset, list[Part]]:
+    """Open the datasets of a training.
+
+    Returns:
+        The first dataset, and those to mix in with their training scans. These share
+        `training.others` of each epoch equally; if it is 0, all of their scans are taken.
+    """
     first, *others = [open_for_training(spec, taxonomy, recipe, out, init) for spec in specs]
-    return first, [TrainingScans(dataset, training_records(dataset), []) for dataset in others]
-
-
-def _frame(recipe: Recipe, taxonomy: Taxonomy, earlier: Weights | None) -> Weights:
-    """Return weights without parameters that say what scans are to be normalised to."""
-    weights = Weights(recipe.model, taxonomy, recipe.sensor)
-    if earlier is None:
-        return weights
-    return dataclasses.replace(weights, training=earlier.training)
+    share = recipe.training.others / len(others) if others else 0.0
+    parts = []
+    for dataset in others:
+        parts.append(Part(dataset, training_records(dataset), share or None))
+    return first, parts
 
 
 def _earlier_weights(out: Path) -> Weights | None:

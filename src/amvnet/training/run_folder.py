@@ -53,10 +53,10 @@ def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
         "classes": dataset.taxonomy.name,
         "train": sequence_names(plan.scans.train),
         "val": sequence_names(plan.scans.val),
-        "init": None if init is None else {part: init.digest(part) for part in init.parts},
+        "init": None if init is None else init.digests(),
     }
     if plan.scores is not None:
-        entry["scores"] = plan.scores.to_dict()
+        entry["scores"] = repr(plan.scores)
 
     # The entries of earlier calls, for other stages, stay; the new one comes last.
     entries = _entries(plan.out / "run.yaml")

@@ -32,11 +32,11 @@ from amvnet.evaluation.metrics import metrics
 from amvnet.memory import keep_freed_memory
 from amvnet.models.sync_batch_norm import synchronise_batch_norms
 from amvnet.models.views.points import PointBatch
+from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
-from amvnet.training.loaders import count_classes
-from amvnet.training.losses import class_weights
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import LAST
+from amvnet.weights.file import Weights
 
 MOMENTUM_CYCLE = 0.1  # the one-cycle schedule lowers the momentum by this much
 LOGGED_EVERY = 10  # batches, of the loss
@@ -51,11 +51,7 @@ Loaders = tuple[DataLoader[Any], DataLoader[Any] | None]
 
 
 class Stage(L.LightningModule):
-    """The base of all stages: class weights, metrics of the validation, the one-cycle schedule.
-
-    Args:
-        weights: (K,) class weights of the loss, or None for equal weights.
-    """
+    """The base of all stages: metrics of the validation, the one-cycle schedule."""
 
     name: str  # the value of --stage
     trained: nn.Module  # the part of the model that this stage trains
@@ -65,18 +61,12 @@ class Stage(L.LightningModule):
         self,
         config: NetworkTraining | HeadTraining,
         taxonomy: Taxonomy,
-        weights: np.ndarray | None,
         processes: Processes = ALONE,
     ) -> None:
         super().__init__()
         self.config = config
         self.taxonomy = taxonomy
         self.processes = processes
-
-        self.class_weights: Tensor | None
-        tensor = None if weights is None else torch.from_numpy(weights)
-        self.register_buffer("class_weights", tensor, persistent=False)
-
         self.matrix = self.empty_matrix()
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
@@ -160,24 +150,24 @@ class KeepSignals(Callback):
             signal.signal(signal.SIGTERM, self._handler)
 
 
-def class_weights_of(plan: Plan) -> np.ndarray:
-    """Return the (K,) weights of the classes in the loss (section 4.2 of the paper)."""
-    path = plan.out / "class_counts.npz"
-    scans = plan.scans
-    return class_weights(count_classes(scans.dataset, scans.train, path, plan.processes, plan.say))
-
-
-def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: KeepWeights) -> None:
-    """Train a stage in its folder of the run.
+def fit(
+    stage: Stage,
+    plan: Plan,
+    loaders: Loaders,
+    weights: Weights,
+    intensity: TrainedIntensity | None,
+) -> None:
+    """Train a stage in its folder of the run, and write its weights after each epoch.
 
     Args:
-        keep_weights: writes weights at the end of each epoch, before the checkpoint, which
-            therefore never claims more than has been written.
+        weights: those that the training begins with.
+        intensity: what the intensities of the scans are brought to.
 
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
     """
-    quiet_lightning()
+    for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when imported
+        logging.getLogger(name).setLevel(logging.ERROR)
     stage.train()
     train, val = loaders
     device = device_of(plan.recipe.training.accelerator)
@@ -188,17 +178,14 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: KeepWeights) -
         synchronise_batch_norms(stage.trained, cuda=device == "cuda")
     if precision == DOUBLE:
         stage.double()
-    if plan.recipe.training.compile:
-        stage.trained.compile()
 
-    checkpoint = plan.out / stage.name / LAST
+    folder = plan.out / stage.name
+    checkpoint = folder / LAST
     begun = checkpoint if plan.resume and checkpoint.is_file() else None
     if begun is not None:
         # Lightning sets the sampler's epoch only after the reading processes have begun to draw.
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
 
-    folder = plan.out / stage.name
-    has_bar = plan.bars and plan.processes.first
     # The statistics of synchronised batch norms are the same everywhere, and processes may validate
     # unequal shares.
     ddp = DDPStrategy(broadcast_buffers=False)
@@ -206,7 +193,7 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: KeepWeights) -
         # Lightning's own way to double precision does not convert our batches.
         precision=SINGLE if precision == DOUBLE else precision,
         accelerator=plan.recipe.training.accelerator,
-        devices=plan.processes.here,
+        devices=plan.processes.size // plan.processes.nodes,  # on each machine
         num_nodes=plan.processes.nodes,
         strategy=ddp if plan.processes.size > 1 else "auto",
         plugins=[environment()],
@@ -214,10 +201,10 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: KeepWeights) -
         limit_val_batches=0 if val is None else None,
         accumulate_grad_batches=getattr(stage.config, "accumulate", 1),
         gradient_clip_val=getattr(stage.config, "clip", None),
-        callbacks=_callbacks(stage, plan, keep_weights, has_bar),
+        callbacks=_callbacks(stage, plan, KeepWeights(plan, stage.name, weights, intensity)),
         default_root_dir=folder,
         logger=TensorBoardLogger(folder, name="", version=""),
-        enable_progress_bar=has_bar,
+        enable_progress_bar=plan.bars and plan.processes.first,
         enable_model_summary=False,
         log_every_n_steps=min(LOGGED_EVERY, len(train)),
         num_sanity_val_steps=0,
@@ -231,17 +218,21 @@ def fit(stage: Stage, plan: Plan, loaders: Loaders, keep_weights: KeepWeights) -
         raise InputError(line.removeprefix(f"{InputError.__module__}.InputError: ")) from None
 
 
-def _callbacks(
-    stage: Stage, plan: Plan, keep_weights: KeepWeights, has_bar: bool
-) -> list[Callback]:
-    """Return the callbacks of a stage, those that write before the checkpoint."""
-    folder = plan.out / stage.name
+def _callbacks(stage: Stage, plan: Plan, keep_weights: KeepWeights) -> list[Callback]:
+    """Return the callbacks of a stage.
+
+    Weights are written before the checkpoint, which never claims more than has been written.
+    """
+    has_bar = plan.bars and plan.processes.first
     callbacks: list[Callback] = [
         keep_weights,
         KeepSignals(),
         SeedBatches(plan.recipe.training.seed, plan.processes.rank),
         ModelCheckpoint(
-            folder, filename="last", enable_version_counter=False, save_on_train_epoch_end=True
+            plan.out / stage.name,
+            filename="last",
+            enable_version_counter=False,
+            save_on_train_epoch_end=True,
         ),
         LearningRateMonitor(),
         RichProgressBar() if has_bar else EpochLines(plan.say, stage.name),
@@ -284,9 +275,3 @@ def _epochs_done(checkpoint: Path) -> int:
         raise InputError(
             f"{checkpoint}: expected a checkpoint, found a broken file; delete it to train again"
         ) from None
-
-
-def quiet_lightning() -> None:
-    """Suppress Lightning's notes; it sets its log levels when it is imported."""
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.ERROR)

@@ -117,6 +117,10 @@ class Weights:
 
         return digest.hexdigest()[:16]
 
+    def digests(self) -> dict[str, str]:
+        """Return the digest of each part."""
+        return {part: self.digest(part) for part in self.parts}
+
     def replace_part(self, name: str, other: Weights) -> Weights:
         """Return these weights with one part taken from other weights.
 
@@ -184,8 +188,11 @@ class Weights:
         """Return whether the parameters of one part have the sizes of another configuration."""
         with torch.device("meta"):  # without memory
             part = getattr(build_amvnet(model, self.taxonomy.size), name)
-        expected = {key: tensor.shape for key, tensor in part.state_dict().items()}
-        return expected == {key: tensor.shape for key, tensor in self.part(name).items()}
+        try:
+            part.load_state_dict(self.part(name), assign=True)
+        except RuntimeError:
+            return False
+        return True
 
     def resized(self, name: str, model: ModelConfig) -> Weights:
         """Return these weights with the sizes of one part taken from another configuration.
@@ -229,12 +236,8 @@ class Weights:
 
     def _load_part(self, part: str, module: torch.nn.Module) -> None:
         """Load the parameters of one part into its module, as float32."""
-        state = {}
-        for key, tensor in self.part(part).items():
-            state[key] = tensor.float()
-
         try:
-            module.load_state_dict(state)
+            module.load_state_dict(self.part(part))
         except RuntimeError:
             raise InputError(
                 f"expected parameters of {part} that fit its description, found others; "

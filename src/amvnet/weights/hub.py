@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
-from amvnet.errors import InputError, one_line_errors
+from amvnet.errors import InputError, import_optional, one_line_errors
 
 PREFIX = "hf-hub:"
 FILE = "model.safetensors"
@@ -27,7 +26,7 @@ def fetch(name: str) -> Path:
     """
     repository, _, revision = name.removeprefix(PREFIX).partition("@")
     check_name(repository, name)
-    hub = client()
+    hub = import_optional("huggingface_hub", "hub")
 
     with hub_errors(name, f"check the name and the network, and that {FILE} is there"):
         path = hub.hf_hub_download(repo_id=repository, filename=FILE, revision=revision or None)
@@ -38,22 +37,6 @@ def check_name(repository: str, name: str) -> None:
     """Check that a repository has the form OWNER/NAME; raise InputError with `name` if not."""
     if repository.count("/") != 1 or not all(repository.split("/")):
         raise InputError(f"expected {PREFIX}OWNER/NAME, found {name!r}; name both")
-
-
-def client() -> Any:
-    """Return the hub's own client, the module `huggingface_hub`.
-
-    Raises:
-        InputError: if it is not installed.
-    """
-    try:
-        import huggingface_hub
-    except ImportError:
-        raise InputError(
-            "expected huggingface_hub for the hub, found none; pip install 'amvnet[hub]'"
-        ) from None
-
-    return huggingface_hub
 
 
 def hub_errors(name: str, advice: str) -> AbstractContextManager[None]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from amvnet.errors import import_optional
 from amvnet.weights.card import front_matter, model_card
 from amvnet.weights.file import Weights, load, save
-from amvnet.weights.hub import FILE, PREFIX, check_name, client, hub_errors
+from amvnet.weights.hub import FILE, PREFIX, check_name, hub_errors
 
 CARD = "README.md"
 
@@ -35,7 +36,7 @@ def push(
     check_name(name, name)
     if not isinstance(weights, Weights):
         weights = load(weights)
-    hub = client()
+    hub = import_optional("huggingface_hub", "hub")
 
     with TemporaryDirectory() as folder:
         save(weights, Path(folder) / FILE)

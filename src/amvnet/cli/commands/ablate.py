@@ -11,6 +11,7 @@ from amvnet.cli.options import TrainingChoice, describe_records, join_processes
 
 def ablate(
     recipe: Any,
+    /,
     data: str,
     out: Path,
     choice: TrainingChoice,

@@ -6,21 +6,22 @@ from pathlib import Path
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
-    ComputeChoice,
     LabelledChoice,
     parse_counts,
     parse_names,
 )
 from amvnet.errors import InputError
+from amvnet.models.methods import Compute
 from amvnet.progress import counted
 
 
 def analyze(
     data: str,
+    /,
     weights: str,
     out: Path,
     choice: LabelledChoice,
-    compute: ComputeChoice,
+    compute: Compute,
     neighbours: str | None = None,
     recipe: str | None = None,
     train_sequences: str | None = None,
@@ -43,6 +44,7 @@ def analyze(
     from amvnet.data.datasets.select import TrainingScans
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
+    from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.training.ablation import sweep_neighbours
@@ -56,7 +58,7 @@ def analyze(
         )
     loaded = load(weights)
     dataset = open_for_weights(data, loaded)
-    segmenter = compute.segmenter(loaded, "amvnet")
+    segmenter = make_segmenter(loaded, "amvnet", compute, say=say)
     records = choice.records(dataset)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.

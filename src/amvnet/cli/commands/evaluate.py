@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json as json_format
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amvnet.cli.console import progress, show
+from amvnet.cli.console import progress, say, show
 from amvnet.cli.options import (
-    ComputeChoice,
     LabelledChoice,
     join_processes,
     open_data,
@@ -16,7 +16,7 @@ from amvnet.cli.options import (
 )
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
-from amvnet.models.methods import widest_method
+from amvnet.models.methods import Compute, widest_method
 
 if TYPE_CHECKING:
     from amvnet.evaluation.metrics import Evaluation
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 def evaluate(
     data: str,
+    /,
     choice: LabelledChoice,
-    compute: ComputeChoice,
+    compute: Compute,
     weights: str | None = None,
     predictions: Path | None = None,
     methods: str = "rv,bev,ensemble,amvnet",
@@ -56,8 +57,10 @@ def evaluate(
     from amvnet.data.class_maps import class_map
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
+    from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
+    from amvnet.models.precision import choose_device
     from amvnet.weights.file import load
 
     processes = join_processes()
@@ -71,7 +74,9 @@ def evaluate(
         method_names = parse_methods(methods)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in method_names]
-        segmenter = compute.segmenter(loaded, widest_method(parts), tau, processes)
+        device = processes.device(choose_device(compute.device, compute.engine))
+        compute = replace(compute, device=device)
+        segmenter = make_segmenter(loaded, widest_method(parts), compute, tau, say)
         labeller = label_by_weights(dataset, segmenter, method_names, mapping)
     elif predictions is not None and weights is None:
         if tau is not None:

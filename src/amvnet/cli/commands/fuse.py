@@ -13,6 +13,7 @@ from amvnet.progress import counted
 
 def fuse(
     inputs: list[str],
+    /,
     out: Path,
     models: ScoresChoice,
     choice: ScanChoice,
@@ -34,7 +35,7 @@ def fuse(
             the head's.
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the
             head's or the inputs'.
-        overwrite: replace files that exist.
+        overwrite: replace files in the folder that amvnet did not write, too.
     """
     from amvnet.data.taxonomy import taxonomy_named
     from amvnet.inference.fuse import fuse_files

@@ -5,7 +5,7 @@ from __future__ import annotations
 from amvnet.cli.console import say_lines, show
 
 
-def info(weights: str | None = None) -> None:
+def info(weights: str | None = None, /) -> None:
     """Describe a weights file; without one, show what is installed.
 
     Args:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
-    ComputeChoice,
     ScanChoice,
     SensorChoice,
 )
 from amvnet.config.bounds import Count, Share
-from amvnet.errors import InputError
-from amvnet.models.methods import MethodName
+from amvnet.errors import InputError, import_optional
+from amvnet.models.methods import Compute, MethodName
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
@@ -26,11 +24,12 @@ FormatName = Literal["label", "npy", "ply"]
 
 def predict(
     inputs: list[str],
+    /,
     weights: str,
     out: str,
     choice: ScanChoice,
     known: SensorChoice,
-    compute: ComputeChoice,
+    compute: Compute,
     method: MethodName = "amvnet",
     tau: Share | None = None,
     scores: bool = False,
@@ -64,7 +63,7 @@ def predict(
         classes: write the ids of these classes, to which those of the weights are mapped: coarse,
             or a YAML file.
         batch: scans that go through the networks at a time; more than one suits a GPU.
-        overwrite: replace files that exist.
+        overwrite: replace files in the folder that amvnet did not write, too.
         ray: share the scans among the workers of a Ray cluster, and write a table of results;
             without an address, Ray starts on this machine.
         workers: of --ray, their number; default: one for each GPU, or for each 4 cores.
@@ -74,7 +73,7 @@ def predict(
 
     mapping = None if classes is None else class_map(classes)
     if ray:
-        cluster = _import_cluster()
+        cluster = import_optional("amvnet.fleet.cluster", "fleet")
         labelling = cluster.Labelling(
             load(weights),
             out,
@@ -83,11 +82,11 @@ def predict(
             uncertain=uncertain,
             method=method,
             tau=tau,
+            compute=compute,
             batch=batch,
             sensor=known.parse(),
             layout=_layout(choice),
             classes=mapping,
-            **asdict(compute),
         )
         with progress("segmenting") as step:
             written = cluster.label_fleet(
@@ -103,12 +102,13 @@ def predict(
         say(f"{counted(written, 'label file')} in {out}; the table of results is in {out}/results")
         return
 
+    from amvnet.export.engines import make_segmenter
     from amvnet.inference.pipeline import OutputOptions
     from amvnet.inference.predict import predict as predict_inputs
 
     _refuse_urls([*inputs, out])
     sensor = known.parse()
-    segmenter = compute.segmenter(load(weights), method, tau)
+    segmenter = make_segmenter(load(weights), method, compute, tau, say)
 
     with progress("segmenting") as step:
         written = predict_inputs(
@@ -130,21 +130,6 @@ def predict(
             say=say,
         )
     say(f"{counted(written, 'label file')} in {out}")
-
-
-def _import_cluster() -> Any:
-    """Import what needs Ray.
-
-    Raises:
-        InputError: if it is not installed.
-    """
-    try:
-        from amvnet.fleet import cluster
-    except ImportError as error:
-        raise InputError(
-            f'--ray: expected the package {error.name}, found none; run pip install "amvnet[fleet]"'
-        ) from None
-    return cluster
 
 
 def _layout(choice: ScanChoice) -> RowLayout:

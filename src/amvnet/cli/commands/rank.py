@@ -5,16 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import ComputeChoice, LabelledChoice
+from amvnet.cli.options import LabelledChoice
+from amvnet.models.methods import Compute
 from amvnet.progress import counted
 
 
 def rank(
     data: str,
+    /,
     weights: str,
     out: Path,
     choice: LabelledChoice,
-    compute: ComputeChoice,
+    compute: Compute,
     overwrite: bool = False,
 ) -> None:
     """Rank clusters of points whose labels both views contradict, to check them.
@@ -25,23 +27,25 @@ def rank(
         out: the table of the clusters, FILE.csv.
         choice: which scans to rank.
         compute: where and how the networks are computed.
-        overwrite: replace the table if it exists.
+        overwrite: replace files that amvnet did not write, too.
     """
-    from amvnet.files import check_free, make_folder
+    from amvnet.export.engines import make_segmenter
+    from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.ranking.label_errors import rank as rank_records
     from amvnet.ranking.label_errors import write_clusters
     from amvnet.weights.file import load
+    from amvnet.written import protecting
 
     # Before any scan is scored, so that no time is wasted.
     make_folder(out.parent)
-    check_free([out], overwrite)
-    loaded = load(weights)
-    dataset = open_for_weights(data, loaded)
-    records = choice.records(dataset, "all")
-    segmenter = compute.segmenter(loaded, "ensemble")
+    with protecting([out], overwrite):
+        loaded = load(weights)
+        dataset = open_for_weights(data, loaded)
+        records = choice.records(dataset, "all")
+        segmenter = make_segmenter(loaded, "ensemble", compute, say=say)
 
-    with progress("scoring") as step:
-        clusters = rank_records(dataset, records, segmenter, step)
-    write_clusters(clusters, records, dataset.taxonomy, out)
-    say(f"{counted(len(clusters), 'cluster')} of {counted(len(records), 'scan')} in {out}")
+        with progress("scoring") as step:
+            clusters = rank_records(dataset, records, segmenter, step)
+        write_clusters(clusters, records, dataset.taxonomy, out)
+        say(f"{counted(len(clusters), 'cluster')} of {counted(len(records), 'scan')} in {out}")

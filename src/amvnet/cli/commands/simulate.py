@@ -11,6 +11,7 @@ from amvnet.progress import counted
 
 def simulate(
     out: Path,
+    /,
     sensor: str = "hdl64e",
     sequences: int = 1,
     scans: int = 10,

@@ -11,6 +11,7 @@ from amvnet.cli.options import ScoresChoice, TrainingChoice, describe_records, j
 
 def train(
     recipe: Any,
+    /,
     data: list[str],
     out: Path,
     choice: TrainingChoice,
@@ -52,9 +53,9 @@ def train(
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     weights = None if init is None else load(init)
     recipe = sized_by_init(recipe, weights)
-    dataset, others = open_parts(data, taxonomy, recipe, out, weights)
+    dataset, parts = open_parts(data, taxonomy, recipe, out, weights)
     recipe = without_mean(recipe, weights, dataset.taxonomy, say)
-    scans = join(choice.scans(dataset, with_val), others, recipe.training.others)
+    scans = join(choice.scans(dataset, with_val), parts)
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
 
     plan = Plan(

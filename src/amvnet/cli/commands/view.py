@@ -5,17 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import ComputeChoice, ScanChoice, SensorChoice
+from amvnet.cli.options import ScanChoice, SensorChoice
 from amvnet.errors import InputError
-from amvnet.models.methods import widest_method
+from amvnet.models.methods import Compute, widest_method
 from amvnet.progress import counted
 
 
 def view(
     inputs: list[str],
+    /,
     choice: ScanChoice,
     known: SensorChoice,
-    compute: ComputeChoice,
+    compute: Compute,
     labels: Path | None = None,
     weights: str | None = None,
     html: Path | None = None,
@@ -37,14 +38,14 @@ def view(
         scans: at most this many, evenly spaced.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
     """
-    from amvnet.data.spacing import evenly_spaced
     from amvnet.data.taxonomy import taxonomy_named
+    from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
     from amvnet.inference.listing import list_inputs
     from amvnet.inference.reading import normaliser_for
     from amvnet.sensors.normalise import Normaliser
     from amvnet.viewing.page import open_page, temporary_page, write_page
-    from amvnet.viewing.shown_scans import check_labels, show_scans
+    from amvnet.viewing.shown_scans import ShownScans
     from amvnet.weights.file import load
 
     if labels is not None and weights is not None:
@@ -54,8 +55,6 @@ def view(
             "expected no --taxonomy together with --weights, which define their classes; "
             "leave it out"
         )
-    if scans < 1:
-        raise InputError(f"expected a number of scans from 1, found {scans}; say --scans 5")
     sensor = known.parse()
     # Before any scan is segmented, so that no time is wasted if a folder cannot be made.
     if html is not None:
@@ -66,19 +65,16 @@ def view(
     normaliser = Normaliser(None, sensor, say)
     if weights is not None:
         loaded = load(weights)
-        segmenter = compute.segmenter(loaded, widest_method(loaded.parts))
+        segmenter = make_segmenter(loaded, widest_method(loaded.parts), compute, say=say)
         classes = segmenter.taxonomy
         normaliser = normaliser_for(loaded, sensor, say)
 
     listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser)
-    if labels is not None:
-        check_labels(labels, len(listed))
-    chosen = evenly_spaced(listed, scans)
+    shown = ShownScans(classes, listed, segmenter, labels).spaced(scans)
     page = html or temporary_page()
     with progress("looking") as step:
-        shown = show_scans(chosen, classes, segmenter, labels, progress=step)
-        write_page(page, shown, classes, _title(inputs, weights))
-    say(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")
+        write_page(page, shown.each(step), shown.taxonomy, _title(inputs, weights))
+    say(f"{counted(len(shown), 'scan')} in {page}; open it in a browser")
     if html is None:
         open_page(page)
 

@@ -96,7 +96,11 @@ class Dataset(ABC):
         return list(records)
 
     def count_points(self, record: ScanRecord) -> int:
-        """Return the number of points of a scan; raise the errors of `read`."""
+        """Return the number of points of a scan.
+
+        Raises:
+            InputError: as `read`.
+        """
         return len(self.read(record, labels=False))
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:

@@ -59,7 +59,6 @@ class RowLayout:
                     f"--dtype: expected float32, float64, float16, uint8, ..., found {dtype!a}; "
                     "give the type of all columns, or one for each with commas"
                 )
-
         is_stated = self.dtypes != (USUAL_TYPE,)
         fits_columns = len(self.dtypes) in (1, len(self.columns))
         if is_stated and not (self.columns and fits_columns):
@@ -83,7 +82,11 @@ UNKNOWN = RowLayout()
 
 
 def parse_layout(columns: str | None, dtype: str | None) -> RowLayout:
-    """Return the layout that the options --columns and --dtype describe."""
+    """Return the layout that the options --columns and --dtype describe.
+
+    Raises:
+        InputError: as `RowLayout`.
+    """
     return RowLayout(_split(columns), _split(dtype or USUAL_TYPE))
 
 
