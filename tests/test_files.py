@@ -274,7 +274,7 @@ def test_every_file_has_the_mode_of_the_umask(umask: int, tmp_path: Path) -> Non
     assert (code, error) == (0, "")
 
     paths = [path for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(paths) == 7
+    assert len(paths) == 6
     assert {stat.S_IMODE(path.stat().st_mode) for path in paths} == {0o666 & ~umask}
 
 

@@ -6,7 +6,7 @@ import errno
 import os
 import re
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -87,6 +87,22 @@ def publish(part: Path, path: Path) -> None:
         os.close(folder)
 
 
+def check_free(paths: Iterable[Path], overwrite: bool = False) -> None:
+    """Raise InputError if a command would replace a file, unless it is told to."""
+    existing = [path for path in paths if not overwrite and os.path.lexists(path)]
+    for path in existing:
+        if path.is_dir():
+            raise InputError(
+                f"{path}: expected a file to write, found a folder; give the name of a file in it"
+            )
+    if existing:
+        more = f" (and {len(existing) - 1} more)" if len(existing) > 1 else ""
+        raise InputError(
+            f"{existing[0]}{more}: expected no file, found one; change --out, or say --overwrite "
+            "to replace it"
+        )
+
+
 def inside(folder: Path | str, name: Path | str) -> Path:
     """Return the path of an output file whose name is made from data, such as a token of a table.
 
@@ -115,11 +131,7 @@ def inside(folder: Path | str, name: Path | str) -> Path:
 
 
 def check_no_links(folder: Path) -> None:
-    """Check that the first levels of an output folder, which another library fills, have no links.
-
-    Raises:
-        InputError: if one of its folders is a link.
-    """
+    """Check that no folder in an output folder, which another library fills, is a link."""
     for pattern in ("*", "*/*", "*/*/*"):
         for path in folder.glob(pattern):
             if path.is_dir():
@@ -148,11 +160,7 @@ def _fault_of(name: Path) -> str | None:
 
 
 def checked_token(text: Any) -> str:
-    """Return a token of a table that becomes the name of a file.
-
-    Raises:
-        InputError: if it is not one plain name.
-    """
+    """Return a token that becomes the name of a file; raise InputError if it is no plain name."""
     is_name = isinstance(text, str) and text.isprintable() and text not in ("", ".", "..")
     if not is_name or set(text) & set("/\\"):
         raise InputError(

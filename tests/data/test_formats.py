@@ -73,7 +73,8 @@ def test_every_format_holds_the_same_scan(folder: Path, name: str) -> None:
     assert (scan.ring is None) == (name != "nuscenes.pcd.bin")
 
 
-@pytest.mark.parametrize("name", WRITERS)
+# Rows of numbers have no first bytes of their own: only their names tell.
+@pytest.mark.parametrize("name", [name for name in WRITERS if not name.endswith(".bin")])
 @pytest.mark.parametrize("disguise", ["scan.bin", "scan.ply", "scan", "scan.txt", "scan.pcd"])
 def test_the_content_counts_if_the_name_is_wrong(
     folder: Path, tmp_path: Path, name: str, disguise: str

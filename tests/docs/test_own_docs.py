@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -78,6 +79,7 @@ def test_every_command_runs(
 
     assert words[0] == "amvnet"
     monkeypatch.chdir(folder)
+    shutil.rmtree("labels", ignore_errors=True)  # of another command
     assert main(words[1:]) == 0
     text = capsys.readouterr().out
     assert "assumed" in text
@@ -108,7 +110,7 @@ def test_the_line_that_is_shown_is_the_one_that_is_said(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(folder)
-    succeed("predict cloud.pcd --weights sim-hdl64e --method bev --out labels")
+    succeed("predict cloud.pcd --weights sim-hdl64e --method bev --out labels --overwrite")
     lines = capsys.readouterr().out.splitlines()
     (printed,) = [line for line in lines if line.startswith("cloud.pcd")]
     (documented,) = re.findall(r"    (cloud\.pcd: .*)\n    (.*)\n", read_page("own_scans.md"))

@@ -21,7 +21,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.measure import MEASURED
-from amvnet.viewing.shown_scans import ShownScans
+from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import Weights, save
 
 from fixtures.sensors import LASERS, place
@@ -233,7 +233,7 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
     np.testing.assert_array_equal(raw, weights.taxonomy.to_raw(expected))
 
     scans, taxonomy = list_inputs([f"{tmp_path}/a.npy"], normaliser=normaliser_for(weights))
-    (shown,) = ShownScans(taxonomy, scans, segmenter).each()
+    (shown,) = show_scans(scans, taxonomy, segmenter)
     np.testing.assert_array_equal(shown.labels["amvnet"], expected)
     np.testing.assert_array_equal(segmenter(tmp_path / "a.npy").labels, expected)
 

@@ -316,7 +316,7 @@ def test_scans_are_never_overwritten(
 def test_uncertain_points_next_to_scans_are_not_scans(world: Path, tmp_path: Path) -> None:
     some_points(400).tofile(tmp_path / "a.bin")
     for _ in range(2):
-        assert predict(world, tmp_path, tmp_path, "--uncertain")[0] == 0
+        assert predict(world, tmp_path, tmp_path, "--uncertain", "--overwrite")[0] == 0
     assert files(tmp_path) == {"a.bin", "a.label", "a.uncertain.npy"}
 
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from amvnet.config.recipes import load_recipe
-from amvnet.data.datasets.joined import MixedRecord, Part, join
+from amvnet.data.datasets.joined import MixedRecord, join
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.own import open_own
 from amvnet.data.datasets.select import TrainingScans
@@ -34,15 +34,15 @@ from fixtures.worlds import (
 )
 
 
-def joined(tmp_path: Path, share: float | None, first: int = 4, second: int = 14) -> TrainingScans:
+def joined(tmp_path: Path, share: float, first: int = 4, second: int = 14) -> TrainingScans:
     a = open_dataset(str(make_streets(tmp_path / "a", ("00", "08"), first)))
     b = open_dataset(str(make_streets(tmp_path / "b", ("00",), second)))
     scans = TrainingScans(a, a.records(["00"]), a.records(["08"]))
-    return join(scans, [Part(b, b.records(["00"]), share)])
+    return join(scans, [TrainingScans(b, b.records(["00"]), [])], share)
 
 
 def test_without_a_share_every_scan_is_in_every_epoch(tmp_path: Path) -> None:
-    scans = joined(tmp_path, None)
+    scans = joined(tmp_path, 0)
     assert len(scans.train) == 4 + 14
     for epoch in range(3):
         originals = set()
@@ -74,7 +74,7 @@ def test_all_scans_of_a_mixed_dataset_take_equally_many_turns(tmp_path: Path) ->
 
 
 def test_a_mixed_scan_is_read_from_its_own_dataset(tmp_path: Path) -> None:
-    scans = joined(tmp_path, None)
+    scans = joined(tmp_path, 0)
     b = open_dataset(str(tmp_path / "b"))
     record = scans.dataset.at_epoch(scans.train[7], 2)
     assert isinstance(record, MixedRecord)
@@ -89,17 +89,16 @@ def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: P
     scans = TrainingScans(a, a.records(["00"]), [])
     nuscenes = open_dataset(f"nuscenes:{GOLDEN / 'nuscenes'}")
     assert nuscenes.taxonomy == NUSCENES
-    other = Part(nuscenes, nuscenes.records(nuscenes.sequences("all")))
+    other = TrainingScans(nuscenes, nuscenes.records(nuscenes.sequences("all")), [])
     with pytest.raises(InputError, match="classes"):
         join(scans, [other])
-    half = Part(a, a.records(["08"]), 0.5)
-    with pytest.raises(InputError, match="shares below 1"):
-        join(scans, [half, half])
+    with pytest.raises(InputError, match="share below 1"):
+        join(scans, [TrainingScans(a, a.records(["08"]), [])], share=1.0)
 
 
 def test_scans_that_are_normalised_are_not_mixed_with_others(tmp_path: Path) -> None:
     """The rows of their points are given in some of the scans only."""
-    scans = joined(tmp_path, None)
+    scans = joined(tmp_path, 0)
     np.save(tmp_path / "scan.npy", np.ones((5, 4), np.float32))
     classes = {name: number for number, name in enumerate(SEMANTICKITTI.classes, start=1)}
     description = {"classes": classes, "scans": "*.npy"}
@@ -107,7 +106,7 @@ def test_scans_that_are_normalised_are_not_mixed_with_others(tmp_path: Path) -> 
     own = open_own(tmp_path / "own.yaml")
     own.is_normalised = True
     with pytest.raises(InputError, match="found both"):
-        join(scans, [Part(own, own.records(own.sequences("all")))])
+        join(scans, [TrainingScans(own, own.records(own.sequences("all")), [])])
 
 
 def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought_to(
@@ -117,7 +116,7 @@ def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought
     weights = fresh_weights(open_own(paths[0]).taxonomy)
     own = [open_for_weights(str(path), weights) for path in paths]
     records = [dataset.records(dataset.sequences("train")) for dataset in own]
-    scans = join(TrainingScans(own[0], records[0], ()), [Part(own[1], records[1])])
+    scans = join(TrainingScans(own[0], records[0], ()), [TrainingScans(own[1], records[1], ())])
 
     record = sensor_record(scans.dataset, scans.train)
 

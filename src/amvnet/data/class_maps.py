@@ -52,11 +52,7 @@ class ClassMap:
 
 
 def class_map(name: str) -> ClassMap:
-    """Return the built-in map `coarse`, or that of a YAML file.
-
-    Raises:
-        InputError: if there is neither, or the file is no map.
-    """
+    """Return the map `coarse`, or that of a YAML file; raise InputError if there is none."""
     if name == COARSE_NAME:
         text = (resources.files("amvnet.data") / "coarse.yaml").read_text(encoding="utf-8")
         return _parse(name, parse_yaml(text, name))

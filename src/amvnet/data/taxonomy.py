@@ -78,7 +78,7 @@ class Taxonomy:
             self._check(type(number) is int, "whole numbers as ids and colours", number)
         self._check_range("colours", channels, 255)
         self._check_range("train ids", train_ids, self.size)
-        self._check_range("raw ids", self.raw_ids, INSTANCE_MASK)
+        self._check_range("raw ids", [*raw_ids, *self.train_to_raw], INSTANCE_MASK)
 
         for kind, values in (("colours", self.colors), ("raw ids", self.train_to_raw)):
             expected = f"{self.size + 1} {kind} (ignored and {self.size} classes)"
@@ -109,11 +109,6 @@ class Taxonomy:
         """K + 1 names, indexed by train id; the first is "unlabelled"."""
         return ("unlabelled", *self.classes)
 
-    @property
-    def raw_ids(self) -> list[int]:
-        """The numeric raw ids of `raw_to_train`, followed by those of `train_to_raw`."""
-        return [raw for raw in (*self.raw_to_train, *self.train_to_raw) if isinstance(raw, int)]
-
     @cached_property
     def _raw_id_lookup(self) -> np.ndarray:
         """(65536,) int16 train ids by raw id; UNKNOWN if the taxonomy has no such raw id."""
@@ -129,13 +124,7 @@ class Taxonomy:
         return table
 
     def to_train(self, raw: np.ndarray) -> np.ndarray:
-        """Turn raw labels into train ids.
-
-        Args:
-            raw: (N,) integers as the files hold them; instance bits (the upper 16) are dropped.
-
-        Returns:
-            (N,) uint8 train ids in 0..K.
+        """Return the (N,) uint8 train ids of (N,) raw ids, whose upper 16 bits are dropped.
 
         Raises:
             InputError: if a raw id is not in the table.
@@ -159,17 +148,7 @@ class Taxonomy:
         return train_ids.astype(np.uint8)
 
     def to_raw(self, ids: np.ndarray) -> np.ndarray:
-        """Turn train ids into the raw ids that prediction files hold.
-
-        Args:
-            ids: (N,) train ids in 0..K.
-
-        Returns:
-            (N,) uint32 raw ids.
-
-        Raises:
-            InputError: if an id is outside 0..K.
-        """
+        """Return the (N,) uint32 raw ids of (N,) train ids; raise InputError if one is wrong."""
         ids = np.asarray(ids)
         if ids.size and (ids.min() < 0 or ids.max() > self.size):
             raise InputError(
@@ -185,11 +164,7 @@ class Taxonomy:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Taxonomy:
-        """Return the taxonomy whose fields `to_dict` returned.
-
-        Raises:
-            InputError: if a field is missing or has the wrong type.
-        """
+        """Return the taxonomy of what `to_dict` returned; raise InputError if it is wrong."""
         expected = "taxonomy: expected its fields as this package writes them"
         with _one_line(expected, "use a weights file of this package"):
             return cls(
@@ -318,11 +293,7 @@ def user_taxonomy(
     raw_to_train: Mapping[int | str, int],
     train_to_raw: Sequence[int],
 ) -> Taxonomy:
-    """Return the taxonomy of a user's classes, given their entries as `class_entries` does.
-
-    Raises:
-        InputError: as `Taxonomy`.
-    """
+    """Return the taxonomy of a user's classes, given the entries of `class_entries`."""
     return Taxonomy(
         name=f"own-{name}" if name in TAXONOMIES else name,
         classes=tuple(map(str, entries)),
@@ -368,11 +339,7 @@ NUSCENES = TAXONOMIES["nuscenes"]
 
 
 def taxonomy_named(text: str) -> Taxonomy:
-    """Return the classes of a benchmark, given its name, or of a label map, given its path (YAML).
-
-    Raises:
-        InputError: as `taxonomy_from_yaml`.
-    """
+    """Return the classes of a benchmark, by its name, or of a label map (YAML), by its path."""
     if text in TAXONOMIES:
         return TAXONOMIES[text]
     return taxonomy_from_yaml(text)

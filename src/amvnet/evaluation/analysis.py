@@ -26,26 +26,9 @@ BINS = 100  # of the cosine similarity, which lies in [0, 1]
 SWEPT = 98  # lowest bins of points that the head settles: tau is swept up to 0.98
 
 
-@dataclass(frozen=True)
-class Swept:
-    """AMVNet with one value of a swept parameter.
-
-    Attributes:
-        value: of the parameter.
-        uncertain: share of the points that are uncertain.
-        miou, accuracy: fractions.
-    """
-
-    value: float
-    uncertain: float
-    miou: float
-    accuracy: float
-
-    @classmethod
-    def of(cls, value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxonomy) -> Swept:
-        """Return the figures of a (K + 1, K + 1) confusion matrix."""
-        figures = metrics(matrix, taxonomy)
-        return cls(value, uncertain, figures["miou"] or 0.0, figures["accuracy"] or 0.0)
+# AMVNet with one value of a parameter: the value, and in percent the uncertain points, the mIoU and
+# the accuracy.
+SweptRow = tuple[float, float, float, float]
 
 
 @dataclass
@@ -73,14 +56,20 @@ class Analysis:
         self.ensemble += other.ensemble
         self.head += other.head
 
-    def sweep(self) -> list[Swept]:
+    def sweep(self) -> list[SweptRow]:
         """Return AMVNet's figures for each tau from 0 to 0.98, with the head as it is."""
         sweep = []
         for bins in range(SWEPT + 1):
             matrix = self.head[:bins].sum(axis=0) + self.ensemble[bins:].sum(axis=0)
             share = float(self.points[:bins].sum() / max(self.points.sum(), 1))
-            sweep.append(Swept.of(bins / BINS, share, matrix, self.evaluation.taxonomy))
+            sweep.append(swept_row(bins / BINS, share, matrix, self.evaluation.taxonomy))
         return sweep
+
+
+def swept_row(value: float, uncertain: float, matrix: np.ndarray, taxonomy: Taxonomy) -> SweptRow:
+    """Return the row of a value, given the share of uncertain points and a confusion matrix."""
+    figures = metrics(matrix, taxonomy)
+    return value, 100 * uncertain, 100 * (figures["miou"] or 0), 100 * (figures["accuracy"] or 0)
 
 
 def analyze(
@@ -89,7 +78,7 @@ def analyze(
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> Analysis:
-    """Score labelled scans by every method, and by the head for every point that a tau would ask.
+    """Score labelled scans by every method, and by the head wherever some tau asks it.
 
     Raises:
         InputError: if the weights lack a part, or a scan has no ground truth.
@@ -121,7 +110,7 @@ def analyze(
 
 @torch.inference_mode()
 def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> Analysis:
-    """Score a scan by every method, and by the head for every point that a tau would ask."""
+    """Score a scan by every method, and by the head wherever some tau asks it."""
 
     def is_asked(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
         return (_bins(f, g) < SWEPT) | assertion(f, g, points)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from amvnet.evaluation.analysis import BINS, Analysis, Swept
+from amvnet.evaluation.analysis import BINS, Analysis, SweptRow
 from amvnet.evaluation.metrics import metrics
 from amvnet.files import atomic_write
 from amvnet.models.methods import title_of
@@ -31,11 +31,7 @@ STYLES = {
 
 
 def write_all(analysis: Analysis, dataset: str, out: Path) -> list[Path]:
-    """Write Figures 5, 6 and 8a and Tables 3 and 4 of the paper; return the files.
-
-    Args:
-        dataset: the dataset as the user named it, for the titles.
-    """
+    """Write Figures 5, 6 and 8a and Tables 3 and 4 of the paper; return the files."""
     return [
         *_write_similarity(analysis, dataset, out / "similarity"),
         *_write_distance(analysis, dataset, out / "distance"),
@@ -46,24 +42,18 @@ def write_all(analysis: Analysis, dataset: str, out: Path) -> list[Path]:
 
 
 def write_sweep(
-    swept: Sequence[Swept], name: str, used: float, dataset: str, path: Path
+    rows: Sequence[SweptRow], name: str, used: float, dataset: str, path: Path
 ) -> list[Path]:
-    """Write Figure 8 of the paper: mIoU and share of uncertain points for values of a parameter.
-
-    Return the files.
+    """Write Figure 8 of the paper, mIoU and share of uncertain points; return the files.
 
     Args:
         used: the parameter's value in the weights.
         path: the files to write, without an ending.
     """
-    rows = []
-    for result in swept:
-        percents = (100 * result.uncertain, 100 * result.miou, 100 * result.accuracy)
-        rows.append((result.value, *percents))
     values, shares, mious, _ = zip(*rows, strict=True)
 
     figure, axes = _figure(f"{name} on {dataset}")
-    marker = "" if len(swept) > MOST_MARKED else "o"
+    marker = "" if len(rows) > MOST_MARKED else "o"
     miou_line = axes.plot(values, mious, color="black", marker=marker, label="mIoU")
     axes.set(xlabel=name, ylabel="mIoU (%)")
     axes.axvline(used, color="0.6", linewidth=0.8, linestyle=":")

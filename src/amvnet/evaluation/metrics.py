@@ -20,8 +20,7 @@ def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarra
     """Count how often each true class was predicted as each class.
 
     Args:
-        truth: (N,) train ids in 0..K.
-        prediction: (N,) train ids in 0..K.
+        truth, prediction: (N,) train ids in 0..K.
         size: K, the number of classes.
 
     Returns:
@@ -167,11 +166,7 @@ class Evaluation:
         return total
 
     def report(self, dataset: str) -> dict[str, Any]:
-        """Return all metrics, of all points and by distance, as JSON types.
-
-        Args:
-            dataset: the dataset, as the user named it.
-        """
+        """Return all metrics of a dataset, of all points and by distance, as JSON types."""
         methods = {}
         for method, matrices in self.matrices.items():
             bins = []

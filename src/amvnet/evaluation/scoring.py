@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -16,6 +15,7 @@ from amvnet.data.class_maps import ClassMap
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import check_classes
 from amvnet.data.spacing import evenly_spaced
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
@@ -44,13 +44,22 @@ class Labeller:
 
     Attributes:
         label: labels a scan by one or several methods.
+        taxonomy: the classes of the labels.
+        classes: maps these, and those of the data, to the classes that are scored; None if they
+            are the same.
         at_once: scans that it labels at the same time, each in a thread.
-        classes: maps the classes of the data to those of the labels; None if they are the same.
     """
 
     label: Callable[[ScanRecord, Scan], MethodLabels]
-    at_once: int = 1
+    taxonomy: Taxonomy
     classes: ClassMap | None = None
+    at_once: int = 1
+
+    def table(self, taxonomy: Taxonomy) -> np.ndarray:
+        """Return the (K + 1,) uint8 train ids that are scored, by those of a taxonomy."""
+        if self.classes is None:
+            return np.arange(taxonomy.size + 1, dtype=np.uint8)
+        return self.classes.table(taxonomy)
 
 
 def evaluate(
@@ -64,18 +73,18 @@ def evaluate(
     """Score the labels of some scans.
 
     Args:
-        labeller: labels the scans, in the classes that are scored.
         pictures: folder for pictures of a few of the scans from above; None draws none.
         progress: called with the number of this process's scans that are done, and their total.
         processes: the processes that share the scans; each returns the evaluation of all scans.
 
     Raises:
-        InputError: if a scan has no ground truth.
+        InputError: if the labels do not have the dataset's classes, or a scan has no ground truth.
     """
-    own = dataset.taxonomy
-    classes = labeller.classes
-    taxonomy = own if classes is None else classes.target
-    table = np.arange(own.size + 1, dtype=np.uint8) if classes is None else classes.table(own)
+    taxonomy = dataset.taxonomy if labeller.classes is None else labeller.classes.target
+    if labeller.classes is None:
+        check_classes(dataset, labeller.taxonomy)
+    true_table = labeller.table(dataset.taxonomy)
+    table = labeller.table(labeller.taxonomy)
     evaluation = Evaluation(taxonomy)
     pictured = {record.name for record in evenly_spaced(records, PICTURES)}
 
@@ -86,8 +95,10 @@ def evaluate(
     labelled = stream_labelled(dataset, share, label, labeller.at_once, progress)
     for record, scan, labels in labelled:
         assert scan.labels is not None
-        truth = table[scan.labels]
-        ids, uncertain = labels
+        truth = true_table[scan.labels]
+        labels_by_name, uncertain = labels
+        ids = {name: table[values] for name, values in labels_by_name.items()}
+
         evaluation.add(scan.points, truth, ids, uncertain)
         if pictures is not None and record.name in pictured:
             view = TopView(
@@ -105,14 +116,7 @@ def stream_labelled(
     at_once: int,
     progress: Progress,
 ) -> Iterator[Result]:
-    """Read scans, each of which must have ground truth, and compute on several at the same time.
-
-    Yields:
-        The result of each scan, in order.
-
-    Raises:
-        InputError: at the first scan that has no ground truth.
-    """
+    """Yield results as `stream_scans` does; raise InputError if a scan has no ground truth."""
 
     def read(record: ScanRecord) -> Scan:
         scan = dataset.read(record)
@@ -122,11 +126,7 @@ def stream_labelled(
             )
         return scan
 
-    progress(0, len(records))
-    with closing(stream_scans(records, read, compute, at_once)) as results:
-        for done, result in enumerate(results, start=1):
-            yield result
-            progress(done, len(records))
+    return stream_scans(records, read, compute, at_once, progress)
 
 
 def label_by_weights(
@@ -135,27 +135,13 @@ def label_by_weights(
     methods: Sequence[str] = PAPER_METHODS,
     classes: ClassMap | None = None,
 ) -> Labeller:
-    """Return what labels scans by several methods.
-
-    Args:
-        classes: maps the classes of the weights to those that are scored; None if they are the
-            same.
-
-    Raises:
-        InputError: if the weights do not have the dataset's classes.
-    """
-    if classes is None:
-        check_classes(dataset, segmenter.taxonomy)
-        table = np.arange(segmenter.taxonomy.size + 1, dtype=np.uint8)
-    else:
-        table = classes.table(segmenter.taxonomy)
+    """Return what labels scans by several methods."""
     segmenter = segmenter.for_dataset(dataset)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
-        labels, uncertain = labels_by_method(segmenter, check_scan(scan), methods)
-        return {name: table[ids] for name, ids in labels.items()}, uncertain
+        return labels_by_method(segmenter, check_scan(scan), methods)
 
-    return Labeller(label, segmenter.at_once, classes)
+    return Labeller(label, segmenter.taxonomy, classes, segmenter.at_once)
 
 
 def labels_by_method(
@@ -201,20 +187,11 @@ def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatc
 
 
 def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = None) -> Labeller:
-    """Return what reads the labels of scans from a folder of predictions.
-
-    Args:
-        classes: maps the classes of the dataset to those that are scored; None scores these.
-
-    Raises:
-        InputError: if there is no such folder.
-    """
+    """Return what reads labels from a folder; raise InputError if there is no such folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
-    table = None if classes is None else classes.table(dataset.taxonomy)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
-        ids = dataset.read_prediction(record, folder)
-        return {"predictions": ids if table is None else table[ids]}, None
+        return {"predictions": dataset.read_prediction(record, folder)}, None
 
-    return Labeller(label, classes=classes)
+    return Labeller(label, dataset.taxonomy, classes)

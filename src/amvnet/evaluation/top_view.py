@@ -66,15 +66,12 @@ class TopView:
 
 
 def draw_scan(path: Path | str, view: TopView) -> Path:
-    """Draw one scan from above, x to the right and y up, 50 m to each side.
+    """Draw one scan from above, x to the right and y up, 50 m to each side; return the path.
 
     The first row shows the truth and each prediction. Below each prediction are its errors
     (correct in grey, wrong in red; ignored points count as neither), below the truth the
     uncertain points. The legend has the classes that appear. The PNG appears whole or not at
     all.
-
-    Returns:
-        The path that was written.
     """
     from matplotlib.figure import Figure
 

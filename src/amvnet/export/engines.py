@@ -64,10 +64,9 @@ def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> Non
     """Let an engine run the networks of a segmenter, which were set up for torch.
 
     Everything around the networks stays with torch. `onnx` exports the networks once, in half a
-    minute, and keeps them in `cache_folder`; it takes scans one by one, and computes on a GPU if
-    the installed ONNX Runtime can. So does `int8`, which stays on the CPU and also converts the
-    convolutions to 8-bit integers; it calibrates them once, in a few minutes, on simulated scans of
-    the weights' sensor.
+    minute, and keeps them in `cache_folder`. It takes scans one by one, and computes on a GPU if
+    the installed ONNX Runtime can. `int8` does the same on the CPU with convolutions in 8-bit
+    integers, which it calibrates once, in a few minutes, on simulated scans of the weights' sensor.
 
     Args:
         engine: one of `ENGINES`.
@@ -119,11 +118,7 @@ def cache_folder() -> Path:
 
 
 def exported(segmenter: Segmenter, int8: str | None = None, say: Say = say_nothing) -> Path:
-    """Return the folder of a segmenter's exported networks, which are exported if necessary.
-
-    Args:
-        int8: as for `export`.
-    """
+    """Return the folder of a segmenter's exported networks, which are exported if necessary."""
     check_libraries()
     weights = segmenter.weights
     digests = [weights.digest(part) for part in weights.parts]

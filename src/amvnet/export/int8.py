@@ -151,6 +151,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
 
     ready = path.with_suffix(".ready")
     quantised = path.with_suffix(".int8")
+
     with quiet("root"):
         quant_pre_process(path, ready, skip_symbolic_shape=True)
         quantize_static(
@@ -166,6 +167,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
             nodes_to_exclude=_first_layer(ready) if FIRST_KEPT[path.stem] else [],
             extra_options={"CalibMovingAverage": True},
         )
+
     ready.unlink()
     os.replace(quantised, path)
     strip(path)

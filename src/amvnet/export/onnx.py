@@ -200,6 +200,7 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
             "neighbours": head.neighbours,
             "position_scale": head.position_scale,
         }
+
     described = {"taxonomy": taxonomy.name, "classes": classes, "opset": OPSET, "graphs": graphs}
     return description | described
 

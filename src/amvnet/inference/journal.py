@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from amvnet.errors import InputError
 from amvnet.files import PARTS, atomic_write, make_folder
-from amvnet.written import folder_lock, hold, is_held
 
 JOURNAL = ".amvnet-journal.jsonl"  # of a run that has ended
 UNFINISHED = ".unfinished.jsonl"  # until the run ends
@@ -54,14 +56,14 @@ class Journal:
     ) -> None:
         self.folder = folder
         self.path = folder / UNFINISHED
-        _check_alone(folder)
 
         make_folder(folder)
-        with folder_lock(folder):
+        with _lock(folder):
             _check_alone(folder)
             _write(self.path, settings, done)
             self._file = self.path.open("a")
-            hold(self._file)
+            with suppress(OSError):  # some network file systems have no locks
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             (folder / JOURNAL).unlink(missing_ok=True)
             for path in folder.rglob(PARTS):  # that earlier runs did not finish
                 path.unlink()
@@ -101,20 +103,35 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
             names = ", ".join(changed)
             raise InputError(
                 f"{folder}: expected the settings of the earlier run, found another {names}; "
-                "resume it with the same, or leave --resume out to start over"
+                "resume it with the same, or start over with --overwrite instead of --resume"
             )
         for entry in entries:
             done[entry.scan] = entry
     return done
 
 
+@contextmanager
+def _lock(folder: Path) -> Iterator[None]:
+    """Keep other processes out of this block for the same folder."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def _check_alone(folder: Path) -> None:
-    """Raise InputError if another run is writing into the folder."""
-    if is_held(folder / UNFINISHED):
-        raise InputError(
-            f"{folder}: expected a folder for this run alone, found another run that is writing "
-            "into it; wait until it ends, or change --out"
-        )
+    """Raise InputError if another run is writing into the folder: it has locked its journal."""
+    with suppress(OSError), (folder / UNFINISHED).open() as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"{folder}: expected a folder for this run alone, found another run that is "
+                "writing into it; wait until it ends, or change --out"
+            ) from None
 
 
 def _write(path: Path, settings: Mapping[str, Any], entries: Iterable[Entry]) -> None:

@@ -20,15 +20,14 @@ from amvnet.data.formats.registry import COLUMN_READERS
 from amvnet.data.labels.writers import check_kind, write_uncertain
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError, SomeBroken, memory_for
-from amvnet.files import atomic_write, inside
-from amvnet.inference.journal import Entry, Journal, read_journals
+from amvnet.files import atomic_write, check_free, inside
+from amvnet.inference.journal import UNFINISHED, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan, LoadedScan
 from amvnet.inference.scan_stream import AHEAD, stream_groups
 from amvnet.inference.segmentation import Segmentation
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan
 from amvnet.sensors.measure import MEASURED
-from amvnet.written import WrittenFiles
 
 UNCERTAIN_ENDING = ".uncertain.npy"
 DIGITS = 16  # of a digest in the journal
@@ -44,7 +43,7 @@ class OutputOptions:
         scores: also write both networks' probabilities, float16 (N, K), as `rv` and `bev` in an
             `.npz`.
         uncertain: also write (N,) bool, the uncertain points, as `.uncertain.npy`.
-        overwrite: replace files that this package did not write, too.
+        overwrite: replace files that exist.
         resume: leave out the scans that an earlier run into the same folder has done.
 
     Raises:
@@ -113,16 +112,16 @@ class Pipeline:
 
         Raises:
             InputError: if two scans would have the same files, an output folder is that of a scan,
-                a file of the user would be replaced, or another run is writing into the folder.
+                a file would be replaced, or another run is writing into the folder.
         """
-        is_new = not self.output.folder.exists()
-        written = self._check_output()
-        done = self._read_done(settings, written)
+        folder = self.output.folder
+        is_new = not folder.exists()
+        earlier = read_journals(folder, settings) if self.output.resume else {}
+        self._check_output(earlier)
+        done = self._still_done(earlier)
         remaining = [scan for scan in self.scans if _key(scan) not in done]
 
-        # Files are claimed before any is written.
-        journal = Journal(self.output.folder, settings, done.values())
-        written.claim(self._paths_of(remaining))
+        journal = Journal(folder, settings, done.values())
         faults = []
         for count, outcome in enumerate(self.stream(remaining, self.write_or_explain)):
             progress(count, len(remaining))
@@ -133,49 +132,45 @@ class Pipeline:
         progress(len(remaining), len(remaining))
 
         entries = journal.close()
-        written.finish(self._paths_of(remaining))
         if is_new:
             with suppress(OSError):  # stays unless all scans were broken
-                self.output.folder.rmdir()
+                folder.rmdir()
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
-    def _check_output(self) -> WrittenFiles:
-        """Check that the output replaces no file of the user; return the record of the folder's.
+    def _check_output(self, earlier: Mapping[str, Entry]) -> None:
+        """Check the names of the files, and that only those of an earlier run are replaced.
 
         Raises:
-            InputError: if it does, two scans have the same files, or a file would lie outside the
-                folder.
+            InputError: if another file would be replaced, two scans have the same files, or a file
+                would lie outside the folder.
         """
-        paths = self._paths_of(self.scans)
-        for path in paths:
-            inside(self.output.folder, path)
+        folder = self.output.folder
         _check_names(self.scans)
+        new_paths: list[Path] = []
         for scan in self.scans:
+            paths = [inside(folder, path) for path in self.output.paths_of(scan)]
             _check_folder(scan, self.output)
+            if _key(scan) not in earlier:
+                new_paths += paths
 
-        written = WrittenFiles(self.output.folder)
-        if not self.output.overwrite:
-            written.check(paths)
-        return written
+        # The journal of a run that was killed lacks the files that it wrote last.
+        is_killed = self.output.resume and (folder / UNFINISHED).exists()
+        check_free(new_paths, self.output.overwrite or is_killed)
 
-    def _read_done(self, settings: Mapping[str, Any], written: WrittenFiles) -> dict[str, Entry]:
+    def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return what an earlier run has done that is as this run would do it.
 
-        The files have to be there, as they were written, and the scan has to be the same, and
-        normalised by the same first ones of its recording.
+        The files have to be there, and the scan has to be the same, and normalised by the same
+        first ones of its recording.
         """
-        if not self.output.resume:
-            return {}
-        earlier = read_journals(self.output.folder, settings)
         done = dict(earlier)
         for scan in self.scans:
             entry = earlier.get(_key(scan))
             if entry is None:
                 continue
-            paths = self.output.paths_of(scan)
-            is_there = all((self.output.folder / path).is_file() for path in paths)
+            paths = [self.output.folder / path for path in self.output.paths_of(scan)]
             is_same = entry.origin == self._origins[entry.scan]
-            if not is_there or not is_same or any(map(written.is_foreign, paths)):
+            if not is_same or not all(map(Path.is_file, paths)):
                 del done[entry.scan]
         return done
 
@@ -194,10 +189,6 @@ class Pipeline:
             digest = hashlib.sha256(json.dumps(values).encode()).hexdigest()
             origins[_key(scan)] = digest[:DIGITS]
         return origins
-
-    def _paths_of(self, scans: Sequence[InputScan]) -> list[Path]:
-        """Return the paths of the files of scans, relative to the folder."""
-        return list(chain.from_iterable(map(self.output.paths_of, scans)))
 
     def stream(
         self, scans: Sequence[InputScan], write: Callable[[Outcome], Written], writers: int = 1

@@ -6,12 +6,13 @@ import math
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 from typing import Any, TypeVar
 
 import torch
 
+from amvnet.progress import Progress, no_progress
 from amvnet.threads import thread_pool
 
 AHEAD = 3  # scans that are read ahead of the computing, and that may wait to be written
@@ -65,8 +66,12 @@ def stream_scans(
     load: Callable[[Record], Loaded],
     compute: Callable[[Record, Loaded], Result],
     at_once: int = 1,
+    progress: Progress = no_progress,
 ) -> Generator[Result]:
     """Read scans and compute on each; as `stream_groups` for groups of one scan.
+
+    Args:
+        progress: called with the number of scans that are done, and their total.
 
     Yields:
         The result of each scan, in order. An exception of `load` or `compute` is raised in its
@@ -77,7 +82,11 @@ def stream_scans(
         ((record, reading),) = group
         return compute(record, reading.result())
 
-    yield from stream_groups(records, load, compute_one, at_once=at_once)
+    progress(0, len(records))
+    with closing(stream_groups(records, load, compute_one, at_once=at_once)) as results:
+        for done, result in enumerate(results, start=1):
+            yield result
+            progress(done, len(records))
 
 
 class CallingThread(Executor):

@@ -19,7 +19,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmentation import expand_to_scan
+from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
 from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
@@ -101,12 +101,10 @@ def rank(
     def rank_scan(record: ScanRecord, scan: Scan) -> np.ndarray:
         return find_clusters(find_doubts(check_scan(scan), segmenter))
 
-    progress(0, len(records))
-    rows_by_scan = [np.zeros(0, dtype=ROW)]  # so that there may be no scans
-    for rows in stream_scans(records, dataset.read, rank_scan, segmenter.at_once):
+    rows_by_scan = [np.zeros(0, dtype=ROW)]  # in case there are no scans
+    for rows in stream_scans(records, dataset.read, rank_scan, segmenter.at_once, progress):
         rows["scan"] = len(rows_by_scan) - 1
         rows_by_scan.append(rows)
-        progress(len(rows_by_scan) - 1, len(records))
 
     clusters = np.concatenate(rows_by_scan)
     _, kind, counts = np.unique(clusters["kind"], return_inverse=True, return_counts=True)
@@ -116,11 +114,7 @@ def rank(
 
 
 def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
-    """Return how doubtful the label of each point of a scan is.
-
-    Raises:
-        InputError: if the scan has no labels.
-    """
+    """Return how doubtful each label of a scan is; raise InputError if it has no labels."""
     label = scan.labels
     if label is None:
         raise InputError(
@@ -133,8 +127,8 @@ def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
     assert result.bev is not None
     f = torch.from_numpy(result.rv[valid])  # (P, K) class probabilities of the P valid points
     g = torch.from_numpy(result.bev[valid])  # (P, K)
-    rv = _predicted_ids(f, valid)
-    bev = _predicted_ids(g, valid)
+    rv = expand_labels(f, valid)
+    bev = expand_labels(g, valid)
 
     xyz = scan.points[:, :3]
     distance = np.hypot(xyz[valid, 0], xyz[valid, 1])
@@ -145,13 +139,7 @@ def find_doubts(scan: Scan, segmenter: Segmenter) -> Doubts:
     # One number for each pair of train ids.
     kind = label.astype(np.int64) * 256 + expand_to_scan(agreed_ids, valid)
     whole = _thing_sizes(xyz, label, valid)
-    return Doubts(xyz, doubt, rv, bev, label, kind=kind, whole=whole)
-
-
-def _predicted_ids(probabilities: torch.Tensor, valid: np.ndarray) -> np.ndarray:
-    """Return (N,) train ids of all points, 0 if not valid, from (P, K) of the valid ones."""
-    ids = probabilities.argmax(dim=1) + 1
-    return expand_to_scan(ids.to(torch.uint8), valid)
+    return Doubts(xyz, doubt, rv=rv, bev=bev, label=label, kind=kind, whole=whole)
 
 
 def _contradiction(
@@ -238,6 +226,7 @@ def write_clusters(
     with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
+
         for position, row in enumerate(clusters, start=1):
             x, y, z = row["xyz"]
             values = [

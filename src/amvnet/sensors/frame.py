@@ -23,6 +23,8 @@ AROUND = (
 UP_AXES = ("z-down", "z-forward", "y-up")  # are tried if no ground is found below
 SAME_TILT = 3.5  # degrees: roads slope by up to 3.1 as seen from the cars of the datasets
 STEADY_TILT = 3.0  # degrees: if tilts in a recording differ by more, each scan gets its own
+SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
+LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Frame:
     def complete(self, sensor: Sensor) -> Sensor:
         """Return the sensor with everything about its frame known.
 
-        What the user described is done first: the rest turns the scan about the sensor.
+        What the user described is applied first; the rest turns the scan about the sensor.
         """
         if sensor.rotate is not None:
             return dataclasses.replace(sensor, unit=self.unit)
@@ -61,6 +63,37 @@ class Frame:
         turn = complete.turn @ sensor.turn.T
         x, y, z = turn @ np.array(sensor.offset)
         return dataclasses.replace(complete, offset=(float(x), float(y), float(z)))
+
+    def is_on_ground(self, sensor: Sensor) -> bool:
+        """Return whether the origin of the coordinates lies on the ground, or below."""
+        may_be_higher = sensor.height is None or sensor.height >= LOWEST
+        return self.height is not None and self.height < LOWEST and may_be_higher
+
+    def rises(self, sensor: Sensor, usual_height: float | None) -> tuple[float, float]:
+        """Return how far to move a scan up, metres.
+
+        Args:
+            sensor: what is known of it.
+            usual_height: metres over the ground of a sensor that is not at the origin, if nothing
+                says how high it is; None if that is unknown, too.
+
+        Returns:
+            The rise after which the sensor is at the origin, and the one after which it is
+            `usual_height` over the ground.
+        """
+        known = sensor.height
+        if self.is_on_ground(sensor):
+            assert self.height is not None
+            above = known if known is not None else usual_height
+            if above is None:
+                return 0.0, 0.0
+            target = above if usual_height is None else usual_height
+            return self.height - above, self.height - target
+
+        height = known if known is not None else self.height
+        if height is None or usual_height is None or abs(height - usual_height) < SAME_HEIGHT:
+            return 0.0, 0.0
+        return 0.0, height - usual_height
 
 
 def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:

@@ -106,11 +106,7 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
 
 
 def simulated_intensity(sensor: str) -> TrainedIntensity:
-    """Return the intensities that the scans of a simulated sensor are brought to in training.
-
-    Raises:
-        KeyError: if no sensor of this name is simulated.
-    """
+    """Return the intensities that scans of a simulated sensor are brought to in training."""
     return TrainedIntensity(QUANTILES[sensor], is_matched=True)
 
 
@@ -138,7 +134,7 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
 def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Return the quantiles of a source, increasing, and what they become; linear in between.
 
-    Equal quantiles of the source, such as many zeros, become the mean of the training's quantiles.
+    Equal quantiles of the source, such as many zeros, become the mean of those of the training.
     """
     levels, index = np.unique(quantiles, return_inverse=True)
     becomes = np.bincount(index, weights=trained) / np.bincount(index)
@@ -156,11 +152,7 @@ def are_quantiles(values: Any) -> TypeGuard[list[float]]:
 
 
 def check_quantiles(values: Any, source: str) -> list[float]:
-    """Return the quantiles that a file holds.
-
-    Raises:
-        InputError: if they cannot be quantiles.
-    """
+    """Return the quantiles that a file holds; raise InputError if they cannot be quantiles."""
     if not are_quantiles(values):
         raise InputError(
             f"{source}: expected {len(PROBABILITIES)} quantiles of the intensities, different "

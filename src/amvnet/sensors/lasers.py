@@ -76,8 +76,11 @@ class SensorGeometry:
 
     def override(self, sensor: Sensor) -> SensorGeometry:
         """Return the geometry with what is known of the sensor in place of what was measured."""
-        stated = SensorGeometry(sensor.beams, sensor.fov_up, sensor.fov_down, sensor.height)
-        return dataclasses.replace(self, **stated.known())
+        changes = {}
+        for key in MEASURES:
+            if getattr(sensor, key) is not None:
+                changes[key] = getattr(sensor, key)
+        return dataclasses.replace(self, **changes)
 
 
 def _is_near(angle: float | None, other: float | None) -> bool:

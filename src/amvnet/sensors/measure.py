@@ -19,8 +19,6 @@ from amvnet.sensors.lidars import Sensor
 
 MEASURED = 5  # scans of a recording that are measured; later ones get the median of these
 STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
-SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
-LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at the sensor
 QUICK_STEP = 7  # every 7th point suffices for most sensors; 7 divides no usual number of lasers
 
 
@@ -46,101 +44,24 @@ class Estimate:
         return is_of_one_range and self.lasers.is_like(other.lasers)
 
 
-@dataclass(frozen=True)
-class Gauge:
-    """Measures scans by what is known of their sensor.
-
-    Attributes:
-        sensor: what is known; the rest is measured.
-        usual_height: metres over the ground of a sensor that is not at the origin, if nothing says
-            how high it is; None if that is unknown, too.
-    """
-
-    sensor: Sensor
-    usual_height: float | None = None
-
-    def __call__(self, cloud: Cloud) -> Estimate:
-        """Measure the sensor of one scan.
-
-        Raises:
-            InputError: if the unit of the coordinates is in doubt, or no point is usable.
-        """
-        usable = np.isfinite(cloud.xyz).all(axis=1) & (cloud.xyz != 0).any(axis=1)
-        with errors_of(cloud.name):
-            frame = find_frame(cloud.xyz[usable], self.sensor)
-
-        return self._measure(cloud, frame)
-
-    def _measure(self, cloud: Cloud, frame: Frame) -> Estimate:
-        """Measure lasers and intensities of a scan whose frame is known."""
-        # The points as the sensor saw them; a point without an intensity was seen, too.
-        scan = level_scan(cloud, frame.complete(self.sensor))
-        to_sensor, _ = self.rises(frame)
-        seen = raise_points(scan, to_sensor)
-        valid = scan.valid
-        lasers = measure_lasers(seen.points[valid], None if scan.ring is None else scan.ring[valid])
-        return Estimate(frame, lasers, quantiles_of(cloud.intensity))
-
-    def recognises(self, cloud: Cloud, usual: Estimate) -> bool:
-        """Return whether a scan is of an estimate's sensor, in the estimate's frame.
-
-        For most scans, some of the points are enough.
-        """
-        for step in (QUICK_STEP, 1):
-            part = dataclasses.replace(
-                cloud,
-                xyz=cloud.xyz[::step],
-                intensity=None if cloud.intensity is None else cloud.intensity[::step],
-                ring=None if cloud.ring is None else cloud.ring[::step],
-            )
-            with suppress(InputError):
-                if self._measure(part, usual.frame).is_like(usual):
-                    return True
-        return False
-
-    def is_on_ground(self, frame: Frame) -> bool:
-        """Return whether the origin of the coordinates lies on the ground, or below."""
-        height = self.sensor.height
-        may_be_higher = height is None or height >= LOWEST
-        return frame.height is not None and frame.height < LOWEST and may_be_higher
-
-    def rises(self, frame: Frame) -> tuple[float, float]:
-        """Return how far to move a scan up, metres.
-
-        Returns:
-            The rise after which the sensor is at the origin, and the one after which it is
-            `usual_height` over the ground.
-        """
-        known = self.sensor.height
-        usual = self.usual_height
-
-        if self.is_on_ground(frame):
-            assert frame.height is not None
-            above = known if known is not None else usual
-            if above is None:
-                return 0.0, 0.0
-            target = above if usual is None else usual
-            return frame.height - above, frame.height - target
-
-        height = known if known is not None else frame.height
-        if height is None or usual is None or abs(height - usual) < SAME_HEIGHT:
-            return 0.0, 0.0
-        return 0.0, height - usual
-
-
 class Recording:
     """What is assumed of the scans of one source, by what is measured of the first ones.
 
     Its scans get the median of the first `MEASURED` estimates. If these are of several sensors,
     each scan gets its own estimate, and so does a later scan of another sensor.
 
+    Args:
+        sensor: what is known of the sensor; the rest is measured.
+        usual_height: as for `Frame.rises`.
+
     Attributes:
         usual: the median; None as long as nothing is measured, and for several sensors.
     """
 
-    def __init__(self, gauge: Gauge) -> None:
+    def __init__(self, sensor: Sensor, usual_height: float | None) -> None:
         self.usual: Estimate | None = None
-        self._gauge = gauge
+        self._sensor = sensor
+        self._usual_height = usual_height
         self._first: list[Estimate] = []
         self._is_learnt = False
 
@@ -155,30 +76,22 @@ class Recording:
         self._is_learnt = True
 
     def learn(self, first: Sequence[Callable[[], Cloud]]) -> None:
-        """Measure the first scans; later ones add nothing.
-
-        Args:
-            first: functions that read these scans; broken scans are left out.
-        """
+        """Measure the first scans, given what reads them; later ones add nothing."""
         for read in first:
             if not self._is_learnt:
                 with suppress(InputError):
-                    self._add(self._gauge(read()))
+                    self._add(self._measure(read()))
 
         self._is_learnt = bool(self._first)
 
     def estimate(self, cloud: Cloud) -> tuple[Estimate, bool]:
-        """Return what to assume of the sensor of a scan, and whether it is that of the first scans.
-
-        Raises:
-            InputError: as `Gauge`.
-        """
+        """Return what to assume of a scan, and whether its sensor is that of the first scans."""
         if self._is_learnt and self.usual is not None and self.usual.is_steady:
-            if self._gauge.recognises(cloud, self.usual):
+            if self._recognises(cloud, self.usual):
                 return self.usual, True
-            return self._gauge(cloud), False
+            return self._measure(cloud), False
 
-        measured = self._gauge(cloud)
+        measured = self._measure(cloud)
         if not self._is_learnt:
             self._add(measured)
         if self.usual is None:
@@ -188,6 +101,40 @@ class Recording:
         if self.usual.is_steady:
             return self.usual, True
         return dataclasses.replace(measured, quantiles=self.usual.quantiles), True
+
+    def _measure(self, cloud: Cloud) -> Estimate:
+        """Measure the sensor of one scan."""
+        usable = np.isfinite(cloud.xyz).all(axis=1) & (cloud.xyz != 0).any(axis=1)
+        with errors_of(cloud.name):
+            frame = find_frame(cloud.xyz[usable], self._sensor)
+        return self._measure_in(frame, cloud)
+
+    def _measure_in(self, frame: Frame, cloud: Cloud) -> Estimate:
+        """Measure lasers and intensities of a scan whose frame is known."""
+        # The points as the sensor saw them; a point without an intensity was seen, too.
+        scan = level_scan(cloud, frame.complete(self._sensor))
+        to_sensor, _ = frame.rises(self._sensor, self._usual_height)
+        seen = raise_points(scan, to_sensor)
+        valid = scan.valid
+        lasers = measure_lasers(seen.points[valid], None if scan.ring is None else scan.ring[valid])
+        return Estimate(frame, lasers, quantiles_of(cloud.intensity))
+
+    def _recognises(self, cloud: Cloud, usual: Estimate) -> bool:
+        """Return whether a scan is of an estimate's sensor, in the estimate's frame.
+
+        For most scans, some of the points are enough.
+        """
+        for step in (QUICK_STEP, 1):
+            part = dataclasses.replace(
+                cloud,
+                xyz=cloud.xyz[::step],
+                intensity=None if cloud.intensity is None else cloud.intensity[::step],
+                ring=None if cloud.ring is None else cloud.ring[::step],
+            )
+            with suppress(InputError):
+                if self._measure_in(usual.frame, part).is_like(usual):
+                    return True
+        return False
 
     def _add(self, estimate: Estimate) -> None:
         """Add the estimate of one of the first scans."""
@@ -223,15 +170,7 @@ def _are_steady(frames: Sequence[Frame]) -> bool:
 
 
 def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:
-    """Return a scan in the package's axes.
-
-    Args:
-        sensor: with everything about its frame known.
-        intensity: (N,) in [0, 1]; None means zeros.
-
-    Raises:
-        InputError: if no point is usable.
-    """
+    """Return a scan in the package's axes, with (N,) intensities in [0, 1] or else zeros."""
     xyz = sensor.to_level(cloud.xyz)
     return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 

@@ -22,7 +22,6 @@ from amvnet.sensors.lidars import SENSORS, Sensor
 from amvnet.sensors.measure import (
     MEASURED,
     Estimate,
-    Gauge,
     Recording,
     level_scan,
     median_of,
@@ -74,7 +73,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     intensity = to_intensity(cloud.intensity, len(cloud.xyz))
     scan = level_scan(cloud, estimate.frame.complete(sensor), intensity)
 
-    to_sensor, to_trained = Gauge(sensor, expected.sensor.height).rises(estimate.frame)
+    to_sensor, to_trained = estimate.frame.rises(sensor, expected.sensor.height)
     seen = raise_points(scan, to_sensor)
     moved = raise_points(scan, to_trained)
 
@@ -91,7 +90,7 @@ def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expecta
     assumed += [
         _intensity_map(cloud, estimate.quantiles, sensor, expected).text,
         *_describe_frame(estimate.frame, sensor),
-        _describe_height(estimate.frame, Gauge(sensor, expected.sensor.height)),
+        _describe_height(estimate.frame, sensor, expected.sensor.height),
         describe_lasers(lasers),
     ]
     line = f"{cloud.name}: assumed {', '.join(assumed)}"
@@ -170,18 +169,18 @@ class Normaliser:
     def measure(self, source: str) -> Recording:
         """Return what is measured of a source: the first time, of the scans that were announced."""
         if source not in self._recordings:
-            self._recordings[source] = Recording(self._gauge())
-            self._recordings[source].learn(self._first.pop(source, []))
+            self._begin(source).learn(self._first.pop(source, []))
         return self._recordings[source]
 
     def recall(self, source: str, usual: Estimate | None) -> None:
         """Normalise the scans of a source by what `measure` found before, in another process."""
-        self._recordings[source] = Recording(self._gauge())
-        self._recordings[source].recall(usual)
+        self._begin(source).recall(usual)
 
-    def _gauge(self) -> Gauge:
+    def _begin(self, source: str) -> Recording:
         assert self.expected is not None
-        return Gauge(self.sensor, self.expected.sensor.height)
+        recording = Recording(self.sensor, self.expected.sensor.height)
+        self._recordings[source] = recording
+        return recording
 
     def for_sensor(self, sensor: Sensor) -> Normaliser:
         """Return a normaliser to the same weights for scans of a described sensor."""
@@ -234,11 +233,7 @@ class Normaliser:
 def _intensity_map(
     cloud: Cloud, quantiles: np.ndarray | None, sensor: Sensor, expected: Expectation
 ) -> IntensityMap:
-    """Return how the intensities of a scan become those of the training.
-
-    Args:
-        quantiles: of the intensities of the recording; None if it has none.
-    """
+    """Return how the intensities of a scan become those of the training."""
     known_scale = sensor.intensity_scale
     scale = known_scale or cloud.full or 1.0
     if known_scale is None and cloud.full is None and quantiles is not None:
@@ -333,19 +328,19 @@ def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
     return texts
 
 
-def _describe_height(frame: Frame, gauge: Gauge) -> str:
+def _describe_height(frame: Frame, sensor: Sensor, usual_height: float | None) -> str:
     """Return how high the sensor is, and how far scans are moved for that."""
-    height = gauge.sensor.height if gauge.sensor.height is not None else frame.height
+    height = sensor.height if sensor.height is not None else frame.height
     if height is None:
         return "no ground to measure the height by (give --height; --axes if z is not up)"
 
-    if gauge.is_on_ground(frame):
+    if frame.is_on_ground(sensor):
         text = f"the ground {-(frame.height or 0):+.2f} m from the origin"
     else:
         text = f"sensor {height:.2f} m over the ground"
-    _, rise = gauge.rises(frame)
+    _, rise = frame.rises(sensor, usual_height)
     if rise:
-        text += f" (moved by {rise:+.2f} m to {gauge.usual_height:.2f} m)"
+        text += f" (moved by {rise:+.2f} m to {usual_height:.2f} m)"
     return text
 
 

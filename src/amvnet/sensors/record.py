@@ -67,12 +67,9 @@ def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
 
 
 def measure_sensor(scans: Iterable[Scan]) -> dict[str, float]:
-    """Measure the sensor of some scans, as weights carry it: the median of each measure.
+    """Return the medians of those of `MEASURES` that some scans have, as weights carry them.
 
     If the scans have rings, the field of view ends at the highest and the lowest laser.
-
-    Returns:
-        What could be measured of `MEASURES`.
     """
     measured = []
     for scan in scans:

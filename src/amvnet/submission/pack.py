@@ -28,8 +28,9 @@ def write(
     use_external: bool = False,
     progress: Progress = no_progress,
 ) -> int:
-    """Check a folder of predictions and pack it; the same predictions give the same bytes.
+    """Check a folder of predictions and pack it; return their number.
 
+    The same predictions give the same bytes.
     Files that have no place in the archive (scores, other splits) are left out. One scan is in
     memory at a time.
 
@@ -38,9 +39,6 @@ def write(
         out: NAME.zip; it appears whole or not at all.
         use_external: whether the method learnt from other data, too, if the benchmark asks for it.
         progress: called before each file and at the end.
-
-    Returns:
-        The number of predictions in it.
 
     Raises:
         InputError: if a prediction is missing or breaks the rules, or the archive cannot be

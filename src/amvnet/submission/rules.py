@@ -54,11 +54,7 @@ class Rules:
     official: int | None = None
 
     def check_ids(self, data: bytes, path: Path) -> None:
-        """Check the ids of a prediction whose size has been checked.
-
-        Raises:
-            InputError: if an id is not one of the benchmark, or a point needs a class and has none.
-        """
+        """Raise InputError if a prediction of the right size has an id that it may not have."""
         ids = train_ids(path, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
         if not self.unlabelled and not ids.all():
             raise InputError(

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from amvnet.config.schema import Recipe
-from amvnet.evaluation.analysis import Swept
+from amvnet.evaluation.analysis import SweptRow, swept_row
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.segmenter import Segmenter
@@ -20,7 +20,7 @@ from amvnet.weights.file import Weights
 
 def sweep_neighbours(
     plan: Plan, counts: Sequence[int], weights: Weights, device: str = "cpu"
-) -> Iterator[Swept]:
+) -> Iterator[SweptRow]:
     """Train a head for each number of neighbours, and yield its figures (Fig. 8 of the paper).
 
     Args:
@@ -40,7 +40,7 @@ def sweep_neighbours(
         segmenter = Segmenter(train(head_plan, "head", networks), device)
         evaluation = evaluate(dataset, plan.scans.val, label_by_weights(dataset, segmenter))
         uncertain = evaluation.uncertain / max(evaluation.asked, 1)
-        yield Swept.of(count, uncertain, evaluation.matrices["amvnet"][0], dataset.taxonomy)
+        yield swept_row(count, uncertain, evaluation.matrices["amvnet"][0], dataset.taxonomy)
 
 
 def _with_neighbours(weights: Weights, count: int) -> Weights:

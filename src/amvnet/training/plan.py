@@ -9,7 +9,6 @@ from pathlib import Path
 
 from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
-from amvnet.data.datasets.joined import Part
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, taxonomy_from_yaml
@@ -159,19 +158,10 @@ def open_for_training(
 
 def open_parts(
     specs: Sequence[str], taxonomy: Path | None, recipe: Recipe, out: Path, init: Weights | None
-) -> tuple[Dataset, list[Part]]:
-    """Open the datasets of a training.
-
-    Returns:
-        The first dataset, and those to mix in with their training scans. These share
-        `training.others` of each epoch equally; if it is 0, all of their scans are taken.
-    """
+) -> tuple[Dataset, list[TrainingScans]]:
+    """Open the datasets of a training; return the first, and those to mix in with their scans."""
     first, *others = [open_for_training(spec, taxonomy, recipe, out, init) for spec in specs]
-    share = recipe.training.others / len(others) if others else 0.0
-    parts = []
-    for dataset in others:
-        parts.append(Part(dataset, training_records(dataset), share or None))
-    return first, parts
+    return first, [TrainingScans(dataset, training_records(dataset), []) for dataset in others]
 
 
 def _earlier_weights(out: Path) -> Weights | None:

@@ -71,15 +71,12 @@ class Packed:
 
 
 def show(result: Segmentation, path: Path | str | None = None, open_browser: bool = True) -> Path:
-    """Write a self-contained HTML page that shows a segmented scan in 3D, and open it.
+    """Write a self-contained HTML page that shows a segmented scan in 3D, open it, return its path.
 
     It shows the labels, those of each network, uncertain points, and errors if the scan has labels.
 
     Args:
         path: the file, NAME.html; by default in a temporary folder.
-
-    Returns:
-        The path of the page.
 
     Raises:
         InputError: if the file cannot be written.

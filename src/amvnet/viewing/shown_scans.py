@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, LoadedScan
@@ -54,89 +52,57 @@ class ShownScan:
     disagreement: np.ndarray | None = None
 
 
-@dataclass(frozen=True)
-class ShownScans:
-    """Scans to look at; each is read and labelled when it is needed.
+def check_labels(labels: Path, count: int) -> None:
+    """Raise InputError if labels do not exist, or one file is named for several scans."""
+    if not labels.exists():
+        raise InputError(
+            f"{labels}: expected a file or a folder of labels, found none; check the path"
+        )
+    if labels.is_file() and count > 1:
+        raise InputError(
+            f"{labels}: expected a folder of labels for {count} scans, found a file; give a folder"
+        )
 
-    Attributes:
-        taxonomy: the classes of the ids.
-        scans: the scans, in order.
-        segmenter: labels the scans by every method, or None.
-        labels: a folder of predictions as `predict` writes them, or the label file of one scan, or
-            None.
+
+def show_scans(
+    scans: Sequence[InputScan],
+    taxonomy: Taxonomy,
+    segmenter: Segmenter | None = None,
+    labels: Path | None = None,
+    progress: Progress = no_progress,
+) -> Iterator[ShownScan]:
+    """Yield scans to look at, in order; each is read and labelled when it is needed.
+
+    Args:
+        taxonomy: the classes of the labels.
+        segmenter: labels the scans by every method.
+        labels: without a segmenter, a folder of predictions as `predict` writes them, or the label
+            file of one scan.
 
     Raises:
-        InputError: if the labels do not exist, or one file is named for several scans.
+        InputError: if a file is broken or missing.
     """
 
-    taxonomy: Taxonomy
-    scans: Sequence[InputScan]
-    segmenter: Segmenter | None = None
-    labels: Path | None = None
+    def load(scan_input: InputScan) -> LoadedScan:
+        return scan_input.load(labels=True)
 
-    def __post_init__(self) -> None:
-        if self.labels is None:
-            return
-
-        if not self.labels.exists():
-            raise InputError(
-                f"{self.labels}: expected a file or a folder of labels, found none; check the path"
-            )
-
-        if self.labels.is_file() and len(self.scans) > 1:
-            raise InputError(
-                f"{self.labels}: expected a folder of labels for {len(self.scans)} scans, found a "
-                "file; give a folder"
-            )
-
-    def __len__(self) -> int:
-        return len(self.scans)
-
-    def spaced(self, count: int) -> ShownScans:
-        """Return at most `count` of the scans, evenly spaced.
-
-        Raises:
-            InputError: if `count` is below 1.
-        """
-        if count < 1:
-            raise InputError(f"expected a number of scans from 1, found {count}; say --scans 5")
-        return replace(self, scans=evenly_spaced(self.scans, count))
-
-    def each(self, progress: Progress = no_progress) -> Iterator[ShownScan]:
-        """Yield the scans in order, and report the progress.
-
-        Raises:
-            InputError: if a file is broken or missing.
-        """
-        at_once = 1 if self.segmenter is None else self.segmenter.at_once
-
-        progress(0, len(self))
-        scans = stream_scans(self.scans, _load_with_labels, self._show, at_once)
-        with closing(scans):
-            for done, shown in enumerate(scans, start=1):
-                yield shown
-                progress(done, len(self))
-
-    def _show(self, scan_input: InputScan, loaded: LoadedScan) -> ShownScan:
+    def show(scan_input: InputScan, loaded: LoadedScan) -> ShownScan:
         scan = check_scan(loaded.scan)
-        shown = ShownScan(scan_input.title, scan.points, scan.valid, scan.labels)
-
-        if self.labels is not None:
-            ids = scan_input.read_labels(self.labels, len(scan), self.taxonomy)
-            shown = replace(shown, labels={"labels": ids})
-
-        segmenter = self.segmenter
         if segmenter is not None:
-            if scan_input.is_normalised:
-                segmenter = segmenter.by_ring()
-            result = segmenter(scan)
+            fitting = segmenter.by_ring() if scan_input.is_normalised else segmenter
+            result = fitting(scan)
             assert result.origin is not None
-            shown = replace(shown_scan(result, result.origin), name=shown.name)
-        return shown
+            return replace(shown_scan(result, result.origin), name=scan_input.title)
 
+        shown = ShownScan(scan_input.title, scan.points, scan.valid, truth=scan.labels)
+        if labels is None:
+            return shown
 
-def _load_with_labels(scan: InputScan) -> LoadedScan:
-    return scan.load(labels=True)
+        ids = scan_input.read_labels(labels, len(scan), taxonomy)
+        return replace(shown, labels={"labels": ids})
+
+    at_once = 1 if segmenter is None else segmenter.at_once
+    return stream_scans(scans, load, show, at_once, progress)
 
 
 def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
@@ -156,7 +122,8 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
 
     labels = {name: expand_labels(values, scan.valid) for name, values in probabilities.items()}
     labels[origin.method] = result.labels
-    shown = ShownScan(Path(scan.name).name or "scan", scan.points, scan.valid, scan.labels, labels)
+    name = Path(scan.name).name or "scan"
+    shown = ShownScan(name, scan.points, scan.valid, truth=scan.labels, labels=labels)
     if not has_two:
         return shown
 

@@ -35,7 +35,7 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
 
     predictions = out / "predictions"
     with progress("segmenting") as step:
-        predict([str(data)], segmenter, OutputOptions(predictions), progress=step)
+        predict([str(data)], segmenter, OutputOptions(predictions, overwrite=True), progress=step)
 
     dataset = SemanticKitti(data)
     records = dataset.records(dataset.sequences("all"))

@@ -15,13 +15,14 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
         out: folder for the graphs and amvnet.json.
         int8: convert the convolutions to 8-bit integers, for CPUs, calibrated with these scans: a
             dataset, scan files or a folder of them as predict takes them, or the word simulated.
-        overwrite: replace files in the folder that amvnet did not write, too.
+        overwrite: replace files that exist.
     """
     from amvnet.export.onnx import export as export_weights
     from amvnet.export.onnx import possible_files
-    from amvnet.written import protecting
+    from amvnet.files import check_free
 
-    with protecting(possible_files(out), overwrite), progress("exporting") as step:
+    check_free(possible_files(out), overwrite)
+    with progress("exporting") as step:
         graphs = export_weights(weights, out, step, int8)
     differences = [graph["difference"] for graph in graphs.values() if "difference" in graph]
     say(f"{len(graphs)} graphs and amvnet.json in {out}")

@@ -35,7 +35,7 @@ def fuse(
             the head's.
         taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the
             head's or the inputs'.
-        overwrite: replace files in the folder that amvnet did not write, too.
+        overwrite: replace files that exist.
     """
     from amvnet.data.taxonomy import taxonomy_named
     from amvnet.inference.fuse import fuse_files

@@ -63,7 +63,7 @@ def predict(
         classes: write the ids of these classes, to which those of the weights are mapped: coarse,
             or a YAML file.
         batch: scans that go through the networks at a time; more than one suits a GPU.
-        overwrite: replace files in the folder that amvnet did not write, too.
+        overwrite: replace files that exist.
         ray: share the scans among the workers of a Ray cluster, and write a table of results;
             without an address, Ray starts on this machine.
         workers: of --ray, their number; default: one for each GPU, or for each 4 cores.

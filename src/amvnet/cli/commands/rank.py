@@ -27,25 +27,24 @@ def rank(
         out: the table of the clusters, FILE.csv.
         choice: which scans to rank.
         compute: where and how the networks are computed.
-        overwrite: replace files that amvnet did not write, too.
+        overwrite: replace the table if it exists.
     """
     from amvnet.export.engines import make_segmenter
-    from amvnet.files import make_folder
+    from amvnet.files import check_free, make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.ranking.label_errors import rank as rank_records
     from amvnet.ranking.label_errors import write_clusters
     from amvnet.weights.file import load
-    from amvnet.written import protecting
 
     # Before any scan is scored, so that no time is wasted.
     make_folder(out.parent)
-    with protecting([out], overwrite):
-        loaded = load(weights)
-        dataset = open_for_weights(data, loaded)
-        records = choice.records(dataset, "all")
-        segmenter = make_segmenter(loaded, "ensemble", compute, say=say)
+    check_free([out], overwrite)
+    loaded = load(weights)
+    dataset = open_for_weights(data, loaded)
+    records = choice.records(dataset, "all")
+    segmenter = make_segmenter(loaded, "ensemble", compute, say=say)
 
-        with progress("scoring") as step:
-            clusters = rank_records(dataset, records, segmenter, step)
-        write_clusters(clusters, records, dataset.taxonomy, out)
-        say(f"{counted(len(clusters), 'cluster')} of {counted(len(records), 'scan')} in {out}")
+    with progress("scoring") as step:
+        clusters = rank_records(dataset, records, segmenter, step)
+    write_clusters(clusters, records, dataset.taxonomy, out)
+    say(f"{counted(len(clusters), 'cluster')} of {counted(len(records), 'scan')} in {out}")

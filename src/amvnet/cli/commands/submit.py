@@ -30,11 +30,11 @@ def submit(
         split: the official split; the servers score test, the others are for trials.
         sequences: sequences or scenes instead, separated by commas, for trials.
         use_external: nuScenes: the method learnt from data that are not of nuScenes, too.
-        overwrite: replace an archive that amvnet did not write, too.
+        overwrite: replace the archive if it exists.
     """
+    from amvnet.files import check_free
     from amvnet.submission import pack
     from amvnet.submission.rules import rules_for
-    from amvnet.written import protecting
 
     rules = rules_for(open_data(data), split, parse_names(sequences))
     if use_external and rules.meta is None:
@@ -42,7 +42,8 @@ def submit(
             f"--use-external: expected nuScenes, found {rules.taxonomy.name}; leave it out"
         )
 
-    with protecting([out], overwrite), progress("packing") as step:
+    check_free([out], overwrite)
+    with progress("packing") as step:
         count = pack.write(rules, predictions, out, use_external, step)
     packed = counted(count, "prediction")
     fit = "keeps" if count == 1 else "keep"

@@ -53,9 +53,9 @@ def train(
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     weights = None if init is None else load(init)
     recipe = sized_by_init(recipe, weights)
-    dataset, parts = open_parts(data, taxonomy, recipe, out, weights)
+    dataset, others = open_parts(data, taxonomy, recipe, out, weights)
     recipe = without_mean(recipe, weights, dataset.taxonomy, say)
-    scans = join(choice.scans(dataset, with_val), parts)
+    scans = join(choice.scans(dataset, with_val), others, recipe.training.others)
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")
 
     plan = Plan(

@@ -38,6 +38,7 @@ def view(
         scans: at most this many, evenly spaced.
         taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
     """
+    from amvnet.data.spacing import evenly_spaced
     from amvnet.data.taxonomy import taxonomy_named
     from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
@@ -45,7 +46,7 @@ def view(
     from amvnet.inference.reading import normaliser_for
     from amvnet.sensors.normalise import Normaliser
     from amvnet.viewing.page import open_page, temporary_page, write_page
-    from amvnet.viewing.shown_scans import ShownScans
+    from amvnet.viewing.shown_scans import check_labels, show_scans
     from amvnet.weights.file import load
 
     if labels is not None and weights is not None:
@@ -55,6 +56,8 @@ def view(
             "expected no --taxonomy together with --weights, which define their classes; "
             "leave it out"
         )
+    if scans < 1:
+        raise InputError(f"expected a number of scans from 1, found {scans}; say --scans 5")
     sensor = known.parse()
     # Before any scan is segmented, so that no time is wasted if a folder cannot be made.
     if html is not None:
@@ -70,11 +73,14 @@ def view(
         normaliser = normaliser_for(loaded, sensor, say)
 
     listed, classes = list_inputs(inputs, choice.parse(), classes, normaliser)
-    shown = ShownScans(classes, listed, segmenter, labels).spaced(scans)
+    if labels is not None:
+        check_labels(labels, len(listed))
+    chosen = evenly_spaced(listed, scans)
     page = html or temporary_page()
     with progress("looking") as step:
-        write_page(page, shown.each(step), shown.taxonomy, _title(inputs, weights))
-    say(f"{counted(len(shown), 'scan')} in {page}; open it in a browser")
+        shown = show_scans(chosen, classes, segmenter, labels, progress=step)
+        write_page(page, shown, classes, _title(inputs, weights))
+    say(f"{counted(len(chosen), 'scan')} in {page}; open it in a browser")
     if html is None:
         open_page(page)
 

@@ -96,11 +96,7 @@ class Dataset(ABC):
         return list(records)
 
     def count_points(self, record: ScanRecord) -> int:
-        """Return the number of points of a scan.
-
-        Raises:
-            InputError: as `read`.
-        """
+        """Return the number of points of a scan; raise the errors of `read`."""
         return len(self.read(record, labels=False))
 
     def read_prediction(self, record: ScanRecord, folder: Path) -> np.ndarray:

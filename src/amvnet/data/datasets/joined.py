@@ -37,19 +37,6 @@ class MixedRecord(ScanRecord):
     original: ScanRecord
 
 
-@dataclass(frozen=True)
-class Part:
-    """A dataset that is mixed in.
-
-    Attributes:
-        share: of the scans of an epoch; None takes every scan once per epoch.
-    """
-
-    dataset: Dataset
-    records: Sequence[ScanRecord]
-    share: float | None = None
-
-
 class Joined(Dataset):
     """Several datasets with the same classes. `Dataset` documents the methods and their errors.
 
@@ -58,25 +45,27 @@ class Joined(Dataset):
     shows others of its scans in each epoch, all of them equally often.
 
     Args:
-        dataset: the first of them; names the split, is validated, and takes predictions.
-        parts: the others.
-        places: of each of the parts, how many scans an epoch has.
+        scans: of the first dataset, which names the split, is validated, and takes predictions.
+        others: the other datasets, with the scans to train on.
+        share: as for `join`.
     """
 
-    def __init__(self, dataset: Dataset, parts: Sequence[Part], places: Sequence[int]) -> None:
-        super().__init__(dataset.root, dataset.taxonomy, dataset.spec)
-        self.is_normalised = dataset.is_normalised
-        self.dataset = dataset
-        self.parts = parts
-        self.places = places
+    def __init__(self, scans: TrainingScans, others: Sequence[TrainingScans], share: float) -> None:
+        self.dataset = scans.dataset
+        super().__init__(self.dataset.root, self.dataset.taxonomy, self.dataset.spec)
+        self.is_normalised = self.dataset.is_normalised
+        self.others = others
+        self.share = share / len(others)  # of each
+        self.places = _places(len(scans.train), others, share)  # of each, in an epoch
 
     @property
     def specs(self) -> list[str]:
         """What all of them are opened with: PATH or PATH@SHARE."""
         texts = [self.dataset.spec]
-        for part in self.parts:
-            share = "" if part.share is None else f"@{part.share:g}"
-            texts.append(f"{part.dataset.spec}{share}")
+        for other in self.others:
+            texts.append(
+                f"{other.dataset.spec}@{self.share:g}" if self.share else other.dataset.spec
+            )
         return texts
 
     def sequences(self, split: str) -> tuple[str, ...]:
@@ -101,18 +90,18 @@ class Joined(Dataset):
             return self.dataset.at_epoch(record, epoch)
 
         turn = self._record(record.member, record.place, epoch)
-        dataset = self.parts[record.member - 1].dataset
+        dataset = self.others[record.member - 1].dataset
         return dataclasses.replace(turn, original=dataset.at_epoch(turn.original, epoch))
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read a scan of any of them."""
         if not isinstance(record, MixedRecord):
             return self.dataset.read(record, labels)
-        return self.parts[record.member - 1].dataset.read(record.original, labels)
+        return self.others[record.member - 1].dataset.read(record.original, labels)
 
     def _record(self, member: int, place: int, epoch: int) -> MixedRecord:
         """Return the record of the scan whose turn it is at a place in an epoch."""
-        records = self.parts[member - 1].records
+        records = self.others[member - 1].train
         turn = epoch * self.places[member - 1] + place
         original = records[_order(member, len(records))[turn % len(records)]]
 
@@ -123,24 +112,30 @@ class Joined(Dataset):
         return MixedRecord(**fields, member=member, place=place, original=original)
 
 
-def join(scans: TrainingScans, parts: Sequence[Part]) -> TrainingScans:
+def join(
+    scans: TrainingScans, others: Sequence[TrainingScans], share: float = 0.0
+) -> TrainingScans:
     """Return scans to train on, with others mixed in; the scans to validate with stay.
+
+    Args:
+        share: of an epoch's scans, for the others, which have equal parts of it; 0 takes all of
+            their scans once per epoch.
 
     Raises:
         InputError: if a dataset has other classes, scans of a user's own are mixed with others, or
-            the shares leave nothing for the first.
+            the share leaves nothing for the first.
     """
-    if not parts:
+    if not others:
         return scans
-    for part in parts:
-        check_classes(part.dataset, scans.dataset.taxonomy)
-        if part.dataset.is_normalised != scans.dataset.is_normalised:
+    for other in others:
+        check_classes(other.dataset, scans.dataset.taxonomy)
+        if other.dataset.is_normalised != scans.dataset.is_normalised:
             raise InputError(
-                f"{part.dataset.root}: expected either scans of your own (a YAML file) or datasets "
-                "in every --data, found both; train on one after the other, with --init"
+                f"{other.dataset.root}: expected either scans of your own (a YAML file) or "
+                "datasets in every --data, found both; train on one after the other, with --init"
             )
 
-    joined = Joined(scans.dataset, parts, _places(len(scans.train), parts))
+    joined = Joined(scans, others, share)
     return TrainingScans(joined, [*scans.train, *joined.mixed_records()], scans.val)
 
 
@@ -152,23 +147,14 @@ def _order(member: int, count: int) -> np.ndarray:
     return indices[indices < count]
 
 
-def _places(first: int, parts: Sequence[Part]) -> list[int]:
-    """Return how many scans of an epoch each of the parts has, at least one.
-
-    Args:
-        first: scans of the first dataset.
-    """
-    shares = sum(part.share for part in parts if part.share is not None)
-    if shares >= 1:
+def _places(first: int, others: Sequence[TrainingScans], share: float) -> list[int]:
+    """Return how many scans of an epoch each other dataset has, next to `first` scans."""
+    if not share:
+        return [max(len(other.train), 1) for other in others]
+    if share >= 1:
         raise InputError(
-            f"expected shares below 1 in all, to leave some for the first --data, found "
-            f"{shares:g}; lower them"
+            "training.others: expected a share below 1, to leave some for the first --data, found "
+            f"{share:g}; lower it"
         )
-
-    whole = first + sum(len(part.records) for part in parts if part.share is None)
-    epoch = whole / (1 - shares)
-    places = []
-    for part in parts:
-        count = len(part.records) if part.share is None else round(part.share * epoch)
-        places.append(max(count, 1))
-    return places
+    epoch = first / (1 - share)
+    return [max(round(share / len(others) * epoch), 1)] * len(others)

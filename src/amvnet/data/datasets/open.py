@@ -62,12 +62,8 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
 
 
 def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
-    """Open a dataset that must have the classes of some weights.
-
-    Raises:
-        InputError: as `open_dataset`, or if it has other classes.
-    """
-    # A benchmark brings its own classes; a user's own ones, it must be read with.
+    """Open a dataset; raise InputError if it does not have the classes of some weights."""
+    # A benchmark has its own classes, but for weights with a user's classes it is read with these.
     is_custom = taxonomy.name not in TAXONOMIES and not is_own(spec)
     dataset = open_dataset(spec, taxonomy if is_custom else None)
     check_classes(dataset, taxonomy)
@@ -75,11 +71,7 @@ def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
 
 
 def open_if_dataset(spec: str, taxonomy: Taxonomy | None) -> Dataset | None:
-    """Open a dataset, with the classes of weights if there are any; None if it names scan files.
-
-    Raises:
-        InputError: as `open_with_classes`.
-    """
+    """Open a dataset, with the classes of weights if there are any; None if it names scan files."""
     if not is_dataset(spec):
         return None
     if taxonomy is None:

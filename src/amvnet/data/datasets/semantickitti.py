@@ -58,7 +58,7 @@ class SemanticKitti(Dataset):
         """Return the scans of these sequences, in order."""
         records: list[ScanRecord] = []
         for sequence in sorted(set(sequences)):
-            records.extend(self._records(sequence))
+            records += self._records(sequence)
         return records
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:

@@ -33,8 +33,8 @@ VAL_STREETS = 6
 FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
-# An epoch of a training takes the streets whose numbers are this much higher than those of the one
-# before: other streets help, more scans of the same streets do not (docs/log/training.md).
+# Each epoch of a training takes other streets, whose numbers are higher by this: they help, while
+# more scans of the same streets do not (docs/log/training.md).
 STREET_STEP = 1000
 
 SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
@@ -81,10 +81,7 @@ class SimulatedStreets(Dataset):
         return records
 
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the same scan of the street that takes the place of its street in an epoch.
-
-        Streets to validate with stay.
-        """
+        """Return the same scan of an epoch's street; streets to validate with stay."""
         number = int(record.sequence)
         if number >= FIRST_VAL_STREET:
             return record
@@ -135,12 +132,7 @@ class SimulatedStreets(Dataset):
         )
 
     def _load(self, record: ScanRecord, labels: bool) -> Scan:
-        """Read a scan from the cache.
-
-        Raises:
-            FileNotFoundError: if it is not there.
-            InputError: if a file is broken.
-        """
+        """Read a scan from the cache; raise FileNotFoundError if it is not there."""
         folder = record.points_path
 
         try:
@@ -170,7 +162,7 @@ class SimulatedStreets(Dataset):
         _make_room(self.root, street)
 
     def _drive(self, number: int) -> Iterator[Scan]:
-        """Yield the scans of a street as reading the files of `amvnet simulate` returns them."""
+        """Yield the scans of a street, as they are read from files of `amvnet simulate`."""
         seed = np.random.SeedSequence((SEED, number))
         with one_line_errors(str, only=(SimulationError,)):
             for scan in drive_street(self.sensor, SCANS, seed):
@@ -224,12 +216,7 @@ def _put(part: Path, street: Path) -> None:
 
 
 def _make_room(root: Path, latest: Path) -> None:
-    """Remove the streets that were read the longest time ago until the cache is small enough.
-
-    Args:
-        root: the folder of the cache.
-        latest: a street that stays.
-    """
+    """Remove the streets that were read the longest time ago, but not the latest, to make room."""
     for part in root.glob("streets-*/.*.part"):
         with suppress(FileNotFoundError):  # another process may be removing it
             if time.time() - part.stat().st_mtime > ABANDONED:

@@ -59,11 +59,7 @@ class Bag:
         return self._count
 
     def read(self, index: int) -> Cloud:
-        """Read the scan at this index, from 0. In order is fastest.
-
-        Raises:
-            InputError: if it is broken, or the bag ends before it.
-        """
+        """Read the scan at this index; raise InputError if it is broken. In order is fastest."""
         if index != self._next or self._next == 0:
             self._next = 0
             self._rest = self._messages()
@@ -154,11 +150,7 @@ def _with_scans(connections: Iterable[Any]) -> list[Any]:
 
 
 def _choose_topic(connections: Iterable[Any], topic: str | None, path: Path) -> tuple[str, int]:
-    """Return the topic to read, and the number of its scans.
-
-    Args:
-        topic: None for the only one with scans.
-    """
+    """Return the topic to read, if it is None the only one, and the number of its scans."""
     counts: dict[str, int] = {}
     for connection in _with_scans(connections):
         counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount
@@ -174,6 +166,7 @@ def _choose_topic(connections: Iterable[Any], topic: str | None, path: Path) -> 
             f"{path}: expected {expected} with PointCloud2, found {listing}; choose one with "
             "--topic"
         )
+
     others = [f"{other.topic} ({other.msgtype})" for other in connections]
     raise InputError(
         f"{path}: expected {expected} with PointCloud2, found "

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -121,11 +120,7 @@ def usual_scale(largest: float, is_integer: bool) -> float:
 
 
 def check_usable(points: np.ndarray, source: Path | str) -> np.ndarray:
-    """Return the (N, 4) points of a scan.
-
-    Raises:
-        InputError: if none of them is valid.
-    """
+    """Return the (N, 4) points of a scan; raise InputError if none of them is valid."""
     if not Scan(points).valid.any():
         raise InputError(f"{source}: {_why_unusable(points[:, :3])}")
     return points
@@ -195,26 +190,8 @@ def reading(path: Path | str, expected: str, advice: str) -> Iterator[None]:
         yield
 
 
-def require(source: Path | str, packages: Sequence[str]) -> None:
-    """Check that packages of the extra `formats` are installed, by the names of their modules.
-
-    Raises:
-        InputError: if one is missing.
-    """
-    missing = [package for package in packages if find_spec(package) is None]
-    if missing:
-        raise InputError(
-            f"{source}: expected the package {' and '.join(missing)}, found none; "
-            'run pip install "amvnet[formats]"'
-        )
-
-
 def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str, int]:
-    """Return the index of each wanted column that a file has, by its key.
-
-    Args:
-        names: of the columns of the file; upper and lower case do not matter.
-    """
+    """Return the index of each wanted column that a file has, by its key; case does not matter."""
     lower_names = list(map(str.lower, names))
 
     columns = {}
@@ -229,11 +206,7 @@ def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str
 def require_columns(
     names: Sequence[str], path: Path | str, wanted: Names = COLUMN_NAMES
 ) -> dict[str, int]:
-    """Find columns as `find_columns` does, and check that those not `OPTIONAL` are among them.
-
-    Raises:
-        InputError: if one is missing.
-    """
+    """Find columns as `find_columns` does; raise InputError if one that is needed is missing."""
     columns = find_columns(names, wanted)
     expected = []
     for key, aliases in wanted.items():
@@ -280,9 +253,7 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
 def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
     """Return (N,) values as int64 ring indices, 0 for those that are not finite.
 
-    Returns:
-        (N,) int64; None if there are no values, all are the same, or one is negative, too large or
-        not a whole number.
+    None if there are no values, all are the same, or one is negative, too large or not whole.
     """
     if values is None or not len(values):
         return None

@@ -1,11 +1,11 @@
-"""Detect the format of a scan file by its first bytes, its values or its name."""
+"""Detect the format of a scan file by its first bytes, or else by its name."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-from amvnet.data.formats.raw import NUSCENES_ENDING, load, usual_layout
+from amvnet.data.formats.raw import NUSCENES_ENDING
 from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
 
@@ -65,9 +65,13 @@ def ending_of(path: Path) -> str:
     if find_table(head) is not None:
         return named if named in TEXT else TEXT[0]
 
-    if named in (NUSCENES_ENDING, ".bin"):
-        return named
-    return _guess_ending(path, named)
+    if named is None:
+        raise InputError(
+            f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; convert "
+            "it to one, or play the packets of a sensor with its driver and record PointCloud2 in "
+            "a bag"
+        )
+    return named
 
 
 def _begins_as(beginning: bytes) -> str | None:
@@ -78,19 +82,6 @@ def _begins_as(beginning: bytes) -> str | None:
             if text.startswith(known):
                 return ending
     return None
-
-
-def _guess_ending(path: Path, named: str | None) -> str:
-    """Return the ending that the values in a file tell, or else its name."""
-    if usual_layout(load(path)) is not None:
-        return ".bin"
-    if named is not None:
-        return named
-
-    raise InputError(
-        f"{path}: expected a scan file ({', '.join(ENDINGS)}), found another format; convert it to "
-        "one, or play the packets of a sensor with its driver and record PointCloud2 in a bag"
-    )
 
 
 def named_ending(path: Path) -> str | None:

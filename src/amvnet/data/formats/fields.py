@@ -39,22 +39,13 @@ class Fields:
             fields.append((str(index), dtype, (count,)))
         return np.dtype(fields)
 
-    @property
-    def values(self) -> int:
-        """How many values a record has."""
-        return sum(self.counts)
-
     def read_binary(self, file: BinaryIO, count: int, chosen: dict[str, int]) -> Arrays:
         """Read the first value of chosen fields, by their index, of at most `count` records."""
         records = np.fromfile(file, self.record, count)
         return {key: records[str(index)][:, 0] for key, index in chosen.items()}
 
     def read_text(self, file: BinaryIO, count: int, chosen: dict[str, int], path: Path) -> Arrays:
-        """Read chosen fields of the next lines of numbers, as `read_binary` does.
-
-        Raises:
-            InputError: if there are fewer lines.
-        """
+        """Read chosen fields of the next lines of numbers; raise InputError if some are missing."""
         positions = list(accumulate(self.counts, initial=0))
         columns = [positions[index] for index in chosen.values()]
         table = np.zeros((0, len(columns)))

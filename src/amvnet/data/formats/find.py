@@ -114,14 +114,7 @@ def list_scans(
 
 
 def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read the only scan that a text names.
-
-    Args:
-        layout: as `list_scans`.
-
-    Raises:
-        InputError: if it is missing, of another format, broken, or not the only one.
-    """
+    """Read the only scan that a text names; raise InputError if there are several."""
     scans = list(list_scans(path, layout=layout))
     if len(scans) > 1:
         raise InputError(

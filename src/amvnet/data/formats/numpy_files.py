@@ -40,10 +40,7 @@ ARCHIVE_ADVICE = "save it again with np.savez"
 
 
 def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read one array.
-
-    Args:
-        layout: what its columns hold; the types are in the file.
+    """Read one array, whose columns are those of the layout, if it says any.
 
     Raises:
         InputError: if it is not an array of numbers, has an unsuitable shape or is truncated.
@@ -58,9 +55,6 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     They are its only array, or the one named `points`, `positions` (Open3D), `xyz`, `scan` or
     `arr_0`, with arrays named `intensity` and `ring` next to it; or arrays named `x`, `y`, `z` and
     so on.
-
-    Raises:
-        InputError: as `read_npy`, or if there are no such arrays.
     """
     with reading(path, "a NumPy archive", ARCHIVE_ADVICE):
         names = member_names(path)
@@ -93,11 +87,7 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some columns of an array of points; those without names are called "0", "1", ...
-
-    Raises:
-        InputError: as `read_npy`.
-    """
+    """Read some columns of an array of points; those without names are called "0", "1", ..."""
     return _columns_of(read_array(path), path, wanted)
 
 
@@ -117,11 +107,7 @@ def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
 
 
 def member_names(path: Path) -> list[str]:
-    """Return the names of the arrays in an archive.
-
-    Raises:
-        InputError: if the file is no archive.
-    """
+    """Return the names of the arrays in an archive; raise InputError if the file is none."""
     with reading(path, "a NumPy archive", ARCHIVE_ADVICE), zipfile.ZipFile(path) as archive:
         return [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
 
@@ -132,9 +118,6 @@ def read_array(path: Path, key: str | None = None) -> np.ndarray:
     Args:
         path: a `.npy` or `.npz` file.
         key: the name of the array in an archive; None means the one with the points.
-
-    Raises:
-        InputError: as `read_npy`.
     """
     with reading(path, "NumPy arrays", ADVICE):
         if not zipfile.is_zipfile(path):

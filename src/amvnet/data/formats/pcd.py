@@ -56,7 +56,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
         if encoding == "ascii":
             # Each value takes at least one digit, and each but the last a separator.
-            check_point_count(points, path, 2 * fields.values * points - 1)
+            check_point_count(points, path, 2 * sum(fields.counts) * points - 1)
             return fields.read_text(file, points, chosen, path)
 
         if encoding == "binary":
@@ -122,11 +122,7 @@ def _read_compressed(
 
 
 def unpack_lzf(data: bytes, size: int) -> bytearray:
-    """Return the `size` bytes that LZF packed into `data`.
-
-    Raises:
-        ValueError, IndexError: if `data` does not unpack to exactly `size` bytes.
-    """
+    """Return the `size` bytes that LZF packed; raise ValueError or IndexError if it did not."""
     output = bytearray()
     position = 0
 

@@ -74,7 +74,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
             # Each value, and each line before the vertices, takes at least one digit and, but for
             # the last, a separator.
             lines = sum(element.count for element in before)
-            least = 2 * (lines + vertex.count * fields.values) - 1
+            least = 2 * (lines + vertex.count * sum(fields.counts)) - 1
             check_point_count(lines + vertex.count, path, least)
             for _ in range(lines):
                 file.readline()

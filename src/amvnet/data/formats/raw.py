@@ -37,12 +37,14 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     Raises:
         InputError: if the file is not a whole number of rows, or the values fit neither layout.
     """
-    data = load(path, max(len(layout.columns), NUSCENES_COLUMNS))
+    columns = max(len(layout.columns), NUSCENES_COLUMNS)
+    check_point_count(path.stat().st_size // (WIDEST * columns), path)
+    data = np.fromfile(path, np.uint8)
     if layout.columns:
         return _to_cloud(data, path, layout)
 
     is_named = path.name.lower().endswith(NUSCENES_ENDING)
-    usual = usual_layout(data, is_named)
+    usual = _usual_layout(data, is_named)
     if usual is None and len(data) >= FEW:
         raise InputError(
             f"{path}: expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found "
@@ -52,16 +54,6 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
 
     full = FULL_INTENSITY if is_named and usual == NUSCENES_ROWS else None
     return replace(_to_cloud(data, path, usual), full=full, note="")
-
-
-def load(path: Path, columns: int = NUSCENES_COLUMNS) -> np.ndarray:
-    """Return the (B,) bytes of a file.
-
-    Raises:
-        InputError: if they are more than those of `MAX_POINTS` rows of as many columns.
-    """
-    check_point_count(path.stat().st_size // (WIDEST * columns), path)
-    return np.fromfile(path, np.uint8)
 
 
 def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
@@ -79,10 +71,7 @@ def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
 
 
 def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
-    """Read a file of rows of `columns` values each, with nothing else in it.
-
-    Returns:
-        (N, columns) of `dtype`.
+    """Read a file of nothing but rows of values, as (N, columns) of `dtype`.
 
     Raises:
         InputError: if the file is missing, or its size is not a whole number of rows.
@@ -92,11 +81,7 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
 
 
 def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
-    """Return the number of rows of such a file from its size alone.
-
-    Raises:
-        InputError: as `read_table`.
-    """
+    """Return the number of rows of such a file from its size; raise the errors of `read_table`."""
     if not path.is_file():
         raise InputError(
             f"{path}: expected a file, found none; check the path or complete the dataset"
@@ -113,7 +98,7 @@ def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
 
 
 @np.errstate(invalid="ignore", over="ignore")
-def usual_layout(data: np.ndarray, is_named: bool = False) -> RowLayout | None:
+def _usual_layout(data: np.ndarray, is_named: bool) -> RowLayout | None:
     """Return the layout of KITTI or nuScenes if the values of a file fit it.
 
     Args:
@@ -137,10 +122,7 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     """Return whether (N, 5) values can be x, y, z, intensity and ring.
 
     The ring holds whole numbers, at least two different ones, and the coordinates do not.
-    Intensities are never negative.
-
-    Args:
-        is_named: whether the name says it, so that the last column is no label.
+    Intensities are never negative. Without the name, the ring must not look like labels, either.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]

@@ -71,7 +71,7 @@ def call(function: str, path: Path, *arguments: Any) -> dict[str, Any]:
 
         try:
             values = _process.exchange(request)
-        except BaseException as error:  # an interruption, too: the reply would be that of the next
+        except BaseException as error:  # an interruption, too: its reply would go to the next call
             reason = _process.stop()
             _process = None
             if not isinstance(error, (OSError, EOFError)):
@@ -117,11 +117,7 @@ class _Process:
         self._replies = os.fdopen(os.dup(cast(BinaryIO, self._popen.stdout).fileno()), "rb")
 
     def exchange(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Send a request and return the reply.
-
-        Raises:
-            EOFError, OSError: if the process has ended.
-        """
+        """Send a request; return the reply. Raise EOFError or OSError if the process has ended."""
         cast(BinaryIO, self._popen.stdin).write(json.dumps(request).encode() + b"\n")
         line = self._replies.readline()
         if not line.endswith(b"\n"):
@@ -156,7 +152,7 @@ _lock = Lock()
 
 
 def _forget() -> None:
-    """Leave the process to the one that forked this one."""
+    """Forget the process: it belongs to the process that forked this one."""
     global _process, _lock
     _process = None
     _lock = Lock()
@@ -184,7 +180,7 @@ def serve() -> None:
 
     for line in sys.stdin.buffer:
         request = json.loads(line)
-        os.chdir(request["folder"])  # of the other process, which may have changed since the last
+        os.chdir(request["folder"])  # of the caller, which may have changed it
         _set_limits(request["size"])
 
         module, _, function = request["function"].partition(":")

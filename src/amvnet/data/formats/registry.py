@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
 from amvnet.data.formats import las, numpy_files, pcd, ply, text
 from amvnet.data.formats.bags import Bag
-from amvnet.data.formats.cloud import COLUMN_NAMES, Arrays, Cloud, Names, make_cloud, require
+from amvnet.data.formats.cloud import COLUMN_NAMES, Arrays, Cloud, Names, make_cloud
 from amvnet.data.formats.detect import BAGS, FOLDER, NUSCENES_ENDING, TEXT
 from amvnet.data.formats.raw import read_raw
 from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
+from amvnet.errors import InputError
 
 OPEN_FILES = 4  # that the process with limits keeps open
 
@@ -60,13 +62,10 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
 
 
 def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
-    """Read some columns of a file of points, such as their labels.
+    """Read some columns of a file of points: by key, a number for each point, in any shape.
 
     Args:
         ending: one of `COLUMN_READERS`.
-
-    Returns:
-        A number for each point, in any shape, by key.
 
     Raises:
         InputError: if the file is broken, lacks a column, or needs a package that is missing.
@@ -101,7 +100,12 @@ def _read_one(path: Path, *what: Any) -> Cloud:
 
 def _with_limits(function: str, path: Path, ending: str, *arguments: Any) -> dict[str, Any]:
     """Call a function of this module in the process with limits, if the packages are there."""
-    require(path, PACKAGES[ending])
+    missing = [package for package in PACKAGES[ending] if find_spec(package) is None]
+    if missing:
+        raise InputError(
+            f"{path}: expected the package {' and '.join(missing)}, found none; "
+            'run pip install "amvnet[formats]"'
+        )
     return call(f"{__name__}:{function}", path, ending, *arguments)
 
 

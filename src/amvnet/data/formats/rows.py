@@ -59,6 +59,7 @@ class RowLayout:
                     f"--dtype: expected float32, float64, float16, uint8, ..., found {dtype!a}; "
                     "give the type of all columns, or one for each with commas"
                 )
+
         is_stated = self.dtypes != (USUAL_TYPE,)
         fits_columns = len(self.dtypes) in (1, len(self.columns))
         if is_stated and not (self.columns and fits_columns):
@@ -82,11 +83,7 @@ UNKNOWN = RowLayout()
 
 
 def parse_layout(columns: str | None, dtype: str | None) -> RowLayout:
-    """Return the layout that the options --columns and --dtype describe.
-
-    Raises:
-        InputError: as `RowLayout`.
-    """
+    """Return the layout that the options --columns and --dtype describe."""
     return RowLayout(_split(columns), _split(dtype or USUAL_TYPE))
 
 

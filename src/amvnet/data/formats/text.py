@@ -92,11 +92,7 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some columns of all points as float64; those without names are called "0", "1", ...
-
-    Raises:
-        InputError: as `read_text_cloud`, or if a column is missing.
-    """
+    """Read some columns of all points as float64; those without names are called "0", "1", ..."""
     with reading(path, EXPECTED, ADVICE):
         table = _require_table(path)
         names = table.names or tuple(map(str, range(table.count)))

@@ -43,11 +43,7 @@ def write_ids(path: Path | str, raw_ids: np.ndarray, dtype: DTypeLike = np.uint3
 
 
 def check_count(ids: np.ndarray, path: Path, count: int) -> np.ndarray:
-    """Check that there is one id per point, and return the ids as an array.
-
-    Raises:
-        InputError: if the shape of the ids is not (count,).
-    """
+    """Return the ids of a scan as an array; raise InputError if their shape is not (count,)."""
     ids = np.asarray(ids)
     if ids.shape != (count,):
         raise InputError(
@@ -83,14 +79,10 @@ def check_size(name: Path | str, size: int, count: int, dtype: DTypeLike) -> Non
 
 
 def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarray:
-    """Turn raw ids into train ids; an error names the likely mistake.
+    """Return the (N,) uint8 train ids of (N,) raw ids; an error names the likely mistake.
 
     Args:
         name: the beginning of the message.
-        raw: (N,) raw ids, integers.
-
-    Returns:
-        (N,) uint8 train ids in 0..K.
 
     Raises:
         InputError: if an id is not one of the raw ids of the taxonomy, or if all of them look like

@@ -20,11 +20,7 @@ PLY_TYPES = {"f4": "float", "f8": "double", "i4": "int", "u1": "uchar"}
 
 
 def check_kind(kind: str) -> None:
-    """Check that a format can be written; call this before the work starts.
-
-    Raises:
-        InputError: if the format is unknown.
-    """
+    """Raise InputError if labels cannot be written in a format. Call this before the work."""
     if kind not in KINDS:
         raise InputError(
             f"expected a format of {', '.join(KINDS)}, found {kind!r}; give one of them"
@@ -39,7 +35,7 @@ def write_scan_labels(
     taxonomy: Taxonomy,
     uncertain: np.ndarray | None = None,
 ) -> Path:
-    """Write the labels of a scan, one row per point, in the scan's order.
+    """Write the labels of a scan, one row per point, in the scan's order; return the path.
 
     The file appears whole or not at all. Its formats:
 
@@ -53,9 +49,6 @@ def write_scan_labels(
         xyz: (N, 3) coordinates, metres, as in the scan's file. `label` and `npy` use only N.
         ids: (N,) train ids in 0..K.
         uncertain: (N,) bool; None if unknown, which leaves the column out.
-
-    Returns:
-        The path of the file.
 
     Raises:
         InputError: as `check_kind`, or if there is not one id per point, an id is outside 0..K, or

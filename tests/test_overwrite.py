@@ -1,21 +1,18 @@
-"""No command replaces a file that is not its own, and each may replace what it wrote."""
+"""No command replaces a file without --overwrite, and --resume goes on with what is there."""
 
 from __future__ import annotations
 
 import shlex
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from amvnet.inference.journal import UNFINISHED
+from amvnet.files import check_free
+from amvnet.inference.journal import JOURNAL, UNFINISHED
 from amvnet.onnx_runner import DESCRIPTION
 from amvnet.weights.file import save
-from amvnet.written import RECORD, WrittenFiles, protecting
 
 from fixtures.worlds import (
     fails,
@@ -96,19 +93,14 @@ def test_a_users_file_stays_and_nothing_is_written(name: str, world: Path, tmp_p
 
 
 @pytest.mark.parametrize("name", ["predict", "dataset", "fuse", "rank", "submit"])
-def test_a_command_repeats_itself_but_does_not_replace_what_was_changed(
-    name: str, world: Path, tmp_path: Path
-) -> None:
+def test_a_command_repeats_itself_only_if_told_to(name: str, world: Path, tmp_path: Path) -> None:
     case = CASES[name]
     command = case.text(world, tmp_path)
     succeed(command)
-    succeed(command)
-
-    path = tmp_path / case.file
-    size = path.stat().st_size
-    path.write_bytes(bytes(size))  # the size stays
-    assert case.file in refusal(command)
-    assert path.read_bytes() == bytes(size)
+    written = (tmp_path / case.file).read_bytes()
+    assert "--overwrite" in refusal(command)
+    succeed(f"{command} --overwrite")
+    assert (tmp_path / case.file).read_bytes() == written
 
 
 def test_export_keeps_to_it_before_it_exports(world: Path, tmp_path: Path) -> None:
@@ -119,11 +111,11 @@ def test_export_keeps_to_it_before_it_exports(world: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_export_replaces_its_own(world: Path, tmp_path: Path) -> None:
+def test_export_replaces_its_graphs_if_told_to(world: Path, tmp_path: Path) -> None:
     pytest.importorskip("onnxscript")
     command = f"export --weights {world}/w.safetensors --out {tmp_path}"
     succeed(command)
-    succeed(command)
+    succeed(f"{command} --overwrite")
 
 
 def test_labels_in_the_folder_of_the_scans_stay(world: Path, tmp_path: Path) -> None:
@@ -136,24 +128,45 @@ def test_labels_in_the_folder_of_the_scans_stay(world: Path, tmp_path: Path) -> 
 
     (tmp_path / "a.label").unlink()
     succeed(command)
-    succeed(command)
 
 
-def test_runs_into_one_folder_know_each_others_files(world: Path, tmp_path: Path) -> None:
-    for name in ("a", "b", "a", "b"):
+def test_two_runs_share_a_folder_if_their_scans_differ(world: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
         scan = f"{world}/scans/{name}.bin"
         succeed(f"predict {scan} --weights {world}/w.safetensors --out {tmp_path}")
     assert files(tmp_path) == {"a.label", "b.label"}
 
 
-def test_what_a_killed_run_has_written_is_its_own(world: Path, tmp_path: Path) -> None:
+def test_what_a_killed_run_wrote_last_is_written_again(world: Path, tmp_path: Path) -> None:
     """The run was killed after it wrote a file, and before it noted that."""
     command = CASES["predict"].text(world, tmp_path)
-    WrittenFiles(tmp_path).claim([Path("a.label"), Path("b.label")])
-    (tmp_path / "a.label").write_bytes(b"half")
+    succeed(command)
+    lines = (tmp_path / JOURNAL).read_text().splitlines(keepends=True)
+    (tmp_path / JOURNAL).unlink()
+    (tmp_path / UNFINISHED).write_text("".join(lines[:-1]))
+    (tmp_path / "b.label").write_bytes(b"half")
+
     succeed(f"{command} --resume")
     assert files(tmp_path) == {"a.label", "b.label"}
+    assert (tmp_path / "b.label").read_bytes() != b"half"
     assert not (tmp_path / UNFINISHED).exists()
+
+
+def test_resuming_keeps_corrected_labels_and_a_users_own(world: Path, tmp_path: Path) -> None:
+    """Labels of a finished run may be corrected; those of a scan that is new are the user's."""
+    scans = tmp_path / "scans"
+    scans.mkdir()
+    shutil.copy(world / "scans/a.bin", scans)
+    out = tmp_path / "out"
+    command = f"predict {scans} --weights {world}/w.safetensors --out {out} --resume"
+    succeed(command)
+    (out / "a.label").write_bytes(MINE)
+    succeed(command)
+
+    shutil.copy(world / "scans/b.bin", scans)
+    (out / "b.label").write_bytes(MINE)
+    assert "b.label" in refusal(command)
+    assert {(out / name).read_bytes() for name in files(out)} == {MINE}
 
 
 def test_the_labels_of_a_broken_scan_stay_the_users(world: Path, tmp_path: Path) -> None:
@@ -168,7 +181,6 @@ def test_the_labels_of_a_broken_scan_stay_the_users(world: Path, tmp_path: Path)
     assert code == 3
     assert "b.bin" in error
     assert (out / "b.label").read_bytes() == MINE
-    assert "b.label" in refusal(command)
 
 
 def test_a_run_that_writes_nothing_leaves_no_folder(world: Path, tmp_path: Path) -> None:
@@ -179,82 +191,12 @@ def test_a_run_that_writes_nothing_leaves_no_folder(world: Path, tmp_path: Path)
     assert not (tmp_path / "out").exists()
 
 
-# ---- the record
-
-
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "1", '{"a": 5}', '{"a": [1]}', '{"a": "x"}', "[" * 10**5, "\x00"]
-)
-def test_a_broken_record_protects_all(text: str, tmp_path: Path) -> None:
-    (tmp_path / RECORD).write_text(text)
-    (tmp_path / "a").write_bytes(MINE)
-    fails(lambda: WrittenFiles(tmp_path).check([Path("a")]), "a", "--overwrite")
-    WrittenFiles(tmp_path).finish([Path("a")])
-    WrittenFiles(tmp_path).check([Path("a")])
-
-
-def test_files_that_were_claimed_and_not_written_are_forgotten(tmp_path: Path) -> None:
-    record = WrittenFiles(tmp_path)
-    record.claim([Path("a"), Path("b")])
-    (tmp_path / "b").write_bytes(b"b")
-    record.finish([Path("a"), Path("b")])
-
-    (tmp_path / "a").write_bytes(MINE)
-    fails(lambda: WrittenFiles(tmp_path).check([Path("b"), Path("a")]), tmp_path / "a")
-    WrittenFiles(tmp_path).check([Path("b")])
-
-
 def test_the_message_counts_the_files(tmp_path: Path) -> None:
-    paths = [Path("a"), Path("b"), Path("c")]
+    paths = [tmp_path / name for name in ("a", "b", "c")]
     for path in paths:
-        (tmp_path / path).write_bytes(MINE)
-    fails(lambda: WrittenFiles(tmp_path).check(paths), tmp_path / "a", "and 2 more")
+        path.write_bytes(MINE)
+    fails(lambda: check_free(paths), tmp_path / "a", "and 2 more")
 
 
 def test_a_folder_is_not_called_another_file(tmp_path: Path) -> None:
-    fails(lambda: WrittenFiles(tmp_path.parent).check([Path(tmp_path.name)]), tmp_path, "a folder")
-
-
-def failing(call: Callable[[], None], folder: Path) -> None:
-    with protecting([folder / "a"]):
-        call()
-
-
-def test_a_file_that_a_command_could_write_and_does_not_stays_the_users(tmp_path: Path) -> None:
-    (tmp_path / "a").write_bytes(MINE)
-    (tmp_path / "b").write_bytes(MINE)
-    with protecting([tmp_path / "a", tmp_path / "b"], overwrite=True):
-        (tmp_path / "a").write_bytes(b"of the command")
-    WrittenFiles(tmp_path).check([Path("a")])
-    fails(lambda: WrittenFiles(tmp_path).check([Path("b")]), tmp_path / "b")
-
-
-def test_a_command_that_fails_lists_nothing(tmp_path: Path) -> None:
-    def fail() -> None:
-        raise OSError(28, "No space left on device")
-
-    with pytest.raises(OSError, match="No space"):
-        failing(fail, tmp_path)
-    assert not (tmp_path / RECORD).exists()
-
-
-CLAIM = """
-import sys
-from pathlib import Path
-from amvnet.written import WrittenFiles
-
-for index in range(50):
-    path = Path(f"{sys.argv[2]}-{index}")
-    (Path(sys.argv[1]) / path).write_text("labels")
-    WrittenFiles(Path(sys.argv[1])).finish([path])
-"""
-
-
-def test_processes_that_write_into_one_folder_keep_each_others_entries(tmp_path: Path) -> None:
-    pytest.importorskip("fcntl")
-    processes = [
-        subprocess.Popen([sys.executable, "-c", CLAIM, tmp_path, name]) for name in ("a", "b", "c")
-    ]
-    assert [process.wait() for process in processes] == [0, 0, 0]
-    written = [Path(f"{name}-{index}") for name in ("a", "b", "c") for index in range(50)]
-    WrittenFiles(tmp_path).check(written)
+    fails(lambda: check_free([tmp_path]), tmp_path, "a folder")
