@@ -18,7 +18,9 @@ import pytest
 from amvnet.cli.main import main
 from amvnet.data.formats.detect import ENDINGS
 from amvnet.data.formats.registry import PACKAGES
+from amvnet.inference.segmentation import Verdict
 from amvnet.sensors.lidars import SENSORS
+from amvnet.weights.file import load
 
 from fixtures.scan_writers import write_bag1, write_pcd
 from fixtures.sensors import LASERS, place
@@ -130,6 +132,14 @@ def test_the_table_of_formats_is_that_of_the_code() -> None:
     packages = {ending: "formats" for ending in PACKAGES if ending}
     assert list(extras) == list(ENDINGS)
     assert extras == dict.fromkeys(ENDINGS, "") | packages
+
+
+def test_the_share_that_is_warned_about_is_that_of_the_weights() -> None:
+    (percent,) = re.findall(r"above (\d+) % for `sim-hdl64e`", read_page("own_scans.md"))
+    weights = load("sim-hdl64e")
+    usual = weights.usual_uncertain_at(weights.model.assertion.threshold)
+    assert not Verdict(int(percent) / 100, usual).is_doubtful
+    assert Verdict((int(percent) + 1) / 100, usual).is_doubtful
 
 
 def test_the_names_of_sensors_are_those_that_are_known() -> None:

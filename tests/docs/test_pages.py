@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -11,6 +13,7 @@ from amvnet.cli.main import VERBS, WITH_RECIPE
 from amvnet.cli.parser import make_parser
 from amvnet.cli.recipe_options import HELP_ALL, add_recipe
 from amvnet.config.schema import Recipe
+from amvnet.models.methods import EngineName
 
 from fixtures.worlds import commands_of
 
@@ -30,6 +33,11 @@ def test_every_command_can_be_parsed(page: str) -> None:
         if verb in WITH_RECIPE:
             add_recipe(parser, Recipe())
         parser.values(arguments)
+
+
+def test_make_bench_asks_for_engines_that_there_are() -> None:
+    (engines,) = re.findall(r"--engines ([\w,]+)", (ROOT / "Makefile").read_text())
+    assert set(engines.split(",")) <= set(get_args(EngineName))
 
 
 def test_the_readme_names_every_extra() -> None:
