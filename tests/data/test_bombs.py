@@ -34,7 +34,6 @@ from pathlib import Path
 from amvnet.data.class_maps import class_map
 from amvnet.data.formats import reader_process
 from amvnet.data.formats.find import list_scans
-from amvnet.data.taxonomy import taxonomy_from_yaml
 
 kind, path, seconds, memory = sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4])
 resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
@@ -43,8 +42,6 @@ message = ""
 try:
     if kind == "classes":
         class_map(path)
-    elif kind == "taxonomy":
-        taxonomy_from_yaml(path)
     else:
         for scan in list_scans(path):
             scan.read().to_scan()
@@ -291,7 +288,7 @@ BOMBS: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "number.xyz": ("scan", long_number, ""),
     "text.pcd": ("scan", pcd_of_text, ""),
     "merges.yaml": ("classes", yaml_of_merges, "alias"),
-    "aliases.yaml": ("taxonomy", yaml_of_aliases, "alias"),
+    "aliases.yaml": ("classes", yaml_of_aliases, "alias"),
 }
 
 

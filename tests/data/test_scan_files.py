@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 
 from amvnet import read as read_scan
 from amvnet.data.formats.find import find_scans
 from amvnet.data.labels.ids import write_ids
-from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy, taxonomy_from_yaml
+from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI, TAXONOMIES, Taxonomy
 from amvnet.files import atomic_write, read_yaml
 
-from fixtures.worlds import fails, label_map
+from fixtures.worlds import fails
 
 # --- single files ---
 
@@ -155,52 +154,6 @@ def test_sizes_of_the_benchmarks() -> None:
     assert (SEMANTICKITTI.size, NUSCENES.size) == (19, 16)
     assert (len(SEMANTICKITTI.raw_to_train), len(NUSCENES.raw_to_train)) == (34, 32)
     assert SEMANTICKITTI.splits["val"] == ("08",)
-
-
-def test_yaml_label_map_is_the_built_in_one(tmp_path: Path) -> None:
-    path = tmp_path / "semantic-kitti.yaml"
-    path.write_text(yaml.safe_dump(label_map()))
-    assert taxonomy_from_yaml(path) == SEMANTICKITTI
-
-
-@pytest.mark.parametrize("key", label_map())
-def test_label_maps_without_a_key_are_named(tmp_path: Path, key: str) -> None:
-    path = tmp_path / "labels.yaml"
-    incomplete = label_map()
-    del incomplete[key]
-    path.write_text(yaml.safe_dump(incomplete))
-    fails(lambda: taxonomy_from_yaml(path), path, key)
-
-
-def test_unusable_label_maps_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "labels.yaml"
-    fails(lambda: taxonomy_from_yaml(path), path)
-
-    one_name = label_map()
-    one_name["labels"][11] = "car"
-    path.write_text(yaml.safe_dump(one_name))
-    fails(lambda: taxonomy_from_yaml(path), path, "car", "twice")
-
-    few_labels = yaml.safe_dump({**label_map(), "labels": {0: "unlabeled"}})
-    large_ids = yaml.safe_dump({**label_map(), "learning_map": {70_000: 1}})
-    for content in ("a: [", "[1]", few_labels, large_ids):
-        path.write_text(content)
-        fails(lambda: taxonomy_from_yaml(path), path)
-
-
-@pytest.mark.parametrize("number", [".inf", ".nan", "9" * 9000, "0x" + "f" * 9000])
-@pytest.mark.parametrize("key", ["learning_map", "learning_map_inv", "color_map", "split"])
-def test_numbers_that_are_no_ids_are_one_line(tmp_path: Path, key: str, number: str) -> None:
-    path = tmp_path / "labels.yaml"
-    places = {
-        "learning_map": {10: "NUMBER"},
-        "learning_map_inv": {**label_map()["learning_map_inv"], 1: "NUMBER"},
-        "color_map": {**label_map()["color_map"], 10: [0, 0, "NUMBER"]},
-        "split": {"train": ["NUMBER"], "valid": [8], "test": []},
-    }
-    text = yaml.safe_dump({**label_map(), key: places[key]}, default_flow_style=True)
-    path.write_text(text.replace("NUMBER", number))
-    fails(lambda: taxonomy_from_yaml(path), path)
 
 
 def test_aliases_in_yaml_are_refused_and_anchors_are_not(tmp_path: Path) -> None:

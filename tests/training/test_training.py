@@ -40,7 +40,6 @@ from fixtures.worlds import (
     fake_drive,
     files,
     fresh_weights,
-    label_map,
     make_streets,
     run_cli,
     write_recipe,
@@ -524,22 +523,6 @@ def test_nuscenes_is_trained_predicted_and_evaluated(tmp_path: Path) -> None:
 
     assert run_cli("evaluate", data, "--predictions", out, *scene)[0] == 0
     assert run_cli("evaluate", data, "--weights", run, *scene)[0] == 0
-
-
-def test_a_users_label_map_is_learnt(world: Path, tmp_path: Path) -> None:
-    classes = label_map()
-    classes["learning_ignore"][19] = True  # one class less than the benchmark has
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(classes))
-    options = ("--stage", "rv", "--taxonomy", tmp_path / "mine.yaml", "--training.rv.epochs", 1)
-    taxonomy = train(world, tmp_path / "run", *options).taxonomy
-    assert taxonomy.name == "mine"
-    assert taxonomy.size == 18
-
-    data = world / "data"
-    weights = ("--weights", tmp_path / "run")
-    predicted = ("--method", "rv", "--out", tmp_path / "predicted", "--sequences", "08")
-    assert run_cli("predict", data, *weights, *predicted) == (0, "")
-    assert run_cli("evaluate", data, *weights)[0] == 0
 
 
 def test_if_the_networks_agree_everywhere_the_head_learns_from_all_points(

@@ -169,14 +169,6 @@ def join_processes(cuda: bool = False) -> Processes:
     return processes
 
 
-def open_data(data: str, taxonomy: Path | None = None) -> Dataset:
-    """Open the dataset that a verb is given, with a user's YAML file of classes if there is one."""
-    from amvnet.data.datasets.open import open_dataset
-    from amvnet.data.taxonomy import taxonomy_from_yaml
-
-    return open_dataset(data, None if taxonomy is None else taxonomy_from_yaml(taxonomy))
-
-
 def describe_records(records: Sequence[ScanRecord]) -> str:
     """Return how many scans there are, and of which sequences."""
     if not records:

@@ -6,20 +6,17 @@ import colorsys
 import dataclasses
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from importlib import resources
 from itertools import chain
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from amvnet.config.bounds import check_text
-from amvnet.errors import InputError, errors_of, one_line_errors, shown
-from amvnet.files import read_yaml
+from amvnet.errors import InputError, one_line_errors, shown
 
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
@@ -30,10 +27,6 @@ VALUE = 0.95
 GOLDEN_ANGLE = 0.381966  # of the circle of hues
 SHOWN = 5  # unknown ids in a message
 UNKNOWN = -1  # in lookup tables: no train id belongs to this raw id
-
-# A YAML label map has these tables, and its own name for each split.
-_YAML_TABLES = "labels, color_map, learning_map, learning_map_inv, learning_ignore and split"
-_YAML_SPLITS = {"train": "train", "val": "valid", "test": "test"}
 
 Color = tuple[int, int, int]  # RGB in 0..255
 
@@ -165,8 +158,16 @@ class Taxonomy:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Taxonomy:
         """Return the taxonomy of what `to_dict` returned; raise InputError if it is wrong."""
-        expected = "taxonomy: expected its fields as this package writes them"
-        with _one_line(expected, "use a weights file of this package"):
+
+        def message(error: BaseException) -> str:
+            return (
+                "taxonomy: expected its fields as this package writes them, found "
+                f"{shown(error)}; use a weights file of this package"
+            )
+
+        # AttributeError: a table that is none; OverflowError: .inf as an id.
+        faults = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+        with one_line_errors(message, only=faults):
             return cls(
                 name=values["name"],
                 classes=tuple(values["classes"]),
@@ -176,80 +177,6 @@ class Taxonomy:
                 splits={split: tuple(sequences) for split, sequences in values["splits"].items()},
                 counts_absent=bool(values["counts_absent"]),
             )
-
-
-def taxonomy_from_yaml(path: Path | str) -> Taxonomy:
-    """Read a label map in the format of `semantic-kitti.yaml`.
-
-    Args:
-        path: a YAML file with the keys labels, color_map (BGR, as in the official file),
-            learning_map, learning_map_inv, learning_ignore and split (train, valid, test).
-
-    Raises:
-        InputError: if the file does not exist, is not YAML or lacks a key, or its tables do not
-            fit each other.
-    """
-    path = Path(path)
-    config = read_yaml(path, "a label map")
-    expected = f"{path}: expected the tables {_YAML_TABLES} that fit each other, of whole numbers"
-    with errors_of(path), _one_line(expected, "correct them"):
-        return _from_config(path.stem, config)
-
-
-def _one_line(expected: str, advice: str) -> AbstractContextManager[None]:
-    """Turn what tables of other keys and types raise into an InputError of one line."""
-
-    def message(error: BaseException) -> str:
-        return f"{expected}, found {shown(error)}; {advice}"
-
-    # AttributeError: a table that is none; OverflowError: .inf as an id.
-    faults = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
-    return one_line_errors(message, only=faults)
-
-
-def _from_config(name: str, config: Mapping[str, Any]) -> Taxonomy:
-    """Build the taxonomy of a YAML label map.
-
-    The file's learning ids become the train ids 1..K, without gaps; ignored ones become 0.
-    """
-    learning_to_raw = config["learning_map_inv"]
-    is_ignored = config["learning_ignore"]
-    learning_ids = []
-    for learning_id in learning_to_raw:
-        if learning_id != 0 and not is_ignored[learning_id]:
-            learning_ids.append(learning_id)
-
-    train_to_raw = [learning_to_raw[0]]
-    learning_to_train = {}
-    for train_id, learning_id in enumerate(sorted(learning_ids), start=1):
-        train_to_raw.append(learning_to_raw[learning_id])
-        learning_to_train[learning_id] = train_id
-
-    classes = []
-    colors = []
-    for raw_id in train_to_raw:
-        classes.append(str(config["labels"][raw_id]))
-        colors.append(_rgb(reversed(config["color_map"][raw_id])))
-
-    raw_to_train: dict[int | str, int] = {}
-    for raw_id, learning_id in config["learning_map"].items():
-        if learning_id not in learning_to_raw:
-            raise KeyError(learning_id)
-        raw_to_train[int(raw_id)] = learning_to_train.get(learning_id, 0)
-
-    splits = {}
-    for split, yaml_split in _YAML_SPLITS.items():
-        splits[split] = tuple(f"{int(sequence):02d}" for sequence in config["split"][yaml_split])
-
-    return Taxonomy(
-        name="semantickitti" if name == "semantic-kitti" else name,
-        classes=tuple(classes[1:]),
-        colors=tuple(colors),
-        raw_to_train=raw_to_train,
-        train_to_raw=tuple(map(int, train_to_raw)),
-        splits=splits,
-        counts_absent=True,
-    )
 
 
 def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, Any]]:
@@ -336,10 +263,3 @@ def _built_in() -> dict[str, Taxonomy]:
 TAXONOMIES: Mapping[str, Taxonomy] = _built_in()
 SEMANTICKITTI = TAXONOMIES["semantickitti"]
 NUSCENES = TAXONOMIES["nuscenes"]
-
-
-def taxonomy_named(text: str) -> Taxonomy:
-    """Return the classes of a benchmark, by its name, or of a label map (YAML), by its path."""
-    if text in TAXONOMIES:
-        return TAXONOMIES[text]
-    return taxonomy_from_yaml(text)

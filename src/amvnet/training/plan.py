@@ -11,7 +11,7 @@ from amvnet.config.schema import Recipe
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
-from amvnet.data.taxonomy import TAXONOMIES, Taxonomy, taxonomy_from_yaml
+from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.inference.reading import open_for_weights
@@ -132,23 +132,16 @@ def without_mean(recipe: Recipe, init: Weights | None, classes: Taxonomy, say: S
     return dataclasses.replace(recipe, training=dataclasses.replace(recipe.training, **networks))
 
 
-def open_for_training(
-    data: str, taxonomy: Path | None, recipe: Recipe, out: Path, init: Weights | None = None
-) -> Dataset:
+def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None = None) -> Dataset:
     """Open the dataset of a training.
 
     A user's own scans are normalised as by `predict`: to the initial weights, to what this run has
     trained before, or else to the sensor of the recipe.
 
-    Args:
-        data: as `open_dataset` takes it.
-        taxonomy: a YAML file of other classes.
-
     Raises:
         InputError: as `open_dataset`.
     """
-    classes = None if taxonomy is None else taxonomy_from_yaml(taxonomy)
-    dataset = open_dataset(data, classes)
+    dataset = open_dataset(data)
     weights = Weights(recipe.model, dataset.taxonomy, recipe.sensor)
     earlier = init or _earlier_weights(out)
     if earlier is not None:
@@ -157,10 +150,10 @@ def open_for_training(
 
 
 def open_parts(
-    specs: Sequence[str], taxonomy: Path | None, recipe: Recipe, out: Path, init: Weights | None
+    specs: Sequence[str], recipe: Recipe, out: Path, init: Weights | None
 ) -> tuple[Dataset, list[TrainingScans]]:
     """Open the datasets of a training; return the first, and those to mix in with their scans."""
-    first, *others = [open_for_training(spec, taxonomy, recipe, out, init) for spec in specs]
+    first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
     return first, [TrainingScans(dataset, training_records(dataset), []) for dataset in others]
 
 

@@ -33,7 +33,7 @@ def ablate(
     from amvnet.training.plan import Plan, open_for_training
 
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
-    dataset = open_for_training(data, None, recipe, out)
+    dataset = open_for_training(data, recipe, out)
     scans = choice.scans(dataset)
     say(f"training on {describe_records(scans.train)}; scoring on {describe_records(scans.val)}")
 

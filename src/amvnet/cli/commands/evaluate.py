@@ -11,7 +11,6 @@ from amvnet.cli.console import progress, say, show
 from amvnet.cli.options import (
     LabelledChoice,
     join_processes,
-    open_data,
     parse_methods,
 )
 from amvnet.config.bounds import Share
@@ -33,7 +32,6 @@ def evaluate(
     tau: Share | None = None,
     json: Path | None = None,
     pictures: Path | None = None,
-    taxonomy: Path | None = None,
     classes: str | None = None,
 ) -> None:
     """Score weights, or predictions of any tool, by the benchmark's official formulas.
@@ -50,11 +48,11 @@ def evaluate(
             go to the head, in [0, 1]; fewer points take less time; default: that of the weights.
         json: file for all figures.
         pictures: folder for drawings of some scans from above.
-        taxonomy: a semantic-kitti.yaml with other classes.
         classes: score these classes instead, to which those of the data and of the weights are
             mapped: coarse, or a YAML file.
     """
     from amvnet.data.class_maps import class_map
+    from amvnet.data.datasets.open import open_dataset
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.export.engines import make_segmenter
@@ -67,8 +65,7 @@ def evaluate(
     mapping = None if classes is None else class_map(classes)
     if weights is not None and predictions is None:
         loaded = load(weights)
-        has_own = taxonomy is not None or mapping is not None
-        opened = open_data(data, taxonomy) if has_own else None
+        opened = None if mapping is None else open_dataset(data)
         dataset = open_for_weights(data, loaded, opened)
         records = choice.records(dataset)
         method_names = parse_methods(methods)
@@ -81,7 +78,7 @@ def evaluate(
     elif predictions is not None and weights is None:
         if tau is not None:
             raise InputError("--tau: expected --weights, found --predictions; leave --tau out")
-        dataset = open_data(data, taxonomy)
+        dataset = open_dataset(data)
         records = choice.records(dataset)
         labeller = label_from_files(dataset, predictions, mapping)
     else:

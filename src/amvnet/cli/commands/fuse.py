@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import ScanChoice, ScoresChoice
@@ -19,7 +20,7 @@ def fuse(
     choice: ScanChoice,
     head: str | None = None,
     tau: Share | None = None,
-    taxonomy: str | None = None,
+    taxonomy: Literal["semantickitti", "nuscenes"] | None = None,
     overwrite: bool = False,
 ) -> None:
     """Fuse the scores of any two models: labels by the point head, or by the ensemble.
@@ -33,11 +34,10 @@ def fuse(
             ensemble is used.
         tau: points whose scores have a cosine similarity of at most this are uncertain; default:
             the head's.
-        taxonomy: semantickitti, nuscenes, or a semantic-kitti.yaml with other classes; default: the
-            head's or the inputs'.
+        taxonomy: the classes; default: the head's or the inputs'.
         overwrite: replace files that exist.
     """
-    from amvnet.data.taxonomy import taxonomy_named
+    from amvnet.data.taxonomy import TAXONOMIES
     from amvnet.inference.fuse import fuse_files
     from amvnet.inference.pipeline import OutputOptions
     from amvnet.weights.file import load
@@ -50,7 +50,7 @@ def fuse(
         raise InputError(
             "expected no --taxonomy together with --head, which defines its classes; leave it out"
         )
-    classes = None if taxonomy is None else taxonomy_named(taxonomy)
+    classes = None if taxonomy is None else TAXONOMIES[taxonomy]
 
     with progress("fusing") as step:
         written, uncertain = fuse_files(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import open_data, parse_names
+from amvnet.cli.options import parse_names
 from amvnet.errors import InputError
 from amvnet.progress import counted
 
@@ -32,11 +32,12 @@ def submit(
         use_external: nuScenes: the method learnt from data that are not of nuScenes, too.
         overwrite: replace the archive if it exists.
     """
+    from amvnet.data.datasets.open import open_dataset
     from amvnet.files import check_free
     from amvnet.submission import pack
     from amvnet.submission.rules import rules_for
 
-    rules = rules_for(open_data(data), split, parse_names(sequences))
+    rules = rules_for(open_dataset(data), split, parse_names(sequences))
     if use_external and rules.meta is None:
         raise InputError(
             f"--use-external: expected nuScenes, found {rules.taxonomy.name}; leave it out"

@@ -20,7 +20,6 @@ def train(
     init: str | None = None,
     resume: bool = False,
     with_val: bool = False,
-    taxonomy: Path | None = None,
 ) -> None:
     """Train the two networks and the point head.
 
@@ -42,7 +41,6 @@ def train(
         resume: continue an earlier run in the folder.
         with_val: train on the scans to validate with, too, as for a benchmark's server; then
             nothing is validated.
-        taxonomy: a semantic-kitti.yaml with other classes.
     """
     from amvnet.data.datasets.joined import join
     from amvnet.distributed import device_of
@@ -53,7 +51,7 @@ def train(
     processes = join_processes(device_of(recipe.training.accelerator) == "cuda")
     weights = None if init is None else load(init)
     recipe = sized_by_init(recipe, weights)
-    dataset, others = open_parts(data, taxonomy, recipe, out, weights)
+    dataset, others = open_parts(data, recipe, out, weights)
     recipe = without_mean(recipe, weights, dataset.taxonomy, say)
     scans = join(choice.scans(dataset, with_val), others, recipe.training.others)
     say(f"training on {describe_records(scans.train)}; validating on {describe_records(scans.val)}")

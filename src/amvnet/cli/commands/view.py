@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import ScanChoice, SensorChoice
@@ -21,7 +22,7 @@ def view(
     weights: str | None = None,
     html: Path | None = None,
     scans: int = 5,
-    taxonomy: str | None = None,
+    taxonomy: Literal["semantickitti", "nuscenes"] | None = None,
 ) -> None:
     """Look at scans, labels, uncertain points and errors in 3D, in a browser.
 
@@ -36,10 +37,10 @@ def view(
             are shown.
         html: the page to write; by default a temporary one, which opens in the browser.
         scans: at most this many, evenly spaced.
-        taxonomy: the classes of labels without a dataset: semantickitti, nuscenes or a YAML file.
+        taxonomy: the classes of labels without a dataset.
     """
     from amvnet.data.spacing import evenly_spaced
-    from amvnet.data.taxonomy import taxonomy_named
+    from amvnet.data.taxonomy import TAXONOMIES
     from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
     from amvnet.inference.listing import list_inputs
@@ -64,7 +65,7 @@ def view(
         make_folder(html.parent)
 
     segmenter = None
-    classes = None if taxonomy is None else taxonomy_named(taxonomy)
+    classes = None if taxonomy is None else TAXONOMIES[taxonomy]
     normaliser = Normaliser(None, sensor, say)
     if weights is not None:
         loaded = load(weights)
