@@ -276,7 +276,7 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     cases = [
         ("headless", "", "point_head"),
         ("weights", "--neighbours 3", "--recipe"),
-        ("weights", f"--neighbours 3,x {recipe}", "3,x"),
+        ("weights", f"--neighbours 3,x {recipe}", "found 'x'"),
         ("weights", f"--neighbours ² {recipe}", "²"),
         ("weights", "--neighbours 3 --recipe nonsense", "nonsense"),
         ("weights", f"--neighbours 3 {recipe} --split all", "both"),

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import silence
-from amvnet.config.bounds import Range
-from amvnet.errors import InputError, shown
-from amvnet.models.methods import METHODS
+from amvnet.errors import InputError
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
@@ -25,7 +23,6 @@ Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]  # the 
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 SHOWN = 20  # names of sequences in a line
-NEIGHBOURS = Range(1, 1000)
 
 
 @dataclass(frozen=True)
@@ -34,7 +31,7 @@ class ScanChoice:
 
     split: Split = "all"
     """of datasets, the official split."""
-    sequences: str | None = None
+    sequences: tuple[str, ...] | None = None
     """of datasets, these sequences or scenes instead, separated by commas."""
     topic: str | None = None
     """of bags, the topic of the scans; default: the only one with scans."""
@@ -55,7 +52,7 @@ class ScanChoice:
         from amvnet.inference.listing import ScanOptions
 
         layout = parse_layout(self.columns, self.dtype)
-        return ScanOptions(parse_names(self.sequences), self.split, self.topic, layout)
+        return ScanOptions(self.sequences, self.split, self.topic, layout)
 
 
 @dataclass(frozen=True)
@@ -64,32 +61,30 @@ class LabelledChoice:
 
     split: Split | None = None
     """the official split; default: val, and of rank: all."""
-    sequences: str | None = None
+    sequences: tuple[str, ...] | None = None
     """sequences or scenes instead, separated by commas."""
 
     def records(self, dataset: Dataset, default: Split = "val") -> Sequence[ScanRecord]:
         """Return the scans; raise InputError if there are none."""
         from amvnet.data.datasets.base import choose_records
 
-        names = parse_names(self.sequences)
-        return dataset.labelled(choose_records(dataset, names, self.split or default))
+        return dataset.labelled(choose_records(dataset, self.sequences, self.split or default))
 
 
 @dataclass(frozen=True)
 class TrainingChoice:
     """Which scans to train on and to validate with."""
 
-    train_sequences: str | None = None
+    train_sequences: tuple[str, ...] | None = None
     """sequences or scenes, separated by commas, to train on; default: the official split."""
-    val_sequences: str | None = None
+    val_sequences: tuple[str, ...] | None = None
     """sequences or scenes, separated by commas, to validate with; default: the official split."""
 
     def scans(self, dataset: Dataset, with_val: bool = False) -> TrainingScans:
         """Return the scans; `with_val` moves those to validate with to those to train on."""
         from amvnet.data.datasets.select import split_records
 
-        names = parse_names(self.train_sequences)
-        return split_records(dataset, names, parse_names(self.val_sequences), with_val)
+        return split_records(dataset, self.train_sequences, self.val_sequences, with_val)
 
 
 @dataclass(frozen=True)
@@ -179,50 +174,3 @@ def describe_records(records: Sequence[ScanRecord]) -> str:
         text += f" and {len(names) - SHOWN} more"
 
     return f"{counted(len(records), 'scan')} of {text}"
-
-
-def parse_names(text: str | None) -> list[str] | None:
-    """Parse names separated by commas; None if the option was left out.
-
-    Raises:
-        InputError: if there is no name.
-    """
-    if text is None:
-        return None
-    stripped = [name.strip() for name in text.split(",")]
-    names = [name for name in stripped if name]
-    if not names:
-        raise InputError(
-            f"expected names of sequences with commas, found {text!r}; "
-            "name some, or leave the option out"
-        )
-
-    return names
-
-
-def parse_methods(text: str) -> list[str]:
-    """Parse methods separated by commas; raise InputError if a name is no method."""
-    names = parse_names(text) or []
-    for name in names:
-        if name not in METHODS:
-            raise InputError(
-                f"expected methods of {', '.join(METHODS)}, found {name!r}; use some of them"
-            )
-    return names
-
-
-def parse_counts(text: str) -> list[int]:
-    """Parse numbers of neighbours separated by commas; return them sorted, each once.
-
-    Raises:
-        InputError: if one is no number, or out of range.
-    """
-    counts = set()
-    for name in parse_names(text) or []:
-        count = int(name) if name.isdecimal() and len(name) < 9 else -1
-        if count not in NEIGHBOURS:
-            raise InputError(
-                f"expected numbers {NEIGHBOURS} with commas, found {shown(text)}; say 5,10,15"
-            )
-        counts.add(count)
-    return sorted(counts)

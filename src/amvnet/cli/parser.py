@@ -83,6 +83,16 @@ def _convert(flag: str, text: str, kind: Any) -> Any:
     Raises:
         InputError: if it does not fit, or a number is out of the `Range` of an `Annotated` type.
     """
+    item_kind = _item_kind_of(kind)
+    if item_kind is not None:
+        texts = list(filter(None, map(str.strip, text.split(","))))
+        if not texts:
+            raise InputError(
+                f"{flag}: expected values with commas, found {shown(text)}; "
+                "name some, or leave the option out"
+            )
+        return tuple(_convert(flag, item, item_kind) for item in texts)
+
     choices = literals(kind)
     if choices and text not in choices:
         raise InputError(
@@ -106,6 +116,14 @@ def _convert(flag: str, text: str, kind: Any) -> Any:
                     )
             return value
     return Path(text) if Path in kinds else text
+
+
+def _item_kind_of(kind: Any) -> Any:
+    """Return the type of the values in a tuple, also in an optional one; None of other types."""
+    for part in (kind, *get_args(kind)):
+        if get_origin(part) is tuple:
+            return get_args(part)[0]
+    return None
 
 
 def _parts_of(kind: Any) -> Iterator[Any]:
@@ -198,7 +216,7 @@ def _add_option(target: Any, name: str, kind: Any, default: Any, text: str) -> N
         options["required"] = True
         options["help"] += " (required)"
     else:
-        options["default"] = default
+        options["default"] = ",".join(default) if isinstance(default, tuple) else default
 
     if kind is bool:
         options["action"] = "store_true"
@@ -218,7 +236,7 @@ def flag_of(name: str) -> str:
 
 def metavar_of(name: str, kind: Any) -> str:
     """Return what stands for an option's value in the help: its choices, or its name."""
-    choices = literals(kind)
+    choices = literals(kind) if _item_kind_of(kind) is None else ()
     if choices:
         return "{" + ",".join(choices) + "}"
     return name.upper().replace("_", "-")

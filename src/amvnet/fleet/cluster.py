@@ -82,11 +82,7 @@ def label_fleet(
 
 
 def _check_inputs(inputs: Sequence[str], out: Place, labelling: Labelling) -> None:
-    """Check what can be told without listing.
-
-    Raises:
-        InputError: if an input is a dataset, or what is written among the scans looks like scans.
-    """
+    """Raise InputError for datasets, and if what is written among the scans looks like scans."""
     looks_like_scans = labelling.kind != "label" or labelling.scores or labelling.uncertain
     for text in inputs:
         if is_dataset(text):
@@ -200,11 +196,7 @@ class FleetRun:
         return lost
 
     def _take(self, rows: pa.Table) -> None:
-        """Add rows to the results, and count them.
-
-        Raises:
-            OSError: if one says that labels cannot be written.
-        """
+        """Add rows to the results; raise OSError if one says that labels cannot be written."""
         is_fatal = rows["is_fatal"]
         self.results.add(rows.filter(pc.invert(is_fatal)).drop_columns(["is_fatal"]))
         for line in rows["error"].filter(is_fatal).to_pylist():

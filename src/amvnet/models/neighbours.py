@@ -60,11 +60,7 @@ def _search(
 
 
 def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
-    """Return a search for the m nearest of the points (P, 3).
-
-    Raises:
-        ImportError: if pykdtree is not installed.
-    """
+    """Return a search for the m nearest of points (P, 3); raise ImportError without pykdtree."""
     from pykdtree.kdtree import KDTree
 
     tree = KDTree(xyz, leafsize=LEAF)

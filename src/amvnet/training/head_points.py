@@ -41,24 +41,12 @@ Scorer = Callable[[ScanRecord, Scan, PointBatch], tuple[Tensor, Tensor]]
 HeadBatch = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
-def point_dtype(classes: int, neighbours: int) -> np.dtype:
-    """Return the type of a point on disk, for K classes and n neighbours; see `HeadBatch`."""
-    width = 2 * classes + POINT_VALUES
-    return np.dtype(
-        [
-            ("point", np.float16, width),
-            ("rows", np.float16, (neighbours, width)),
-            ("stands_for", np.float32),
-        ]
-    )
-
-
 class HeadPoints:
     """The labelled uncertain points of some scans on disk, and statistics of all their points.
 
     Args:
         paths: the files of the points, one for each process that scored scans.
-        dtype: of a point, from `point_dtype`.
+        dtype: of a point.
         files: (U,) which file has a point; in its file, the points have the same order.
         labels: (U,) train ids.
         certain: (K + 1, K + 1) confusion matrix of the ensemble over the certain points.
@@ -284,7 +272,7 @@ class PointGatherer:
         """Score one scan, and draw at most `most` of its uncertain points.
 
         Returns:
-            (U,) points of `point_dtype`, their (U,) uint8 train ids, and the (2, K + 1, K + 1)
+            (U,) points, their (U,) uint8 train ids, and the (2, K + 1, K + 1)
             confusion matrices of the ensemble over the certain and over all uncertain points of the
             scan.
         """
@@ -331,8 +319,16 @@ class PointGatherer:
 
     @property
     def _dtype(self) -> np.dtype:
+        """The type of a point on disk; see `HeadBatch`."""
+        width = 2 * self.weights.taxonomy.size + POINT_VALUES
         neighbours = self.weights.model.point_head.neighbours
-        return point_dtype(self.weights.taxonomy.size, neighbours)
+        return np.dtype(
+            [
+                ("point", np.float16, width),
+                ("rows", np.float16, (neighbours, width)),
+                ("stands_for", np.float32),
+            ]
+        )
 
 
 def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:

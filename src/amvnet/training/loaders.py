@@ -241,10 +241,8 @@ def count_classes(
     totals = np.sum(processes.gather(counts), axis=0)[1:]
 
     if processes.first:
-        scans = np.array(source["scans"])
-        classes = np.array(source["classes"])
         with atomic_write(path) as part:
-            np.savez(part, counts=totals, scans=scans, classes=classes)
+            np.savez(part, counts=totals, scans=source["scans"], classes=source["classes"])
     return totals
 
 

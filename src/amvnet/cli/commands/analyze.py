@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import (
     LabelledChoice,
-    parse_counts,
-    parse_names,
 )
+from amvnet.config.bounds import Range
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute
 from amvnet.progress import counted
+
+Neighbours = Annotated[int, Range(1, 1000)]
 
 
 def analyze(
@@ -22,9 +24,9 @@ def analyze(
     out: Path,
     choice: LabelledChoice,
     compute: Compute,
-    neighbours: str | None = None,
+    neighbours: tuple[Neighbours, ...] | None = None,
     recipe: str | None = None,
-    train_sequences: str | None = None,
+    train_sequences: tuple[str, ...] | None = None,
 ) -> None:
     """Draw the paper's figures: agreement, mIoU by distance, sweeps, tables by class and by method.
 
@@ -65,8 +67,8 @@ def analyze(
     counts: list[int] = []
     plan = None
     if neighbours is not None and recipe is not None:
-        counts = parse_counts(neighbours)
-        names = parse_names(train_sequences) or dataset.sequences("train")
+        counts = sorted(set(neighbours))
+        names = train_sequences or dataset.sequences("train")
         scans = TrainingScans(dataset, dataset.labelled(dataset.records(names)), records)
         folder = out / "neighbours"
         plan = Plan(load_recipe(recipe), scans, folder, resume=True, say=say)

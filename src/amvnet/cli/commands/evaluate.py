@@ -11,11 +11,10 @@ from amvnet.cli.console import progress, say, show
 from amvnet.cli.options import (
     LabelledChoice,
     join_processes,
-    parse_methods,
 )
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
-from amvnet.models.methods import Compute, widest_method
+from amvnet.models.methods import PAPER_METHODS, Compute, MethodName, widest_method
 
 if TYPE_CHECKING:
     from amvnet.evaluation.metrics import Evaluation
@@ -28,7 +27,7 @@ def evaluate(
     compute: Compute,
     weights: str | None = None,
     predictions: Path | None = None,
-    methods: str = "rv,bev,ensemble,amvnet",
+    methods: tuple[MethodName, ...] = PAPER_METHODS,
     tau: Share | None = None,
     json: Path | None = None,
     pictures: Path | None = None,
@@ -68,13 +67,12 @@ def evaluate(
         opened = None if mapping is None else open_dataset(data)
         dataset = open_for_weights(data, loaded, opened)
         records = choice.records(dataset)
-        method_names = parse_methods(methods)
         # The head runs only if AMVNet is among the methods.
-        parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in method_names]
+        parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]
         device = processes.device(choose_device(compute.device, compute.engine))
         compute = replace(compute, device=device)
         segmenter = make_segmenter(loaded, widest_method(parts), compute, tau, say)
-        labeller = label_by_weights(dataset, segmenter, method_names, mapping)
+        labeller = label_by_weights(dataset, segmenter, methods, mapping)
     elif predictions is not None and weights is None:
         if tau is not None:
             raise InputError("--tau: expected --weights, found --predictions; leave --tau out")

@@ -133,11 +133,7 @@ def predict(
 
 
 def _layout(choice: ScanChoice) -> RowLayout:
-    """Return what rows of numbers hold.
-
-    Raises:
-        InputError: if there are options of datasets or bags.
-    """
+    """Return what rows of numbers hold; raise InputError if options are of datasets or bags."""
     options = choice.parse()
     if choice != ScanChoice(columns=choice.columns, dtype=choice.dtype):
         raise InputError(

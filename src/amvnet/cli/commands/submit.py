@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import parse_names
 from amvnet.errors import InputError
 from amvnet.progress import counted
 
@@ -17,7 +16,7 @@ def submit(
     predictions: Path,
     out: Path,
     split: Literal["train", "val", "test"] = "test",
-    sequences: str | None = None,
+    sequences: tuple[str, ...] | None = None,
     use_external: bool = False,
     overwrite: bool = False,
 ) -> None:
@@ -37,7 +36,7 @@ def submit(
     from amvnet.submission import pack
     from amvnet.submission.rules import rules_for
 
-    rules = rules_for(open_dataset(data), split, parse_names(sequences))
+    rules = rules_for(open_dataset(data), split, sequences)
     if use_external and rules.meta is None:
         raise InputError(
             f"--use-external: expected nuScenes, found {rules.taxonomy.name}; leave it out"
