@@ -112,10 +112,10 @@ predict city32 --sequences simulated-0000 --weights sim-hdl32e --precision bfloa
 # Lone scans: each format of labels; a sensor that is measured, named and described
 predict city64/sequences/00/velodyne --weights sim-hdl64e --uncertain --out lone/label
 predict city64/sequences/00/velodyne --weights sim-hdl64e --format ply --out lone/ply
-predict city64/sequences/00/velodyne --weights sim-hdl64e --format pcd --uncertain \
-    --sensor os1-64 --height 1.2 --out lone/pcd
-predict city64/sequences/00/velodyne --weights sim-hdl64e --format las --axes y-forward \
-    --rotate 0,5,0 --offset 0.5,0,0.1 --intensity-scale 2 --out lone/las
+predict city64/sequences/00/velodyne --weights sim-hdl64e --format npy --uncertain \
+    --sensor os1-64 --height 1.2 --out lone/sensor
+predict city64/sequences/00/velodyne --weights sim-hdl64e --format npy --axes y-forward \
+    --rotate 0,5,0 --offset 0.5,0,0.1 --intensity-scale 2 --out lone/frame
 predict city64/sequences/00/velodyne --weights sim-hdl32e --format npy --out lone/npy
 
 # Figures and pictures
@@ -130,7 +130,7 @@ analyze city64 --split all --weights sim-hdl64e --out figures/analysis
 fuse city64 --scores-a labels/64/rv --scores-b labels/64/bev --out fused/ensemble
 fuse city64 --scores-a labels/64/amvnet --scores-b labels/64/amvnet \
     --head sim-hdl64e --tau 0.7 --out fused/head
-rank city32 --weights sim-hdl32e --out rank/suspects.csv --pictures rank/suspects
+rank city32 --weights sim-hdl32e --out rank/suspects.csv
 
 # What others read
 view city64 --weights sim-hdl64e --scans 2 --html pages/weights.html
@@ -143,7 +143,7 @@ submit city32 --sequences simulated-0000 --predictions labels/32/amvnet --use-ex
 train kitti.yaml --data city64 --out runs/kitti --train-sequences 00,01 --val-sequences 02
 train nuscenes.yaml --data city32 --out runs/nuscenes --training.workers 1
 train kitti.yaml --data city64 --out runs/tau --stage head --init runs/kitti \
-    --train-sequences 00,01 --val-sequences 02 --training.head.class_weights true \
+    --train-sequences 00,01 --val-sequences 02 \
     --model.assertion.threshold 0.8
 train kitti.yaml --data city64 --out runs/scores --stage head --with-val \
     --scores-a labels/64/amvnet --scores-b labels/64/amvnet

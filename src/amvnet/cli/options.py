@@ -81,7 +81,7 @@ class TrainingChoice:
     """sequences or scenes, separated by commas, to validate with; default: the official split."""
 
     def scans(self, dataset: Dataset, with_val: bool = False) -> TrainingScans:
-        """Return the scans; `with_val` moves those to validate with to those to train on."""
+        """Return the scans; if `with_val`, those to validate with are trained on, too."""
         from amvnet.data.datasets.select import split_records
 
         return split_records(dataset, self.train_sequences, self.val_sequences, with_val)

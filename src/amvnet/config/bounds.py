@@ -44,8 +44,8 @@ NotNegative = Annotated[float, Range(0)]
 Positive = Annotated[float, Range(0, open=True)]
 Share = Annotated[float, Range(0, 1)]
 
-# Values by field that earlier versions wrote, and that ask for nothing else than what is done now.
-# None: any value.
+# By field, the values that earlier versions wrote and that ask for what is done now anyway. None
+# stands for any value.
 Obsolete = Mapping[str, Sequence[Any] | None]
 
 

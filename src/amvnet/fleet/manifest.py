@@ -163,8 +163,8 @@ def _read_manifest(place: Place) -> Iterator[pa.Table]:
 def _resolve(row: dict[str, Any], folder: str) -> tuple[str, str, str]:
     """Return the URL, the name and the drive of a row.
 
-    A path is relative to the folder of the manifest. The name is that path without an ending; of a
-    URL, what follows the bucket.
+    A path is relative to the folder of the manifest. The name is the path without its ending; if
+    the path is a URL, only what follows the bucket.
     """
     path = row["path"] or ""
     _, is_url, rest = path.partition("://")

@@ -10,16 +10,14 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
-import yaml
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor
 
-from amvnet.files import atomic_write
 from amvnet.progress import Say
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.loaders import sensor_record
 from amvnet.training.plan import Plan
-from amvnet.training.run_folder import PART_OF, SETTINGS, description, stage_settings
+from amvnet.training.run_folder import PART_OF, SETTINGS, description, stage_settings, write_yaml
 from amvnet.weights.file import Weights, part_state, save
 
 
@@ -145,8 +143,7 @@ class KeepWeights(Callback):
             trained = self._trained(state, metrics)
             for name in ("last", "best") if is_best else ("last",):
                 save(trained, self.folder / f"{name}.safetensors")
-            with atomic_write(self.folder / SETTINGS) as file:
-                file.write_text(yaml.safe_dump(self.settings, sort_keys=False))
+            write_yaml(self.folder / SETTINGS, self.settings)
 
     def _trained(self, state: dict[str, Tensor], metrics: dict[str, float]) -> Weights:
         """Return the weights of the trained part alone, given its parameters."""

@@ -101,8 +101,8 @@ def train_head(plan: Plan, weights: Weights) -> None:
     config = training.head
     folder = plan.out / "head"
 
-    # Gather the uncertain points of all scans, with their scores and neighbours. Other models'
-    # scores are of the scans as they are.
+    # Gather the uncertain points of all scans, with their scores and neighbours. Other models
+    # scored the scans as they are, so that intensities are not brought to those of a training.
     for part in BOTH_NETWORKS if plan.scores is None else ():
         if part not in weights.parts:
             raise InputError(

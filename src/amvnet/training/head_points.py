@@ -285,7 +285,10 @@ class PointGatherer:
 
         f, g = scorer(scans.records[key[1]], scan, batch)
         if scans.augment is not None:
-            f, g = self._disturbed(f, g, batch.points, np.random.default_rng([*seeds, 1]))
+            chance = self.plan.recipe.training.head.disturb
+            rng = np.random.default_rng([*seeds, 1])
+            f = disturb(f, batch.points, rng) if rng.random() < chance else f
+            g = disturb(g, batch.points, rng) if rng.random() < chance else g
         uncertain = assertion(f, g, batch.points) & (labels > 0)
         matrices = _ensemble_matrices(f, g, labels, uncertain)
 
@@ -303,15 +306,6 @@ class PointGatherer:
         points["rows"] = rows.cpu().numpy()
         points["stands_for"] = len(candidates) / max(len(index), 1)
         return points, labels[index].cpu().numpy().astype(np.uint8), matrices
-
-    def _disturbed(
-        self, f: Tensor, g: Tensor, points: Tensor, rng: np.random.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Return the scores of both networks, each disturbed with the recipe's probability."""
-        chance = self.plan.recipe.training.head.disturb
-        disturbed_f = disturb(f, points, rng) if rng.random() < chance else f
-        disturbed_g = disturb(g, points, rng) if rng.random() < chance else g
-        return disturbed_f, disturbed_g
 
     @property
     def _device(self) -> str:

@@ -272,7 +272,7 @@ def sensor_record(
     is_known = mean == NO_INTENSITY or are_quantiles(mean)
     record: dict[str, Any] = {INTENSITY: mean if is_known else []}
 
-    # Scans that are normalised are as the weights will get them: what they are brought to counts.
+    # Normalised scans are as the weights will get them: record what they are normalised to.
     first = dataset.dataset if isinstance(dataset, Joined) else dataset
     if isinstance(first, OwnScans) and first.is_normalised:
         record |= normalised_record(first)

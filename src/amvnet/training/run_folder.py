@@ -62,11 +62,12 @@ def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
     entries = _entries(plan.out / "run.yaml")
     entries.pop(stage, None)
     entries[stage] = entry
-    _write_yaml(plan.out / "recipe.yaml", to_dict(plan.recipe))
-    _write_yaml(plan.out / "run.yaml", entries)
+    write_yaml(plan.out / "recipe.yaml", to_dict(plan.recipe))
+    write_yaml(plan.out / "run.yaml", entries)
 
 
-def _write_yaml(path: Path, tree: dict[str, Any]) -> None:
+def write_yaml(path: Path, tree: dict[str, Any]) -> None:
+    """Write a YAML file, whole or not at all; its keys stay in their order."""
     with atomic_write(path) as part:
         part.write_text(yaml.safe_dump(tree, sort_keys=False, width=1000))
 

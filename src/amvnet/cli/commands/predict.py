@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -106,7 +105,9 @@ def predict(
     from amvnet.inference.pipeline import OutputOptions
     from amvnet.inference.predict import predict as predict_inputs
 
-    _refuse_urls([*inputs, out])
+    for text in (*inputs, out):
+        if "://" in text:
+            raise InputError(f"{text}: expected a path, found a URL; say --ray to use it")
     sensor = known.parse()
     segmenter = make_segmenter(load(weights), method, compute, tau, say)
 
@@ -141,10 +142,3 @@ def _layout(choice: ScanChoice) -> RowLayout:
             "datasets and bags; leave one out"
         )
     return options.layout
-
-
-def _refuse_urls(texts: Sequence[str]) -> None:
-    """Raise InputError if one of the texts is a URL."""
-    for text in texts:
-        if "://" in text:
-            raise InputError(f"{text}: expected a path, found a URL; say --ray to use it")
