@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Color, Taxonomy
 from amvnet.files import atomic_write
 
 REACH = 50.0  # metres shown on each side of the sensor
@@ -23,10 +23,8 @@ LEGEND_LINE = 0.2  # inches, height of one line of the legend
 LEGEND_MARGIN = 0.5  # inches
 DOT = 1.1  # area of a point in square typographic points
 
-IGNORED = (0.8, 0.8, 0.8)  # RGB in [0, 1]
-PLAIN = (0.75, 0.75, 0.75)
-
-Color = tuple[float, float, float]
+IGNORED: Color = (204, 204, 204)
+PLAIN = (0.75, 0.75, 0.75)  # RGB in [0, 1]
 
 
 @dataclass(frozen=True)
@@ -100,8 +98,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
 
     The truth has the first column, and each prediction a column of its own.
     """
-    palette = np.asarray(class_colors(view.taxonomy)) / 255.0
-    palette[0] = IGNORED
+    palette = np.asarray([IGNORED, *class_colors(view.taxonomy)[1:]]) / 255.0
     labelled = view.truth > 0
 
     first_row: list[_Panel | None] = [_Panel("truth", palette[view.truth], labelled)]
@@ -117,7 +114,7 @@ def _grid(view: TopView) -> list[list[_Panel | None]]:
     return [first_row, second_row]
 
 
-def _highlight(title: str, mask: np.ndarray, total: int, color: Sequence[int]) -> _Panel:
+def _highlight(title: str, mask: np.ndarray, total: int, color: Color) -> _Panel:
     """Return a panel with the points of a mask in one colour and all others in grey.
 
     The title also gives the number of these points as a share of `total`.
@@ -132,18 +129,16 @@ def _legend_entries(view: TopView) -> list[tuple[str, Color]]:
     class_ids = np.unique([view.truth, *view.predictions.values()]).tolist()
 
     colors = class_colors(view.taxonomy)
-    entries: list[tuple[str, Sequence[int]]] = []
+    entries: list[tuple[str, Color]] = []
     for class_id in class_ids:
         if class_id > 0:
             entries.append((view.taxonomy.names[class_id], colors[class_id]))
     entries.append(("wrong", WRONG))
     if view.uncertain is not None:
         entries.append(("uncertain", UNCERTAIN))
-
-    shares: list[tuple[str, Color]] = []
-    for name, (red, green, blue) in entries:
-        shares.append((name, (red / 255, green / 255, blue / 255)))
-    return [*shares, ("ignored", IGNORED)] if 0 in class_ids else shares
+    if 0 in class_ids:
+        entries.append(("ignored", IGNORED))
+    return entries
 
 
 def _draw_panel(axes: Any, points: np.ndarray, panel: _Panel) -> None:
@@ -168,8 +163,11 @@ def _draw_panel(axes: Any, points: np.ndarray, panel: _Panel) -> None:
 def _draw_legend(figure: Any, entries: Sequence[tuple[str, Color]], columns: int) -> None:
     from matplotlib.patches import Patch
 
+    handles = []
+    for name, color in entries:
+        handles.append(Patch(facecolor=np.divide(color, 255), edgecolor="0.5", label=name))
     figure.legend(
-        handles=[Patch(facecolor=color, edgecolor="0.5", label=name) for name, color in entries],
+        handles=handles,
         loc="outside lower center",
         ncols=min(len(entries), ENTRIES * columns),
         frameon=False,

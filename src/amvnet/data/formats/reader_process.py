@@ -14,6 +14,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -45,12 +46,11 @@ ADVICE = "copy the file again, or write it again"
 CODE = f"from {__name__} import serve; serve()"
 
 
-def call(function: str, path: Path, *arguments: Any) -> dict[str, Any]:
+def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -> dict[str, Any]:
     """Call a function that reads a file, in the process with limits.
 
     Args:
-        function: its module and its name, such as `package.module:name`. It returns a dictionary
-            of arrays and of values that JSON can hold.
+        function: of a module. It returns arrays, and values that JSON can hold.
         path: its first argument: the file, or a folder of files.
         arguments: its other arguments, values that JSON can hold.
 
@@ -59,8 +59,10 @@ def call(function: str, path: Path, *arguments: Any) -> dict[str, Any]:
     """
     global _process
     request = {
-        "function": function,
-        "arguments": [str(path), *arguments],
+        "module": function.__module__,
+        "function": function.__name__,
+        "path": str(path),
+        "arguments": arguments,
         "folder": os.sep if path.is_absolute() else os.getcwd(),
         "size": size_of(path),
     }
@@ -183,10 +185,10 @@ def serve() -> None:
         os.chdir(request["folder"])  # of the caller, which may have changed it
         _set_limits(request["size"])
 
-        module, _, function = request["function"].partition(":")
         try:
-            with reading(request["arguments"][0], "a file that can be read", ADVICE):
-                values = getattr(import_module(module), function)(*request["arguments"])
+            with reading(request["path"], "a file that can be read", ADVICE):
+                function = getattr(import_module(request["module"]), request["function"])
+                values = function(Path(request["path"]), *request["arguments"])
         except InputError as error:
             values = {"error": str(error)}
         _send(replies, values)

@@ -70,9 +70,8 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
     Raises:
         InputError: if the file is broken, lacks a column, or needs a package that is missing.
     """
-    if ending in PACKAGES:
-        return _with_limits("columns_within_limits", path, ending, wanted)
-    return COLUMN_READERS[ending](path, wanted)
+    columns: Arrays = _call(COLUMN_READERS[ending], path, ending, wanted)
+    return columns
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
@@ -86,49 +85,47 @@ def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cl
     Raises:
         InputError: if the bag is broken, has no scan, or needs a package that is missing.
     """
-    which = (path, ending, topic, uuid4().hex)
-    count = _with_limits("bag_length_within_limits", *which)["count"]
+    which = (ending, topic, uuid4().hex)
+    count = _call(measure_bag, path, ending, *which)["count"]
     readers: list[Callable[[], Cloud]] = []
     for index in range(count):
-        readers.append(partial(_read_one, *which, index))
+        readers.append(partial(_read_one, path, ending, *which, index))
     return readers
 
 
-def _read_one(path: Path, *what: Any) -> Cloud:
-    return Cloud(**_with_limits("bag_scan_within_limits", path, *what))
+def _read_one(path: Path, ending: str, *which_and_index: Any) -> Cloud:
+    return Cloud(**_call(read_from_bag, path, ending, *which_and_index))
 
 
-def _with_limits(function: str, path: Path, ending: str, *arguments: Any) -> dict[str, Any]:
-    """Call a function of this module in the process with limits, if the packages are there."""
+def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any) -> Any:
+    """Call a function that reads a file: in the process with limits, if it needs packages."""
+    if ending not in PACKAGES:
+        return function(path, *arguments)
+
     missing = [package for package in PACKAGES[ending] if find_spec(package) is None]
     if missing:
         raise InputError(
             f"{path}: expected the package {' and '.join(missing)}, found none; "
             'run pip install "amvnet[formats]"'
         )
-    return call(f"{__name__}:{function}", path, ending, *arguments)
+    return call(function, path, *arguments)
 
 
 # --- in the process with limits ---
 
 
-def columns_within_limits(path: str, ending: str, wanted: Names) -> Arrays:
-    """Return some columns of a file."""
-    return COLUMN_READERS[ending](Path(path), wanted)
-
-
-def bag_length_within_limits(path: str, *which: Any) -> dict[str, int]:
+def measure_bag(path: Path, *which: Any) -> dict[str, int]:
     """Return the number of scans in a bag."""
     return {"count": len(_open(path, *which))}
 
 
-def bag_scan_within_limits(path: str, *which_and_index: Any) -> dict[str, Any]:
+def read_from_bag(path: Path, *which_and_index: Any) -> dict[str, Any]:
     """Return the attributes of a cloud in a bag."""
     *which, index = which_and_index
     return vars(_open(path, *which).read(index))
 
 
 @lru_cache(OPEN_FILES)
-def _open(path: str, ending: str, topic: str | None, _key: str) -> Bag:
+def _open(path: Path, ending: str, topic: str | None, _key: str) -> Bag:
     """Open a bag; the key is another each time that it is opened, as it may have changed."""
-    return Bag(Path(path), ending, topic)
+    return Bag(path, ending, topic)
