@@ -235,8 +235,8 @@ def _intensity_map(
 ) -> IntensityMap:
     """Return how the intensities of a scan become those of the training."""
     known_scale = sensor.intensity_scale
-    scale = known_scale or cloud.full or 1.0
-    if known_scale is None and cloud.full is None and quantiles is not None:
+    scale = known_scale or 1.0
+    if known_scale is None and quantiles is not None:
         assert cloud.intensity is not None
         scale = usual_scale(quantiles[-1], is_integer=cloud.intensity.dtype.kind in "iu")
     return intensity_map(quantiles, scale, expected.intensity, known_scale is not None)

@@ -53,7 +53,6 @@ class Cloud:
         intensity: (N,) numbers, or None if the file has none.
         ring: (N,) int64 index of the laser, or None.
         name: where the scan comes from, for messages.
-        full: the largest possible intensity, or None if the format does not define it.
         note: what the reader had to assume about the file; empty if nothing.
     """
 
@@ -61,18 +60,15 @@ class Cloud:
     intensity: np.ndarray | None = None
     ring: np.ndarray | None = None
     name: str = ""
-    full: float | None = None
     note: str = ""
 
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.
 
-        If the format does not define the largest possible intensity, the largest value in the scan
-        decides, without the `WILD_SHARE` of outliers. Up to 1 (floats only) the divisor is 1, up to
-        255 it is 255, up to 65535 it is 65535, and beyond that it is the value itself.
+        The largest value in the scan decides, without the `WILD_SHARE` of outliers. Up to 1 (floats
+        only) the divisor is 1, up to 255 it is 255, up to 65535 it is 65535, and beyond that it is
+        the value itself.
         """
-        if self.full is not None:
-            return self.full
         if self.intensity is None:
             return None
 

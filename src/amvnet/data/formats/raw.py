@@ -52,8 +52,7 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
         )
     usual = usual or (NUSCENES_ROWS if is_named else KITTI_ROWS)
 
-    full = FULL_INTENSITY if is_named and usual == NUSCENES_ROWS else None
-    return replace(_to_cloud(data, path, usual), full=full, note="")
+    return replace(_to_cloud(data, path, usual), note="")
 
 
 def _to_cloud(data: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
