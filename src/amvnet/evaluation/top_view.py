@@ -164,8 +164,9 @@ def _draw_legend(figure: Any, entries: Sequence[tuple[str, Color]], columns: int
     from matplotlib.patches import Patch
 
     handles = []
-    for name, color in entries:
-        handles.append(Patch(facecolor=np.divide(color, 255), edgecolor="0.5", label=name))
+    for name, (red, green, blue) in entries:
+        color = (red / 255, green / 255, blue / 255)
+        handles.append(Patch(facecolor=color, edgecolor="0.5", label=name))
     figure.legend(
         handles=handles,
         loc="outside lower center",

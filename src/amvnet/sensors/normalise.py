@@ -86,14 +86,14 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
 def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
     """Return a line on what is assumed of a scan, and whether the weights know such a sensor."""
     lasers = estimate.lasers.override(sensor)
-    assumed = [cloud.note] if cloud.note else []
-    assumed += [
+    assumed = [
+        cloud.note,
         _intensity_map(cloud, estimate.quantiles, sensor, expected).text,
         *_describe_frame(estimate.frame, sensor),
         _describe_height(estimate.frame, sensor, expected.sensor.height),
         describe_lasers(lasers),
     ]
-    line = f"{cloud.name}: assumed {', '.join(assumed)}"
+    line = f"{cloud.name}: assumed {', '.join(filter(None, assumed))}"
 
     trained = expected.sensor
     is_named = bool(sensor.name) and sensor.name == trained.name
@@ -224,9 +224,8 @@ class Normaliser:
             self._said.add(source)
             has_intensity = cloud.intensity is not None and scale is not None
             intensity = f"intensity 0 to {scale:g}" if has_intensity else "no intensity"
-            axes = f"axes {self.sensor.axes or 'x-forward'}"
-            assumed = [cloud.note, intensity, axes] if cloud.note else [intensity, axes]
-            self._say(f"{cloud.name}: assumed {', '.join(assumed)}")
+            assumed = [cloud.note, intensity, f"axes {self.sensor.axes or 'x-forward'}"]
+            self._say(f"{cloud.name}: assumed {', '.join(filter(None, assumed))}")
         return scan
 
 

@@ -67,7 +67,7 @@ def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
 
 
 def measure_sensor(scans: Iterable[Scan]) -> dict[str, float]:
-    """Return the medians of those of `MEASURES` that some scans have, as weights carry them.
+    """Return the medians of the sensor's measures over some scans, as weights carry them.
 
     If the scans have rings, the field of view ends at the highest and the lowest laser.
     """

@@ -148,7 +148,7 @@ def _order(member: int, count: int) -> np.ndarray:
 
 
 def _places(first: int, others: Sequence[TrainingScans], share: float) -> list[int]:
-    """Return how many scans of an epoch each other dataset has, next to `first` scans."""
+    """Return how many scans of an epoch each other dataset has, if the first has `first`."""
     if not share:
         return [max(len(other.train), 1) for other in others]
     if share >= 1:

@@ -216,7 +216,7 @@ def _put(part: Path, street: Path) -> None:
 
 
 def _make_room(root: Path, latest: Path) -> None:
-    """Remove the streets that were read the longest time ago, but not the latest, to make room."""
+    """Make room: remove streets, those first that were read long ago, but not the latest one."""
     for part in root.glob("streets-*/.*.part"):
         with suppress(FileNotFoundError):  # another process may be removing it
             if time.time() - part.stat().st_mtime > ABANDONED:

@@ -122,7 +122,7 @@ def _read_compressed(
 
 
 def unpack_lzf(data: bytes, size: int) -> bytearray:
-    """Return the `size` bytes that LZF packed; raise ValueError or IndexError if it did not."""
+    """Unpack `size` bytes of LZF; raise ValueError or IndexError if the data are broken."""
     output = bytearray()
     position = 0
 
