@@ -12,7 +12,7 @@ import pytest
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, VAL, NuScenes
 from amvnet.data.datasets.open import is_dataset, open_dataset
-from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
+from amvnet.data.taxonomy import SEMANTICKITTI
 
 from fixtures.datasets import COUNTS, MAKERS, Layout, make_nuscenes, make_semantickitti
 from fixtures.worlds import fails
@@ -271,24 +271,6 @@ def test_opening_names_what_it_looked_for(tmp_path: Path) -> None:
     make_semantickitti(tmp_path)
     fails(lambda: open_dataset(f"semantickitti:{tmp_path}@v1.0-mini"), tmp_path, "v1.0-mini")
     assert open_dataset(str(tmp_path)).taxonomy is SEMANTICKITTI
-
-
-def test_another_taxonomy_can_be_given(tmp_path: Path) -> None:
-    layout = make_semantickitti(tmp_path)
-    taxonomy = Taxonomy(
-        name="two",
-        classes=("car", "rest"),
-        colors=((0, 0, 0),) * 3,
-        raw_to_train={252: 1, 40: 2, 99: 2, 81: 2},
-        train_to_raw=(0, 252, 40),
-        splits={},
-        counts_absent=True,
-    )
-
-    dataset = open_dataset(layout.spec, taxonomy)
-    scan = dataset.read(first_record(dataset, layout))
-    assert scan.labels is not None
-    assert scan.labels.tolist() == [1, 2, 2, 2, 1, 2, 2]
 
 
 # --- real data ---

@@ -14,7 +14,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
-from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
+from amvnet.data.taxonomy import NUSCENES, UNKNOWN
 from amvnet.errors import InputError, shown
 from amvnet.files import checked_token
 from amvnet.scan import Scan
@@ -63,10 +63,8 @@ class NuScenes(Dataset):
             missing.
     """
 
-    def __init__(
-        self, root: Path | str, version: str | None = None, taxonomy: Taxonomy = NUSCENES
-    ) -> None:
-        super().__init__(root, taxonomy)
+    def __init__(self, root: Path | str, version: str | None = None) -> None:
+        super().__init__(root, NUSCENES)
         self.version = self._find_version(version)
 
         try:

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.nuscenes import NuScenes
-from amvnet.data.datasets.own import is_description, open_own
+from amvnet.data.datasets.own import OwnScans, is_description, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.simulated import SENSORS, SimulatedStreets
-from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
+from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
 Reader = type[SemanticKitti] | type[NuScenes]
@@ -19,7 +19,7 @@ OWN = "files"  # prefix of the YAML file of a user's own scans
 SIMULATED = {f"simulated-{sensor}": sensor for sensor in SENSORS}  # names of sensors by prefix
 
 
-def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
+def open_dataset(spec: str) -> Dataset:
     """Open a dataset.
 
     Args:
@@ -27,19 +27,11 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
             the layout of one of them; or `simulated-hdl64e:PATH` or `simulated-hdl32e:PATH`, for
             streets that are simulated when they are read and cached in a folder; or `files:FILE`,
             or only FILE, the YAML file that describes a user's own scans and classes.
-        taxonomy: the classes, if they are not the benchmark's own.
 
     Raises:
-        InputError: if the path does not exist or does not have the layout, or the dataset brings
-            its own classes and `taxonomy` is given.
+        InputError: if the path does not exist or does not have the layout.
     """
     kind, _, rest = spec.partition(":")
-    if taxonomy is not None and (kind in SIMULATED or is_own(spec)):
-        raise InputError(
-            f"{spec}: expected its own classes, found those of {taxonomy.name}; "
-            "leave --taxonomy out, or write simulated streets with amvnet simulate"
-        )
-
     if kind in SIMULATED:
         return SimulatedStreets(Path(rest).expanduser(), SIMULATED[kind])
     if is_own(spec):
@@ -50,22 +42,18 @@ def open_dataset(spec: str, taxonomy: Taxonomy | None = None) -> Dataset:
         raise InputError(f"{path}: expected the folder of a dataset, found none; check the path")
 
     reader = READERS[kind] if kind in READERS else _guess_reader(path)
-    options = {} if taxonomy is None else {"taxonomy": taxonomy}
     if issubclass(reader, NuScenes):
-        return reader(path, version=version, **options)
-
+        return reader(path, version)
     if version is not None:
         raise InputError(
             f"{path}: expected no version after @, found {version}; only nuScenes has versions"
         )
-    return reader(path, **options)
+    return reader(path)
 
 
 def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
     """Open a dataset; raise InputError if it does not have the classes of some weights."""
-    # A benchmark has its own classes, but for weights with a user's classes it is read with these.
-    is_custom = taxonomy.name not in TAXONOMIES and not is_own(spec)
-    dataset = open_dataset(spec, taxonomy if is_custom else None)
+    dataset = open_dataset(spec)
     check_classes(dataset, taxonomy)
     return dataset
 
@@ -74,14 +62,15 @@ def open_if_dataset(spec: str, taxonomy: Taxonomy | None) -> Dataset | None:
     """Open a dataset, with the classes of weights if there are any; None if it names scan files."""
     if not is_dataset(spec):
         return None
-    if taxonomy is None:
-        return open_dataset(spec)
-    if not is_own(spec):
-        return open_with_classes(spec, taxonomy)
 
-    own = open_own(spec.removeprefix(f"{OWN}:"))
-    # Without its labels, a scan can be labelled by weights of any classes.
-    return own if own.taxonomy.classes == taxonomy.classes else own.with_classes(taxonomy)
+    dataset = open_dataset(spec)
+    if taxonomy is None:
+        return dataset
+    # Without its labels, a user's scan can be labelled by weights of any classes.
+    if isinstance(dataset, OwnScans) and dataset.taxonomy.classes != taxonomy.classes:
+        return dataset.with_classes(taxonomy)
+    check_classes(dataset, taxonomy)
+    return dataset
 
 
 def is_own(spec: str) -> bool:
@@ -99,11 +88,11 @@ def is_dataset(spec: str) -> bool:
 
 
 def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
-    """Raise InputError if weights, or the user, name other classes than the dataset's."""
+    """Raise InputError if a dataset has other classes than weights, or the user, name."""
     if taxonomy.classes != dataset.taxonomy.classes:
         raise InputError(
             f"{dataset.root}: expected the classes of {dataset.taxonomy.name}, found those of "
-            f"{taxonomy.name}; use weights, a head or a --taxonomy with the dataset's classes"
+            f"{taxonomy.name}; use weights or a head with the dataset's classes"
         )
 
 

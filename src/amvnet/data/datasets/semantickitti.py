@@ -11,7 +11,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import check_usable
 from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids, train_ids
-from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
+from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -26,8 +26,8 @@ class SemanticKitti(Dataset):
         InputError: if `root` does not have this layout.
     """
 
-    def __init__(self, root: Path | str, taxonomy: Taxonomy = SEMANTICKITTI) -> None:
-        super().__init__(root, taxonomy)
+    def __init__(self, root: Path | str) -> None:
+        super().__init__(root, SEMANTICKITTI)
         if not self._sequences_on_disk():
             raise InputError(
                 f"{self.root}: expected sequences/XX/velodyne/*.bin, found no folder XX/velodyne; "
