@@ -92,10 +92,12 @@ class Rays:
     """The shots of one rotation that the car does not block, in the sensor's frame.
 
     They are (R,) rows, sorted by laser from the top down, then by azimuth from +x: unit vectors,
-    indices of the lasers (0 = lowest), and seconds from the moment when the sensor looks ahead.
+    heights of their origins in metres, indices of the lasers (0 = lowest), and seconds from the
+    moment when the sensor looks ahead.
     """
 
     direction: np.ndarray
+    height: np.ndarray
     ring: np.ndarray
     time: np.ndarray
 
@@ -106,7 +108,8 @@ class Hits:
 
     Attributes:
         direction: (N, 3) unit vectors.
-        distance: (N,) metres.
+        height: (N,) metres from the origin of the coordinates up to that of the ray.
+        distance: (N,) metres along the ray.
         cosine: (N,) of the angle between ray and surface normal.
         surface: (N,) rows of the reflection table.
         tint: (N,) as in `Mesh`.
@@ -116,6 +119,7 @@ class Hits:
     """
 
     direction: np.ndarray
+    height: np.ndarray
     distance: np.ndarray
     cosine: np.ndarray
     surface: np.ndarray
@@ -143,6 +147,8 @@ def rays_of(sensor: LidarModel) -> Rays:
     z = np.sin(elevation) + 0 * azimuth
     direction = np.stack([x, y, z], axis=-1).reshape(-1, 3)
 
+    height = np.interp(sensor.elevations, *np.transpose(sensor.origins))
+    height = np.repeat(height, sensor.azimuth_steps)
     ring = np.repeat(np.arange(lasers, dtype=np.uint8)[::-1], sensor.azimuth_steps)
     sign = 1 if sensor.counter_clockwise else -1
     time = sensor.rotation_period * ((fraction + 0.5) % 1 - 0.5) * sign
@@ -150,10 +156,11 @@ def rays_of(sensor: LidarModel) -> Rays:
     free = ~_is_hidden(sensor)
     rays = Rays(
         direction=direction[free].astype(np.float32),
+        height=height[free].astype(np.float32),
         ring=ring[free],
         time=time.ravel()[free].astype(np.float32),
     )
-    for array in (rays.direction, rays.ring, rays.time):
+    for array in (rays.direction, rays.height, rays.ring, rays.time):
         array.flags.writeable = False
     return rays
 
@@ -232,7 +239,9 @@ def trace(
     direction = rays.direction @ rotation.T
     shift = np.zeros_like(direction)
     shift[:, 0] = speed * rays.time
-    origin = (pose[:3, 3] + shift @ rotation.T).astype(np.float32)
+    start = shift.copy()
+    start[:, 2] += rays.height
+    origin = (pose[:3, 3] + start @ rotation.T).astype(np.float32)
 
     nearest = _NearestHits(scenes, origin, direction)
     _enter_foliage(nearest, scenes, origin, direction, rng)
@@ -255,6 +264,7 @@ def trace(
 
     return Hits(
         direction=rays.direction[hit],
+        height=rays.height[hit],
         distance=distance,
         cosine=np.where(has_leaves, LEAF_COSINE, np.abs(nearest.facing[hit])),
         surface=surface,

@@ -35,10 +35,12 @@ class Lasers:
     Attributes:
         gain: (L,) factors on the intensity; a few are far from 1.
         near_loss: (L,) shares of the brightness of near surfaces that are lost.
+        range_error: (L,) metres by which each laser measures too far.
     """
 
     gain: np.ndarray
     near_loss: np.ndarray
+    range_error: np.ndarray
 
 
 def draw_lasers(sensor: LidarModel, rng: np.random.Generator) -> Lasers:
@@ -49,7 +51,8 @@ def draw_lasers(sensor: LidarModel, rng: np.random.Generator) -> Lasers:
     # The mean of this beta distribution is a third.
     near_loss = 3 * sensor.near_loss * rng.beta(1, 2, count)
     near_loss[: count // 2] = 0
-    return Lasers(np.clip(gain, 0.3, 1.3), near_loss)
+    range_error = sensor.range_error * rng.standard_normal(count)
+    return Lasers(np.clip(gain, 0.3, 1.3), near_loss, range_error.astype(np.float32))
 
 
 def receive(
@@ -69,7 +72,7 @@ def receive(
     reach = sensor.reach * np.sqrt(reflectivity * np.maximum(hits.cosine, 1e-3))
     chance = 1 / (1 + (hits.distance / reach) ** 6) * (1 - drop) * (1 - sensor.drop)
 
-    distance = _measured_distance(hits, sensor, relief, rng)
+    distance = _measured_distance(hits, sensor, relief, rng) + lasers.range_error[hits.ring]
     is_ghost = rng.random(count, np.float32) < ghost
     beyond = GHOST_NEAREST + GHOST_MEAN * rng.standard_exponential(is_ghost.sum())
     distance[is_ghost] += beyond.astype(np.float32)
@@ -84,6 +87,7 @@ def receive(
     chance[is_own] = 1
 
     xyz = hits.direction * distance[:, None]
+    xyz[:, 2] += hits.height
     if sensor.motion_corrected:
         xyz = xyz + hits.shift
 

@@ -27,6 +27,9 @@ class LidarModel:
     max_range: float
     # Standard deviation of the range in metres.
     range_noise: float
+    # Constant error of the range of each laser, which the calibration leaves: its standard deviation
+    # between lasers in metres.
+    range_error: float
     # Range in metres at which half of the returns of a white surface hit head-on are lost.
     reach: float
     # Share of the returns at a depth edge that lie between the two surfaces.
@@ -54,6 +57,9 @@ class LidarModel:
     shadow: tuple[tuple[float, float, float, float], ...]
     # Share of the returns that are lost, whatever they hit.
     drop: float = 0.01
+    # Elevations in degrees, rising, and the heights in metres above the origin of the coordinates
+    # from which lasers of these elevations look out.
+    origins: tuple[tuple[float, float], ...] = ((0.0, 0.0),)
     # Range in metres at which the device reports half of the reflectivity, whatever the power.
     half_range: float = np.inf
     # Ranges in metres, rising, and the factors on the brightness of returns at these ranges.
@@ -72,8 +78,8 @@ class LidarModel:
     roll: float = 0.0
     # How much these numbers differ between drives: standard deviations of the height in metres, of
     # the mounting angles in degrees, of the elevations of all lasers together and of each laser in
-    # degrees, and of the logarithms of `range_noise`, `drop` and `gain_spread`; `gain` varies
-    # by a quarter of it.
+    # degrees, and of the logarithms of `range_noise`, `range_error`, `drop` and `gain_spread`;
+    # `gain` varies by a quarter of it.
     height_spread: float = 0.0
     mounting_spread: float = 0.6
     elevation_spread: float = 0.15
@@ -126,4 +132,5 @@ def draw_device(sensor: LidarModel, rng: np.random.Generator) -> LidarModel:
         drop=sensor.drop * float(np.exp(sensor.response_spread * draw())),
         gain=sensor.gain * float(np.exp(0.25 * sensor.response_spread * draw())),
         gain_spread=sensor.gain_spread * float(np.exp(sensor.response_spread * draw())),
+        range_error=sensor.range_error * float(np.exp(sensor.response_spread * draw())),
     )
