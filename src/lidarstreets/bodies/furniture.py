@@ -171,15 +171,25 @@ def sign(rng: np.random.Generator) -> Mesh:
 def _large_board(rng: np.random.Generator) -> Mesh:
     """Return a direction sign, a town sign or a notice board on two posts."""
     width = rng.uniform(0.8, 3.2)
-    rise = rng.uniform(0.5, 1.0) * min(width, 2.5)
-    height = rng.uniform(0.6, 2.4)
+    return _board(rng, width, rng.uniform(0.5, 1.0) * min(width, 2.5), rng.uniform(0.6, 2.4), 2)
 
-    post_y = np.array([-0.35, 0.35]) * width
-    post_solid = tube((0, 0, -FOOT), (0, 0, height + rise), rng.uniform(0.03, 0.06), closed=False)
-    posts = part([copies(post_solid, y=post_y)], Surface.METAL, Label.POLE)
-    front = box((0.03, width, rise), (-0.1, 0, height))
-    back = box((0.02, width, rise), (-0.074, 0, height))
-    return join(posts, _two_sided(rng, front, back))
+
+def direction_board(rng: np.random.Generator) -> Mesh:
+    """Return the large board of a main road on two to four posts, facing -x or +x."""
+    width = rng.uniform(1.5, 4.5)
+    posts = int(rng.integers(2, 5)) if width > 2.5 else 2
+    board = _board(rng, width, rng.uniform(0.5, 1.1) * width, rng.uniform(1.0, 3.2), posts)
+    return place(board, 0, 0, 0, rng.normal(scale=0.15) + (np.pi if rng.random() < 0.4 else 0.0))
+
+
+def _board(rng: np.random.Generator, width: float, rise: float, height: float, posts: int) -> Mesh:
+    """Return a board whose lower edge is at a height, on a number of posts."""
+    post_y = np.linspace(-0.4, 0.4, posts) * width
+    radius = rng.uniform(0.03, 0.08)
+    post_solid = tube((0, 0, -FOOT), (0, 0, height + rise), radius, closed=False)
+    masts = part([copies(post_solid, y=post_y)], Surface.METAL, Label.POLE, tint=DARK_METAL)
+    front = box((0.03, width, rise), (-0.12, 0, height))
+    return join(masts, _two_sided(rng, front, front + np.array([0.031, 0, 0])))
 
 
 def _chevron(rng: np.random.Generator) -> Mesh:

@@ -27,8 +27,7 @@ class LidarModel:
     max_range: float
     # Standard deviation of the range in metres.
     range_noise: float
-    # Constant error of the range of each laser, which the calibration leaves: its standard deviation
-    # between lasers in metres.
+    # Standard deviation between lasers of the constant error of their range, in metres.
     range_error: float
     # Range in metres at which half of the returns of a white surface hit head-on are lost.
     reach: float

@@ -14,6 +14,8 @@ POSTS = 0.5
 SLENDER_BUSHES = 0.8  # times `Style.green`
 CLUTTER = 1.6
 SHELTERS = 0.15
+# Direction boards per 100 m on each side of the streets of a kind.
+BOARDS = {"motorway": 0.35, "fast": 0.35, "rural": 0.12, "avenue": 0.12, "urban": 0.05}
 # Share of the streets of a kind with a crash barrier along one side.
 GUARD_RAIL = {"motorway": 0.75, "fast": 0.6, "rural": 0.15}
 # Metres: distance between the segments of crash barriers, and by how much two of steel and two of
@@ -42,7 +44,8 @@ def fill_roadside(site: Site, side: int) -> None:
         for x in np.arange(rng.uniform(0, style.trees), ground.length, style.trees):
             tree = trees.random_tree(rng, rng.uniform(4, 9))
             site.put(tree, x + rng.normal(), back_t, margin=2.0)
-    if np.isfinite(style.parking_period) and style.parking[int(side > 0)] and rng.random() < 0.6:
+    has_parking = style.parking[int(side > 0)] > 0 and not style.is_bus_bay[int(side > 0)]
+    if np.isfinite(style.parking_period) and has_parking and rng.random() < 0.6:
         _plant_parking_islands(site, side)
 
     roadside = (
@@ -51,6 +54,7 @@ def fill_roadside(site: Site, side: int) -> None:
         (plants.slender_bush, SLENDER_BUSHES * style.green, back_t),
         (clutter.clutter, CLUTTER, back_t),
         (clutter.shelter, SHELTERS, back_t),
+        (furniture.direction_board, BOARDS.get(style.kind, 0.0), back_t + side * 1.5),
     )
 
     for make, per_100_m, t in roadside:

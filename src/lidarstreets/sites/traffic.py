@@ -8,6 +8,7 @@ from lidarstreets.bodies import clutter, furniture
 from lidarstreets.bodies.vehicles import buses, cars, machines, people, trucks, two_wheelers
 from lidarstreets.bodies.vehicles.cars import open_door
 from lidarstreets.chance import weighted_choice
+from lidarstreets.materials import Label
 from lidarstreets.mesh import Maker, Mesh, join, place
 from lidarstreets.sites.site import Site
 from lidarstreets.streets.plans import SideRoad
@@ -44,7 +45,7 @@ def fill_parking_lane(site: Site, side: int) -> None:
     """Put parked vehicles along one side of the road, if it has a parking lane."""
     style = site.ground.style
     index = int(side > 0)
-    if not style.parking[index]:
+    if not style.parking[index] or style.is_bus_bay[index]:
         return
 
     if style.parking_angle[index]:
@@ -66,7 +67,8 @@ def _fill_parallel(site: Site, side: int) -> None:
         half = length_of(mesh) / 2 + rng.uniform(0.2, 1.0)
         middle = x + half
         if rng.random() < style.parked and _is_bay(site, middle, half):
-            if rng.random() < 0.05:
+            is_car = bool((mesh.label == Label.CAR).any())
+            if is_car and rng.random() < 0.05:
                 mesh = join(mesh, open_door(rng))
             t = side * (style.road / 2 + width / 2 + rng.normal(scale=0.12))
             yaw = along_road(side) + rng.normal(scale=0.03) + np.pi * (rng.random() < 0.12)

@@ -183,8 +183,10 @@ class Ground(MiddleLine):
             label[plots[inside]] = patch.label
 
         # Where few cars park, the benchmarks call the lane at the kerb road.
-        is_used = self.style.parked > RARELY_PARKED
-        label[(places.kerb < 0) & (places.road >= 0)] = Label.PARKING if is_used else Label.ROAD
+        right, left = self.style.is_bus_bay
+        is_used = ~np.where(places.t < 0, right, left) & (self.style.parked > RARELY_PARKED)
+        at_kerb = (places.kerb < 0) & (places.road >= 0)
+        label[at_kerb] = np.where(is_used[at_kerb], Label.PARKING, Label.ROAD)
         on_road = places.road < 0
         label[on_road] = Label.ROAD
         if self.style.painted:

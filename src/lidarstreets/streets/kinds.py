@@ -48,6 +48,8 @@ class Kind(Surroundings):
     islands: float
     # Chance of a parking lane on each side.
     parking: float
+    # Chance of a bus bay or a lane for turning on a side without parking lane.
+    bus_bays: float
     # Chances of the arrangements of strips on each side; their names are those in
     # `_draw_strips` of `styles`.
     sides: dict[str, float]

@@ -14,6 +14,7 @@ from lidarstreets.streets.styles import Strip, Style
 # Metres: the islands of the middle reach this far beyond the simulated land.
 OVERHANG = 50.0
 TIGHTEST_SIDE_ROAD = 45.0  # metres: radius of the tightest bend of a side road
+WIDE_SIDE_ROADS = 0.25  # share of the side roads that are as wide as a main road
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,12 @@ class Planner:
         turn = rng.normal(scale=0.15) if rng.random() < 0.5 else rng.uniform(-1.0, 1.0)
         is_drive = rng.random() < 0.2
         width = rng.uniform(2.6, 4.0) if is_drive else rng.uniform(4.5, 9.0)
-        is_short = is_drive or rng.random() < 0.3
+        corner = rng.uniform(1, 3) if is_drive else rng.uniform(2, 12)
+        is_wide = not is_drive and rng.random() < WIDE_SIDE_ROADS
+        if is_wide:
+            width = rng.uniform(9.0, 18.0)
+            corner = rng.uniform(6, 18)
+        is_short = is_drive or (not is_wide and rng.random() < 0.3)
         length = self.style.road / 2 + rng.uniform(15, 60) if is_short else np.inf
         has_bend = rng.random() < 0.5
 
@@ -128,7 +134,7 @@ class Planner:
             bend=float(rng.uniform(-1, 1) / TIGHTEST_SIDE_ROAD) if has_bend else 0.0,
             length=float(length),
             turning=float(rng.uniform(5, 9)) if is_short and rng.random() < 0.3 else 0.0,
-            corner=float(rng.uniform(1, 3) if is_drive else rng.uniform(2, 12)),
+            corner=float(corner),
             strips=self._draw_side_strips(),
         )
 

@@ -67,8 +67,10 @@ class Style(Surroundings):
     has_long_median: bool
     # (t, direction) of each lane: its place across the street, and 1 along +x or -1 against it.
     lanes: tuple[tuple[float, int], ...]
-    # Width of the lane for parking on each side; 0 if there is none.
+    # Width of the lane for parking on each side; 0 if there is none. Nobody parks on it if it is a
+    # bus bay or a lane for turning.
     parking: tuple[float, float]
+    is_bus_bay: tuple[bool, bool]
     # Angle in radians between parked cars and the street on each side.
     parking_angle: tuple[float, float]
     # Distance between the islands that interrupt the lanes for parking; infinite if there are none.
@@ -100,7 +102,7 @@ def draw_style(rng: np.random.Generator) -> Style:
     has_islands = bool(kind.median <= middle < kind.median + kind.islands)
     median = _draw_median(rng, has_long_median, has_islands)
     lanes, road = _draw_lanes(rng, kind, median)
-    parking, angles = _draw_parking(rng, kind)
+    parking, angles, is_bus_bay = _draw_parking(rng, kind)
     is_flush = name == "living" or rng.random() < 0.06
 
     return Style(
@@ -111,6 +113,7 @@ def draw_style(rng: np.random.Generator) -> Style:
         has_long_median=has_long_median,
         lanes=lanes,
         parking=parking,
+        is_bus_bay=is_bus_bay,
         parking_angle=angles,
         parking_period=float(rng.uniform(9, 40)) if rng.random() < 0.4 else np.inf,
         strips=(_draw_strips(rng, kind.sides), _draw_strips(rng, kind.sides)),
@@ -170,10 +173,14 @@ def _draw_lanes(
 
 def _draw_parking(
     rng: np.random.Generator, kind: Kind
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Draw widths of the lanes for parking and angles of the cars on them, (right, left) each."""
+) -> tuple[tuple[float, float], tuple[float, float], tuple[bool, bool]]:
+    """Draw the lanes for parking, (right, left) each.
+
+    Return their widths, the angles of the cars on them, and whether nobody parks on them.
+    """
     widths = []
     angles = []
+    bays = []
     for _ in range(2):
         angle = 0.0
         width = rng.uniform(1.6, 2.6)
@@ -181,10 +188,14 @@ def _draw_parking(
             angle = np.pi / 2 if rng.random() < 0.6 else rng.uniform(0.6, 1.2)
             width = rng.uniform(4.2, 5.4)
         has_parking = rng.random() < kind.parking
-        widths.append(float(width) if has_parking else 0.0)
+        is_bay = not has_parking and rng.random() < kind.bus_bays
+        if is_bay:
+            width = rng.uniform(2.6, 3.8)
+        widths.append(float(width) if has_parking or is_bay else 0.0)
         angles.append(float(angle))
+        bays.append(bool(is_bay))
 
-    return (widths[0], widths[1]), (angles[0], angles[1])
+    return (widths[0], widths[1]), (angles[0], angles[1]), (bays[0], bays[1])
 
 
 def _draw_strips(rng: np.random.Generator, sides: dict[str, float]) -> tuple[Strip, ...]:

@@ -52,6 +52,7 @@ MAKERS: dict[str, tuple[Maker, set[Label]]] = {
     "utility pole": (furniture.utility_pole, POLE_AND_SIGN),
     "flag pole": (furniture.flag_pole, POLE_AND_SIGN),
     "sign": (furniture.sign, {Label.POLE, Label.TRAFFIC_SIGN}),
+    "direction board": (furniture.direction_board, {Label.POLE, Label.TRAFFIC_SIGN}),
     "traffic light": (furniture.traffic_light, {Label.POLE, Label.TRAFFIC_SIGN}),
     "gantry": (lambda rng: furniture.gantry(rng, 14.0), POLE_AND_SIGN),
     "railway mast": (furniture.railway_mast, {Label.POLE}),

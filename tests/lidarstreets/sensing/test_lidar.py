@@ -22,6 +22,8 @@ HDL64E = SENSORS["hdl64e"]
 EXACT = replace(
     HDL64E,
     range_noise=0.0,
+    range_error=0.0,
+    origins=((0.0, 0.0),),
     drop=0.0,
     mixed=0.0,
     gain_spread=0.0,
@@ -90,7 +92,7 @@ def ground() -> Points:
     pose = np.eye(4)
     pose[:3, 3] = (3.0, -2.0, HDL64E.height)
 
-    sensor = replace(HDL64E, rotation_period=0.0, own_returns=0.0)
+    sensor = replace(EXACT, range_noise=HDL64E.range_noise, drop=0.01, mixed=HDL64E.mixed)
     points, labels, ring = scan_mesh(plane, sensor, pose)
     assert (labels == Label.ROAD).all()
     return points, ring
@@ -126,7 +128,7 @@ def test_the_car_hides_what_is_behind_its_parts(ground: Points) -> None:
     azimuth = np.degrees(np.arctan2(y, x))
     elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
     behind = np.abs(azimuth) > 170
-    assert elevation[behind].min() > -18.5
+    assert elevation[behind].min() > -19.7
     assert elevation[~behind].min() < -23
 
 
@@ -266,6 +268,34 @@ def test_lasers_differ_in_gain_and_the_upper_ones_see_near_surfaces_darker() -> 
     far, _, far_ring = scan_mesh(wall(20), sensor)
     assert brightness(near[near_ring >= 32]) < 0.85 * brightness(near[near_ring < 32])
     assert brightness(far[far_ring >= 32]) == pytest.approx(brightness(far[far_ring < 32]), rel=0.1)
+
+
+def test_each_laser_measures_a_wall_with_an_error_of_its_own() -> None:
+    sensor = replace(EXACT, range_error=0.05)
+    errors = draw_lasers(sensor, np.random.default_rng(3)).range_error
+    assert 0.03 < errors.std() < 0.07
+
+    lasers = draw_lasers(sensor, np.random.default_rng(3))
+    for x in (8.0, 30.0):
+        hits = trace([RayScene(wall(x))], sensor, np.eye(4), PlainRoad(), np.random.default_rng(0))
+        points, _, ring = receive(hits, sensor, lasers, np.random.default_rng(1))
+        distance = np.linalg.norm(points[:, :3].astype(float), axis=1)
+        to_the_wall = x * distance / points[:, 0]
+        assert np.allclose(distance - to_the_wall, errors[ring], atol=1e-3)
+
+
+def test_a_laser_sees_near_things_from_its_own_height() -> None:
+    """Points of one laser lie on a line that begins at its height, at any range."""
+    sensor = replace(EXACT, origins=HDL64E.origins)
+    heights = np.interp(sensor.elevations, *np.transpose(sensor.origins))[::-1]
+    slopes = np.tan(np.radians(sensor.elevations))[::-1]
+    assert heights.max() == pytest.approx(0.21, abs=0.005)
+    assert heights.min() == pytest.approx(0.12, abs=0.005)
+
+    for x in (5.0, 25.0):
+        points, _, ring = scan_mesh(wall(x), sensor)
+        across = np.hypot(points[:, 0], points[:, 1])
+        assert np.allclose(points[:, 2], heights[ring] + slopes[ring] * across, atol=2e-3)
 
 
 def brightness(points: np.ndarray) -> float:

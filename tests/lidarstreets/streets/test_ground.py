@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarstreets.materials import Label
-from lidarstreets.streets.ground import Ground, Patch
+from lidarstreets.streets.ground import RARELY_PARKED, Ground, Patch
 from lidarstreets.streets.kinds import KINDS
 from lidarstreets.streets.plans import Island, SideRoad, rounded_union, strip_at
 from lidarstreets.streets.styles import Strip, draw_style
@@ -66,12 +66,13 @@ def test_strips_have_their_class(ground: Ground) -> None:
             assert label_at(ground, x, side * (edge + 0.5)) == Label.TERRAIN
 
 
-def test_parking_lanes_are_parking(ground: Ground) -> None:
+def test_parking_lanes_are_parking_and_bus_bays_are_road(ground: Ground) -> None:
     for x in plain_places(ground)[::5]:
-        for side, width in zip((-1, 1), ground.style.parking, strict=True):
+        for index, width in enumerate(ground.style.parking):
             if width and ground.is_bay(x):
-                t = side * (ground.style.road / 2 + width / 2)
-                assert label_at(ground, x, t) == Label.PARKING
+                t = (2 * index - 1) * (ground.style.road / 2 + width / 2)
+                is_road = ground.style.is_bus_bay[index] or ground.style.parked <= RARELY_PARKED
+                assert label_at(ground, x, t) == (Label.ROAD if is_road else Label.PARKING)
 
 
 def test_a_patch_covers_plots_but_no_road() -> None:
