@@ -8,7 +8,7 @@ import numpy as np
 from lidarstreets.chance import weighted_choice
 from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Maker, Mesh, join, part
-from lidarstreets.solids import box, copies, hull, leaning, moved, planks, tube
+from lidarstreets.solids import box, copies, hull, moved, planks, tube
 
 FOOT = 0.3  # metres by which objects reach below the ground, so that a slope leaves no gap
 
@@ -62,25 +62,6 @@ def bench(rng: np.random.Generator) -> Mesh:
     return _object(solids, Surface.WOOD, rng)
 
 
-def parasol(rng: np.random.Generator) -> Mesh:
-    """Return a parasol over a table with chairs."""
-    height = rng.uniform(2.1, 2.6)
-    roof = tube((0, 0, height), (0, 0, height + 0.45), rng.uniform(1.1, 1.8), 0.05, sides=8)
-    stand = tube((0, 0, 0), (0, 0, height), 0.03, sides=5)
-    table = tube((0, 0, 0.68), (0, 0, 0.74), 0.5)
-    chair = np.concatenate(
-        [box((0.45, 0.45, 0.05), (0, 0, 0.42)), box((0.45, 0.04, 0.9), (0, 0.22, 0))]
-    )
-    chairs = []
-    for angle in rng.uniform(0, 6.28, size=3):
-        at = (0.9 * np.cos(angle), 0.9 * np.sin(angle), 0.0)
-        chairs.append(moved(chair, at, angle - np.pi / 2))
-    parts = [_object([table, stand, *chairs], Surface.PLASTIC, rng)]
-    if rng.random() < 0.6:
-        parts.append(_object([roof], Surface.CLOTH, rng))
-    return join(*parts)
-
-
 def column(rng: np.random.Generator) -> Mesh:
     """Return an advertising column, a lit poster or a phone box."""
     if rng.random() < 0.4:
@@ -107,38 +88,6 @@ def planter(rng: np.random.Generator) -> Mesh:
     radii = (size[0] * 0.45, size[1] * 0.45, rng.uniform(0.2, 0.6))
     leaves = hull(rng, (0, 0, size[2]), radii, fine=False)
     return join(tub, part([leaves], Surface.LEAF, Label.VEGETATION, 0.1))
-
-
-def playground(rng: np.random.Generator) -> Mesh:
-    """Return a swing, a climbing frame or a slide."""
-    height = rng.uniform(1.8, 2.8)
-    width = rng.uniform(2, 4)
-    bars = []
-    for x in (-width / 2, width / 2):
-        for y in (-0.8, 0.8):
-            bars.append(tube((x, y, -FOOT), (x, y * 0.15, height), 0.06, sides=5))
-    bars.append(tube((-width / 2, 0, height), (width / 2, 0, height), 0.06, sides=5))
-    parts = [_object(bars, Surface.WOOD, rng)]
-    if rng.random() < 0.6:
-        tower = box((1.2, 1.2, 0.1), (width, 0, 1.2))
-        legs = copies(box((0.1, 0.1, 2.2)), x=width + np.array([[-0.6], [0.6]]), y=[-0.6, 0.6])
-        slide = leaning(planks(0, 0.5, 0, 1.3), 0, 1.5)
-        parts.append(_object([tower, legs, moved(slide, (width, -2.6, 0))], Surface.PLASTIC, rng))
-    return join(*parts)
-
-
-def trampoline(rng: np.random.Generator) -> Mesh:
-    """Return a garden trampoline with a net."""
-    radius = rng.uniform(1.2, 2.0)
-    mat = tube((0, 0, 0.75), (0, 0, 0.85), radius, sides=12)
-    net = part(
-        [tube((0, 0, 0.85), (0, 0, 2.5), radius, sides=12)], Surface.CLOTH, Label.OTHER_OBJECT, 3.0
-    )
-    legs = []
-    for angle in np.arange(6) * np.pi / 3:
-        foot = (radius * np.cos(angle), radius * np.sin(angle), -0.1)
-        legs.append(tube(foot, (foot[0], foot[1], 2.5), 0.03, sides=4))
-    return join(_object([mat, *legs], Surface.PLASTIC, rng), net)
 
 
 def heap(rng: np.random.Generator) -> Mesh:
@@ -187,15 +136,6 @@ def bike_rack(rng: np.random.Generator) -> Mesh:
         ]
     )
     return _object([copies(hoop, x=np.arange(int(rng.integers(2, 8))) * 0.8)], Surface.METAL, rng)
-
-
-def statue(rng: np.random.Generator) -> Mesh:
-    """Return a figure or a stone on a plinth, or a fountain."""
-    width = rng.uniform(0.5, 1.4)
-    plinth = box((width, width, rng.uniform(0.4, 1.4) + FOOT), (0, 0, -FOOT), top=(0.8, 0.8))
-    figure = hull(rng, (0, 0, 1.7), (0.3, 0.3, 0.9), fine=False)
-    solids = [plinth, figure] if rng.random() < 0.6 else [plinth]
-    return _object(solids, Surface.STONE, rng)
 
 
 def tent(rng: np.random.Generator) -> Mesh:
@@ -267,18 +207,13 @@ _STREET: dict[Maker, float] = {
     container: 0.05,
     structure: 0.04,
     bike_rack: 0.05,
-    statue: 0.03,
 }
 _YARD: dict[Maker, float] = {
     bins: 0.20,
     bench: 0.10,
-    parasol: 0.10,
     planter: 0.10,
-    playground: 0.10,
-    trampoline: 0.06,
     heap: 0.20,
     tent: 0.05,
-    statue: 0.04,
     container: 0.05,
     structure: 0.14,
 }
