@@ -112,6 +112,14 @@ def test_weights_without_a_record_have_the_sensor_of_the_table(name: str) -> Non
     assert sensor.beams == (SENSORS[name].beams if name in SENSORS else None)
 
 
+def test_a_record_that_fits_the_sheet_keeps_the_lasers_of_the_sheet() -> None:
+    """Lasers at two heights cannot be counted by their elevations."""
+    fits = {"fov_up": 2.9, "fov_down": -23.9, "height": 1.75}
+    other = {"fov_up": 15.0, "fov_down": -25.0, "height": 1.75}
+    assert trained_sensor({"range_net": {KEY: fits}}, "hdl64e").beams == 64
+    assert trained_sensor({"range_net": {KEY: other}}, "hdl64e").beams is None
+
+
 @pytest.mark.parametrize(
     "record",
     [

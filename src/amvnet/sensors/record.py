@@ -57,8 +57,10 @@ def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
             continue
         if abs(value) < LARGEST:  # also false for NaN
             measures[key] = round(value) if key == "beams" else float(value)
-    if measures:
-        measures.setdefault("beams", None)  # a measured sensor need not be that of the data sheet
+    measured = SensorGeometry(fov_up=measures.get("fov_up"), fov_down=measures.get("fov_down"))
+    sheet = SensorGeometry(fov_up=sensor.fov_up, fov_down=sensor.fov_down)
+    if measures and not measured.has_ends_of(sheet):
+        measures.setdefault("beams", None)  # the sensor is not that of the data sheet
 
     try:
         return dataclasses.replace(sensor, **measures)
