@@ -182,7 +182,7 @@ def test_wrong_input_is_one_line_before_a_cluster_is_started(fleet: Path, bucket
         ),
         (f"{fleet}/scans {weights} --out {fleet}/scans/x --format ply --ray", ("--out",)),
         (f"{fleet}/scans {weights} --out x --ray scans", ("address", "scans", "before --ray")),
-        (f"{fleet}/scans {weights} --out x --ray --workers 0", ("--workers", "found 0")),
+        (f"{fleet}/scans {weights} --out x --ray --workers 0", ("--workers", "found '0'")),
         (f"{fleet}/scans {weights} --out x --ray --topic points", ("--topic",)),
         (f"simulated-hdl64e:{fleet} {weights} --out x --ray", ("dataset", "without --ray")),
         (f"s3://fleet/scans {weights} --out x", ("s3://fleet/scans", "say --ray")),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import signal
 import threading
 import warnings
@@ -27,6 +28,7 @@ CORES = 4  # of a worker without a GPU, if the machine has them
 RETRIES = 2  # of a table whose worker ends, and of workers that end before they are ready
 QUEUED = 2  # tables that a worker has at a time, so that it need not wait for the next
 PATIENCE = 1.0  # seconds between two looks at signals
+ADDRESS = re.compile(r"auto|local|(ray://)?[\w.\-\[\]]+:\d+")
 
 
 def connect(address: str | None = None) -> None:
@@ -36,8 +38,13 @@ def connect(address: str | None = None) -> None:
         address: such as `auto` or `ray://HOST:10001`; None starts Ray on this machine.
 
     Raises:
-        InputError: if there is no cluster at the address.
+        InputError: if the text is no address, or there is no cluster at it.
     """
+    if address is not None and not ADDRESS.fullmatch(address):
+        raise InputError(
+            f"--ray: expected an address such as auto or ray://HOST:10001, found {address!r}; "
+            "name the inputs before --ray"
+        )
     if ray.is_initialized():
         return
     options: dict[str, Any] = {"address": address or "local"}
@@ -52,7 +59,7 @@ def connect(address: str | None = None) -> None:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
             f"--ray {address or ''}: expected a Ray cluster, found {reason}; start one with "
-            "ray start --head, leave the address out, or name the inputs before --ray"
+            "ray start --head, or leave the address out"
         ) from None
 
 
