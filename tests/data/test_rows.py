@@ -97,6 +97,16 @@ def test_values_that_fit_nothing_are_refused_and_both_options_named(tmp_path: Pa
     fails(lambda: read_cloud(path), path, "--columns x,y,z,intensity,ring", "--dtype float32")
 
 
+def test_a_file_that_ends_within_a_row_is_called_truncated(
+    table: np.ndarray, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.bin"
+    data = row_bytes(table[:, :4], "float32")
+    assert len(data) > 5000
+    path.write_bytes(data[:-1])
+    fails(lambda: read_cloud(path), path, f"{len(data) - 1} bytes", "copy the file again")
+
+
 def test_a_table_that_was_written_column_by_column_is_refused(
     table: np.ndarray, tmp_path: Path
 ) -> None:

@@ -46,9 +46,15 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     is_named = path.name.lower().endswith(NUSCENES_ENDING)
     usual = _usual_layout(data, is_named)
     if usual is None and len(data) >= FEW:
+        sizes = (KITTI_ROWS.record.itemsize, NUSCENES_ROWS.record.itemsize)
+        found = "values that fit neither"
+        advice = ADVICE
+        if all(len(data) % size for size in sizes):
+            found = f"{len(data)} bytes, which is a multiple of neither {sizes[0]} nor {sizes[1]}"
+            advice = f"copy the file again if it is truncated, or {ADVICE}"
         raise InputError(
             f"{path}: expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found "
-            f"values that fit neither; {ADVICE}"
+            f"{found}; {advice}"
         )
     usual = usual or (NUSCENES_ROWS if is_named else KITTI_ROWS)
 
