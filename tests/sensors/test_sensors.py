@@ -389,10 +389,13 @@ def test_sensors_are_described_as_they_are_simulated() -> None:
         sensor = SENSORS[name]
         ends = np.array([simulated.elevations[0], simulated.elevations[-1]])
         heights = np.interp(ends, *np.transpose(simulated.origins))
-        top, bottom = ends + np.degrees(heights / np.array([18.0, 4.0]))  # metres: typical ranges
+        slopes = np.tan(np.radians(ends))
+        # The lowest laser sees the ground, the highest one mostly things about 18 m away.
+        distance = np.array([18.0, -(simulated.height + heights[1]) / slopes[1]])
+        top, bottom = np.degrees(np.arctan(slopes + heights / distance))
         assert sensor.beams == len(simulated.elevations)
         assert sensor.fov_up == pytest.approx(top, abs=0.1)
-        assert sensor.fov_down == pytest.approx(bottom, abs=0.7)
+        assert sensor.fov_down == pytest.approx(bottom, abs=0.5)
         assert HEIGHTS[name] == simulated.height
 
 

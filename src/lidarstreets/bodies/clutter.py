@@ -96,6 +96,7 @@ def heap(rng: np.random.Generator) -> Mesh:
     if kind < 0.4:
         size = rng.uniform(0.6, 3.0, size=2)
         mound = hull(rng, (0, 0, -0.1), (size[0], size[1], rng.uniform(0.4, 1.6)), fine=False)
+        mound[..., 2] = np.maximum(mound[..., 2], -FOOT)
         surface = Surface.GRAVEL if rng.random() < 0.5 else Surface.STONE
         return _object([mound], surface, rng)
     if kind < 0.7:

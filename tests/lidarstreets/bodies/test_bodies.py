@@ -74,7 +74,7 @@ def test_a_body_is_finite_stands_on_the_ground_and_has_labels_of_its_kind(name: 
         z = mesh.triangles[..., 2]
         assert np.isfinite(mesh.triangles).all()
         assert np.isfinite(mesh.tint).all()
-        assert -1.8 < z.min() < 0.6
+        assert -1.6 < z.min() < 0.6
         assert 0.1 < z.max() < 30
         assert set(mesh.label.tolist()) <= labels
         assert (mesh.depth >= 0).all()
