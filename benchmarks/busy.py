@@ -27,7 +27,7 @@ from tempfile import TemporaryDirectory
 from rich.console import Console
 from rich.table import Table
 
-from amvnet.threads import WAITING
+from amvnet.runtime.threads import WAITING
 from lidarstreets import simulate
 
 WARM_UP = 2  # calls that are not counted

@@ -92,6 +92,12 @@ def test_imports_go_down_only() -> None:
     assert not upward
 
 
+def test_the_house_stays_small() -> None:
+    heights = levels()
+    assert len(heights) - len({"lidarstreets"}) <= 20
+    assert max(heights.values()) < 9
+
+
 def test_no_imports_make_a_circle() -> None:
     try:
         TopologicalSorter(imports()).prepare()

@@ -17,7 +17,6 @@ from amvnet.config.schema import AssertionConfig, Recipe
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.distributed import Processes
 from amvnet.evaluation import analysis
 from amvnet.evaluation.analysis import BINS, SWEPT, Analysis, analyze
 from amvnet.evaluation.metrics import confusion, metrics
@@ -26,6 +25,7 @@ from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import run_once
 from amvnet.models.methods import arithmetic_mean, maximum
 from amvnet.progress import Say, say_nothing
+from amvnet.runtime.distributed import Processes
 from amvnet.sensors.intensity import KEY, MATCHED, PROBABILITIES
 from amvnet.training import ablation
 from amvnet.weights.file import Weights, load, save

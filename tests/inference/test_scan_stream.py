@@ -20,8 +20,8 @@ from amvnet.evaluation.scoring import evaluate, label_by_weights
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.scan_stream import AHEAD, stream_scans
 from amvnet.inference.segmenter import Segmenter
-from amvnet.memory import available_memory
 from amvnet.ranking.label_errors import rank
+from amvnet.runtime.memory import available_memory
 from amvnet.viewing.shown_scans import show_scans
 from amvnet.weights.file import save
 
@@ -114,8 +114,8 @@ def test_a_scan_for_each_core_is_computed_if_the_memory_suffices(
 def test_the_available_memory_is_that_of_the_machine_or_of_the_control_group(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("amvnet.memory.MEMINFO", tmp_path / "meminfo")
-    monkeypatch.setattr("amvnet.memory.CONTROL_GROUP", tmp_path)
+    monkeypatch.setattr("amvnet.runtime.memory.MEMINFO", tmp_path / "meminfo")
+    monkeypatch.setattr("amvnet.runtime.memory.CONTROL_GROUP", tmp_path)
     assert available_memory() > 0  # neither file is there
 
     (tmp_path / "meminfo").write_text("MemTotal: 9000000 kB\nMemAvailable:    4194304 kB\n")

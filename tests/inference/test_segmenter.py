@@ -438,7 +438,7 @@ def test_every_exported_name_is_there() -> None:
 PEAK = """
 import sys, numpy as np
 from amvnet import Segmenter
-from amvnet.memory import keep_freed_memory
+from amvnet.runtime.memory import keep_freed_memory
 keep_freed_memory()
 points = np.random.default_rng(0).normal(size=(int(sys.argv[2]), 4)).astype(np.float32) * 10
 points[:, 3] = 0.5

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from amvnet.config.schema import HeadTraining
-from amvnet.distributed import ALONE, Processes
+from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.training.head_points import PointSampler
 
 ONE_CLASS = np.ones(1000, dtype=np.uint8)

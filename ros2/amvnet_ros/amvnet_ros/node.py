@@ -24,7 +24,7 @@ from std_msgs.msg import Header, String
 
 from amvnet.data.formats.pointcloud2 import CLOUD_TYPE
 from amvnet.errors import InputError
-from amvnet.threads import wait_passively
+from amvnet.runtime.threads import wait_passively
 from amvnet_ros.health import Health, Labelled
 from amvnet_ros.messages import (
     FIELD_TYPE,

@@ -93,7 +93,7 @@ class CloudSegmenter:
 
         import amvnet
         from amvnet.inference.reading import normaliser_for
-        from amvnet.memory import keep_freed_memory
+        from amvnet.runtime.memory import keep_freed_memory
         from amvnet.sensors.lidars import make_sensor
 
         sensor = make_sensor(**settings.sensor_options())

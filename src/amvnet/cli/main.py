@@ -27,7 +27,7 @@ from amvnet.cli.console import complain, say, say_lines, stdout
 from amvnet.cli.parser import first_line, make_parser, run_with
 from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
-from amvnet.threads import wait_passively
+from amvnet.runtime.threads import wait_passively
 
 VERBS = {
     run.__name__: run
@@ -169,7 +169,7 @@ def _has_several_processes() -> bool:
     """Return whether torchrun or SLURM has started several processes."""
     if not {"WORLD_SIZE", "SLURM_STEP_ID"} & set(os.environ):
         return False
-    from amvnet.distributed import started  # imports torch
+    from amvnet.runtime.distributed import started  # imports torch
 
     return started() > 1
 

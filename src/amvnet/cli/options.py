@@ -14,9 +14,9 @@ from amvnet.progress import counted
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.data.datasets.select import TrainingScans
-    from amvnet.distributed import Processes
     from amvnet.inference.listing import ScanOptions
     from amvnet.inference.scores import ScorePair
+    from amvnet.runtime.distributed import Processes
     from amvnet.sensors.lidars import Sensor
 
 Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]  # the last two: nuScenes
@@ -156,7 +156,7 @@ class ScoresChoice:
 
 def join_processes(cuda: bool = False) -> Processes:
     """Join the processes of this job, if torchrun or SLURM started several; only one prints."""
-    from amvnet.distributed import join
+    from amvnet.runtime.distributed import join
 
     processes = join(cuda)
     if not processes.first:

@@ -16,7 +16,6 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import check_classes
 from amvnet.data.spacing import evenly_spaced
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import Evaluation
 from amvnet.evaluation.top_view import TopView, draw_scan
@@ -29,6 +28,7 @@ from amvnet.models.methods import METHODS, PAPER_METHODS
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import vote
 from amvnet.progress import Progress, no_progress
+from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan, check_scan
 
 Result = TypeVar("Result")

@@ -17,12 +17,12 @@ from amvnet.errors import InputError
 from amvnet.export.int8 import SIMULATED
 from amvnet.export.onnx import OPSET, check_libraries, export
 from amvnet.inference.segmenter import Segmenter
-from amvnet.memory import keep_freed_memory
 from amvnet.models.methods import METHODS, Compute, EngineName, MethodName
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.precision import choose_device
 from amvnet.onnx_runner import DESCRIPTION
 from amvnet.progress import Say, say_nothing
+from amvnet.runtime.memory import keep_freed_memory
 from amvnet.weights.file import Weights
 
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)

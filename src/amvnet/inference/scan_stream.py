@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import torch
 
 from amvnet.progress import Progress, no_progress
-from amvnet.threads import thread_pool
+from amvnet.runtime.threads import thread_pool
 
 AHEAD = 3  # scans that are read ahead of the computing, and that may wait to be written
 

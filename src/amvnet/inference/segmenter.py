@@ -18,7 +18,6 @@ from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.reading import array_scan, normaliser_for
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
-from amvnet.memory import available_memory, return_freed_memory
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.assertion import Disagreement
 from amvnet.models.graphs import Captured
@@ -29,9 +28,10 @@ from amvnet.models.precision import InPrecision, check_device, choose_device, ch
 from amvnet.models.streams import TwoStreams, side_by_side
 from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import vote
+from amvnet.runtime.memory import available_memory, return_freed_memory
+from amvnet.runtime.threads import survive_forks
 from amvnet.scan import Scan, check_scan
 from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
-from amvnet.threads import survive_forks
 from amvnet.weights.file import Weights, load
 
 EACH = 2**30  # bytes that a scan may take; one of 120,000 points takes half, at the paper's size

@@ -15,10 +15,10 @@ import torch
 
 from amvnet.inference.segmentation import label_ids
 from amvnet.inference.segmenter import Segmenter
-from amvnet.memory import peak_memory
 from amvnet.models.methods import geometric_mean
 from amvnet.models.streams import one_after_the_other
 from amvnet.progress import Progress, no_progress
+from amvnet.runtime.memory import peak_memory
 from amvnet.scan import Scan
 
 STAGES = ("read", "project", "RV", "BEV", "compare", "neighbours", "head", "merge", "write")

@@ -14,7 +14,7 @@ from amvnet.models.layers import PointLinear
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks
 from amvnet.models.views.points import concatenate, occurring
-from amvnet.threads import run_parts
+from amvnet.runtime.threads import run_parts
 
 POINT_VALUES = 4  # x, y, z, intensity
 LEAST = 1e-24  # product of two probabilities whose logarithm is still taken

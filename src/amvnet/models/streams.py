@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from amvnet.threads import run_parts
+from amvnet.runtime.threads import run_parts
 
 Score = Callable[[], Tensor]  # runs one network; returns (P, K)
 

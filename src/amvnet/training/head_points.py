@@ -17,7 +17,6 @@ from torch import Tensor
 
 from amvnet.config.schema import HeadTraining
 from amvnet.data.datasets.base import ScanRecord
-from amvnet.distributed import ALONE, Processes, device_of
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import confusion
 from amvnet.inference.scores import SURE
@@ -26,6 +25,7 @@ from amvnet.models.methods import geometric_mean
 from amvnet.models.point_head import POINT_VALUES, head_features, nearest_neighbours, point_table
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Say, Tenths, say_nothing
+from amvnet.runtime.distributed import ALONE, Processes, device_of
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.augment import disturb

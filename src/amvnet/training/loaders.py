@@ -18,11 +18,11 @@ from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.joined import Joined
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.spacing import evenly_spaced
-from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Say, Tenths, say_nothing
+from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITY
 from amvnet.sensors.intensity import (

@@ -12,12 +12,12 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
-from amvnet.distributed import ALONE, Processes
 from amvnet.errors import InputError
 from amvnet.inference.reading import open_for_weights
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Say, say_nothing
+from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.weights.file import Weights, load
 
 

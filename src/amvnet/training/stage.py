@@ -26,12 +26,12 @@ from torch.utils.data import DataLoader
 
 from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.distributed import ALONE, Processes, device_of, environment
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
-from amvnet.memory import keep_freed_memory
 from amvnet.models.sync_batch_norm import synchronise_batch_norms
 from amvnet.models.views.points import PointBatch
+from amvnet.runtime.distributed import ALONE, Processes, device_of, environment
+from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
 from amvnet.training.plan import Plan

@@ -27,8 +27,8 @@ def ablate(
         device: where the trained networks are scored: cpu, cuda, cuda:1, ..., or auto: cuda if
             there is a GPU.
     """
-    from amvnet.distributed import device_of
     from amvnet.evaluation import charts
+    from amvnet.runtime.distributed import device_of
     from amvnet.training.ablation import ablate as ablate_recipe
     from amvnet.training.plan import Plan, open_for_training
 

@@ -43,7 +43,7 @@ def train(
             nothing is validated.
     """
     from amvnet.data.datasets.joined import join
-    from amvnet.distributed import device_of
+    from amvnet.runtime.distributed import device_of
     from amvnet.training.plan import Plan, open_parts, sized_by_init, without_mean
     from amvnet.training.run import train as train_stages
     from amvnet.weights.file import load

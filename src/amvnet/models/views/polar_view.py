@@ -13,7 +13,7 @@ from torch import Tensor
 
 from amvnet.config.schema import PolarViewConfig
 from amvnet.models.views.points import PointBatch, occurring
-from amvnet.threads import run_parts
+from amvnet.runtime.threads import run_parts
 
 FEATURES = 9  # offset from the voxel's centre (3), polar coordinates (3), x, y, intensity
 

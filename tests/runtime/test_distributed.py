@@ -16,8 +16,8 @@ import torch
 from torch import nn
 
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.distributed import Processes
 from amvnet.models.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
+from amvnet.runtime.distributed import Processes
 from amvnet.training.loaders import EpochSampler, ScanSet, make_loader
 from amvnet.weights.file import Weights, load, save
 
@@ -254,7 +254,7 @@ def test_a_synced_batch_norm_evaluates_like_the_one_it_replaces() -> None:
 
 
 DIES = """
-from amvnet.distributed import Processes, dist
+from amvnet.runtime.distributed import Processes, dist
 
 def fail(*_: object, **__: object) -> None:
     raise RuntimeError("Connection closed by peer")

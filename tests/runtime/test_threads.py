@@ -18,7 +18,7 @@ from torch import Tensor
 
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models import point_head, polar_net
-from amvnet.threads import WAITING, run_parts
+from amvnet.runtime.threads import WAITING, run_parts
 from amvnet.weights.file import save
 
 from fixtures.worlds import fresh_weights, street
