@@ -83,7 +83,7 @@ class Reflection:
         shade: standard deviation of the logarithm of the reflectivity between bodies.
         dark: share of dark returns: glossy surfaces reflect most light elsewhere.
         drop: share of the pulses that never return, whatever the range.
-        rough: mean height in metres of relief, such as grass, that is too fine for triangles.
+        rough: height in metres of relief, such as grass, that is too fine for triangles.
         ghost: share of returns from a mirrored body and so from farther along the ray.
     """
 
@@ -99,36 +99,36 @@ class Reflection:
 class Surface(IntEnum):
     """A kind of surface; the value is its row in `REFLECTIONS`."""
 
-    ASPHALT = Reflection(0.28, spread=0.11, shade=0.14, dark=0.004)
-    PAVING = Reflection(0.32, spread=0.09, shade=0.12, dark=0.003)
-    GRASS = Reflection(0.375, spread=0.12, shade=0.06, dark=0.001, rough=0.018)
-    GRAVEL = Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.004)
+    ASPHALT = Reflection(0.28, spread=0.09, shade=0.14, dark=0.04, rough=0.0004)
+    PAVING = Reflection(0.32, spread=0.08, shade=0.12, dark=0.02, rough=0.0006)
+    GRASS = Reflection(0.375, spread=0.12, shade=0.06, dark=0.001, rough=0.012)
+    GRAVEL = Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.003)
     ROAD_PAINT = Reflection(0.55, spread=0.20, shade=0.15)
-    PLASTER = Reflection(0.43, spread=0.10, shade=0.20, drop=0.01)
-    BRICK = Reflection(0.39, spread=0.12, shade=0.20, drop=0.01, rough=0.002)
+    PLASTER = Reflection(0.43, spread=0.10, shade=0.20, dark=0.04, drop=0.001)
+    BRICK = Reflection(0.39, spread=0.12, shade=0.20, drop=0.001, rough=0.002)
     GLASS = Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65, ghost=0.04)
-    WOOD = Reflection(0.38, spread=0.13, shade=0.25, rough=0.003)
-    LEAF = Reflection(0.38, spread=0.23, shade=0.17, dark=0.006, drop=0.03)
-    BARK = Reflection(0.39, spread=0.28, shade=0.20, dark=0.01, rough=0.010)
-    METAL = Reflection(0.33, spread=0.26, shade=0.40, dark=0.08, drop=0.03, rough=0.004)
-    SIGN_FACE = Reflection(0.50, spread=0.20, shade=0.40)
-    CLOTH = Reflection(0.46, spread=0.20, shade=0.25, rough=0.006)
+    WOOD = Reflection(0.38, spread=0.11, shade=0.25, rough=0.003)
+    LEAF = Reflection(0.38, spread=0.20, shade=0.17, dark=0.006, drop=0.003)
+    BARK = Reflection(0.39, spread=0.28, shade=0.20, dark=0.01, rough=0.013)
+    METAL = Reflection(0.33, spread=0.26, shade=0.40, dark=0.08, drop=0.006, rough=0.004)
+    SIGN_FACE = Reflection(0.50, spread=0.13, shade=0.40)
+    CLOTH = Reflection(0.46, spread=0.20, shade=0.25, rough=0.005)
     SKIN = Reflection(0.45, spread=0.20, shade=0.10, dark=0.03)
     # Cars: most of a pulse is reflected elsewhere, whatever the colour.
-    DARK_PAINT = Reflection(0.13, spread=0.50, shade=0.50, dark=0.45, drop=0.18, rough=0.002)
-    LIGHT_PAINT = Reflection(0.34, spread=0.30, shade=0.40, dark=0.22, drop=0.12, rough=0.002)
+    DARK_PAINT = Reflection(0.13, spread=0.25, shade=0.50, dark=0.65, drop=0.08, rough=0.003)
+    LIGHT_PAINT = Reflection(0.34, spread=0.15, shade=0.40, dark=0.4, drop=0.05, rough=0.003)
     # Load boxes, caravans and machines.
-    COATING = Reflection(0.42, spread=0.25, shade=0.25, dark=0.05, drop=0.03, rough=0.002)
+    COATING = Reflection(0.42, spread=0.15, shade=0.25, dark=0.05, drop=0.006, rough=0.003)
     # Tubes, rims and spokes of a bicycle.
-    CYCLE = Reflection(0.34, spread=0.55, shade=0.25, dark=0.08, drop=0.05)
-    RUBBER = Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.10)
+    CYCLE = Reflection(0.42, spread=0.6, shade=0.4, dark=0.08, drop=0.05)
+    RUBBER = Reflection(0.08, spread=0.50, shade=0.40, dark=0.40, drop=0.05)
     PLATE = Reflection(0.95, spread=0.10, shade=0.10, dark=0.0)
-    PLASTIC = Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.03)
-    ROOF_TILE = Reflection(0.33, spread=0.13, shade=0.20, drop=0.01, rough=0.003)
+    PLASTIC = Reflection(0.34, spread=0.20, shade=0.40, dark=0.06, drop=0.006)
+    ROOF_TILE = Reflection(0.33, spread=0.13, shade=0.20, drop=0.001, rough=0.003)
     # The window of a house. Unlike a car's, it has curtains and frames that reflect.
-    WINDOW = Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.25, rough=0.01, ghost=0.02)
-    STONE = Reflection(0.36, spread=0.16, shade=0.25, rough=0.014)
-    TWIG = Reflection(0.30, spread=0.28, shade=0.20, dark=0.03, drop=0.05)
+    WINDOW = Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.03, rough=0.01, ghost=0.02)
+    STONE = Reflection(0.36, spread=0.16, shade=0.25, rough=0.013)
+    TWIG = Reflection(0.30, spread=0.26, shade=0.20, dark=0.03, drop=0.008)
 
     reflection: Reflection
 

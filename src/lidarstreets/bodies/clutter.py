@@ -139,26 +139,6 @@ def bike_rack(rng: np.random.Generator) -> Mesh:
     return _object([copies(hoop, x=np.arange(int(rng.integers(2, 8))) * 0.8)], Surface.METAL, rng)
 
 
-def tent(rng: np.random.Generator) -> Mesh:
-    """Return a market stall, a pavilion or a covered vehicle."""
-    size = rng.uniform(2, 4, size=2)
-    roof = box((size[0], size[1], 0.8), (0, 0, 2.1), top=(0.1, 0.1))
-    x = np.array([[-0.5], [0.5]]) * size[0]
-    legs = copies(box((0.06, 0.06, 2.1)), x=x, y=np.array([-0.5, 0.5]) * size[1])
-    parts = [_structure([roof], Surface.CLOTH, rng), _structure([legs], Surface.METAL, rng)]
-    if rng.random() < 0.5:
-        side = planks(0, size[0], 0, 2.1, size[1] / 2)
-        parts.append(_structure([side], Surface.CLOTH, rng))
-    return join(*parts)
-
-
-def pump(rng: np.random.Generator) -> Mesh:
-    """Return the pump of a petrol station on its island."""
-    island = box((4.0, 1.2, 0.15))
-    body = box((0.9, 0.5, rng.uniform(1.4, 2.2)), (0, 0, 0.15))
-    return _object([island, body], Surface.PLASTIC, rng)
-
-
 def structure(rng: np.random.Generator) -> Mesh:
     """Return something large without a class: a pergola, a billboard, a ramp or a scaffold."""
     kind = rng.random()
@@ -214,7 +194,6 @@ _YARD: dict[Maker, float] = {
     bench: 0.10,
     planter: 0.10,
     heap: 0.20,
-    tent: 0.05,
     container: 0.05,
     structure: 0.14,
 }

@@ -102,7 +102,7 @@ def _creepers(rng: np.random.Generator, fence: Fence, length: float) -> Mesh:
     height = fence.height * rng.uniform(0.4, 1.25)
     leaves = bank(rng, length * rng.uniform(0.4, 1.1), "bulge", (width, height), 0.07, step=0.9)
     leaves = leaves + np.array([0, rng.uniform(-0.5, 0.5), 0])
-    return foliage([leaves], rng.uniform(0.04, 0.5), rng.normal(scale=0.5))
+    return foliage([leaves], rng.uniform(0.068, 0.85), rng.normal(scale=0.5))
 
 
 def _posts(length: float, height: float, radius: float = 0.04, y: float = 0.0) -> np.ndarray:

@@ -91,7 +91,7 @@ def draw_hedge(rng: np.random.Generator, height: float) -> Hedge:
         section=sections[rng.integers(len(sections))],
         width=float(rng.uniform(0.3, 1.2) if is_clipped else rng.uniform(0.8, 1.8)),
         height=height,
-        depth=float(rng.uniform(0.008, 0.06) if is_clipped else rng.uniform(0.03, 0.3)),
+        depth=float(rng.uniform(0.014, 0.1) if is_clipped else rng.uniform(0.05, 0.5)),
         uneven=float(rng.uniform(0.005, 0.05) if is_clipped else rng.uniform(0.05, 0.2)),
         tint=float(rng.normal(scale=0.7)),
     )
@@ -103,14 +103,14 @@ def bush(rng: np.random.Generator, radius: float) -> Mesh:
     kind = rng.random()
 
     if kind < 0.15:
-        return join(_sticks(rng, radius, 1.7 * height), _ball(rng, radius, height, 0.9))
+        return join(_sticks(rng, radius, 1.7 * height), _ball(rng, radius, height, 1.5))
     if kind < 0.33:
-        return _ball(rng, radius, height, rng.uniform(0.15, 0.9))
+        return _ball(rng, radius, height, rng.uniform(0.26, 1.5))
     if kind < 0.5:
         clipped = hull(rng, (0, 0, height), (radius, radius, height), square=0.6, fine=False)
-        return foliage([clipped], rng.uniform(0.01, 0.04))
+        return foliage([clipped], rng.uniform(0.017, 0.068))
 
-    return _ball(rng, radius, height, rng.uniform(0.02, 0.15))
+    return _ball(rng, radius, height, rng.uniform(0.034, 0.26))
 
 
 def slender_bush(rng: np.random.Generator) -> Mesh:
@@ -124,7 +124,7 @@ def slender_bush(rng: np.random.Generator) -> Mesh:
     radii = (radius, radius * rng.uniform(0.7, 1.3), half)
     taper = rng.uniform(0.3, 1.0)
     leaves = hull(rng, (0, 0, middle), radii, taper=taper, fine=False)
-    depth = rng.uniform(0.01, 0.3)
+    depth = rng.uniform(0.017, 0.51)
     stem = tube((0, 0, -FOOT), (0, 0, middle), rng.uniform(0.01, 0.03), sides=4, closed=False)
 
     return join(
@@ -156,7 +156,7 @@ def tall_grass(rng: np.random.Generator, length: float) -> Mesh:
     height = rng.uniform(1.2, 2.4) if is_reed else rng.uniform(0.2, 0.9)
     size = (rng.uniform(0.5, 2.2), height)
     blades = bank(rng, length + 0.3, "dome", size, 0.15 * height, step=0.8)
-    return foliage([blades], rng.uniform(0.06, 0.5), rng.normal(scale=0.5))
+    return foliage([blades], rng.uniform(0.1, 0.85), rng.normal(scale=0.5))
 
 
 def turf(
@@ -173,7 +173,7 @@ def turf(
 def ground_cover(rng: np.random.Generator, width: float, height: float) -> Mesh:
     """Return a patch of low plants, which is labelled vegetation."""
     leaves = bank(rng, width + 0.4, "dome", (1.2 * width, height), 0.3 * height, step=0.8)
-    return foliage([leaves], rng.uniform(0.02, 0.4), rng.normal(scale=0.5))
+    return foliage([leaves], rng.uniform(0.034, 0.68), rng.normal(scale=0.5))
 
 
 @dataclass(frozen=True)
@@ -223,37 +223,37 @@ def draw_thicket(rng: np.random.Generator) -> Thicket:
     tint = float(rng.normal(scale=0.8))
     kind = rng.random()
     if kind < 0.5:
-        depth = rng.uniform(0.012, 0.1)
+        depth = rng.uniform(0.02, 0.17)
         return Thicket("dome", (1.2, 3.0), depth, rng.uniform(0.01, 0.05), stems=0.0, tint=tint)
     if kind < 0.82:
-        depth = rng.uniform(0.04, 0.3)
+        depth = rng.uniform(0.068, 0.51)
         return Thicket("bulge", (1.0, 3.0), depth, rng.uniform(0.04, 0.12), stems=0.05, tint=tint)
-    depth = rng.uniform(0.4, 1.8)
+    depth = rng.uniform(0.68, 3.1)
     return Thicket("bulge", (2.0, 6.0), depth, rng.uniform(0.06, 0.15), stems=0.25, tint=tint)
 
 
 def ivy(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """Return creepers that cover a wall at y = 0 from the side of -y."""
     leaves = bank(rng, length, "bulge", (0.35, height), 0.04, step=0.8)
-    return foliage([leaves], rng.uniform(0.03, 0.12), rng.normal(scale=0.5))
+    return foliage([leaves], rng.uniform(0.051, 0.2), rng.normal(scale=0.5))
 
 
 def crop_row(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """Return a row of maize, vines or berries."""
     size = (rng.uniform(0.4, 0.8), height)
     leaves = bank(rng, length, "bulge", size, 0.06, step=1.0)
-    return foliage([leaves], rng.uniform(0.08, 0.4), rng.normal(scale=0.3))
+    return foliage([leaves], rng.uniform(0.14, 0.68), rng.normal(scale=0.3))
 
 
 def flower_bed(rng: np.random.Generator, length: float) -> Mesh:
     """Return a low bed of flowers or a ground cover."""
     size = (rng.uniform(0.5, 2.0), rng.uniform(0.15, 0.5))
     leaves = bank(rng, length, "dome", size, 0.05, step=0.7)
-    return foliage([leaves], rng.uniform(0.03, 0.15), rng.normal(scale=0.7))
+    return foliage([leaves], rng.uniform(0.051, 0.26), rng.normal(scale=0.7))
 
 
 def leaf_heap(rng: np.random.Generator) -> Mesh:
     """Return a heap of cut branches and leaves."""
     radii = (rng.uniform(0.5, 1.6), rng.uniform(0.5, 1.2), rng.uniform(0.3, 0.9))
     heap = leaning(hull(rng, (0, 0, 0), radii, fine=False), rng.normal(scale=0.2), 0)
-    return foliage([heap], rng.uniform(0.05, 0.3), surface=Surface.TWIG)
+    return foliage([heap], rng.uniform(0.085, 0.51), surface=Surface.TWIG)

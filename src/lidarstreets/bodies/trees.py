@@ -63,14 +63,14 @@ def _stem(
 def _ivy(rng: np.random.Generator, fork: Vector, radius: float) -> Mesh:
     half = max(fork[2], 0.6) * rng.uniform(0.3, 0.6)
     wide = radius * rng.uniform(1.3, 2.0) + 0.05
-    return foliage([hull(rng, (0, 0, half * 0.8), (wide, wide, half), fine=False)], 0.05)
+    return foliage([hull(rng, (0, 0, half * 0.8), (wide, wide, half), fine=False)], 0.085)
 
 
 def _clumps(
     rng: np.random.Generator, fork: Vector, height: float, spread: float, radius: float
 ) -> Mesh:
     """Return a crown of several clumps of leaves, each at the end of a bough."""
-    depth = rng.uniform(0.03, 0.5)
+    depth = rng.uniform(0.051, 0.85)
     boughs = []
     clumps = []
     for _ in range(int(rng.integers(3, 8))):
@@ -99,7 +99,7 @@ def _cloud(
     half = (height - low) / 2
     centre = (fork[0], fork[1], low + half)
     crown = hull(rng, centre, (spread, spread * rng.uniform(0.8, 1.2), half))
-    depth = float(np.exp(rng.uniform(np.log(0.1), np.log(2.0))))
+    depth = float(np.exp(rng.uniform(np.log(0.17), np.log(3.4))))
     return join(part(boughs, Surface.BARK, Label.VEGETATION), foliage([crown], depth))
 
 
@@ -121,14 +121,14 @@ def _bare_boughs(
 
     half = (height - fork[2] * 0.8) / 2
     twigs = hull(rng, (*fork[:2], height - half), (spread, spread, half), fine=False)
-    haze = foliage([twigs], rng.uniform(2, 7), surface=Surface.TWIG)
+    haze = foliage([twigs], rng.uniform(3.4, 12), surface=Surface.TWIG)
     return join(part(rods, Surface.BARK, Label.VEGETATION), haze)
 
 
 def _distant_crown(rng: np.random.Generator, fork: Vector, height: float, spread: float) -> Mesh:
     half = (height - fork[2] * 0.8) / 2
     crown = hull(rng, (*fork[:2], height - half), (spread, spread, half), fine=False)
-    return foliage([crown], rng.uniform(0.1, 1.2), rng.normal(scale=0.4))
+    return foliage([crown], rng.uniform(0.17, 2), rng.normal(scale=0.4))
 
 
 def conifer(rng: np.random.Generator, height: float) -> Mesh:
@@ -141,7 +141,7 @@ def conifer(rng: np.random.Generator, height: float) -> Mesh:
     branches = hull(
         rng, (0, 0, height - half), (radius, radius, half), taper=rng.uniform(0.5, 0.8), fine=False
     )
-    leaves = foliage([branches], rng.uniform(0.05, 0.5), rng.normal(scale=0.5))
+    leaves = foliage([branches], rng.uniform(0.085, 0.85), rng.normal(scale=0.5))
     return join(part([trunk], Surface.BARK, Label.TRUNK), leaves)
 
 
@@ -150,7 +150,7 @@ def column(rng: np.random.Generator, height: float) -> Mesh:
     radius = rng.uniform(0.25, 0.7)
     radii = (radius, radius, height * 0.55)
     leaves = hull(rng, (0, 0, height * 0.45), radii, taper=0.35, square=0.8, fine=False)
-    return foliage([leaves], rng.uniform(0.015, 0.08), rng.normal(scale=0.5))
+    return foliage([leaves], rng.uniform(0.025, 0.14), rng.normal(scale=0.5))
 
 
 def stump(rng: np.random.Generator) -> Mesh:
@@ -166,7 +166,7 @@ def sapling(rng: np.random.Generator) -> Mesh:
 
     radius = height * rng.uniform(0.12, 0.25)
     crown = hull(rng, (*fork[:2], height * 0.75), (radius, radius, height * 0.3), fine=False)
-    parts = [part(stem, Surface.BARK, Label.TRUNK), foliage([crown], rng.uniform(0.15, 0.9))]
+    parts = [part(stem, Surface.BARK, Label.TRUNK), foliage([crown], rng.uniform(0.26, 1.5))]
     if rng.random() < 0.5:
         stakes = []
         for x in (-0.3, 0.3):
@@ -191,4 +191,4 @@ def copse(rng: np.random.Generator, length: float, height: float) -> Mesh:
     """Return the edge of a distant wood."""
     size = (rng.uniform(4, 9), height * rng.uniform(0.8, 1.2))
     edge = bank(rng, length + 2, "bulge", size, height * rng.uniform(0.03, 0.12), step=2.5)
-    return foliage([edge], rng.uniform(0.06, 0.9), rng.normal(scale=0.4))
+    return foliage([edge], rng.uniform(0.1, 1.5), rng.normal(scale=0.4))

@@ -10,7 +10,9 @@ from types import ModuleType
 from typing import Protocol
 
 import numpy as np
+from scipy.special import log_ndtr
 
+from lidarstreets.chance import patchy_normal
 from lidarstreets.errors import SimulationError
 from lidarstreets.materials import GROUND_SURFACES, Label, Surface
 from lidarstreets.mesh import Mesh, part
@@ -19,6 +21,7 @@ from lidarstreets.sensing.sensors import LidarModel
 SHADOW_EDGE = 6.0  # degrees by which the edges of the car's shadow differ between lasers
 MOST_CROSSINGS = 16  # surfaces of clumps of leaves that a pulse may cross on its way in and out
 BEYOND = 0.002  # metres behind a surface at which a ray continues
+CLUMP = (0.2, 0.75)  # metres across a clump of leaves, and correlation of how far pulses enter it
 LEAF_COSINE = 0.5  # mean cosine of the angle of incidence: leaves and blades point anywhere
 
 
@@ -110,7 +113,8 @@ class Hits:
         direction: (N, 3) unit vectors.
         height: (N,) metres from the origin of the coordinates up to that of the ray.
         distance: (N,) metres along the ray.
-        cosine: (N,) of the angle between ray and surface normal.
+        facing: (N,) cosine of the angle between ray and surface normal.
+        cosine: (N,) the same, or its mean over the leaves and blades of plants.
         surface: (N,) rows of the reflection table.
         tint: (N,) as in `Mesh`.
         label, instance: (N,) class and instance ids.
@@ -121,6 +125,7 @@ class Hits:
     direction: np.ndarray
     height: np.ndarray
     distance: np.ndarray
+    facing: np.ndarray
     cosine: np.ndarray
     surface: np.ndarray
     tint: np.ndarray
@@ -128,6 +133,11 @@ class Hits:
     instance: np.ndarray
     ring: np.ndarray
     shift: np.ndarray
+
+    @property
+    def places(self) -> np.ndarray:
+        """(N, 3) metres from the origin of the ray to the surface."""
+        return self.direction * self.distance[:, None]
 
 
 @lru_cache(maxsize=4)
@@ -260,13 +270,15 @@ def trace(
         surface[bare[label[bare] == ground_label]] = ground_surface
     tint[bare] = ground.tint(x, y, label[bare])
 
+    facing = np.abs(nearest.facing[hit])
     has_leaves = (nearest.depth[hit] > 0) | np.isin(surface, (Surface.GRASS, Surface.LEAF))
 
     return Hits(
         direction=rays.direction[hit],
         height=rays.height[hit],
         distance=distance,
-        cosine=np.where(has_leaves, LEAF_COSINE, np.abs(nearest.facing[hit])),
+        facing=facing,
+        cosine=np.where(has_leaves, LEAF_COSINE, facing),
         surface=surface,
         tint=tint,
         label=label,
@@ -301,7 +313,8 @@ def _enter_foliage(
         behind = _NearestHits(scenes, next_origin, direction[index])
 
         # Between the two surfaces, a leaf may stop it.
-        free_path = rng.standard_exponential(len(index), dtype=np.float32) * nearest.depth[index]
+        leafless = patchy_normal(rng, next_origin, *CLUMP)
+        free_path = -log_ndtr(leafless) * nearest.depth[index]
         free_path[clumps <= 0] = np.inf
         stops = free_path < behind.distance
         nearest.distance[index[stops]] += free_path[stops]

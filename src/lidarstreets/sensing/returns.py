@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import expit, ndtr
 
+from lidarstreets.chance import patchy_normal
 from lidarstreets.materials import REFLECTIONS, Label
 from lidarstreets.sensing.lidar import Hits
 from lidarstreets.sensing.sensors import LidarModel
@@ -17,8 +19,16 @@ BRIGHTNESS_STEP = 0.02
 # Metres: smallest and largest step in depth within which one pulse gives one return in between.
 SMALLEST_MIXED_STEP = 0.3
 LARGEST_MIXED_STEP = 3.0
-# Spread of the size of the relief from place to place: standard deviation of its logarithm.
-RELIEF_SPREAD = 0.65
+# Neighbouring returns are alike: metres within which they are, and their correlation, for loss and
+# glare, for the height of relief such as tufts of grass, and for the mean height of relief.
+PATCH = (0.5, 0.97)
+TUFT = (0.3, 0.6)
+MEADOW = (2.0, 0.8)
+# Spread of the mean height of relief: standard deviation of its logarithm.
+RELIEF_SPREAD = 0.8
+LEAST_COSINE = 0.06  # of the angle between ray and normal: relief is no deeper along the ray
+LEAST_NOISE = 0.4  # of the mean brightness of a surface
+LOW_LASERS_LEAST = 0.35  # of the least brightness: the lower half of the lasers sees darker things
 # Metres: smallest and mean distance by which a ghost, a mirrored body, lies behind the mirror.
 GHOST_NEAREST = 0.5
 GHOST_MEAN = 6.0
@@ -36,11 +46,13 @@ class Lasers:
         gain: (L,) factors on the intensity; a few are far from 1.
         near_loss: (L,) shares of the brightness of near surfaces that are lost.
         range_error: (L,) metres by which each laser measures too far.
+        least_brightness: (L,) as in `LidarModel`.
     """
 
     gain: np.ndarray
     near_loss: np.ndarray
     range_error: np.ndarray
+    least_brightness: np.ndarray
 
 
 def draw_lasers(sensor: LidarModel, rng: np.random.Generator) -> Lasers:
@@ -51,8 +63,10 @@ def draw_lasers(sensor: LidarModel, rng: np.random.Generator) -> Lasers:
     # The mean of this beta distribution is a third.
     near_loss = 3 * sensor.near_loss * rng.beta(1, 2, count)
     near_loss[: count // 2] = 0
-    range_error = sensor.range_error * rng.standard_normal(count)
-    return Lasers(np.clip(gain, 0.3, 1.3), near_loss, range_error.astype(np.float32))
+    range_error = (sensor.range_error * rng.standard_normal(count)).astype(np.float32)
+    least_brightness = np.full(count, sensor.least_brightness)
+    least_brightness[: count // 2] *= LOW_LASERS_LEAST
+    return Lasers(np.clip(gain, 0.3, 1.3), near_loss, range_error, least_brightness)
 
 
 def receive(
@@ -91,7 +105,7 @@ def receive(
     if sensor.motion_corrected:
         xyz = xyz + hits.shift
 
-    returned = rng.random(count, np.float32) < chance
+    returned = _patchy(hits, rng) < chance
     points = np.column_stack([xyz, intensity])[returned].astype(np.float32)
     has_no_class = is_ghost | is_own
     instances = np.where(has_no_class, 0, hits.instance)[returned].astype(np.uint32)
@@ -126,23 +140,30 @@ def _intensity(
     # The device compensates for range and incidence until the power is too small.
     power = hits.cosine * (10 / np.maximum(hits.distance, 1)) ** 2
     is_near = np.exp(-((hits.distance / NEAR) ** 4))
-    noise = np.maximum(1 + spread * rng.standard_normal(count, np.float32), 0) ** (1 / sensor.gamma)
+    # Few returns are far from the mean, but more than with a normal distribution.
+    noise = np.maximum(1 + spread * rng.standard_t(3, count), LEAST_NOISE) ** (1 / sensor.gamma)
 
     brightness = reflectivity * noise * power**2 / (power**2 + sensor.half_power**2)
     brightness /= 1 + (hits.distance / sensor.half_range) ** FADING
     brightness *= np.interp(hits.distance, *np.transpose(sensor.response))
     brightness *= 1 - lasers.near_loss[hits.ring] * is_near
 
-    brightness[rng.random(count, np.float32) < dark] *= DARK_SHARE
+    darkness = _patchy(hits, rng) / np.maximum(dark, 1e-6)
+    brightness *= np.where(darkness < 1, DARK_SHARE * darkness, 1)
 
     # Weak pulses return, but the device does not tell how bright they were.
     if sensor.least_brightness:
-        excess = (brightness - sensor.least_brightness) / BRIGHTNESS_STEP
-        brightness[rng.logistic(size=count) > excess] = 0
+        excess = (brightness - lasers.least_brightness[hits.ring]) / BRIGHTNESS_STEP
+        brightness[_patchy(hits, rng) > expit(excess)] = 0
 
     brightness *= lasers.gain[hits.ring]
     intensity = np.round(sensor.gain * brightness**sensor.gamma, sensor.decimals)
     return np.clip(intensity, 0, 0.99)
+
+
+def _patchy(hits: Hits, rng: np.random.Generator) -> np.ndarray:
+    """Return (N,) uniform random numbers that are alike for neighbouring hits."""
+    return ndtr(patchy_normal(rng, hits.places, *PATCH))
 
 
 def _hits_own_car(hits: Hits, sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:
@@ -159,12 +180,12 @@ def _measured_distance(
 ) -> np.ndarray:
     """Return (N,) distances with the relief of the surfaces, mixed returns and range noise."""
     count = len(hits.distance)
-    rise = rng.standard_exponential(count, np.float32)
-    fall = rng.standard_exponential(count, np.float32)
+    height = patchy_normal(rng, hits.places, *TUFT)
     mixed = _mixed_distance(hits, sensor, rng)
     noise = rng.standard_normal(count, np.float32)
-    size = relief * np.exp(RELIEF_SPREAD * rng.standard_normal(count, np.float32))
-    return mixed + size * (rise - fall) + sensor.range_noise * noise
+    height *= relief * np.exp(RELIEF_SPREAD * patchy_normal(rng, hits.places, *MEADOW))
+    depth = height / np.maximum(hits.facing, LEAST_COSINE)
+    return mixed + depth + sensor.range_noise * noise
 
 
 def _mixed_distance(hits: Hits, sensor: LidarModel, rng: np.random.Generator) -> np.ndarray:

@@ -12,8 +12,8 @@ from lidarstreets.sites.site import Plot
 SEGMENT = 2.5
 DRIVE_WIDTH = 3.0
 # Chances that a boundary is a hedge, and that a fence has a hedge in front of or behind it.
-HEDGE = 0.62
-FENCE_AND_HEDGE = 0.14
+HEDGE = 0.55
+FENCE_AND_HEDGE = 0.4
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def draw_boundary(rng: np.random.Generator, where: str = "garden") -> Boundary:
     fence = draw_fence(rng, SHARES[where])
     if rng.random() < FENCE_AND_HEDGE:
         hedge = draw_hedge(rng, hedge_height)
-        offset = float(rng.choice([-1, 1]) * rng.uniform(0.1, 0.8))
+        offset = float(rng.choice([-1, 1]) * rng.uniform(0.05, 0.7))
         return Boundary(((fence, 0.0), (hedge, offset)), missing)
     return Boundary(((fence, 0.0),), missing)
 

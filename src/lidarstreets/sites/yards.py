@@ -67,7 +67,7 @@ def _petrol_station(plot: Plot) -> None:
     plot.pave((plot.x, plot.end), (front, front + 22), label)
     plot.put(buildings.canopy(rng), plot.middle, front + 8, plot.facing, margin=8.0)
     for x in (-4, 0, 4):
-        plot.put(clutter.pump(rng), plot.middle + x, front + 8, np.pi / 2, margin=3.0)
+        plot.put(clutter.cabinet(rng), plot.middle + x, front + 8, np.pi / 2, margin=3.0)
     shop = buildings.building(rng, plot.width * 0.5, 8, 3.5, flat=True)
     plot.put(shop, plot.middle, front + 20, plot.facing, margin=9.0)
     car = cars.car(rng)

@@ -61,7 +61,6 @@ MAKERS: dict[str, tuple[Maker, set[Label]]] = {
     "shelter": (clutter.shelter, WITHOUT_CLASS),
     "steps": (clutter.steps, WITHOUT_CLASS),
     "bridge": (lambda rng: clutter.bridge(rng, 14.0), WITHOUT_CLASS),
-    "pump": (clutter.pump, WITHOUT_CLASS),
 }
 
 

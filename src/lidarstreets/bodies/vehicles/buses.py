@@ -14,10 +14,10 @@ def bus(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(2.7, 3.3) if rng.random() < 0.8 else rng.uniform(3.3, 4.0)
 
     kind = rng.random()
-    if kind < 0.2:
+    if kind < 0.35:
         minibus = _minibus if rng.random() < 0.6 else _small_bus
         return minibus(rng, min(height, 2.9))
-    if kind < 0.85:
+    if kind < 0.88:
         return _section(rng, rng.uniform(9.5, 13.5), width, height, (-0.26, 0.30))
 
     front = _section(rng, 9.5, width, 3.0, (-0.15, 0.22))
@@ -33,9 +33,9 @@ def _small_bus(rng: np.random.Generator, height: float) -> Mesh:
 
 def _minibus(rng: np.random.Generator, height: float) -> Mesh:
     """Return a van with a bonnet and rows of seats."""
-    length = rng.uniform(5.3, 7.8)
+    length = rng.uniform(6.1, 8.5)
     width = rng.uniform(1.95, 2.2)
-    bonnet = rng.uniform(0.7, 1.2)
+    bonnet = rng.uniform(0.7, 1.7)
     body = _section(rng, length - bonnet, width, height, (-0.25,))
 
     half = length / 2

@@ -141,8 +141,8 @@ def _axles(rng: np.random.Generator, length: float) -> list[float]:
 
 
 def machine(rng: np.random.Generator) -> Mesh:
-    """Return an excavator, a wheel loader, a tractor, a forklift or a road roller."""
-    makers = {excavator: 0.30, _tractor: 0.28, _wheel_loader: 0.20, _forklift: 0.12, _roller: 0.10}
+    """Return an excavator, a wheel loader or a tractor."""
+    makers = {excavator: 0.40, _tractor: 0.35, _wheel_loader: 0.25}
     return weighted_choice(rng, makers)(rng)
 
 
@@ -216,34 +216,3 @@ def _wheel_loader(rng: np.random.Generator) -> Mesh:
         wheels(_MACHINE, (-1.4, 1.4), 2.3, radius, 0.5),
     )
     return scaled(mesh, rng.uniform(0.6, 1.1))
-
-
-def _forklift(rng: np.random.Generator) -> Mesh:
-    mast = rng.uniform(2.0, 3.2)
-    lift = rng.uniform(0.1, 1.2)
-
-    body = [(-1.2, 0.2), (0.7, 0.2), (0.7, 0.6), (-0.2, 0.7), (-0.4, 1.1), (-1.2, 1.1)]
-    posts = copies(box((0.07, 0.07, 1.3)), x=[[-1.0], [0.5]], y=[-0.45, 0.45], z=0.8)
-    roof = box((1.6, 1.0, 0.07), (-0.25, 0, 2.1))
-    rails = copies(box((0.1, 0.1, mast)), x=0.85, y=[-0.35, 0.35], z=0.1)
-    forks = copies(box((1.1, 0.12, 0.05)), x=1.5, y=[-0.3, 0.3], z=lift)
-    solids = [part([prism(body, 1.05)], Surface.LIGHT_PAINT, _MACHINE)]
-    solids.append(part([posts, roof, rails, forks], Surface.METAL, _MACHINE))
-    solids.append(wheels(_MACHINE, (-0.9, 0.6), 1.1, 0.28, 0.2))
-    return join(*solids)
-
-
-def _roller(rng: np.random.Generator) -> Mesh:
-    width = rng.uniform(0.9, 2.0)
-    drums = []
-    for x in (-1.1, 1.1):
-        drums.append(tube((x, -width / 2, 0.55), (x, width / 2, 0.55), 0.55, sides=12))
-
-    body = box((2.2, width * 0.9, 0.7), (0, 0, 0.75))
-    posts = copies(box((0.07, 0.07, 1.1)), x=[[-0.6], [0.5]], y=[-width * 0.4, width * 0.4], z=1.4)
-    roof = box((1.6, width, 0.08), (0, 0, 2.5))
-
-    return join(
-        part(drums, Surface.METAL, _MACHINE),
-        part([body, posts, roof], Surface.COATING, _MACHINE),
-    )
