@@ -101,7 +101,7 @@ class Surface(IntEnum):
 
     ASPHALT = Reflection(0.28, spread=0.09, shade=0.14, dark=0.04, rough=0.0004)
     PAVING = Reflection(0.32, spread=0.08, shade=0.12, dark=0.02, rough=0.0006)
-    GRASS = Reflection(0.375, spread=0.12, shade=0.06, dark=0.001, rough=0.012)
+    GRASS = Reflection(0.37, spread=0.12, shade=0.06, dark=0.001, rough=0.009)
     GRAVEL = Reflection(0.33, spread=0.13, shade=0.15, dark=0.01, rough=0.003)
     ROAD_PAINT = Reflection(0.55, spread=0.20, shade=0.15)
     PLASTER = Reflection(0.43, spread=0.10, shade=0.20, dark=0.04, drop=0.001)

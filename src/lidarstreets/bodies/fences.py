@@ -91,13 +91,17 @@ def draw_fence(rng: np.random.Generator, shares: dict[str, float]) -> Fence:
         surface=surface,
         lean=float(rng.normal(scale=0.005 if is_neat else 0.05)),
         uneven=float(rng.uniform(0, 0.01) if is_neat else rng.uniform(0.01, 0.05)),
-        overgrown=float(rng.choice([0.0, 0.15, 0.7], p=[0.6, 0.25, 0.15])),
+        overgrown=float(rng.choice([0.0, 0.15, 0.9], p=[0.5, 0.25, 0.25])),
         tint=float(rng.normal(scale=0.8)),
     )
 
 
 def _creepers(rng: np.random.Generator, fence: Fence, length: float) -> Mesh:
-    """Return leaves that grow through a fence, or along one of its sides."""
+    """Return leaves that grow along a fence, or through it: people label those as the fence."""
+    if rng.random() < 0.5:
+        leaves = bank(rng, length, "box", (rng.uniform(0.1, 0.4), fence.height), 0.05, step=0.9)
+        return part([leaves], Surface.LEAF, Label.FENCE, rng.uniform(0.03, 0.3), tint=fence.tint)
+
     width = rng.uniform(0.15, 0.9)
     height = fence.height * rng.uniform(0.4, 1.25)
     leaves = bank(rng, length * rng.uniform(0.4, 1.1), "bulge", (width, height), 0.07, step=0.9)

@@ -23,9 +23,9 @@ LARGEST_MIXED_STEP = 3.0
 # glare, for the height of relief such as tufts of grass, and for the mean height of relief.
 PATCH = (0.5, 0.97)
 TUFT = (0.3, 0.6)
-MEADOW = (2.0, 0.8)
+MEADOW = (8.0, 0.8)
 # Spread of the mean height of relief: standard deviation of its logarithm.
-RELIEF_SPREAD = 0.8
+RELIEF_SPREAD = 1.0
 LEAST_COSINE = 0.06  # of the angle between ray and normal: relief is no deeper along the ray
 LEAST_NOISE = 0.4  # of the mean brightness of a surface
 LOW_LASERS_LEAST = 0.35  # of the least brightness: the lower half of the lasers sees darker things

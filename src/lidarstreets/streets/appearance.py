@@ -22,8 +22,8 @@ class GroundBrightness:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self._tints = 0.9 * rng.standard_normal(256)  # by class id
-        wanted = {Label.ROAD: rng.lognormal(np.log(ASPHALT), 0.10)}
-        if rng.random() < 0.12:
+        wanted = {Label.ROAD: rng.lognormal(np.log(ASPHALT), 0.07)}
+        if rng.random() < 0.08:
             wanted[Label.ROAD] = rng.uniform(0.33, 0.44)  # concrete or cobbles
 
         # A third of the sidewalks, lots and paved verges are asphalt or as bright as it.
@@ -31,7 +31,7 @@ class GroundBrightness:
             if rng.random() < 1 / 3:
                 wanted[label] = wanted[Label.ROAD] * rng.lognormal(0, 0.06)
             else:
-                wanted[label] = rng.lognormal(np.log(PAVEMENT), 0.08)
+                wanted[label] = rng.lognormal(np.log(PAVEMENT), 0.06)
 
         for label, reflectivity in wanted.items():
             reflection = GROUND_SURFACES[label].reflection
