@@ -110,13 +110,13 @@ class Surface(IntEnum):
     WOOD = Reflection(0.38, spread=0.11, shade=0.25, rough=0.003)
     LEAF = Reflection(0.38, spread=0.20, shade=0.17, dark=0.006, drop=0.003)
     BARK = Reflection(0.39, spread=0.28, shade=0.20, dark=0.01, rough=0.013)
-    METAL = Reflection(0.33, spread=0.26, shade=0.40, dark=0.08, drop=0.006, rough=0.004)
+    METAL = Reflection(0.33, spread=0.26, shade=0.40, dark=0.15, drop=0.006, rough=0.004)
     SIGN_FACE = Reflection(0.50, spread=0.13, shade=0.40)
     CLOTH = Reflection(0.46, spread=0.20, shade=0.25, rough=0.005)
     SKIN = Reflection(0.45, spread=0.20, shade=0.10, dark=0.03)
     # Cars: most of a pulse is reflected elsewhere, whatever the colour.
-    DARK_PAINT = Reflection(0.13, spread=0.25, shade=0.50, dark=0.65, drop=0.08, rough=0.003)
-    LIGHT_PAINT = Reflection(0.34, spread=0.15, shade=0.40, dark=0.4, drop=0.05, rough=0.003)
+    DARK_PAINT = Reflection(0.13, spread=0.25, shade=0.50, dark=0.75, drop=0.08, rough=0.003)
+    LIGHT_PAINT = Reflection(0.34, spread=0.15, shade=0.40, dark=0.50, drop=0.05, rough=0.003)
     # Load boxes, caravans and machines.
     COATING = Reflection(0.42, spread=0.15, shade=0.25, dark=0.05, drop=0.006, rough=0.003)
     # Tubes, rims and spokes of a bicycle.

@@ -221,7 +221,7 @@ def _jaccard_increases(is_true: Tensor, group: Tensor, counts: Tensor) -> Tensor
 
     # Within the group, up to each point.
     place = torch.arange(1, len(group) + 1, device=group.device) - before[group]
-    found = true - true_before[group]
+    missed = true - true_before[group]
     total = counts[group]
-    loss = 1 - (total - found).float() / (total + place - found)
+    loss = 1 - (total - missed).float() / (total + place - missed)
     return loss - F.pad(loss, (1, 0))[:-1].where(place > 1, 0)

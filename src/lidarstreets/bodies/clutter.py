@@ -74,13 +74,6 @@ def column(rng: np.random.Generator) -> Mesh:
     return _object([box((0.95, 0.95, 2.3), (0, 0, -0.05))], Surface.PLASTIC, rng)
 
 
-def letter_box(rng: np.random.Generator) -> Mesh:
-    """Return a letter box or a ticket machine on a stand."""
-    size = (rng.uniform(0.25, 0.7), rng.uniform(0.2, 0.5), rng.uniform(0.4, 1.1))
-    stand = box((0.1, 0.1, 0.8 + FOOT), (0, 0, -FOOT))
-    return _object([stand, box(size, (0, 0, rng.uniform(0.4, 0.8)))], Surface.METAL, rng)
-
-
 def planter(rng: np.random.Generator) -> Mesh:
     """Return a tub with a plant."""
     size = (rng.uniform(0.5, 2.0), rng.uniform(0.4, 0.9), rng.uniform(0.35, 0.7))
@@ -183,7 +176,6 @@ _STREET: dict[Maker, float] = {
     cabinet: 0.22,
     bench: 0.08,
     column: 0.06,
-    letter_box: 0.08,
     planter: 0.07,
     container: 0.05,
     structure: 0.04,

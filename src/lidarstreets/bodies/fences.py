@@ -91,7 +91,7 @@ def draw_fence(rng: np.random.Generator, shares: dict[str, float]) -> Fence:
         surface=surface,
         lean=float(rng.normal(scale=0.005 if is_neat else 0.05)),
         uneven=float(rng.uniform(0, 0.01) if is_neat else rng.uniform(0.01, 0.05)),
-        overgrown=float(rng.choice([0.0, 0.15, 0.9], p=[0.5, 0.25, 0.25])),
+        overgrown=float(rng.choice([0.0, 0.15, 0.7], p=[0.6, 0.25, 0.15])),
         tint=float(rng.normal(scale=0.8)),
     )
 

@@ -18,7 +18,7 @@ NEAR = 9.0
 BRIGHTNESS_STEP = 0.02
 # Metres: smallest and largest step in depth within which one pulse gives one return in between.
 SMALLEST_MIXED_STEP = 0.3
-LARGEST_MIXED_STEP = 3.0
+LARGEST_MIXED_STEP = 20.0
 # Neighbouring returns are alike: metres within which they are, and their correlation, for loss and
 # glare, for the height of relief such as tufts of grass, and for the mean height of relief.
 PATCH = (0.5, 0.97)

@@ -13,7 +13,7 @@ SEGMENT = 2.5
 DRIVE_WIDTH = 3.0
 # Chances that a boundary is a hedge, and that a fence has a hedge in front of or behind it.
 HEDGE = 0.55
-FENCE_AND_HEDGE = 0.4
+FENCE_AND_HEDGE = 0.25
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import pytest
 
 from lidarstreets import SENSORS, SimulatedScan, drive_street
 from lidarstreets.bodies import buildings, clutter, fences, furniture, plants, trees
-from lidarstreets.materials import Label
+from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Maker, Mesh, join, place
 from lidarstreets.sensing.lidar import Hits, RayScene, trace
 from lidarstreets.sensing.returns import draw_lasers, receive
@@ -93,10 +93,22 @@ def test_a_fence_is_as_long_and_high_as_it_says(kind: str) -> None:
         assert 0.7 * fence.height < high[2] < fence.height + 0.6
 
 
-def test_an_overgrown_fence_has_leaves() -> None:
+def test_an_overgrown_fence_has_leaves_and_those_within_it_are_fence() -> None:
     rng = np.random.default_rng(0)
     fence = replace(fences.draw_fence(rng, fences.SHARES["garden"]), overgrown=1.0)
-    assert set(fence.segment(rng, 2.5).label.tolist()) == {Label.FENCE, Label.VEGETATION}
+    along = 0
+    for _ in range(30):
+        mesh = fence.segment(rng, 2.5)
+        leaves = mesh.surface == Surface.LEAF
+        assert leaves.any()
+
+        labels = set(mesh.label[leaves].tolist())
+        along += labels == {Label.VEGETATION}
+        if labels == {Label.FENCE}:
+            corners = mesh.triangles[leaves].reshape(-1, 3)
+            assert np.abs(corners[:, 1]).max() < 0.5
+            assert corners[:, 2].max() < 1.3 * fence.height
+    assert 8 < along < 22
 
 
 class NoGround:

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lidarstreets import SENSORS
-from lidarstreets.materials import REFLECTIONS, Label, Reflection, Surface
+from lidarstreets.materials import Label, Surface
 from lidarstreets.mesh import Mesh, join, part, place, with_random_tint
 from lidarstreets.sensing.sensors import LidarModel
 from lidarstreets.solids import box, hull
 
 pytest.importorskip("embreex")
 from lidarstreets.sensing.lidar import RayScene, trace
-from lidarstreets.sensing.returns import RELIEF_SPREAD, draw_lasers, receive
+from lidarstreets.sensing.returns import draw_lasers, receive
 
 HDL64E = SENSORS["hdl64e"]
-ROUGH = [field.name for field in fields(Reflection)].index("rough")
 # A sensor without noise, losses or motion; the tests turn on what they need.
 EXACT = replace(
     HDL64E,
@@ -111,19 +110,25 @@ def test_flat_ground_has_the_ranges_of_the_textbook(ground: Points) -> None:
     assert error[near].std() == pytest.approx(HDL64E.range_noise, rel=0.05)
 
 
-def test_relief_is_deeper_along_a_ray_that_grazes_it(ground: Points) -> None:
-    points, ring = ground
-    distance = np.linalg.norm(points[:, :3].astype(float), axis=1)
-    elevation = np.radians(-np.array(HDL64E.elevations)[::-1][ring])
-    error = distance - HDL64E.height / np.sin(elevation)
+def test_relief_is_deeper_along_a_ray_that_grazes_it() -> None:
+    """Relief is a height: along a ray it is as much deeper as the ray is flatter."""
+    corner = 100.0 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    meadow = part([corner[[[0, 1, 2], [0, 2, 3]]]], Surface.GRASS, Label.TERRAIN)
+    sensor = replace(EXACT, azimuth_steps=300)
+    sine = np.sin(np.radians(-np.array(sensor.elevations)))[::-1]
+    pose = np.eye(4)
+    pose[2, 3] = sensor.height
 
-    # The standard deviation of a product of a normal and a lognormal number.
-    relief = REFLECTIONS[Surface.ASPHALT, ROUGH] * np.exp(RELIEF_SPREAD**2)
-    for low, high in ((6, 9), (12, 18)):
-        ring_of = (distance > low) & (distance < high)
-        depth = relief / np.sin(elevation[ring_of])
-        expected = np.sqrt(HDL64E.range_noise**2 + (depth**2).mean())
-        assert error[ring_of].std() == pytest.approx(expected, rel=0.1)
+    ratios = []
+    for seed in range(20):
+        points, _, ring = scan_mesh(meadow, sensor, pose, seed=seed)
+        distance = np.linalg.norm(points[:, :3].astype(float), axis=1)
+        flat = sensor.height / sine[ring]
+        depth = np.abs(distance - flat)
+        near = np.median(depth[(flat > 5) & (flat < 8)])
+        far = np.median(depth[(flat > 14) & (flat < 22)])
+        ratios.append(np.log(far / near))
+    assert np.mean(ratios) == pytest.approx(np.log(18 / 6.5), abs=0.4)
 
 
 def test_glare_and_loss_come_in_patches_of_a_surface() -> None:
