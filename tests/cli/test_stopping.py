@@ -166,7 +166,7 @@ def test_a_stopped_predict_goes_on(number: int, tmp_path: Path) -> None:
 
     words = [sys.executable, "-m", "amvnet", *map(str, command), str(tmp_path / "parts")]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
-        while not list(tmp_path.glob("parts/*.label")) and process.poll() is None:
+        while not list(tmp_path.glob("parts/[!.]*.label")) and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(number)
         assert process.wait(60) == 128 + number
