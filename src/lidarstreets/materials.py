@@ -78,12 +78,14 @@ class Reflection:
 
     Attributes:
         reflectivity: intensity in [0, 1] that an HDL-64E reports for a near surface hit head-on.
-        spread: standard deviation of the intensity between returns of one body, relative to its
-            mean.
+        spread: of the intensity between returns of one body, relative to its mean: scale of a
+            Student's t distribution with three degrees of freedom.
         shade: standard deviation of the logarithm of the reflectivity between bodies.
-        dark: share of dark returns: glossy surfaces reflect most light elsewhere.
+        dark: share of dark returns, which come in patches: glossy surfaces reflect most light
+            elsewhere.
         drop: share of the pulses that never return, whatever the range.
-        rough: height in metres of relief, such as grass, that is too fine for triangles.
+        rough: standard deviation in metres of the height of relief, such as grass, that is too
+            fine for triangles; the median over places, which differ.
         ghost: share of returns from a mirrored body and so from farther along the ray.
     """
 

@@ -34,7 +34,7 @@ GHOST_NEAREST = 0.5
 GHOST_MEAN = 6.0
 OWN_LASERS = 8  # the lowest lasers, which see racks and other parts of the car itself
 OWN_REACH = 2.0  # metres to the farthest of these parts
-DARK_SHARE = 0.35  # of the reflectivity, if the surface reflects most light elsewhere
+DARK_SHARE = 0.35  # of the reflectivity, at most, that a dark return has
 NEIGHBOUR_ANGLE = 0.5  # degrees between neighbouring shots of one laser, at most
 
 
@@ -46,7 +46,7 @@ class Lasers:
         gain: (L,) factors on the intensity; a few are far from 1.
         near_loss: (L,) shares of the brightness of near surfaces that are lost.
         range_error: (L,) metres by which each laser measures too far.
-        least_brightness: (L,) as in `LidarModel`.
+        least_brightness: (L,) as in `LidarModel`, which has that of the upper half.
     """
 
     gain: np.ndarray

@@ -63,7 +63,8 @@ class LidarModel:
     half_range: float = np.inf
     # Ranges in metres, rising, and the factors on the brightness of returns at these ranges.
     response: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
-    # Brightness below which most returns have the intensity 0; 0 if there is no such limit.
+    # Brightness below which most returns to the upper half of the lasers have the intensity 0; 0 if
+    # there is no such limit.
     least_brightness: float = 0.0
     # Mean share of the brightness of near surfaces that the upper half of the lasers loses: they
     # are focused far away.
