@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import yaml
 
 from amvnet.config.recipes import load_recipe
@@ -17,10 +18,12 @@ from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.inference.reading import open_for_weights
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.record import AS_IS
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.loaders import sensor_record
-from amvnet.training.plan import without_mean
+from amvnet.training.plan import open_parts, sized_by_init, without_mean
 from amvnet.weights.file import load, save
 
 from fixtures.own_scans import make_own_scans
@@ -96,16 +99,41 @@ def test_datasets_of_other_classes_and_impossible_shares_are_refused(tmp_path: P
         join(scans, [TrainingScans(a, a.records(["08"]), [])], share=1.0)
 
 
-def test_scans_that_are_normalised_are_not_mixed_with_others(tmp_path: Path) -> None:
-    """The rows of their points are given in some of the scans only."""
-    scans = joined(tmp_path, 0)
-    np.save(tmp_path / "scan.npy", np.ones((5, 4), np.float32))
+@pytest.fixture
+def own_file(tmp_path: Path) -> Path:
+    """Describe a scan of simulated streets as a user's own."""
+    streets = make_streets(tmp_path / "own", ("00",), 2)
     classes = {name: number for number, name in enumerate(SEMANTICKITTI.classes, start=1)}
-    description = {"classes": classes, "scans": "*.npy"}
-    (tmp_path / "own.yaml").write_text(yaml.safe_dump(description, sort_keys=False))
-    own = open_own(tmp_path / "own.yaml")
-    own.is_normalised = True
-    with pytest.raises(InputError, match="found both"):
+    description = {"classes": classes, "scans": f"{streets.name}/sequences/00/velodyne/*.bin"}
+    path = tmp_path / "own.yaml"
+    path.write_text(yaml.safe_dump(description, sort_keys=False))
+    return path
+
+
+def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_file: Path) -> None:
+    weights = fresh_weights()
+    recipe = sized_by_init(load_recipe("finetune"), weights)
+    streets = make_streets(tmp_path / "streets", ("00",), 2)
+    first, others = open_parts([str(own_file), str(streets)], recipe, tmp_path / "run", weights)
+    records = first.records(first.sequences("all"))
+
+    scans = join(TrainingScans(first, records, ()), others)
+
+    view = RangeView(weights.model.range_view)
+    mixed = [record for record in scans.train if isinstance(record, MixedRecord)]
+    assert len(mixed) == 2
+    for record in mixed:
+        batch = PointBatch.of([scans.dataset.read(record)])
+        as_is = PointBatch.of([open_dataset(str(streets)).read(record.original)])
+        assert batch.ring is not None
+        assert torch.equal(view.by_ring().rows(batch), view.rows(as_is))
+
+
+def test_ones_own_scans_are_the_first_of_a_mixture(tmp_path: Path, own_file: Path) -> None:
+    """Only then do all of them have the rows that the weights expect."""
+    scans = joined(tmp_path, 0)
+    own = open_for_weights(str(own_file), fresh_weights())
+    with pytest.raises(InputError, match="name them first"):
         join(scans, [TrainingScans(own, own.records(own.sequences("all")), [])])
 
 

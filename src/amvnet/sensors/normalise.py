@@ -300,14 +300,22 @@ def _rows(
     if view is None or is_trusted:
         return ring
 
-    batch = PointBatch.of([scan])
-    rows = view.height - 1 - RangeView(view).rows(batch).numpy()
-    if ring is not None and np.median(np.abs(ring[valid] - rows)) < 1:  # most rings are the rows
+    rows = rows_of(scan, view)
+    if ring is not None and np.median(np.abs(ring - rows)[valid]) < 1:  # most rings are the rows
         return ring
+    return rows
 
-    all_rows = np.zeros(len(scan), dtype=np.int64)
-    all_rows[valid] = rows
-    return all_rows
+
+def rows_of(scan: Scan, config: RangeViewConfig) -> np.ndarray:
+    """Return each point's (N,) row in a range image, 0 the lowest; 0 for lost points.
+
+    Raises:
+        InputError: if the rows are lasers, and the scan has no such rings.
+    """
+    rows = np.zeros(len(scan), dtype=np.int64)
+    top_down = RangeView(config).rows(PointBatch.of([scan])).numpy()
+    rows[scan.valid] = config.height - 1 - top_down
+    return rows
 
 
 def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:

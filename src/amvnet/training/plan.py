@@ -13,7 +13,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.reading import open_for_weights
+from amvnet.inference.reading import WithRows, open_for_weights
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Say, say_nothing
@@ -154,6 +154,9 @@ def open_parts(
 ) -> tuple[Dataset, list[TrainingScans]]:
     """Open the datasets of a training; return the first, and those to mix in with their scans."""
     first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
+    if first.is_normalised:
+        view = recipe.model.range_view
+        others = [each if each.is_normalised else WithRows(each, view) for each in others]
     return first, [TrainingScans(dataset, training_records(dataset), []) for dataset in others]
 
 

@@ -79,7 +79,6 @@ def receive(
         half; (N,) uint8 rings.
     """
     base, _, shade, _, drop, relief, ghost = REFLECTIONS[hits.surface].T
-    count = len(hits.distance)
     reflectivity = base * np.exp(shade * hits.tint)
 
     # The received power falls with the square of the range; a return is lost if noise covers it.
@@ -87,7 +86,7 @@ def receive(
     chance = 1 / (1 + (hits.distance / reach) ** 6) * (1 - drop) * (1 - sensor.drop)
 
     distance = _measured_distance(hits, sensor, relief, rng) + lasers.range_error[hits.ring]
-    is_ghost = rng.random(count, np.float32) < ghost
+    is_ghost = rng.random(len(ghost), np.float32) < ghost
     beyond = GHOST_NEAREST + GHOST_MEAN * rng.standard_exponential(is_ghost.sum())
     distance[is_ghost] += beyond.astype(np.float32)
     chance[(distance < sensor.min_range) | (distance > sensor.max_range)] = 0
@@ -135,13 +134,13 @@ def _intensity(
 ) -> np.ndarray:
     """Return the (N,) intensities in [0, 0.99] that the device reports."""
     _, spread, _, dark, *_ = REFLECTIONS[hits.surface].T
-    count = len(hits.distance)
 
     # The device compensates for range and incidence until the power is too small.
     power = hits.cosine * (10 / np.maximum(hits.distance, 1)) ** 2
     is_near = np.exp(-((hits.distance / NEAR) ** 4))
     # Few returns are far from the mean, but more than with a normal distribution.
-    noise = np.maximum(1 + spread * rng.standard_t(3, count), LEAST_NOISE) ** (1 / sensor.gamma)
+    deviation = sensor.intensity_noise * spread * rng.standard_t(3, len(spread))
+    noise = np.maximum(1 + deviation, LEAST_NOISE) ** (1 / sensor.gamma)
 
     brightness = reflectivity * noise * power**2 / (power**2 + sensor.half_power**2)
     brightness /= 1 + (hits.distance / sensor.half_range) ** FADING

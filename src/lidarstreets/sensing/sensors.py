@@ -71,6 +71,8 @@ class LidarModel:
     near_loss: float = 0.0
     # Mean number of returns from the racks and the roof of the car itself.
     own_returns: float = 0.0
+    # Factor on the noise of the intensity, `Reflection.spread`.
+    intensity_noise: float = 1.0
     # True if the motion of the sensor during a rotation is removed from the points.
     motion_corrected: bool = True
     # Angles in degrees between the device and the car: nose up, and left side up.

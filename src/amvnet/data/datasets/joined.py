@@ -122,7 +122,7 @@ def join(
             their scans once per epoch.
 
     Raises:
-        InputError: if a dataset has other classes, scans of a user's own are mixed with others, or
+        InputError: if a dataset has other classes, scans of a user's own are mixed into others, or
             the share leaves nothing for the first.
     """
     if not others:
@@ -131,8 +131,8 @@ def join(
         check_classes(other.dataset, scans.dataset.taxonomy)
         if other.dataset.is_normalised != scans.dataset.is_normalised:
             raise InputError(
-                f"{other.dataset.root}: expected either scans of your own (a YAML file) or "
-                "datasets in every --data, found both; train on one after the other, with --init"
+                f"{other.dataset.root}: expected datasets in every --data, found scans of your "
+                "own (a YAML file) after one; name them first"
             )
 
     joined = Joined(scans, others, share)
