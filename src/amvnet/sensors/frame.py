@@ -13,12 +13,11 @@ from amvnet.errors import InputError
 from amvnet.sensors.ground import Ground, find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
 
-# The unit, by the median distance of the points: 2 to 40 m in the scans of all sensors
-FARTHEST_MEDIAN = 200.0  # farther: not metres
-MIN_MILLIMETRES = 4000.0  # farther: millimetres; between the two, centimetres or millimetres
-AROUND = (
-    0.5  # near points (5 %) are nearer than this share of far ones (95 %), or the origin is off
-)
+# The median distance of the points tells the unit: in metres it is 2 to 40 with all sensors.
+FARTHEST_MEDIAN = 200.0  # of a scan in metres
+MIN_MILLIMETRES = 4000.0  # of one in millimetres; between the two, centimetres or millimetres
+# The origin is near the sensor if near points (5 %) are nearer than this share of far ones (95 %).
+AROUND = 0.5
 
 UP_AXES = ("z-down", "z-forward", "y-up")  # are tried if no ground is found below
 SAME_TILT = 3.5  # degrees: roads slope by up to 3.1 as seen from the cars of the datasets
