@@ -209,12 +209,10 @@ def _add_scene(tables: Tables, sequence: Row) -> None:
 
     # Tokens of the samples and of their scans; an empty one before the first and after the last.
     samples = [""]
-    tokens = [""]
-    for index, scan in enumerate(sequence["scans"]):
+    for index in range(len(sequence["scans"])):
         samples.append(_token(name, "sample", index))
-        tokens.append(scan["token"])
     samples.append("")
-    tokens.append("")
+    tokens = ["", *(scan["token"] for scan in sequence["scans"]), ""]
 
     _add(
         tables,

@@ -19,8 +19,8 @@ class Mesh:
         label: (T,) uint16 class ids; 0 is ground, whose class depends on the place.
         instance: (T,) uint16 instance ids; 0 is none.
         depth: (T,) float32 mean distance in metres that a pulse travels inside the triangles
-            before it is reflected; 0 is solid. A mesh that is not solid must be closed, with its
-            corners counter-clockwise seen from outside.
+            before it is reflected, if there were no gaps between the leaves; 0 is solid. A mesh
+            that is not solid must be closed, with its corners counter-clockwise seen from outside.
         tint: (T,) float32 brightness of the surface, in standard deviations from the mean of its
             kind.
     """

@@ -21,7 +21,9 @@ from lidarstreets.sensing.sensors import LidarModel
 SHADOW_EDGE = 6.0  # degrees by which the edges of the car's shadow differ between lasers
 MOST_CROSSINGS = 16  # surfaces of clumps of leaves that a pulse may cross on its way in and out
 BEYOND = 0.002  # metres behind a surface at which a ray continues
-CLUMP = (0.2, 0.75)  # metres across a clump of leaves, and correlation of how far pulses enter it
+CLUMP = (0.2, 0.7)  # metres across a clump of leaves, and correlation of how far pulses enter it
+GAP = (0.6, 0.9)  # the same of gaps between clumps
+OPENNESS = (1.5, 1.7)  # of gaps: median factor on the depth, and spread of its logarithm
 LEAF_COSINE = 0.5  # mean cosine of the angle of incidence: leaves and blades point anywhere
 
 
@@ -297,7 +299,8 @@ def _enter_foliage(
 ) -> None:
     """Extend rays that hit foliage to the leaf that stops them, or to the surface behind it.
 
-    The distance inside is exponentially distributed; its mean is the depth of the foliage.
+    The distance inside is exponentially distributed. Its mean is the depth of the foliage times a
+    factor that differs from gap to gap.
     """
     index = np.flatnonzero(nearest.depth > 0)  # of the rays that are still on their way
     clumps = np.zeros(len(index), dtype=np.int32)  # that each ray is inside of: clumps overlap
@@ -314,7 +317,9 @@ def _enter_foliage(
 
         # Between the two surfaces, a leaf may stop it.
         leafless = patchy_normal(rng, next_origin, *CLUMP)
-        free_path = -log_ndtr(leafless) * nearest.depth[index]
+        gap = patchy_normal(rng, next_origin, *GAP)
+        depth = OPENNESS[0] * np.exp(OPENNESS[1] * gap) * nearest.depth[index]
+        free_path = -log_ndtr(leafless) * depth
         free_path[clumps <= 0] = np.inf
         stops = free_path < behind.distance
         nearest.distance[index[stops]] += free_path[stops]

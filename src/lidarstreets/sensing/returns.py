@@ -22,10 +22,10 @@ LARGEST_MIXED_STEP = 20.0
 # Neighbouring returns are alike: metres within which they are, and their correlation, for loss and
 # glare, for the height of relief such as tufts of grass, and for the mean height of relief.
 PATCH = (0.5, 0.97)
-TUFT = (0.3, 0.6)
+TUFT = (0.3, 0.85)
 MEADOW = (8.0, 0.8)
 # Spread of the mean height of relief: standard deviation of its logarithm.
-RELIEF_SPREAD = 1.0
+RELIEF_SPREAD = 0.8
 LEAST_COSINE = 0.06  # of the angle between ray and normal: relief is no deeper along the ray
 LEAST_NOISE = 0.4  # of the mean brightness of a surface
 LOW_LASERS_LEAST = 0.35  # of the least brightness: the lower half of the lasers sees darker things
@@ -107,10 +107,9 @@ def receive(
     returned = _patchy(hits, rng) < chance
     points = np.column_stack([xyz, intensity])[returned].astype(np.float32)
     has_no_class = is_ghost | is_own
-    instances = np.where(has_no_class, 0, hits.instance)[returned].astype(np.uint32)
-    classes = np.where(has_no_class, np.uint16(Label.OUTLIER), hits.label)
-    classes = classes[returned].astype(np.uint32)
-    labels = classes | instances << np.uint32(16)
+    instances = np.where(has_no_class, 0, hits.instance).astype(np.uint32)
+    classes = np.where(has_no_class, Label.OUTLIER, hits.label).astype(np.uint32)
+    labels = (classes | instances << np.uint32(16))[returned]
     rings = hits.ring[returned]
     if not sensor.keeps_lost_returns:
         return points, labels, rings

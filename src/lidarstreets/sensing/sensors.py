@@ -121,12 +121,10 @@ def draw_device(sensor: LidarModel, rng: np.random.Generator) -> LidarModel:
     deviations = rng.standard_normal(len(sensor.elevations))
     deviations = np.clip(deviations, -MOST_DEVIATIONS, MOST_DEVIATIONS)
     elevations = np.array(sensor.elevations) + offset + sensor.laser_spread * deviations
-    # From the top down, as neighbours may have changed places.
-    ordered = np.sort(elevations)[::-1]
 
     return replace(
         sensor,
-        elevations=tuple(ordered.tolist()),
+        elevations=tuple(np.sort(elevations)[::-1].tolist()),  # neighbours may change places
         height=sensor.height + sensor.height_spread * draw(),
         pitch=sensor.pitch + sensor.mounting_spread * draw(),
         roll=sensor.roll + sensor.mounting_spread * draw(),

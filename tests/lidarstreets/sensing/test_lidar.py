@@ -14,6 +14,7 @@ from lidarstreets.sensing.sensors import LidarModel
 from lidarstreets.solids import box, hull
 
 pytest.importorskip("embreex")
+from lidarstreets.sensing import lidar
 from lidarstreets.sensing.lidar import RayScene, trace
 from lidarstreets.sensing.returns import draw_lasers, receive
 
@@ -193,6 +194,14 @@ def test_some_returns_at_edges_lie_in_between(mixed: float, smallest: int, large
     assert smallest <= between <= largest
 
 
+@pytest.fixture
+def without_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make all foliage equally dense, so that each pulse ends by chance of its own."""
+    monkeypatch.setattr(lidar, "OPENNESS", (1.0, 0.0))
+    monkeypatch.setattr(lidar, "CLUMP", (0.2, 0.0))
+
+
+@pytest.mark.usefixtures("without_gaps")
 @pytest.mark.parametrize("depth", [0.05, 0.5])
 def test_pulses_end_in_foliage_after_the_mean_depth(depth: float) -> None:
     """In thick foliage the depths are exponential: mean and deviation are the free path."""
@@ -212,17 +221,20 @@ def share_through(scene: Mesh) -> float:
     return float((labels[ahead] == Label.BUILDING).mean())
 
 
+@pytest.mark.usefixtures("without_gaps")
 def test_overlapping_clumps_are_one() -> None:
     """Their union is 4 m deep, not the 2 m at which the first of them ends."""
     scene = join(slab(14, 16, 1), slab(15, 18, 1), wall(22))
     assert share_through(scene) == pytest.approx(np.exp(-4), rel=0.2)
 
 
+@pytest.mark.usefixtures("without_gaps")
 def test_many_clumps_can_be_passed() -> None:
     clumps = [slab(10 + 2 * i, 11 + 2 * i, 100.0) for i in range(5)]
     assert share_through(join(*clumps, wall(22))) == pytest.approx(np.exp(-5 / 100), rel=0.05)
 
 
+@pytest.mark.usefixtures("without_gaps")
 def test_some_pulses_pass_a_thin_crown() -> None:
     """Their share is that of exponential free paths: exp(-thickness / depth)."""
     scene = join(slab(14.5, 15.5, 0.5), wall(20))
@@ -233,6 +245,21 @@ def test_some_pulses_pass_a_thin_crown() -> None:
     is_near_axis = np.abs(points[:, 1]) < 5
     assert np.abs(points[labels == Label.BUILDING, 0] - 20).max() < 0.01
     assert points[(labels == Label.VEGETATION) & is_near_axis, 0].max() < 15.51
+
+
+def test_foliage_has_gaps_and_dense_places() -> None:
+    """Pulses that enter near one another end at a similar depth, others at very different ones."""
+    points, _, _ = scan_mesh(slab(15, 400, 0.1))
+    ahead = points[np.abs(points[:, 1] / points[:, 0]) < 0.2, :3].astype(float)
+    entry = ahead * (15 / ahead[:, :1])
+    depth = np.log(np.linalg.norm(ahead - entry, axis=1) + 1e-3)
+    # The standard deviation of the logarithm of an exponential distribution is 1.28.
+    assert depth.std() > 1.5 * 1.28
+
+    near = np.linalg.norm(np.diff(entry, axis=0), axis=1) < 0.05
+    step = np.diff(depth)
+    assert near.mean() > 0.9
+    assert step[near].std() < 0.9 * np.sqrt(2) * depth.std()
 
 
 def test_a_hull_is_closed_and_faces_outwards() -> None:
