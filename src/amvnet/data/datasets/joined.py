@@ -131,7 +131,7 @@ def join(
         check_classes(other.dataset, scans.dataset.taxonomy)
         if other.dataset.is_normalised != scans.dataset.is_normalised:
             raise InputError(
-                f"{other.dataset.root}: expected datasets in every --data, found scans of your "
+                f"{other.dataset.spec}: expected datasets in every --data, found scans of your "
                 "own (a YAML file) after one; name them first"
             )
 
