@@ -111,7 +111,7 @@ class Surface(IntEnum):
     GLASS = Reflection(0.10, spread=0.50, shade=0.50, dark=0.75, drop=0.65, ghost=0.04)
     WOOD = Reflection(0.38, spread=0.11, shade=0.25, rough=0.003)
     LEAF = Reflection(0.38, spread=0.20, shade=0.17, dark=0.006, drop=0.003)
-    BARK = Reflection(0.39, spread=0.28, shade=0.20, dark=0.01, rough=0.013)
+    BARK = Reflection(0.39, spread=0.23, shade=0.20, dark=0.01, rough=0.013)
     METAL = Reflection(0.33, spread=0.26, shade=0.40, dark=0.15, drop=0.006, rough=0.004)
     SIGN_FACE = Reflection(0.50, spread=0.13, shade=0.40)
     CLOTH = Reflection(0.46, spread=0.20, shade=0.25, rough=0.005)
@@ -131,6 +131,8 @@ class Surface(IntEnum):
     WINDOW = Reflection(0.30, spread=0.30, shade=0.40, dark=0.12, drop=0.03, rough=0.01, ghost=0.02)
     STONE = Reflection(0.36, spread=0.16, shade=0.25, rough=0.013)
     TWIG = Reflection(0.30, spread=0.26, shade=0.20, dark=0.03, drop=0.008)
+    # Poles, which are painted or galvanised.
+    MAST = Reflection(0.30, spread=0.45, shade=0.40, dark=0.15, drop=0.006, rough=0.004)
 
     reflection: Reflection
 

@@ -286,11 +286,6 @@ def _crash_barrier(fence: Fence, rng: np.random.Generator, length: float) -> Mes
     return guard_rail(length, fence.height, beams)
 
 
-def _wire_rope(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
-    ropes = _beams(length, fence.height * np.array([0.55, 0.7, 0.85, 1.0]), 0.03)
-    return fence.solid([ropes, _posts(length, fence.height, 0.05)])
-
-
 def _parapet(fence: Fence, rng: np.random.Generator, length: float) -> Mesh:
     """Return the low concrete wall along a fast road or a bridge."""
     body = box((length, 0.5, fence.height + FOOT), (0, 0, -FOOT), top=(1.0, 0.45))
@@ -360,7 +355,6 @@ KINDS = {
     "screen": FenceKind(_screen, (1.5, 2.2), WOODEN),
     "guard rail": FenceKind(_crash_barrier, (0.65, 0.85)),
     "double guard rail": FenceKind(_crash_barrier, (0.65, 0.85)),
-    "wire rope": FenceKind(_wire_rope, (0.65, 0.85)),
     "parapet": FenceKind(_parapet, (0.8, 1.2), _CONCRETE),
     "noise barrier": FenceKind(_noise_barrier, (2.0, 5.0), _PANELS),
     "glass barrier": FenceKind(_noise_barrier, (1.5, 4.0)),

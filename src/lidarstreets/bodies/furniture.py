@@ -12,7 +12,6 @@ from lidarstreets.mesh import Mesh, join, part, place
 from lidarstreets.solids import box, copies, leaning, prism, tube
 
 FOOT = 0.4  # metres by which poles reach below the ground
-DARK_METAL = -0.8  # tint: poles are painted, and darker than other metal
 
 
 def _pole(
@@ -44,9 +43,8 @@ def lamp(rng: np.random.Generator) -> Mesh:
     if rng.random() < 0.5:
         foot_height = rng.uniform(0.5, 1.4)
         solids.append(tube((0, 0, 0), (0, 0, foot_height), radius * 1.4, closed=False))
-    surface = Surface.METAL if rng.random() < 0.8 else Surface.PLASTER
-    pole = part(solids, surface, Label.POLE, tint=rng.normal(DARK_METAL, 0.6))
-    return join(pole, *_carried(rng))
+    surface = Surface.MAST if rng.random() < 0.8 else Surface.PLASTER
+    return join(part(solids, surface, Label.POLE), *_carried(rng))
 
 
 def _carried(rng: np.random.Generator) -> list[Mesh]:
@@ -59,25 +57,20 @@ def _carried(rng: np.random.Generator) -> list[Mesh]:
         return [part([bin_box], Surface.PLASTIC, Label.OTHER_OBJECT)]
     if kind < 0.20:
         case = box((0.35, 0.25, 0.5), (0, 0.15, rng.uniform(0.8, 2.5)))
-        return [part([case], Surface.METAL, Label.POLE)]
+        return [part([case], Surface.MAST, Label.POLE)]
     return []
 
 
 def post(rng: np.random.Generator) -> Mesh:
-    """Return a bollard, a thin post, a guide post or a hydrant."""
-    kind = rng.random()
-    if kind < 0.25:
+    """Return a bollard, a thin post or a guide post."""
+    if rng.random() < 0.25:
         return guide_post(rng)
-    if kind < 0.3:
-        body = tube((0, 0, -0.1), (0, 0, 0.75), 0.12, 0.1)
-        arms = tube((0, -0.2, 0.5), (0, 0.2, 0.5), 0.06)
-        return part([body, arms], Surface.METAL, Label.POLE)
 
     height = rng.uniform(0.5, 1.3)
     radius = rng.uniform(0.03, 0.08)
-    surface = (Surface.METAL, Surface.PLASTER, Surface.WOOD)[rng.choice(3, p=[0.6, 0.2, 0.2])]
+    surface = (Surface.MAST, Surface.PLASTER, Surface.WOOD)[rng.choice(3, p=[0.6, 0.2, 0.2])]
     body = tube((0, 0, -0.2), (0, 0, height), radius)
-    return part([body], surface, Label.POLE, tint=DARK_METAL)
+    return part([body], surface, Label.POLE)
 
 
 def guide_post(rng: np.random.Generator) -> Mesh:
@@ -110,7 +103,7 @@ def flag_pole(rng: np.random.Generator) -> Mesh:
     height = rng.uniform(6, 9)
     flag = box((0.03, 1.1, rng.uniform(1.5, 3.5)), (0, 0.6, height - 3.8))
     return join(
-        part([_pole(rng, height, 0.05, 0.03)], Surface.METAL, Label.POLE),
+        part([_pole(rng, height, 0.05, 0.03)], Surface.MAST, Label.POLE),
         part([flag], Surface.CLOTH, Label.OTHER_OBJECT),
     )
 
@@ -150,14 +143,9 @@ def sign(rng: np.random.Generator) -> Mesh:
     elif kind < 0.10:
         mesh = _chevron(rng)
     else:
-        # The lower edge of the upper sign; a few are as low as a person.
-        height = rng.uniform(1.6, 2.8) if rng.random() < 0.88 else rng.uniform(0.4, 1.4)
-        mast = part(
-            [_pole(rng, height + 0.5, rng.uniform(0.025, 0.05))],
-            Surface.METAL,
-            Label.POLE,
-            tint=DARK_METAL,
-        )
+        # The lower edge of the upper sign; some are as low as a person.
+        height = rng.uniform(1.6, 2.8) if rng.random() < 0.75 else rng.uniform(0.4, 1.4)
+        mast = part([_pole(rng, height + 0.5, rng.uniform(0.025, 0.05))], Surface.MAST, Label.POLE)
         parts = [mast, _face(rng, height)]
         if rng.random() < 0.3:
             parts.append(_face(rng, height - rng.uniform(0.4, 0.9)))
@@ -187,7 +175,7 @@ def _board(rng: np.random.Generator, width: float, rise: float, height: float, p
     post_y = np.linspace(-0.4, 0.4, posts) * width
     radius = rng.uniform(0.03, 0.08)
     post_solid = tube((0, 0, -FOOT), (0, 0, height + rise), radius, closed=False)
-    masts = part([copies(post_solid, y=post_y)], Surface.METAL, Label.POLE, tint=DARK_METAL)
+    masts = part([copies(post_solid, y=post_y)], Surface.MAST, Label.POLE)
     front = box((0.03, width, rise), (-0.12, 0, height))
     return join(masts, _two_sided(rng, front, front + np.array([0.031, 0, 0])))
 
@@ -197,7 +185,7 @@ def _chevron(rng: np.random.Generator) -> Mesh:
     size = (0.03, rng.uniform(0.25, 1.5), rng.uniform(0.5, 1.0))
     height = rng.uniform(0.2, 0.7)
     front = box(size, (-0.05, 0, height))
-    posts = part([_pole(rng, height + size[2], 0.03)], Surface.METAL, Label.POLE)
+    posts = part([_pole(rng, height + size[2], 0.03)], Surface.MAST, Label.POLE)
     return join(posts, _two_sided(rng, front, front + np.array([0.031, 0, 0])))
 
 
@@ -216,7 +204,7 @@ def traffic_light(rng: np.random.Generator) -> Mesh:
         backboard.append(box((0.02, 0.5, 1.1), (0.1, reach, 4.9)))
 
     return join(
-        part(solids, Surface.METAL, Label.POLE),
+        part(solids, Surface.MAST, Label.POLE),
         part(lamps + backboard, Surface.PLASTIC, Label.TRAFFIC_SIGN),
     )
 
@@ -231,7 +219,7 @@ def gantry(rng: np.random.Generator, width: float) -> Mesh:
     board = box((0.05, width * 0.3, 2.0), (-0.25, -width * 0.2, height))
 
     return join(
-        part([masts], Surface.METAL, Label.POLE),
+        part([masts], Surface.MAST, Label.POLE),
         part([beams], Surface.METAL, Label.OTHER_STRUCTURE),
         _two_sided(rng, board, board + np.array([0.06, 0, 0])),
     )

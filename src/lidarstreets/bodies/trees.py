@@ -15,16 +15,20 @@ def tree(rng: np.random.Generator, height: float, fine: bool = True) -> Mesh:
     """
     fork_height = height * rng.uniform(0.12, 0.4)
     spread = height * rng.uniform(0.18, 0.38)
-    radius = height * rng.uniform(0.008, 0.028)
+    radius = height * rng.uniform(0.01, 0.042)
 
     stems = 1 if rng.random() < 0.8 or not fine else int(rng.integers(2, 5))
     parts = []
     fork: Vector = (0, 0, fork_height)
     for _ in range(stems):
-        stem, fork = _stem(rng, fork_height, radius, slant=0.04 if stems == 1 else 0.22)
+        stem, fork = _stem(rng, fork_height, radius, slant=0.07 if stems == 1 else 0.22)
         parts.append(part(stem, Surface.BARK, Label.TRUNK))
     if rng.random() < 0.1:
         parts.append(_ivy(rng, fork, radius))
+    if rng.random() < 0.4:  # grass and shoots at its foot
+        wide = radius + rng.uniform(0.1, 0.5)
+        tuft = hull(rng, (0, 0, 0), (wide, wide, rng.uniform(0.1, 0.45)), fine=False)
+        parts.append(foliage([tuft], rng.uniform(0.05, 0.6)))
 
     kind = rng.random()
     if not fine:

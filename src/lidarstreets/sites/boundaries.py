@@ -1,6 +1,6 @@
 """Hedges, walls and fences along the borders of plots and along streets."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,17 +11,19 @@ from lidarstreets.sites.site import Plot
 # Metres: length of a segment of a boundary, and width of the drive to a garage.
 SEGMENT = 2.5
 DRIVE_WIDTH = 3.0
-# Chances that a boundary is a hedge, and that a fence has a hedge in front of or behind it.
+# Chances that a boundary is a hedge, that a fence has a hedge in front of or behind it, and that a
+# low wall stands in front of the boundary of a garden.
 HEDGE = 0.55
 FENCE_AND_HEDGE = 0.25
+LOW_WALL = 0.2
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """One kind of boundary: a fence, a hedge, or both, one behind the other.
+    """One kind of boundary: a low wall, a fence, a hedge, or several, one behind the other.
 
     Attributes:
-        layers: each fence or hedge, and its distance from the line of the boundary in metres.
+        layers: each of them, and its distance from the line of the boundary in metres.
         missing: share of the segments that are not there.
     """
 
@@ -33,15 +35,20 @@ def draw_boundary(rng: np.random.Generator, where: str = "garden") -> Boundary:
     """Draw a kind of boundary for a place in fences.toml; only gardens have hedges alone."""
     missing = float(rng.choice([0.0, 0.03, 0.2], p=[0.6, 0.3, 0.1]))
     hedge_height = float(rng.uniform(0.4, 1.4) if rng.random() < 0.4 else rng.uniform(1.2, 3.0))
-    if where == "garden" and rng.random() < HEDGE:
-        return Boundary(((draw_hedge(rng, hedge_height), 0.0),), missing)
+    layers: list[tuple[Fence | Hedge, float]] = []
+    if where == "garden" and rng.random() < LOW_WALL:
+        wall = draw_fence(rng, SHARES["low"])
+        layers.append((replace(wall, height=rng.uniform(0.25, 0.9)), -rng.uniform(0.1, 0.5)))
 
-    fence = draw_fence(rng, SHARES[where])
+    if where == "garden" and rng.random() < HEDGE:
+        layers.append((draw_hedge(rng, hedge_height), 0.0))
+        return Boundary(tuple(layers), missing)
+
+    layers.append((draw_fence(rng, SHARES[where]), 0.0))
     if rng.random() < FENCE_AND_HEDGE:
-        hedge = draw_hedge(rng, hedge_height)
-        offset = float(rng.choice([-1, 1]) * rng.uniform(0.05, 0.7))
-        return Boundary(((fence, 0.0), (hedge, offset)), missing)
-    return Boundary(((fence, 0.0),), missing)
+        offset = rng.choice([-1, 1]) * rng.uniform(0.05, 0.7)
+        layers.append((draw_hedge(rng, hedge_height), offset))
+    return Boundary(tuple(layers), missing)
 
 
 def line_up(
