@@ -11,12 +11,7 @@ from typing import Any
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import (
-    OutputOptions,
-    Pipeline,
-    Segment,
-    check_faults,
-)
+from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_faults
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter

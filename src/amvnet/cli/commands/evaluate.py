@@ -8,10 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say, show
-from amvnet.cli.options import (
-    LabelledChoice,
-    join_processes,
-)
+from amvnet.cli.options import LabelledChoice, join_processes
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
 from amvnet.models.methods import PAPER_METHODS, Compute, MethodName, widest_method
