@@ -14,7 +14,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults
-from amvnet.inference.reading import array_scan, normaliser_for
+from amvnet.inference.reading import checked_scan, normaliser_for
 from amvnet.inference.scores import SURE, ScorePair, check_probabilities
 from amvnet.inference.segmentation import Segmentation, fetch, unpack
 from amvnet.models.amvnet import LateFusion, Scores
@@ -22,7 +22,7 @@ from amvnet.models.assertion import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
-from amvnet.scan import Scan, check_scan
+from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Expectation, Normaliser
@@ -60,9 +60,8 @@ class Fusion:
         Raises:
             InputError: if the shapes do not fit, or the scores are not probabilities.
         """
-        if isinstance(points, np.ndarray):
-            points = array_scan(points, trained=self._intensity)
-        scan = match_scan(check_scan(points), self._intensity)
+        scan = checked_scan(points, trained=self._intensity)
+        scan = match_scan(scan, self._intensity)
         self._check_shapes(scan, f, g)
 
         f_valid = np.asarray(f, dtype=np.float32)[scan.valid]
@@ -162,10 +161,8 @@ def fuse_files(
     def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
         results = []
         for scan_input, scan in zip(inputs, loaded, strict=True):
-            checked = check_scan(scan)
-            f, g = pair.read(scan_input.scores_path, checked, taxonomy.size)
-            results.append(fusion(checked, f, g))
-
+            f, g = pair.read(scan_input.scores_path, scan, taxonomy.size)
+            results.append(fusion(scan, f, g))
         return results
 
     pipeline = Pipeline(scans, segment, output, taxonomy)

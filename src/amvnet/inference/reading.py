@@ -15,7 +15,7 @@ from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
 from amvnet.progress import Say, say_nothing
-from amvnet.scan import Scan
+from amvnet.scan import Scan, check_scan
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
 from amvnet.sensors.lidars import Sensor, make_sensor
 from amvnet.sensors.normalise import Expectation, Normaliser, rows_of
@@ -23,6 +23,21 @@ from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
 
 MOST_COLUMNS = 64  # of an array of points; one with more is transposed
+
+
+def checked_scan(
+    points: np.ndarray | Scan,
+    columns: str | None = None,
+    trained: TrainedIntensity | None = None,
+) -> Scan:
+    """Return a scan, or that of an array (`array_scan`), if it has a point to segment.
+
+    Raises:
+        InputError: as `array_scan`, or if no point is valid.
+    """
+    if isinstance(points, np.ndarray):
+        points = array_scan(points, columns, trained)
+    return check_scan(points)
 
 
 def array_scan(
@@ -55,7 +70,7 @@ def array_scan(
         intensity = np.zeros(len(array)) if trained is None else trained.filler(len(array))
         warnings.warn(
             f"the scan has no intensity: {describe_filler(trained)}; give a fourth column",
-            stacklevel=3,
+            stacklevel=4,
         )
 
     table = np.empty((len(array), 4), np.float32)

@@ -16,7 +16,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import array_scan, normaliser_for
+from amvnet.inference.reading import checked_scan, normaliser_for
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.assertion import Disagreement
@@ -30,7 +30,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import vote
 from amvnet.runtime.memory import available_memory, return_freed_memory
 from amvnet.runtime.threads import survive_forks
-from amvnet.scan import Scan, check_scan
+from amvnet.scan import Scan
 from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
 from amvnet.weights.file import Weights, load
 
@@ -144,10 +144,8 @@ class Segmenter:
                 the model needs a ring index and there is none, or a file cannot be read or holds
                 several scans.
         """
-        if isinstance(points, np.ndarray):
-            points = array_scan(points, columns, self.intensity)
         if not isinstance(points, Path | str):
-            return self.many([points])[0]
+            return self._segment([checked_scan(points, columns, self.intensity)])[0]
 
         scans, assumed = self._open(points)
         if len(scans) > 1:
@@ -163,18 +161,19 @@ class Segmenter:
             InputError: if one of them cannot be segmented; segment them one by one to see which.
         """
         checked = []
-        for values in scans:
-            if isinstance(values, np.ndarray):
-                values = array_scan(values, trained=self.intensity)
-            checked.append(check_scan(values))
-        is_large = sum(map(len, checked)) >= LARGE
-        memory = return_freed_memory() if is_large else nullcontext()
-        with memory:
-            batch = self.batch(checked)
+        for scan in scans:
+            checked.append(checked_scan(scan, trained=self.intensity))
+        return self._segment(checked)
+
+    def _segment(self, scans: Sequence[Scan]) -> list[Segmentation]:
+        """Segment scans in one pass of the networks; each has a valid point."""
+        is_large = sum(map(len, scans)) >= LARGE
+        with return_freed_memory() if is_large else nullcontext():
+            batch = self.batch(scans)
             labels, scores = fetch(self.run(batch))
 
         results = []
-        for scan, points in zip(checked, batch.slices(), strict=True):
+        for scan, points in zip(scans, batch.slices(), strict=True):
             result = unpack(scan.valid, labels, scores, points)
             origin = Origin(scan, self.taxonomy, self.method, self.usual_uncertain)
             results.append(replace(result, origin=origin))
