@@ -15,7 +15,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, reason_of
 from amvnet.fleet.actors import Labelling, LabelScans
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
@@ -56,10 +56,9 @@ def connect(address: str | None = None) -> None:
         with _own_signals():
             ray.init(**options, log_to_driver=False, logging_level=logging.CRITICAL)
     except Exception as error:  # Ray raises this class itself
-        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
-            f"--ray {address or ''}: expected a Ray cluster, found {reason}; start one with "
-            "ray start --head, or leave the address out"
+            f"--ray {address or ''}: expected a Ray cluster, found {reason_of(error)}; start one "
+            "with ray start --head, or leave the address out"
         ) from None
 
 
@@ -210,4 +209,5 @@ def _reason(error: BaseException) -> str:
     own = [line for line in lines if "InputError: " in line]
     if own:
         return own[-1].rpartition("InputError: ")[2]
-    return f"--ray: expected workers that run, found {lines[-1] if lines else error!r}"
+    reason = lines[-1] if lines else repr(error)
+    return f"--ray: expected workers that run, found {reason}; check the cluster's logs"
