@@ -152,7 +152,7 @@ def fuse_files(
         taxonomy = head.taxonomy
 
     scans, taxonomy = list_inputs(inputs, options, taxonomy, normaliser)
-    for scan in scans:
+    for scan in scans:  # raises before anything is written
         pair.a.find(scan.scores_path)
         pair.b.find(scan.scores_path)
 

@@ -158,10 +158,10 @@ class Pipeline:
         check_free(new_paths, self.output.overwrite or is_killed)
 
     def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
-        """Return what an earlier run has done that is as this run would do it.
+        """Return the entries of an earlier run whose scans need not be segmented again.
 
-        The files have to be there, and the scan has to be the same, and normalised by the same
-        first ones of its recording.
+        The files of such a scan are there, and neither it nor the first scans of its recording, by
+        which it is normalised, have changed.
         """
         done = dict(earlier)
         for scan in self.scans:
@@ -196,8 +196,8 @@ class Pipeline:
         """Read, segment and write scans, of which only a few are in memory at a time.
 
         Args:
-            write: takes each outcome, in order but for scans that cannot be read, which may come
-                before their turn; called in other threads, as many as `writers`.
+            write: takes each outcome in order; only scans that cannot be read may come earlier.
+                It is called in `writers` other threads.
 
         Yields:
             What `write` returns.
@@ -214,7 +214,7 @@ class Pipeline:
         with closing(groups), ThreadPoolExecutor(writers) as pool:
             for outcome in chain.from_iterable(groups):
                 writing.append(pool.submit(write, outcome))
-                # Those that are written are yielded at once, so that the journal has them.
+                # Yield what is written at once, so that the journal has it.
                 while writing and (len(writing) > AHEAD or writing[0].done()):
                     yield writing.popleft().result()
             while writing:

@@ -81,7 +81,7 @@ def predict(
 
 
 def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment:
-    """Return what segments scans of the inputs; those that are normalised, by their rings.
+    """Return a function that segments scans; the rows of normalised ones are their rings.
 
     Args:
         classes: maps the labels to other classes; None leaves them.
@@ -93,8 +93,8 @@ def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment
         results: list[Segmentation] = []
         pairs = zip(inputs, scans, strict=True)
         for is_normalised, group in groupby(pairs, key=lambda pair: pair[0].is_normalised):
-            fitting = by_ring if is_normalised else segmenter
-            results += fitting.many([scan for _, scan in group])
+            group_segmenter = by_ring if is_normalised else segmenter
+            results += group_segmenter.many([scan for _, scan in group])
 
         if table is None:
             return results
@@ -129,7 +129,8 @@ def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
     for sensor in list(doubtful)[:NAMED]:
         say(f"warning: {sensor}: {doubtful[sensor]}")
     others = len(doubtful) - NAMED
-    say(f"warning: {f'as in {others} more; ' if others > 0 else ''}{ADVICE}")
+    more = f"as in {others} more; " if others > 0 else ""
+    say(f"warning: {more}{ADVICE}")
 
 
 def _settings(

@@ -43,7 +43,7 @@ def checked_scan(
 def array_scan(
     points: np.ndarray, columns: str | None = None, trained: TrainedIntensity | None = None
 ) -> Scan:
-    """Return the scan of an array, whose columns are those that a file of them would have.
+    """Return the scan of an array with the columns that a scan file may have.
 
     Args:
         points: (N, 3 or more): x, y, z in metres, intensity in [0, 1], ring.
@@ -117,12 +117,11 @@ def open_for_weights(spec: str, weights: Weights, dataset: Dataset | None = None
 
 
 def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
-    """Return a user's own scans, normalised as those of its folders would be.
+    """Return a user's own scans, normalised as scan files are.
 
     Args:
-        normaliser: as for scan files.
-        dataset: the scans. What its file says of the sensor counts, unless the normaliser knows
-            more.
+        normaliser: that of scan files. If it knows nothing of the sensor, what the dataset's file
+            says of it counts.
 
     Raises:
         InputError: if the file describes an impossible sensor.
@@ -157,18 +156,14 @@ class WithRows(Dataset):
         self.view = view
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of a split."""
         return self.dataset.sequences(split)
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
-        """Return the scans of these sequences."""
         return self.dataset.records(sequences)
 
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the scan that takes the place of a scan in an epoch."""
         return self.dataset.at_epoch(record, epoch)
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
-        """Read one scan."""
         scan = self.dataset.read(record, labels)
         return dataclasses.replace(scan, ring=rows_of(scan, self.view))

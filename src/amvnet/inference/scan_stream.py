@@ -1,4 +1,4 @@
-"""Read scans ahead and compute on several at the same time: the way of every command."""
+"""Read scans ahead, and compute on several at the same time, as every command does."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ from amvnet.scan import Scan
 from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
 from amvnet.weights.file import Weights, load
 
-EACH = 2**30  # bytes that a scan may take; one of 120,000 points takes half, at the paper's size
-LARGE = 1_000_000  # points; freed memory of so large scans is returned: it would not be used again
+SCAN_BYTES = 2**30  # that a scan may take; one of 120,000 points takes half, at the paper's size
+LARGE = 1_000_000  # points; memory freed by larger scans is returned: no other scan could use it
 
 
 class Segmenter:
@@ -87,7 +87,7 @@ class Segmenter:
         self.engine = "torch"
         self.at_once = 1
         if self.device == "cpu":
-            self.at_once = max(min(torch.get_num_threads(), available_memory() // EACH), 1)
+            self.at_once = max(min(torch.get_num_threads(), available_memory() // SCAN_BYTES), 1)
 
         # Weights that were trained with other intensities take them, too.
         self.intensity = trained_intensity(self.weights.training, self.weights.sensor)

@@ -40,19 +40,19 @@ class Timing:
     uncertain: int
 
     @property
-    def all(self) -> float:
+    def total(self) -> float:
         """Seconds from the file to the written labels."""
         return sum(self.seconds[stage] for stage in STAGES)
 
     def share_of(self, stages: Sequence[str]) -> float:
         """Return the share of some stages in this time."""
-        return sum(self.seconds[stage] for stage in stages) / self.all
+        return sum(self.seconds[stage] for stage in stages) / self.total
 
 
 def time_runs(
     segmenter: Segmenter, read: Read, write: Write, runs: int, progress: Progress = no_progress
 ) -> dict[str, Any]:
-    """Call `run_once` some times, at least once, and return a report for JSON."""
+    """Time a number of runs, at least one, after those that warm up; return a report for JSON."""
     timings = []
     for run in range(runs + WARM_UP):
         timings.append(run_once(segmenter, read, write))
@@ -127,7 +127,7 @@ def _report(segmenter: Segmenter, timings: Sequence[Timing]) -> dict[str, Any]:
         "points": timings[0].points,
         "uncertain": timings[0].uncertain,
         "stages_ms": stages,
-        "all_ms": _spread([1e3 * timing.all for timing in timings]),
+        "all_ms": _spread([1e3 * timing.total for timing in timings]),
         "fusion_share": _spread([timing.share_of(FUSION) for timing in timings]),
         "peak_memory_mib": memory / MEBIBYTE,
     }
