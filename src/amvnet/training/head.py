@@ -101,16 +101,18 @@ def train_head(plan: Plan, weights: Weights) -> None:
     config = training.head
     folder = plan.out / "head"
 
-    # Gather the uncertain points of all scans, with their scores and neighbours. Other models
-    # scored the scans as they are, so that intensities are not brought to those of a training.
-    for part in BOTH_NETWORKS if plan.scores is None else ():
-        if part not in weights.parts:
-            raise InputError(
-                f"expected trained networks for the head, found no {part}; train it, or give --init"
-            )
+    # Other models scored the scans as they are; networks want the intensities of their training.
     intensity = None
     if plan.scores is None:
+        for part in BOTH_NETWORKS:
+            if part not in weights.parts:
+                raise InputError(
+                    f"expected trained networks for the head, found no {part}; train it, or give "
+                    "--init"
+                )
         intensity = trained_intensity(weights.training, weights.sensor)
+
+    # Gather the uncertain points of all scans, with their scores and neighbours.
     gatherer = PointGatherer(plan, weights, intensity)
     train = gatherer.gather(plan.scans.train, folder / "train", config.views, plan.say)
     val = gatherer.gather(plan.scans.val, folder / "val") if plan.scans.val else None

@@ -63,9 +63,9 @@ class Plan:
             config = getattr(self.recipe.training, name)
             if config.batch % (size * config.accumulate):
                 raise InputError(
-                    f"expected a batch for {size} processes, each in {config.accumulate} parts, "
-                    f"found {config.batch}; set --training.{name}.batch or "
-                    f"--training.{name}.accumulate"
+                    f"expected a batch that {size} processes can share, each in "
+                    f"{config.accumulate} parts, found {config.batch} scans; set "
+                    f"--training.{name}.batch or --training.{name}.accumulate"
                 )
 
         taxonomy = self.scans.dataset.taxonomy.name
@@ -116,9 +116,9 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
 
 
 def without_mean(recipe: Recipe, init: Weights | None, classes: Taxonomy, say: Say) -> Recipe:
-    """Return a recipe that keeps no share of initial weights if these have other classes.
+    """Return a recipe whose networks are no mean with initial weights that have other classes.
 
-    Their last layers are new then, and of no use in a mean.
+    Their last layers would be new, and of no use in a mean.
     """
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
@@ -152,7 +152,7 @@ def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None
 def open_parts(
     specs: Sequence[str], recipe: Recipe, out: Path, init: Weights | None
 ) -> tuple[Dataset, list[TrainingScans]]:
-    """Open the datasets of a training; return the first, and those to mix in with their scans."""
+    """Open the datasets of a training; return the first, and the scans of the others to mix in."""
     first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
     if first.is_normalised:
         view = recipe.model.range_view

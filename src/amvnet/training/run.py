@@ -73,7 +73,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
     else:
         train_network(plan, name, weights)
 
-    # The first process has written the weights; the others read them too.
+    # The first process has written the weights that all read.
     plan.processes.wait()
     trained = with_trained(plan, name, weights)
     if plan.processes.first:
