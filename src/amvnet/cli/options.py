@@ -1,4 +1,4 @@
-"""Options that verbs share, what they are given in words, and the processes that share them."""
+"""Options that several verbs have, the scans that they choose, and the processes of a verb."""
 
 from __future__ import annotations
 
@@ -43,16 +43,12 @@ class ScanChoice:
     each of the columns, separated by commas; default: float32."""
 
     def parse(self) -> ScanOptions:
-        """Return the options as the inputs take them.
-
-        Raises:
-            InputError: if a value cannot be parsed.
-        """
+        """Return the options of `list_inputs`; raise InputError if a value cannot be parsed."""
         from amvnet.data.formats.rows import parse_layout
         from amvnet.inference.listing import ScanOptions
 
         layout = parse_layout(self.columns, self.dtype)
-        return ScanOptions(self.sequences, self.split, self.topic, layout)
+        return ScanOptions(self.sequences, self.split, topic=self.topic, layout=layout)
 
 
 @dataclass(frozen=True)
@@ -111,11 +107,7 @@ class SensorChoice:
     the origin."""
 
     def parse(self) -> Sensor:
-        """Return what is known of the sensor.
-
-        Raises:
-            InputError: if there is no such sensor or file, or a value is impossible.
-        """
+        """Return what is known of the sensor; raise InputError if a value is impossible."""
         from amvnet.sensors.lidars import make_sensor
 
         return make_sensor(**asdict(self))
@@ -135,11 +127,7 @@ class ScoresChoice:
     """which of the two are scores before softmax."""
 
     def parse(self) -> ScorePair | None:
-        """Return the scores of two models; None if no option names any.
-
-        Raises:
-            InputError: if a folder is missing.
-        """
+        """Return the scores, if any are named; raise InputError if a folder is missing."""
         from amvnet.inference.scores import ScoreFolder, ScorePair
 
         if self == ScoresChoice():
@@ -165,7 +153,7 @@ def join_processes(cuda: bool = False) -> Processes:
 
 
 def describe_records(records: Sequence[ScanRecord]) -> str:
-    """Return how many scans there are, and of which sequences."""
+    """Return in words how many scans there are, and of which sequences."""
     if not records:
         return "none"
     names = sorted({record.sequence for record in records})

@@ -22,7 +22,7 @@ METAVARS = {"inputs": "INPUT", "weights": "W"}  # of arguments; that of others i
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Writes a default after each text that does not state one."""
+    """Writes the default of an option after its text, unless the text states it."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=30)
@@ -102,24 +102,26 @@ def _convert(flag: str, text: str, kind: Any) -> Any:
 
     kinds = list(_parts_of(kind))
     for number, words in NUMBERS.items():
-        if number in kinds:
-            try:
-                value = number(text)
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value):
-                raise InputError(f"{flag}: expected {words}, found {shown(text)}; correct it")
-            for allowed in kinds:
-                if isinstance(allowed, Range) and value not in allowed:
-                    raise InputError(
-                        f"{flag}: expected a number {allowed}, found {shown(text)}; correct it"
-                    )
-            return value
+        if number not in kinds:
+            continue
+        try:
+            value = number(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"{flag}: expected {words}, found {shown(text)}; correct it")
+        for allowed in kinds:
+            if isinstance(allowed, Range) and value not in allowed:
+                raise InputError(
+                    f"{flag}: expected a number {allowed}, found {shown(text)}; correct it"
+                )
+        return value
+
     return Path(text) if Path in kinds else text
 
 
 def _item_kind_of(kind: Any) -> Any:
-    """Return the type of the values in a tuple, also in an optional one; None of other types."""
+    """Return the type of the items of a tuple, also of an optional one; else None."""
     for part in (kind, *get_args(kind)):
         if get_origin(part) is tuple:
             return get_args(part)[0]
@@ -127,7 +129,7 @@ def _item_kind_of(kind: Any) -> Any:
 
 
 def _parts_of(kind: Any) -> Iterator[Any]:
-    """Yield a type and what it is made of: of `Count | None` also int and `Range`."""
+    """Yield a type and its parts; those of `Count | None` include int and a `Range`."""
     yield kind
     for part in get_args(kind):
         yield from _parts_of(part)

@@ -18,7 +18,7 @@ HELP_ALL = "--help-all"
 
 
 def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
-    """Add the values of a recipe as options; the help has them if `shows_all`, in groups."""
+    """Add the values of a recipe as options; the help shows them, in groups, if `shows_all`."""
     parser.add_argument(
         HELP_ALL,
         action="help",
@@ -43,11 +43,7 @@ def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
 
 
 def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
-    """Return a recipe with the values of the options whose names have dots.
-
-    Raises:
-        InputError: if a value does not fit.
-    """
+    """Return a recipe with the values of dotted options; raise InputError if one does not fit."""
     tree: dict[str, Any] = {}
     for name, text in values.items():
         if "." not in name or text is None:

@@ -1,4 +1,4 @@
-"""Stop on Ctrl-C or SIGTERM: within a second, with one line and an exit code of its own."""
+"""Stop on Ctrl-C or SIGTERM: within a second, with one line and the signal's exit code."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PATIENCE = 0.6  # seconds in which a verb may end by itself
 
 
 class Stop:
-    """What has become of a request to stop.
+    """Whether a signal has asked the verb to stop, and how it stops.
 
     Args:
         line: what is said when the verb has stopped.
