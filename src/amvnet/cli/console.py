@@ -53,7 +53,7 @@ class SafeStream:
 
     @contextmanager
     def _losing(self) -> Iterator[None]:
-        """Drop this and all that follows if the stream is closed, its disk is full, or the like."""
+        """Drop this and all later output if the stream is closed or its disk is full."""
         try:
             yield
         except (OSError, ValueError, AttributeError) as error:  # after >&- the stream is None

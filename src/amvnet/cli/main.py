@@ -29,13 +29,10 @@ from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
-VERBS = {
-    run.__name__: run
-    for run in (
-        *(demo, simulate, train, predict, evaluate, submit, fuse),
-        *(rank, analyze, ablate, export, view, bench, info),
-    )
-}
+# In the order of the help.
+_FIRST = (demo, simulate, train, predict, evaluate, submit, fuse)
+_LAST = (rank, analyze, ablate, export, view, bench, info)
+VERBS = {run_verb.__name__: run_verb for run_verb in _FIRST + _LAST}
 RESUMED = ("train", "predict")  # verbs with --resume
 GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done
 SHARED = ("train", "evaluate", "ablate")  # verbs whose work several processes can share

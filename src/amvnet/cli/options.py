@@ -43,7 +43,11 @@ class ScanChoice:
     each of the columns, separated by commas; default: float32."""
 
     def parse(self) -> ScanOptions:
-        """Return the options of `list_inputs`; raise InputError if a value cannot be parsed."""
+        """Return the options as the inputs take them.
+
+        Raises:
+            InputError: if a value cannot be parsed.
+        """
         from amvnet.data.formats.rows import parse_layout
         from amvnet.inference.listing import ScanOptions
 
@@ -107,7 +111,11 @@ class SensorChoice:
     the origin."""
 
     def parse(self) -> Sensor:
-        """Return what is known of the sensor; raise InputError if a value is impossible."""
+        """Return what is known of the sensor.
+
+        Raises:
+            InputError: if there is no such sensor or file, or a value is impossible.
+        """
         from amvnet.sensors.lidars import make_sensor
 
         return make_sensor(**asdict(self))
@@ -127,7 +135,11 @@ class ScoresChoice:
     """which of the two are scores before softmax."""
 
     def parse(self) -> ScorePair | None:
-        """Return the scores, if any are named; raise InputError if a folder is missing."""
+        """Return the scores of two models; None if no option names any.
+
+        Raises:
+            InputError: if only one is named, or a folder is missing.
+        """
         from amvnet.inference.scores import ScoreFolder, ScorePair
 
         if self == ScoresChoice():

@@ -43,7 +43,11 @@ def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
 
 
 def with_options(recipe: Recipe, values: dict[str, Any]) -> Recipe:
-    """Return a recipe with the values of dotted options; raise InputError if one does not fit."""
+    """Return a recipe with the values of the options whose names have dots.
+
+    Raises:
+        InputError: if a value does not fit.
+    """
     tree: dict[str, Any] = {}
     for name, text in values.items():
         if "." not in name or text is None:

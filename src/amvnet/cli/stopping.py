@@ -31,7 +31,7 @@ class Stop:
         self.exits = exits
         self.signal: int | None = None
         self._process = os.getpid()
-        self._is_first = threading.Lock()
+        self._ending = threading.Lock()  # taken by the first call of `end`
 
     @property
     def exit_code(self) -> int:
@@ -66,7 +66,7 @@ class Stop:
 
         It leaves no half-written file. Threads that still compute are not waited for.
         """
-        if not self._is_first.acquire(blocking=False):
+        if not self._ending.acquire(blocking=False):
             return
         complain(self.line)
         if not self.exits:

@@ -220,7 +220,7 @@ class LabelScans:
                 fetching = pool.submit(_fetch_file, row["path"], folder)
                 read = partial(_read_fetched, fetching, self.labelling.layout)
                 path = folder / Path(row["path"]).name
-                scan = NamedScan(row["name"], row["drive"], path, "", read)
+                scan = NamedScan(row["name"], row["drive"], path, ending="", read=read)
                 reader.expect(scan)
                 scans.append(FileScan(scan, reader))
             yield scans, Path(temporary, "labels")

@@ -66,7 +66,7 @@ def label_fleet(
     listing = list_blocks(inputs)
     first = next(listing)  # raises if there is no scan
     connect(address)
-    results = Results(out, labelling.settings, resume, overwrite)
+    results = Results(out, labelling.settings, resume=resume, overwrite=overwrite)
 
     with closing(Workers(labelling, most)) as workers:
         run = FleetRun(labelling, results, workers, progress, say)
@@ -224,7 +224,8 @@ class FleetRun:
         """
         entries = []
         for drive, points in self._points.items():
-            entries.append(Entry("", "", drive, points, self._uncertain[drive]))
+            uncertain = self._uncertain[drive]
+            entries.append(Entry("", "", sensor=drive, points=points, uncertain=uncertain))
         if METHODS[self.labelling.method].has_two_networks:
             usual = self.labelling.weights.usual_uncertain_at(self.labelling.tau)
             report(entries, usual, self._say)

@@ -167,7 +167,7 @@ def _check_same(place: Place, settings: Mapping[str, Any]) -> None:
     with suppress(UnicodeDecodeError, json.JSONDecodeError, RecursionError):
         earlier = json.loads(place.read())
     known = earlier if isinstance(earlier, dict) else {}
-    check_settings(place.url, settings, known, advice="change --out")
+    check_settings(place.url, settings, earlier=known, advice="change --out")
 
 
 def _write_settings(place: Place, settings: Mapping[str, Any]) -> None:

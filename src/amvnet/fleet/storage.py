@@ -58,12 +58,20 @@ class Place:
         return Path(self.path) if isinstance(self.filesystem, fs.LocalFileSystem) else None
 
     def kind(self) -> fs.FileType:
-        """Return whether it is a file, a folder or nothing; raise InputError if out of reach."""
+        """Return whether it is a file, a folder or nothing.
+
+        Raises:
+            InputError: if the storage cannot be reached.
+        """
         with reaching(self.url):
             return self.filesystem.get_file_info(self.path).type
 
     def children(self) -> tuple[list[str], list[str]]:
-        """Return the sorted names of a folder's files and folders; raise InputError if it fails."""
+        """Return the sorted names of the files in a folder, and those of its folders.
+
+        Raises:
+            InputError: if the folder cannot be listed.
+        """
         files: list[str] = []
         folders: list[str] = []
         with reaching(self.url):

@@ -41,16 +41,14 @@ class Fusion:
     def __init__(self, head: Head = None, tau: float | None = None) -> None:
         if isinstance(head, str | Path):
             head = load(head)
-        assertion = Disagreement()
         self._intensity = None
         if isinstance(head, Weights):
-            assertion = Disagreement(head.model.assertion.threshold)
             # The head sees the intensities, too.
             self._intensity = trained_intensity(head.training, head.sensor)
+            tau = head.model.assertion.threshold if tau is None else tau
             head = head.build_head()
-        if tau is not None:
-            assertion = Disagreement(tau)
 
+        assertion = Disagreement() if tau is None else Disagreement(tau)
         point_head = None if head is None else copy.deepcopy(head).cpu().eval()
         self.model = LateFusion(assertion, point_head)
 
@@ -76,8 +74,8 @@ class Fusion:
                 torch.from_numpy(g_valid).clamp_min(SURE),
             )
 
-        labels, fused = fetch(Scores(scores.merged, scores.uncertain, None, None))
-        return unpack(scan.valid, labels, fused, slice(None))
+        labels, fused = fetch(Scores(scores.merged, scores.uncertain, rv=None, bev=None))
+        return unpack(scan.valid, labels, fused, points=slice(None))
 
     def _check_shapes(self, scan: Scan, f: np.ndarray, g: np.ndarray) -> None:
         if f.shape != g.shape or f.ndim != 2 or len(f) != len(scan):

@@ -96,7 +96,7 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
             continue
         earlier_settings, entries = _read(path)
         advice = "start over with --overwrite instead of --resume"
-        check_settings(folder, settings, earlier_settings, advice)
+        check_settings(folder, settings, earlier=earlier_settings, advice=advice)
         for entry in entries:
             done[entry.scan] = entry
     return done

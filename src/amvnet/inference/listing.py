@@ -89,7 +89,11 @@ class DatasetScan:
         return Path(self.record.prediction)
 
     def load(self, labels: bool = False) -> LoadedScan:
-        """Read the scan, and its labels if `labels`; raise InputError if it cannot be read."""
+        """Read the scan, with the ground truth if `labels` and there is any.
+
+        Raises:
+            InputError: if it cannot be read.
+        """
         return LoadedScan(self.dataset.read(self.record, labels=labels))
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
@@ -183,8 +187,7 @@ class FileScan:
             taxonomy: turns raw ids into train ids.
         """
         if path.is_dir():
-            stem = path / self.name
-            paths = [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]
+            paths = [path / self.labels_path(kind) for kind in KINDS]
             path = next(filter(Path.is_file, paths), paths[0])
         return read_scan_labels(path, count, taxonomy)
 

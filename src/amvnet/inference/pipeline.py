@@ -138,12 +138,7 @@ class Pipeline:
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
     def _check_output(self, earlier: Mapping[str, Entry]) -> None:
-        """Check the names of the files, and that only those of an earlier run are replaced.
-
-        Raises:
-            InputError: if another file would be replaced, two scans have the same files, or a file
-                would lie outside the folder.
-        """
+        """Raise InputError if a file may not be written: only those of `earlier` are replaced."""
         folder = self.output.folder
         _check_names(self.scans)
         new_paths: list[Path] = []

@@ -108,20 +108,20 @@ def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
     points: Counter[str] = Counter()
     uncertain: Counter[str] = Counter()
     for entry in entries:
-        points[entry.sensor] += entry.points
-        uncertain[entry.sensor] += entry.uncertain
-    if not points.total():
+        if entry.points:
+            points[entry.sensor] += entry.points
+            uncertain[entry.sensor] += entry.uncertain
+    if not points:
         return
 
-    sensors = +points  # those with points
     doubtful = {}
-    for sensor in sensors:
+    for sensor in points:
         verdict = Verdict(uncertain[sensor] / points[sensor], usual)
         if verdict.is_doubtful:
             doubtful[sensor] = verdict
 
     verdict = Verdict(uncertain.total() / points.total(), usual)
-    if len(sensors) == 1 or not doubtful:
+    if len(points) == 1 or not doubtful:
         say(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else verdict.shares)
         return
 

@@ -98,19 +98,23 @@ def normaliser_for(
     return Normaliser(expected, sensor, say)
 
 
-def open_for_weights(spec: str, weights: Weights, dataset: Dataset | None = None) -> Dataset:
-    """Open a dataset whose scans are read as some weights expect them.
-
-    The scans of the benchmarks are as they are; a user's own are normalised as `predict` does.
+def open_for_weights(spec: str, weights: Weights) -> Dataset:
+    """Open a dataset with the classes of some weights, its scans `normalised_for` these.
 
     Args:
         spec: as `open_dataset` takes it.
-        dataset: the dataset, if it is open.
 
     Raises:
         InputError: as `open_with_classes`.
     """
-    dataset = dataset or open_with_classes(spec, weights.taxonomy)
+    return normalised_for(weights, open_with_classes(spec, weights.taxonomy))
+
+
+def normalised_for(weights: Weights, dataset: Dataset) -> Dataset:
+    """Return a dataset whose scans are read as some weights expect them.
+
+    The scans of the benchmarks are as they are; a user's own are normalised as `predict` does.
+    """
     if isinstance(dataset, OwnScans):
         return normalised_by(normaliser_for(weights), dataset)
     return dataset

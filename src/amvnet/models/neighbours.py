@@ -36,10 +36,11 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
         query = _query_by_pykdtree(xyz, m)
     except ImportError:  # not required by `onnx_runner`
         query = _query_by_scipy(xyz, m)
-    is_tied = _search(query, xyz, own, np.arange(len(own)), nearest)
+    is_tied = _search(query, xyz, own, rows=np.arange(len(own)), nearest=nearest)
 
     if is_tied.mean() > FREQUENT_TIES:
-        _search(_query_by_scipy(xyz, m), xyz, own, is_tied.nonzero()[0], nearest)
+        query = _query_by_scipy(xyz, m)
+        _search(query, xyz, own, rows=is_tied.nonzero()[0], nearest=nearest)
     return nearest
 
 
@@ -54,8 +55,9 @@ def _search(
     is_tied = np.empty(len(rows), dtype=bool)
     for start in range(0, len(rows), AT_ONCE):
         part = rows[start : start + AT_ONCE]
-        indices, is_tied[start : start + AT_ONCE] = query(xyz[own[part]])
+        indices, ties = query(xyz[own[part]])
         nearest[part] = _drop_self(indices, own[part], nearest.shape[1])
+        is_tied[start : start + AT_ONCE] = ties
     return is_tied
 
 

@@ -257,10 +257,10 @@ class PointGatherer:
         certain, uncertain = np.sum(processes.gather(matrices), axis=0)
         labelled = certain[1:].sum() + uncertain.sum()
         return HeadPoints(
-            [folder / str(rank) for rank in range(processes.size)],
-            self._dtype,
-            np.concatenate(files),
-            np.concatenate(ordered),
+            paths=[folder / str(rank) for rank in range(processes.size)],
+            dtype=self._dtype,
+            files=np.concatenate(files),
+            labels=np.concatenate(ordered),
             certain=certain,
             uncertain_share=float(uncertain.sum() / max(labelled, 1)),
         )

@@ -68,7 +68,11 @@ class NetworkStage(Stage):
         self.register_buffer("class_weights", tensor, persistent=False)
 
     def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
-        """Return what the loss is over, and the points' logits (P, K), given their ids (P,)."""
+        """Return what the loss is over, and the (P, K) logits of all points.
+
+        Args:
+            labels: (P,) train ids.
+        """
         raise NotImplementedError
 
     def loss(self, scored: Scored) -> Tensor:
@@ -138,9 +142,12 @@ class RangeStage(NetworkStage):
 
         # Pixels without a point have no label.
         index = (view.nearest >= 0).nonzero()[:, 0]
-        scan = index // (len(pixels) // batch.count)
-        pixel_labels = labels[view.nearest[index]]
-        scored = Scored(pixels.index_select(0, index), pixel_labels, scan, batch.count)
+        scored = Scored(
+            logits=pixels.index_select(0, index),
+            labels=labels[view.nearest[index]],
+            scan=index // (len(pixels) // batch.count),
+            scans=batch.count,
+        )
         return scored, pixels[view.pixel]
 
 
@@ -169,10 +176,11 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
     logits = scores.unflatten(1, (vertical, -1)).flatten(0, 1)  # (M * Z, K)
     voxels, (cells,) = occurring(len(logits), view.slot * vertical + view.voxel)
     voxel_logits = logits.index_select(0, voxels)
-    voxel_labels = majority_labels(cells, labels, len(voxels), logits.shape[1])
+    classes = logits.shape[1]
+    voxel_labels = majority_labels(cells, labels, count=len(voxels), classes=classes)
 
     scan = view.occupied[voxels // vertical] // (radial * angular)
-    return Scored(voxel_logits, voxel_labels, scan, scans)
+    return Scored(logits=voxel_logits, labels=voxel_labels, scan=scan, scans=scans)
 
 
 def train_network(plan: Plan, name: str, weights: Weights) -> None:

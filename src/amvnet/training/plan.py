@@ -13,7 +13,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.reading import WithRows, open_for_weights
+from amvnet.inference.reading import WithRows, normalised_for
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Say, say_nothing
@@ -146,7 +146,7 @@ def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None
     earlier = init or _earlier_weights(out)
     if earlier is not None:
         weights = dataclasses.replace(weights, training=earlier.training)
-    return open_for_weights(data, weights, dataset)
+    return normalised_for(weights, dataset)
 
 
 def open_parts(
