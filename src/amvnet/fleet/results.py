@@ -69,8 +69,8 @@ class Results:
         self.folder = out / FOLDER
         self.done = NameSet()
         self._pending: list[pa.Table] = []
-        self._last = time.monotonic()
-        self._number = 0
+        self._last = time.monotonic()  # when the last part was written
+        self._number = 0  # of the next part
 
         self.drives: dict[str, dict[str, Any]] = {}
         place = self.folder / SETTINGS

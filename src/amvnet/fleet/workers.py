@@ -124,7 +124,7 @@ class Workers:
                 if reference in self._starting:
                     self._begin(reference)
                     continue
-                worker, table, ends = running.pop(reference)
+                worker, table, retries = running.pop(reference)
                 result = None
                 try:
                     result = ray.get(reference)
@@ -132,8 +132,8 @@ class Workers:
                     pass  # the method failed
                 except RayError:
                     self._give_up(worker)
-                    if ends < RETRIES:
-                        waiting.append((table, ends + 1))
+                    if retries < RETRIES:
+                        waiting.append((table, retries + 1))
                         continue
                 yield table, result
 
@@ -150,8 +150,8 @@ class Workers:
             worker = min(self._ready, key=loads.__getitem__)
             if loads[worker] >= queued:
                 return
-            table, ends = waiting.popleft()
-            running[getattr(worker, method).remote(table)] = (worker, table, ends)
+            table, retries = waiting.popleft()
+            running[getattr(worker, method).remote(table)] = (worker, table, retries)
             loads[worker] += 1
 
     def _grow(self, wanted: int) -> None:

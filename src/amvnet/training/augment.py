@@ -256,7 +256,7 @@ def _elevations(scan: Scan) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> np.ndarray:
-    """Return the lowest and the highest finite value without `OUTLIERS`, or zeros without any."""
+    """Return the lowest and the highest value without `OUTLIERS`; zeros if none is finite."""
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
         return np.zeros(2)

@@ -154,10 +154,12 @@ def open_parts(
 ) -> tuple[Dataset, list[TrainingScans]]:
     """Open the datasets of a training; return the first, and the scans of the others to mix in."""
     first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
-    if first.is_normalised:
-        view = recipe.model.range_view
-        others = [each if each.is_normalised else WithRows(each, view) for each in others]
-    return first, [TrainingScans(dataset, training_records(dataset), []) for dataset in others]
+    parts = []
+    for dataset in others:
+        if first.is_normalised and not dataset.is_normalised:
+            dataset = WithRows(dataset, recipe.model.range_view)
+        parts.append(TrainingScans(dataset, training_records(dataset), val=[]))
+    return first, parts
 
 
 def _earlier_weights(out: Path) -> Weights | None:
