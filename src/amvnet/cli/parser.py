@@ -78,11 +78,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _convert(flag: str, text: str, kind: Any) -> Any:
-    """Convert the text of an option to its type.
-
-    Raises:
-        InputError: if it does not fit, or a number is out of the `Range` of an `Annotated` type.
-    """
+    """Convert the text of an option to its type; raise InputError if it does not fit."""
     item_kind = _item_kind_of(kind)
     if item_kind is not None:
         texts = list(filter(None, map(str.strip, text.split(","))))
@@ -137,9 +133,7 @@ def _parts_of(kind: Any) -> Iterator[Any]:
 
 def literals(kind: Any) -> tuple[str, ...]:
     """Return the values of a Literal, also of an optional one; none of any other type."""
-    if get_origin(kind) is Literal:
-        return get_args(kind)
-    for part in get_args(kind):
+    for part in (kind, *get_args(kind)):
         if get_origin(part) is Literal:
             return get_args(part)
     return ()
@@ -245,7 +239,7 @@ def metavar_of(name: str, kind: Any) -> str:
 
 
 def first_line(documented: Any) -> str:
-    """Return the first line of the documentation of a class or function, without its period."""
+    """Return the first line of the docstring of a class or function, without its period."""
     return (documented.__doc__ or "").strip().splitlines()[0].rstrip(".")
 
 

@@ -95,7 +95,7 @@ def installation_table() -> Table:
     """Return the table of what is installed: versions, devices, built-in weights and recipes."""
     table = Table(title="AMVNet", show_header=False, show_edge=False)
     required = [re.split(r"[^\w.-]", line)[0] for line in metadata.requires("amvnet") or ()]
-    for name in ("amvnet", *dict.fromkeys(required)):  # each once, also if several extras need it
+    for name in ("amvnet", *dict.fromkeys(required)):  # several extras may name a package
         table.add_row(name, _version(name))
     table.add_row("python", platform.python_version())
 

@@ -186,11 +186,7 @@ class Workers:
 
 
 def _share_cluster(device: str, most: int | None) -> tuple[int, dict[str, Any]]:
-    """Return how many workers there are, and what each needs, as options of Ray.
-
-    Raises:
-        InputError: if the device is a GPU, and the cluster has none.
-    """
+    """Return how many workers there are, and what each needs, as options of Ray."""
     available = ray.cluster_resources()
     cores = int(available.get("CPU", 1))
     gpus = int(available.get("GPU", 0))

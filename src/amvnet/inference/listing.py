@@ -118,8 +118,8 @@ def _title_of(record: ScanRecord) -> str:
 class FileReader:
     """Reads scan files, normalised to what some weights expect.
 
-    Scans that were read to measure their sensor are kept until they are asked for, so that each
-    file is read once.
+    Scans that were read to measure their sensor are kept until they are needed, so that no file is
+    read twice.
 
     Args:
         normaliser: normalises the scans; None reads them as they are.

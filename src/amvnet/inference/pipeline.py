@@ -297,7 +297,7 @@ def _check_names(scans: Sequence[InputScan]) -> None:
 
 
 def _check_folder(scan: InputScan, output: OutputOptions) -> None:
-    """Raise InputError if output files would lie among the scans and could be taken for scans."""
+    """Raise InputError if output files would lie among the scans and look like scans."""
     labels_look_like_scans = f".{output.kind}" in COLUMN_READERS
     scores_look_like_scans = output.scores and scan.path.suffix.lower() == ".npz"
     folder = (output.folder / scan.scores_path).parent

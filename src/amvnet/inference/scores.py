@@ -141,7 +141,7 @@ class ScorePair:
         return self.a.read(prediction, scan, classes), self.b.read(prediction, scan, classes)
 
     def digests(self, records: Sequence[ScanRecord]) -> dict[str, str]:
-        """Return a digest of each model's scores of some scans, the same wherever the files lie."""
+        """Return a digest of each model's scores of some scans, wherever the files lie."""
         return {scores.side: _digest(scores, records) for scores in (self.a, self.b)}
 
 

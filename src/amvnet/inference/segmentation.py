@@ -145,7 +145,7 @@ class Segmentation:
 
     @property
     def raw_ids(self) -> NDArray[np.uint32]:
-        """(N,) the labels as the benchmark's files number them (10 is a car of SemanticKITTI)."""
+        """(N,) the labels as the benchmark's files have them (10 is a car of SemanticKITTI)."""
         raw: NDArray[np.uint32] = self.require_origin().taxonomy.to_raw(self.labels)
         return raw
 

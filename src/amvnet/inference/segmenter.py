@@ -121,7 +121,7 @@ class Segmenter:
 
     @property
     def usual_uncertain(self) -> float | None:
-        """The share of uncertain points in the scans of the validation; None for another tau."""
+        """The share of uncertain points in the validation; None for another tau."""
         return self.weights.usual_uncertain_at(self.tau)
 
     def __repr__(self) -> str:
@@ -158,7 +158,7 @@ class Segmenter:
         """Segment several scans in one pass of the networks, which suits a GPU.
 
         Raises:
-            InputError: if one of them cannot be segmented; segment them one by one to see which.
+            InputError: if one cannot be segmented; segment them one by one to see which.
         """
         checked = []
         for scan in scans:
@@ -232,7 +232,7 @@ class Segmenter:
         return segmenter
 
     def for_dataset(self, dataset: Dataset) -> Segmenter:
-        """Return the segmenter for the scans of a dataset: `by_ring` if these are normalised."""
+        """Return the segmenter for a dataset: `by_ring` if its scans are normalised."""
         return self.by_ring() if dataset.is_normalised else self
 
     @torch.inference_mode()

@@ -33,7 +33,7 @@ Write = Callable[[np.ndarray], object]
 
 @dataclass(frozen=True)
 class Timing:
-    """The seconds of each stage and of `MEAN`, and the numbers of points and uncertain points."""
+    """The seconds of each stage and of `MEAN`; how many points there are, and uncertain ones."""
 
     seconds: dict[str, float]
     points: int
@@ -52,7 +52,7 @@ class Timing:
 def time_runs(
     segmenter: Segmenter, read: Read, write: Write, runs: int, progress: Progress = no_progress
 ) -> dict[str, Any]:
-    """Time a number of runs, at least one, after those that warm up; return a report for JSON."""
+    """Time at least one run, after those that warm up; return a report for JSON."""
     timings = []
     for run in range(runs + WARM_UP):
         timings.append(run_once(segmenter, read, write))

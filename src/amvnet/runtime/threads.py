@@ -47,8 +47,8 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
 
     A thread that sleeps has to be woken for its share of each operation. In a part of many short
     operations this takes longer than the share. So every thread takes whole parts instead; if there
-    are fewer parts than threads, each part gets an equal number of threads. Threads that spin need
-    no waking, and would keep the processors from the threads of the parts.
+    are fewer parts than threads, each part gets equally many. Threads that spin need no waking, and
+    would keep the processors from the threads of the parts.
     """
     import torch
 

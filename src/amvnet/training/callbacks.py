@@ -99,7 +99,7 @@ class AverageWeights(Callback):
 class KeepWeights(Callback):
     """Writes last.safetensors, best.safetensors and `SETTINGS` of a stage after each epoch.
 
-    The best weights have the highest validation mIoU; without validation, they are the last ones.
+    The best weights have the highest validation mIoU, or without validation are the last.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class KeepWeights(Callback):
 
 
 class SeedBatches(Callback):
-    """Seeds PyTorch before each training batch, so that a resumed run repeats the random draws."""
+    """Seeds PyTorch before each training batch, so that a resumed run repeats its draws."""
 
     def __init__(self, seed: int, rank: int = 0) -> None:
         self.seed = seed

@@ -27,12 +27,10 @@ VAL_FACTOR = 64  # a validation batch is as large as this many training batches
 class HeadStage(Stage):
     """Stage `head`: it learns from scores gathered beforehand, so that the networks stay frozen.
 
-    Args:
-        head: the point head.
-        train: the points to train with.
-        val: the points to validate with, or None for no validation.
+    The arguments that are not named here are those of `Stage`.
 
-    The other arguments are those of `Stage`.
+    Args:
+        train, val: the points to train and to validate with; None for no validation.
     """
 
     name = "head"
@@ -101,7 +99,7 @@ def train_head(plan: Plan, weights: Weights) -> None:
     config = training.head
     folder = plan.out / "head"
 
-    # Other models scored the scans as they are; networks want the intensities of their training.
+    # Other models scored the scans as they are; networks need the intensities they learnt.
     intensity = None
     if plan.scores is None:
         for part in BOTH_NETWORKS:

@@ -64,7 +64,7 @@ PASTED = frozenset(
 class ScanSet(data.Dataset[Scan]):
     """Labelled scans by epoch and index.
 
-    The augmentation depends on nothing but seed, epoch and index: it is the same on any number of
+    The augmentation depends only on seed, epoch and index: it is the same on any number of
     processes. Augmented scans are those of the epoch (`Dataset.at_epoch`).
 
     Args:
@@ -222,7 +222,7 @@ def count_classes(
         "classes": list(dataset.taxonomy.classes),
     }
 
-    # What the first process reads counts: others might already see the file that it writes below.
+    # The first process reads for all: others might already see the file that it writes below.
     earlier = processes.gather(_read_counts(path, source))[0]
     if earlier is not None:
         return earlier
@@ -249,7 +249,7 @@ def count_classes(
 def sensor_record(
     dataset: Dataset, records: Sequence[ScanRecord], intensity: TrainedIntensity | None = None
 ) -> dict[str, Any]:
-    """Return what weights carry of the sensor of their training scans, measured on some of them.
+    """Return what weights record of the sensor, measured on some of their training scans.
 
     These are the measures of `sensors.record`, and the mean quantiles of the intensities at
     `sensors.intensity.PROBABILITIES`, empty if no scan has usable ones. Broken scans are left out:

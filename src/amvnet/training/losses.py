@@ -148,8 +148,8 @@ def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> 
 def dice(probabilities: Tensor, targets: Targets) -> Tensor:
     """Return the soft Dice loss: 1 - 2 |p t| / (|p| + |t|), averaged over the classes present.
 
-    The probabilities p are (P, K), and t is the one-hot encoding of the classes of the P points.
-    The loss is a scalar, the mean over the scans.
+    The probabilities p are (P, K), and t is the one-hot encoding of the classes. The loss is a
+    scalar, the mean over the scans.
     """
     truth = F.one_hot(targets.classes, probabilities.shape[1]).to(probabilities)
     members = F.one_hot(targets.scan, len(targets.counts)).to(probabilities).T  # (B, P)

@@ -39,14 +39,11 @@ REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 class NetworkStage(Stage):
     """The base of the two networks' stages, which learn from batches of scans by AdamW.
 
-    A subclass defines `logits`.
+    A subclass defines `logits`. The arguments that are not named here are those of `Stage`.
 
     Args:
-        view: projects the scans.
-        net: the network.
+        view, net: the projection, and the network on it.
         weights: (K,) class weights of the loss, or None for equal weights.
-
-    The other arguments are those of `Stage`.
     """
 
     config: NetworkTraining

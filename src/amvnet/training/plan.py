@@ -34,8 +34,8 @@ class Plan:
         say: prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
         processes: those that share the run; all must see its folder.
-        scores: two other models' scores of the scans; the head is trained on them instead of on
-            those of the networks. None without other models.
+        scores: two other models' scores of the scans, to train the head on instead of on the
+            networks'; None without other models.
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, or the recipe is for
@@ -163,7 +163,7 @@ def open_parts(
 
 
 def _earlier_weights(out: Path) -> Weights | None:
-    """Return weights that an earlier call has written into the folder of a run; None if none."""
+    """Return weights that an earlier call has written into the folder; None without any."""
     for name in ("weights", "rv/last", "bev/last"):
         path = out / f"{name}.safetensors"
         if path.is_file():

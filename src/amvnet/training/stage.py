@@ -187,7 +187,7 @@ def fit(
         # Lightning sets the sampler's epoch only after the reading processes have begun to draw.
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
 
-    # The statistics of synchronised batch norms are the same everywhere, and processes may validate
+    # Synchronised batch norms have the same statistics everywhere, and processes may validate
     # unequal shares.
     ddp = DDPStrategy(broadcast_buffers=False)
     trainer = L.Trainer(

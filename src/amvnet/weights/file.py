@@ -303,11 +303,7 @@ def load(name_or_path: str | Path) -> Weights:
 
 
 def _from_description(text: str) -> Weights:
-    """Return weights without parameters: what the description in a file says.
-
-    Raises:
-        InputError: if it is not a description of this format, or a value is out of its range.
-    """
+    """Return weights without parameters: what the description in a file says."""
     description = None
     if len(text) <= LONGEST:
         with suppress(ValueError, RecursionError):
