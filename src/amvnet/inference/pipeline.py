@@ -155,8 +155,8 @@ class Pipeline:
     def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
         """Return the entries of an earlier run whose scans need not be segmented again.
 
-        The files of such a scan are there, and neither it nor the first scans of its recording, by
-        which it is normalised, have changed.
+        Their files are there, and neither they nor the first scans of their recordings, by which
+        they are normalised, have changed.
         """
         done = dict(earlier)
         for scan in self.scans:

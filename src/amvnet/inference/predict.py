@@ -20,7 +20,7 @@ from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 
-NAMED = 10  # recordings with doubtful labels that get a line of their own
+NAMED = 10  # doubtful recordings, each in a line
 # What to try if the labels are doubtful.
 ADVICE = (
     "check what was assumed, and try --height, --axes, --rotate or --intensity-scale, "

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 FREQUENT_TIES = 0.001  # share of the queries with a tie; chance alone causes fewer
-LEAF = 32  # points; with pykdtree's own 16, a tree takes longer to build and is searched no faster
+LEAF = 32  # points; pykdtree's own 16 take longer to build and no less to search
 AT_ONCE = 2**17  # queries whose distances are in memory: a scan may have millions
 
 # Takes (Q, 3) queries; returns the (Q, m) indices of the nearest points, and whether others are as

@@ -37,7 +37,7 @@ from amvnet.sensors.record import AS_IS, measure_sensor, normalised_record
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
-SAMPLED_SCANS = 60  # to measure: enough for a mean, as the heights of simulated sensors differ
+SAMPLED_SCANS = 60  # to measure: enough for the mean height of simulated sensors
 
 Key = tuple[int, int]  # epoch, index in the list of scans
 
