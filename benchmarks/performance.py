@@ -143,7 +143,7 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
                 read=lambda: read_scan(options.scan),
                 write=lambda ids: write_ids(target, ids),
             )
-            figures = {**run.seconds, "SalsaNext": seconds, "all": run.all}
+            figures = {**run.seconds, "SalsaNext": seconds, "all": run.total}
             figures["points"] = run.points
             figures["uncertain"] = run.uncertain / run.points
             times.append(figures)

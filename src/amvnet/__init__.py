@@ -71,7 +71,9 @@ def load(
     segmenter_class = import_module("amvnet.inference.segmenter").Segmenter
     choose_device = import_module("amvnet.models.precision").choose_device
     device = choose_device(device, engine)
-    segmenter: Segmenter = segmenter_class(weights, device, method, precision, tau)
+    segmenter: Segmenter = segmenter_class(
+        weights, device=device, method=method, precision=precision, tau=tau
+    )
     if engine != "torch":
         import_module("amvnet.export.engines").use_engine(segmenter, engine)
     return segmenter

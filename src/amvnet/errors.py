@@ -44,6 +44,12 @@ def did_you_mean(word: str, known: Iterable[str], advice: str = "correct it") ->
     return f"; did you mean {names[similar[0]]}?"
 
 
+def reason_of(error: BaseException) -> str:
+    """Return the first line of an error's message, or the name of its class without a message."""
+    lines = str(error).splitlines() or [type(error).__name__]
+    return lines[0]
+
+
 class SomeBroken(Exception):
     """Some of several inputs could not be used; the others have been processed.
 
@@ -100,7 +106,7 @@ def import_optional(module: str, extra: str) -> Any:
 
 @contextmanager
 def errors_of(source: object) -> Iterator[None]:
-    """Begin the messages of errors of the input in this block with the file that they are about."""
+    """Begin the message of an `InputError` in this block with the file that it is about."""
     try:
         yield
     except InputError as error:

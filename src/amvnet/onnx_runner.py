@@ -16,7 +16,7 @@ import numpy as np
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
-from amvnet.errors import InputError
+from amvnet.errors import InputError, reason_of
 from amvnet.models.neighbours import nearest_others
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import TrainedIntensity, check_quantiles, match_scan
@@ -389,9 +389,8 @@ def _open_session(folder: Path, graph: Mapping[str, Any], providers: Sequence[st
     try:
         session = onnxruntime.InferenceSession(str(path), providers=list(providers))
     except Exception as error:  # one of a dozen classes without a common base of their own
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            f"{path}: expected a graph of amvnet export, found: {reason}; export again"
+            f"{path}: expected a graph of amvnet export, found: {reason_of(error)}; export again"
         ) from None
 
     inputs = [(value.name, value.shape) for value in session.get_inputs()]

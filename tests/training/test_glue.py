@@ -165,7 +165,7 @@ def test_every_scan_of_a_step_has_the_same_share_of_its_gradient(
         in_step = sizes[step : step + parts]
         for index, size in enumerate(in_step, start=step):
             # Lightning divides by the number of parts, and the loss is a mean over the part.
-            share_of_scan = stage.share_of_step(size, index) / parts / size
+            share_of_scan = stage.step_factor(size, index) / parts / size
             assert share_of_scan == pytest.approx(1 / sum(in_step))
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
@@ -54,6 +54,18 @@ def assert_same_tensors(first: Mapping[str, Tensor], second: Mapping[str, Tensor
 
 
 # --- load and save ---
+
+
+def test_an_error_of_the_disk_needs_no_message(
+    weights: Weights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: Any, **kwargs: Any) -> None:
+        raise SafetensorError
+
+    monkeypatch.setattr("amvnet.weights.file.save_file", fail)
+    with pytest.raises(OSError, match="SafetensorError"):
+        save(weights, tmp_path / "w.safetensors")
+    assert not list(tmp_path.iterdir())
 
 
 def test_saved_weights_are_loaded_unchanged(weights: Weights, path: Path) -> None:

@@ -35,7 +35,7 @@ class SafeStream:
 
     @property
     def _stream(self) -> Any:
-        """The stream as it is now, also if tests or a progress bar have replaced it."""
+        """The stream as it is now: tests or a progress bar may have replaced it."""
         stream = getattr(sys, self.name)
         return getattr(stream, "rich_proxied_file", stream)
 
@@ -53,7 +53,7 @@ class SafeStream:
 
     @contextmanager
     def _losing(self) -> Iterator[None]:
-        """Drop this and all that follows if the stream is closed, its disk is full, or the like."""
+        """Drop this and all later output if the stream is closed or its disk is full."""
         try:
             yield
         except (OSError, ValueError, AttributeError) as error:  # after >&- the stream is None
@@ -110,12 +110,14 @@ def printable(text: str) -> str:
         text = f"{text[:LONGEST_LINE]}... ({len(text):,} characters)"
     if text.isprintable():
         return text
-    characters = []
+
+    escaped = ""
     for character in text:
-        if not character.isprintable():
-            character = character.encode("unicode_escape").decode("ascii")
-        characters.append(character)
-    return "".join(characters)
+        if character.isprintable():
+            escaped += character
+        else:
+            escaped += character.encode("unicode_escape").decode("ascii")
+    return escaped
 
 
 def silence() -> None:

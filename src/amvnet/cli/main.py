@@ -29,13 +29,10 @@ from amvnet.cli.stopping import stoppable
 from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
-VERBS = {
-    run.__name__: run
-    for run in (
-        *(demo, simulate, train, predict, evaluate, submit, fuse),
-        *(rank, analyze, ablate, export, view, bench, info),
-    )
-}
+# In the order of the help.
+_FIRST = (demo, simulate, train, predict, evaluate, submit, fuse)
+_LAST = (rank, analyze, ablate, export, view, bench, info)
+VERBS = {run_verb.__name__: run_verb for run_verb in _FIRST + _LAST}
 RESUMED = ("train", "predict")  # verbs with --resume
 GOES_ON = ("simulate", "ablate")  # verbs that keep what an earlier call has done
 SHARED = ("train", "evaluate", "ablate")  # verbs whose work several processes can share
@@ -63,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with stoppable(_last_words(arguments), exits=argv is None) as stop:
             try:
-                code = _run_in_one_line(arguments)
+                code = _run_and_explain(arguments)
             except BaseException:  # libraries turn an interruption into exceptions of their own
                 if stop.signal is None:
                     raise
@@ -93,8 +90,8 @@ def _last_words(arguments: Sequence[str]) -> str:
     return "stopped"
 
 
-def _run_in_one_line(arguments: Sequence[str]) -> int:
-    """Run the command line as `main` does, and return the exit code."""
+def _run_and_explain(arguments: Sequence[str]) -> int:
+    """Run the command line, and print its errors as one line each; return the exit code."""
     if not arguments or arguments[0] in ("-h", "--help"):
         say_lines(_usage())
         return DONE if arguments else WRONG_INPUT
@@ -148,7 +145,7 @@ def run(verb: str, arguments: Sequence[str]) -> None:
 
 
 def _parse_with_recipe(verb: str, arguments: Sequence[str]) -> dict[str, Any]:
-    """Parse the arguments of a verb with a recipe, and set the values of their options in it."""
+    """Parse the arguments of a verb with a recipe, whose values the options replace."""
     from amvnet.cli.recipe_options import HELP_ALL, add_recipe, with_options
     from amvnet.config.recipes import load_recipe
     from amvnet.config.schema import Recipe

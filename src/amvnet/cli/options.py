@@ -1,4 +1,4 @@
-"""Options that verbs share, what they are given in words, and the processes that share them."""
+"""Options that several verbs have, the scans that they choose, and the processes of a verb."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ScanChoice:
         from amvnet.inference.listing import ScanOptions
 
         layout = parse_layout(self.columns, self.dtype)
-        return ScanOptions(self.sequences, self.split, self.topic, layout)
+        return ScanOptions(self.sequences, self.split, topic=self.topic, layout=layout)
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ class ScoresChoice:
         """Return the scores of two models; None if no option names any.
 
         Raises:
-            InputError: if a folder is missing.
+            InputError: if only one is named, or a folder is missing.
         """
         from amvnet.inference.scores import ScoreFolder, ScorePair
 
@@ -165,7 +165,7 @@ def join_processes(cuda: bool = False) -> Processes:
 
 
 def describe_records(records: Sequence[ScanRecord]) -> str:
-    """Return how many scans there are, and of which sequences."""
+    """Return in words how many scans there are, and of which sequences."""
     if not records:
         return "none"
     names = sorted({record.sequence for record in records})

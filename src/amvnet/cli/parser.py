@@ -22,7 +22,7 @@ METAVARS = {"inputs": "INPUT", "weights": "W"}  # of arguments; that of others i
 
 
 class HelpFormatter(argparse.HelpFormatter):
-    """Writes a default after each text that does not state one."""
+    """Writes the default of an option after its text, unless the text states it."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=30)
@@ -78,11 +78,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _convert(flag: str, text: str, kind: Any) -> Any:
-    """Convert the text of an option to its type.
-
-    Raises:
-        InputError: if it does not fit, or a number is out of the `Range` of an `Annotated` type.
-    """
+    """Convert the text of an option to its type; raise InputError if it does not fit."""
     item_kind = _item_kind_of(kind)
     if item_kind is not None:
         texts = list(filter(None, map(str.strip, text.split(","))))
@@ -102,24 +98,26 @@ def _convert(flag: str, text: str, kind: Any) -> Any:
 
     kinds = list(_parts_of(kind))
     for number, words in NUMBERS.items():
-        if number in kinds:
-            try:
-                value = number(text)
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value):
-                raise InputError(f"{flag}: expected {words}, found {shown(text)}; correct it")
-            for allowed in kinds:
-                if isinstance(allowed, Range) and value not in allowed:
-                    raise InputError(
-                        f"{flag}: expected a number {allowed}, found {shown(text)}; correct it"
-                    )
-            return value
+        if number not in kinds:
+            continue
+        try:
+            value = number(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(f"{flag}: expected {words}, found {shown(text)}; correct it")
+        for allowed in kinds:
+            if isinstance(allowed, Range) and value not in allowed:
+                raise InputError(
+                    f"{flag}: expected a number {allowed}, found {shown(text)}; correct it"
+                )
+        return value
+
     return Path(text) if Path in kinds else text
 
 
 def _item_kind_of(kind: Any) -> Any:
-    """Return the type of the values in a tuple, also in an optional one; None of other types."""
+    """Return the type of the items of a tuple, also of an optional one; else None."""
     for part in (kind, *get_args(kind)):
         if get_origin(part) is tuple:
             return get_args(part)[0]
@@ -127,7 +125,7 @@ def _item_kind_of(kind: Any) -> Any:
 
 
 def _parts_of(kind: Any) -> Iterator[Any]:
-    """Yield a type and what it is made of: of `Count | None` also int and `Range`."""
+    """Yield a type and its parts; those of `Count | None` include int and a `Range`."""
     yield kind
     for part in get_args(kind):
         yield from _parts_of(part)
@@ -135,9 +133,7 @@ def _parts_of(kind: Any) -> Iterator[Any]:
 
 def literals(kind: Any) -> tuple[str, ...]:
     """Return the values of a Literal, also of an optional one; none of any other type."""
-    if get_origin(kind) is Literal:
-        return get_args(kind)
-    for part in get_args(kind):
+    for part in (kind, *get_args(kind)):
         if get_origin(part) is Literal:
             return get_args(part)
     return ()
@@ -243,7 +239,7 @@ def metavar_of(name: str, kind: Any) -> str:
 
 
 def first_line(documented: Any) -> str:
-    """Return the first line of the documentation of a class or function, without its period."""
+    """Return the first line of the docstring of a class or function, without its period."""
     return (documented.__doc__ or "").strip().splitlines()[0].rstrip(".")
 
 

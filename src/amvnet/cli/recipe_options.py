@@ -18,7 +18,7 @@ HELP_ALL = "--help-all"
 
 
 def add_recipe(parser: Parser, recipe: Recipe, shows_all: bool = False) -> None:
-    """Add the values of a recipe as options; the help has them if `shows_all`, in groups."""
+    """Add the values of a recipe as options, which the help shows if `shows_all`."""
     parser.add_argument(
         HELP_ALL,
         action="help",

@@ -1,4 +1,4 @@
-"""Stop on Ctrl-C or SIGTERM: within a second, with one line and an exit code of its own."""
+"""Stop on Ctrl-C or SIGTERM: within a second, with one line and the signal's exit code."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ PATIENCE = 0.6  # seconds in which a verb may end by itself
 
 
 class Stop:
-    """What has become of a request to stop.
+    """Whether a signal has asked the verb to stop, and how it stops.
 
     Args:
         line: what is said when the verb has stopped.
@@ -31,7 +31,7 @@ class Stop:
         self.exits = exits
         self.signal: int | None = None
         self._process = os.getpid()
-        self._is_first = threading.Lock()
+        self._ending = threading.Lock()  # taken by the first call of `end`
 
     @property
     def exit_code(self) -> int:
@@ -66,7 +66,7 @@ class Stop:
 
         It leaves no half-written file. Threads that still compute are not waited for.
         """
-        if not self._is_first.acquire(blocking=False):
+        if not self._ending.acquire(blocking=False):
             return
         complain(self.line)
         if not self.exits:

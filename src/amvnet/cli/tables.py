@@ -60,12 +60,12 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 def timing_table(report: Mapping[str, Any]) -> Table:
     """Return the table of a report of `time_runs`: the time of each stage."""
     points = report["points"]
-    table = Table(
-        title=f"{report['engine']} on {report['device']} in {report['precision']}, "
-        f"{report['threads']} threads: "
-        f"{points:,} points, {report['uncertain'] / points:.1%} of them uncertain",
-        show_edge=False,
+    title = (
+        f"{report['engine']} on {report['device']} in {report['precision']}, "
+        f"{report['threads']} threads: {points:,} points, "
+        f"{report['uncertain'] / points:.1%} of them uncertain"
     )
+    table = Table(title=title, show_edge=False)
     for name in ("stage", "ms", "half of the runs", "share"):
         table.add_column(name, justify="left" if name == "stage" else "right")
 
@@ -95,7 +95,7 @@ def installation_table() -> Table:
     """Return the table of what is installed: versions, devices, built-in weights and recipes."""
     table = Table(title="AMVNet", show_header=False, show_edge=False)
     required = [re.split(r"[^\w.-]", line)[0] for line in metadata.requires("amvnet") or ()]
-    for name in ("amvnet", *dict.fromkeys(required)):  # some of them for several extras
+    for name in ("amvnet", *dict.fromkeys(required)):  # several extras may name a package
         table.add_row(name, _version(name))
     table.add_row("python", platform.python_version())
 

@@ -64,13 +64,13 @@ def to_dict(config: Any) -> dict[str, Any]:
 def replace_values(default: T, tree: Mapping[str, Any], where: str) -> T:
     """Return a copy of a dataclass with the values of a tree; raise the errors of `from_dict`."""
     field_types = get_type_hints(type(default))
-    field_types.pop("obsolete", None)  # of the class, no field
+    field_types.pop("obsolete", None)  # an attribute of the class, not a field
     obsolete = getattr(default, "obsolete", {})
 
     changes = {}
     for key, value in tree.items():
         accepted = obsolete.get(key, ())
-        if accepted is None or value in accepted:
+        if accepted is None or value in accepted:  # asks for what is done anyway
             continue
         if key not in field_types and accepted:
             raise InputError(

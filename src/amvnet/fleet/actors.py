@@ -154,9 +154,9 @@ class LabelScans:
     """Labels scan files, for `map_batches` of Ray Data with `batch_format="pyarrow"`.
 
     A batch has a row for each scan with the columns `path`, `name`, `drive` and `estimates`, of
-    which only the first is needed. Scans of one drive should follow one another:
-    what is measured of its sensor is in `estimates` (`measure`), or else it is measured on the
-    first scans of the drive in the batch.
+    which only the first is needed. The column `estimates` holds what `measure` has found out about
+    the drive's sensor; without it, the sensor is measured on the first scans of the drive in the
+    batch. So scans of one drive should follow one another.
     """
 
     def __init__(self, labelling: Labelling) -> None:
@@ -173,9 +173,9 @@ class LabelScans:
     def __call__(self, batch: pa.Table) -> pa.Table:
         """Return the rows of the table of results for the scans of a batch."""
         rows: list[Row] = []
-        whole = [_complete(row) for row in batch.to_pylist()]
-        for _, scans in groupby(whole, key=itemgetter("drive")):
-            drive = list(scans)
+        scans = [_complete(row) for row in batch.to_pylist()]
+        for _, scans_of_drive in groupby(scans, key=itemgetter("drive")):
+            drive = list(scans_of_drive)
             try:
                 rows += self._label(drive)
             except Exception as error:  # a fault in a library, for example
@@ -209,10 +209,7 @@ class LabelScans:
     def _fetch(
         self, drive: Sequence[Row], reader: FileReader
     ) -> Iterator[tuple[list[FileScan], Path]]:
-        """Yield the scans of a drive, whose files are fetched ahead of their reading.
-
-        Also yield a temporary folder.
-        """
+        """Yield the scans of a drive, whose files are fetched ahead, and a temporary folder."""
         with (
             TemporaryDirectory(prefix="amvnet-") as temporary,
             ThreadPoolExecutor(TRANSFERS) as pool,
@@ -223,7 +220,7 @@ class LabelScans:
                 fetching = pool.submit(_fetch_file, row["path"], folder)
                 read = partial(_read_fetched, fetching, self.labelling.layout)
                 path = folder / Path(row["path"]).name
-                scan = NamedScan(row["name"], row["drive"], path, "", read)
+                scan = NamedScan(row["name"], row["drive"], path, ending="", read=read)
                 reader.expect(scan)
                 scans.append(FileScan(scan, reader))
             yield scans, Path(temporary, "labels")

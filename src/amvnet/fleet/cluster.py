@@ -66,7 +66,7 @@ def label_fleet(
     listing = list_blocks(inputs)
     first = next(listing)  # raises if there is no scan
     connect(address)
-    results = Results(out, labelling.settings, resume, overwrite)
+    results = Results(out, labelling.settings, resume=resume, overwrite=overwrite)
 
     with closing(Workers(labelling, most)) as workers:
         run = FleetRun(labelling, results, workers, progress, say)
@@ -127,11 +127,7 @@ class FleetRun:
         self._uncertain: Counter[str] = Counter()
 
     def plan(self, window: Sequence[pa.Table]) -> list[pa.Table]:
-        """Return the scans of some blocks that are not done.
-
-        Raises:
-            InputError: if two scans have the same name.
-        """
+        """Return the scans that are not done; raise InputError if two have the same name."""
         names = pa.concat_tables(window)["name"].to_pylist()
         is_new = self._names.add(names)
         if not is_new.all():
@@ -153,7 +149,7 @@ class FleetRun:
         return remaining
 
     def measure(self) -> None:
-        """Measure the drives of which only the first scans are known, and write them down."""
+        """Measure the drives that are new in the planned blocks, and write their table."""
         rows = []
         for scans, row in self.workers.run("measure", list(self._first.values())):
             rows.append(row or describe_drive(scans["drive"][0].as_py(), "", None))
@@ -175,10 +171,10 @@ class FleetRun:
             OSError: if labels cannot be written.
         """
         lost = self._run([self._with_estimates(block) for block in blocks])
-        # Workers have ended: with one scan at a time, it is known which one ends them.
+        # A scan in these blocks ends its worker. One scan at a time shows which one.
         singles = [block.slice(index, 1) for block in lost for index in range(len(block))]
         for scan in self._run(singles, queued=1):
-            self._take(self._given_up(scan.to_pylist()[0]))
+            self._take(self._lost_row(scan.to_pylist()[0]))
 
     def _with_estimates(self, block: pa.Table) -> pa.Table:
         """Return a block as `LabelScans` takes it."""
@@ -212,8 +208,8 @@ class FleetRun:
             self._uncertain[row["drive"]] += round(row["uncertain"] * row["points"])
         self._progress(self._labelled + len(self._faults), self._planned)
 
-    def _given_up(self, scan: Row) -> pa.Table:
-        """Return the row of a scan that ends the workers that read it."""
+    def _lost_row(self, scan: Row) -> pa.Table:
+        """Return the row of a scan that ends every worker that reads it."""
         line = f"{scan['path']}: expected a scan, found a file that ends its reader; leave it out"
         row = {"scan": scan["name"], "drive": scan["drive"], "path": scan["path"], "error": line}
         schema = results_schema(self.labelling.taxonomy)
@@ -228,7 +224,8 @@ class FleetRun:
         """
         entries = []
         for drive, points in self._points.items():
-            entries.append(Entry("", "", drive, points, self._uncertain[drive]))
+            uncertain = self._uncertain[drive]
+            entries.append(Entry("", "", sensor=drive, points=points, uncertain=uncertain))
         if METHODS[self.labelling.method].has_two_networks:
             usual = self.labelling.weights.usual_uncertain_at(self.labelling.tau)
             report(entries, usual, self._say)

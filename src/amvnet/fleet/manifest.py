@@ -37,7 +37,8 @@ class NameSet:
         """Add many names; return for each, (N,) bool, whether it is new."""
         digests = _digests(names)
         is_first = np.zeros(len(names), bool)
-        is_first[np.unique(digests, return_index=True)[1]] = True
+        _, first = np.unique(digests, return_index=True)
+        is_first[first] = True
         is_new = is_first & ~self._has(digests)
         self._digests = np.sort(np.concatenate([self._digests, digests[is_new]]))
         return is_new

@@ -1,4 +1,4 @@
-"""The tables of a fleet: results in parts, which are also the journal, and what drives are like."""
+"""The tables of a fleet: results, in parts that are also its journal, and drives."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from pyarrow.fs import FileType
 from amvnet.errors import InputError
 from amvnet.fleet.manifest import NameSet
 from amvnet.fleet.storage import Place, reaching
+from amvnet.inference.journal import check_settings
 from amvnet.sensors.frame import Frame
 from amvnet.sensors.lasers import SensorGeometry
 from amvnet.sensors.measure import Estimate
@@ -68,8 +69,8 @@ class Results:
         self.folder = out / FOLDER
         self.done = NameSet()
         self._pending: list[pa.Table] = []
-        self._last = time.monotonic()
-        self._number = 0
+        self._last = time.monotonic()  # when the last part was written
+        self._number = 0  # of the next part
 
         self.drives: dict[str, dict[str, Any]] = {}
         place = self.folder / SETTINGS
@@ -161,17 +162,12 @@ def _check_empty(out: Place) -> None:
 
 
 def _check_same(place: Place, settings: Mapping[str, Any]) -> None:
-    """Raise InputError if the settings in a file of an earlier run are others."""
+    """Raise InputError if the file of an earlier run holds other settings."""
     earlier = None
     with suppress(UnicodeDecodeError, json.JSONDecodeError, RecursionError):
         earlier = json.loads(place.read())
     known = earlier if isinstance(earlier, dict) else {}
-    changed = [key for key in settings if known.get(key) != settings[key]]
-    if changed:
-        raise InputError(
-            f"{place.url}: expected the settings of the earlier run, found another "
-            f"{', '.join(changed)}; resume it with the same, or change --out"
-        )
+    check_settings(place.url, settings, earlier=known, advice="change --out")
 
 
 def _write_settings(place: Place, settings: Mapping[str, Any]) -> None:
@@ -187,7 +183,7 @@ def _write_settings(place: Place, settings: Mapping[str, Any]) -> None:
 
 
 def describe_drive(drive: str, assumed: str, usual: Estimate | None) -> dict[str, Any]:
-    """Return the row of a drive, which is measured once, for all workers and later runs.
+    """Return the row of a drive in the table of drives, for all workers and later runs.
 
     Args:
         assumed: a line about the first scan.

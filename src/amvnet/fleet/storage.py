@@ -12,7 +12,7 @@ from pathlib import Path
 import pyarrow as pa
 from pyarrow import fs
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, reason_of
 from amvnet.files import atomic_write
 
 # Without it, pyarrow uploads even a small file in three requests.
@@ -94,11 +94,7 @@ class Place:
         return copy
 
     def read(self) -> bytes:
-        """Return the content of a file.
-
-        Raises:
-            InputError: if it cannot be read.
-        """
+        """Return the content of a file; raise InputError if it cannot be read."""
         with reaching(self.url), self.filesystem.open_input_stream(self.path) as stream:
             return bytes(stream.read())
 
@@ -117,7 +113,7 @@ class Place:
             with self.filesystem.open_output_stream(self.path) as stream:
                 stream.write(content)
         except OSError as error:
-            raise OSError(errno.EIO, _first_line(error), self.url) from None
+            raise OSError(errno.EIO, _reason_of(error), self.url) from None
 
     def remove(self) -> None:
         """Remove a file."""
@@ -126,16 +122,12 @@ class Place:
 
 @contextmanager
 def reaching(url: str) -> Iterator[None]:
-    """Turn the errors of a storage into an `InputError` of one line.
-
-    Raises:
-        InputError: if the block cannot reach the storage.
-    """
+    """Turn errors of the storage in this block into an `InputError` of one line."""
     try:
         yield
     except (OSError, pa.ArrowException) as error:
         raise InputError(
-            f"{url}: expected a file or a folder that can be read, found {_first_line(error)}; "
+            f"{url}: expected a file or a folder that can be read, found {_reason_of(error)}; "
             "check the URL and the credentials"
         ) from None
 
@@ -153,12 +145,11 @@ def _open(scheme: str, bucket: str) -> tuple[fs.FileSystem, str]:
         return fs.FileSystem.from_uri(f"fsspec+{root}")
     except (ImportError, ValueError) as error:
         raise InputError(
-            f"{root}: expected a storage that can be opened, found {_first_line(error)}; "
+            f"{root}: expected a storage that can be opened, found {_reason_of(error)}; "
             "install its package, or use s3://, gs:// or file://"
         ) from None
 
 
-def _first_line(error: BaseException) -> str:
-    """Return what an error says, without the number that each request has."""
-    lines = str(error).splitlines() or [type(error).__name__]
-    return lines[0].partition(" (Request ID")[0]
+def _reason_of(error: BaseException) -> str:
+    """Return `reason_of` an error, without the number that each request has."""
+    return reason_of(error).partition(" (Request ID")[0]

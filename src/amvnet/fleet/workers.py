@@ -15,7 +15,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, reason_of
 from amvnet.fleet.actors import Labelling, LabelScans
 
 os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # Ray's C++ code prints to stderr
@@ -56,10 +56,9 @@ def connect(address: str | None = None) -> None:
         with _own_signals():
             ray.init(**options, log_to_driver=False, logging_level=logging.CRITICAL)
     except Exception as error:  # Ray raises this class itself
-        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise InputError(
-            f"--ray {address or ''}: expected a Ray cluster, found {reason}; start one with "
-            "ray start --head, or leave the address out"
+            f"--ray {address or ''}: expected a Ray cluster, found {reason_of(error)}; start one "
+            "with ray start --head, or leave the address out"
         ) from None
 
 
@@ -125,7 +124,7 @@ class Workers:
                 if reference in self._starting:
                     self._begin(reference)
                     continue
-                worker, table, ends = running.pop(reference)
+                worker, table, retries = running.pop(reference)
                 result = None
                 try:
                     result = ray.get(reference)
@@ -133,8 +132,8 @@ class Workers:
                     pass  # the method failed
                 except RayError:
                     self._give_up(worker)
-                    if ends < RETRIES:
-                        waiting.append((table, ends + 1))
+                    if retries < RETRIES:
+                        waiting.append((table, retries + 1))
                         continue
                 yield table, result
 
@@ -151,8 +150,8 @@ class Workers:
             worker = min(self._ready, key=loads.__getitem__)
             if loads[worker] >= queued:
                 return
-            table, ends = waiting.popleft()
-            running[getattr(worker, method).remote(table)] = (worker, table, ends)
+            table, retries = waiting.popleft()
+            running[getattr(worker, method).remote(table)] = (worker, table, retries)
             loads[worker] += 1
 
     def _grow(self, wanted: int) -> None:
@@ -187,11 +186,7 @@ class Workers:
 
 
 def _share_cluster(device: str, most: int | None) -> tuple[int, dict[str, Any]]:
-    """Return how many workers there are, and what each needs, as options of Ray.
-
-    Raises:
-        InputError: if the device is a GPU, and the cluster has none.
-    """
+    """Return how many workers there are, and what each needs, as options of Ray."""
     available = ray.cluster_resources()
     cores = int(available.get("CPU", 1))
     gpus = int(available.get("GPU", 0))
@@ -210,4 +205,5 @@ def _reason(error: BaseException) -> str:
     own = [line for line in lines if "InputError: " in line]
     if own:
         return own[-1].rpartition("InputError: ")[2]
-    return f"--ray: expected workers that run, found {lines[-1] if lines else error!r}"
+    reason = lines[-1] if lines else repr(error)
+    return f"--ray: expected workers that run, found {reason}; check the cluster's logs"

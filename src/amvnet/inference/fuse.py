@@ -14,7 +14,7 @@ from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults
-from amvnet.inference.reading import array_scan, normaliser_for
+from amvnet.inference.reading import checked_scan, normaliser_for
 from amvnet.inference.scores import SURE, ScorePair, check_probabilities
 from amvnet.inference.segmentation import Segmentation, fetch, unpack
 from amvnet.models.amvnet import LateFusion, Scores
@@ -22,7 +22,7 @@ from amvnet.models.assertion import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
-from amvnet.scan import Scan, check_scan
+from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan, trained_intensity
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Expectation, Normaliser
@@ -41,16 +41,14 @@ class Fusion:
     def __init__(self, head: Head = None, tau: float | None = None) -> None:
         if isinstance(head, str | Path):
             head = load(head)
-        assertion = Disagreement()
         self._intensity = None
         if isinstance(head, Weights):
-            assertion = Disagreement(head.model.assertion.threshold)
             # The head sees the intensities, too.
             self._intensity = trained_intensity(head.training, head.sensor)
+            tau = head.model.assertion.threshold if tau is None else tau
             head = head.build_head()
-        if tau is not None:
-            assertion = Disagreement(tau)
 
+        assertion = Disagreement() if tau is None else Disagreement(tau)
         point_head = None if head is None else copy.deepcopy(head).cpu().eval()
         self.model = LateFusion(assertion, point_head)
 
@@ -60,9 +58,8 @@ class Fusion:
         Raises:
             InputError: if the shapes do not fit, or the scores are not probabilities.
         """
-        if isinstance(points, np.ndarray):
-            points = array_scan(points, trained=self._intensity)
-        scan = match_scan(check_scan(points), self._intensity)
+        scan = checked_scan(points, trained=self._intensity)
+        scan = match_scan(scan, self._intensity)
         self._check_shapes(scan, f, g)
 
         f_valid = np.asarray(f, dtype=np.float32)[scan.valid]
@@ -77,8 +74,8 @@ class Fusion:
                 torch.from_numpy(g_valid).clamp_min(SURE),
             )
 
-        labels, fused = fetch(Scores(scores.merged, scores.uncertain, None, None))
-        return unpack(scan.valid, labels, fused, slice(None))
+        labels, fused = fetch(Scores(scores.merged, scores.uncertain, rv=None, bev=None))
+        return unpack(scan.valid, labels, fused, points=slice(None))
 
     def _check_shapes(self, scan: Scan, f: np.ndarray, g: np.ndarray) -> None:
         if f.shape != g.shape or f.ndim != 2 or len(f) != len(scan):
@@ -153,7 +150,7 @@ def fuse_files(
         taxonomy = head.taxonomy
 
     scans, taxonomy = list_inputs(inputs, options, taxonomy, normaliser)
-    for scan in scans:
+    for scan in scans:  # raises before anything is written
         pair.a.find(scan.scores_path)
         pair.b.find(scan.scores_path)
 
@@ -162,10 +159,8 @@ def fuse_files(
     def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
         results = []
         for scan_input, scan in zip(inputs, loaded, strict=True):
-            checked = check_scan(scan)
-            f, g = pair.read(scan_input.scores_path, checked, taxonomy.size)
-            results.append(fusion(checked, f, g))
-
+            f, g = pair.read(scan_input.scores_path, scan, taxonomy.size)
+            results.append(fusion(scan, f, g))
         return results
 
     pipeline = Pipeline(scans, segment, output, taxonomy)

@@ -1,4 +1,4 @@
-"""A record next to the output of which scans are done, so that a run can be resumed."""
+"""A record in the output folder of the scans that are done, so that a run can be resumed."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Entry(NamedTuple):
 
     Attributes:
         scan: its name.
-        origin: a digest of the sizes and times of its file, and of the first ones of its recording
-            if the scan is normalised by these.
+        origin: a digest of the size and time of its file; of a normalised scan, also of those of
+            the first files of its recording, on which the sensor is measured.
         sensor: a title of what recorded it.
         points: how many of its points are valid.
         uncertain: how many are uncertain.
@@ -39,9 +39,9 @@ class Entry(NamedTuple):
 class Journal:
     """A file of the scans that are done, each added after its output.
 
-    A line is lost at most if the process is killed. After a power cut, the last lines may be
-    missing, and the last one torn: these scans are done again. The output of a scan that the
-    journal has is on the disk, because `atomic_write` puts it there before.
+    If the process is killed, at most one line is lost. After a power cut, the last lines may be
+    missing or torn: these scans are done again. The output of a scan in the journal is on the
+    disk, because `atomic_write` puts it there first.
 
     Args:
         settings: what the output depends on, as JSON types.
@@ -65,7 +65,7 @@ class Journal:
             with suppress(OSError):  # some network file systems have no locks
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             (folder / JOURNAL).unlink(missing_ok=True)
-            for path in folder.rglob(PARTS):  # that earlier runs did not finish
+            for path in folder.rglob(PARTS):  # files that earlier runs did not finish
                 path.unlink()
 
     def add(self, entry: Entry) -> None:
@@ -74,10 +74,7 @@ class Journal:
         self._file.flush()
 
     def close(self) -> dict[str, Entry]:
-        """End the run; return all entries by the name of the scan.
-
-        A later run leaves out what the journal has.
-        """
+        """End the run; return all entries by the name of the scan."""
         self._file.close()
         _, entries = _read(self.path)
         if entries:
@@ -98,16 +95,27 @@ def read_journals(folder: Path, settings: Mapping[str, Any]) -> dict[str, Entry]
         if not path.is_file():
             continue
         earlier_settings, entries = _read(path)
-        changed = [key for key in settings if settings[key] != earlier_settings.get(key)]
-        if changed:
-            names = ", ".join(changed)
-            raise InputError(
-                f"{folder}: expected the settings of the earlier run, found another {names}; "
-                "resume it with the same, or start over with --overwrite instead of --resume"
-            )
+        advice = "start over with --overwrite instead of --resume"
+        check_settings(folder, settings, earlier=earlier_settings, advice=advice)
         for entry in entries:
             done[entry.scan] = entry
     return done
+
+
+def check_settings(
+    place: object, settings: Mapping[str, Any], earlier: Mapping[str, Any], advice: str
+) -> None:
+    """Raise InputError if the earlier run in a place had other settings.
+
+    Args:
+        advice: what to do instead of resuming it with the same settings.
+    """
+    changed = [key for key in settings if settings[key] != earlier.get(key)]
+    if changed:
+        raise InputError(
+            f"{place}: expected the settings of the earlier run, found another "
+            f"{', '.join(changed)}; resume it with the same, or {advice}"
+        )
 
 
 @contextmanager

@@ -97,11 +97,7 @@ class DatasetScan:
         return LoadedScan(self.dataset.read(self.record, labels=labels))
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-        """Read the (N,) train ids of the scan's points from a folder of predictions.
-
-        Raises:
-            InputError: if they cannot be read.
-        """
+        """Read the (N,) train ids of the points; raise InputError if they cannot be read."""
         return self.dataset.read_prediction(self.record, path)
 
     def write_labels(
@@ -122,8 +118,8 @@ def _title_of(record: ScanRecord) -> str:
 class FileReader:
     """Reads scan files, normalised to what some weights expect.
 
-    Scans that were read to measure their sensor are kept until they are asked for, so that each
-    file is read once.
+    Scans that were read to measure their sensor are kept until they are needed, so that no file is
+    read twice.
 
     Args:
         normaliser: normalises the scans; None reads them as they are.
@@ -132,7 +128,7 @@ class FileReader:
     def __init__(self, normaliser: Normaliser | None) -> None:
         self.normaliser = normaliser
         self.is_normalising = normaliser is not None and normaliser.expected is not None
-        self._kept: dict[tuple[str, str], Cloud] = {}  # by source and name, of one source
+        self._clouds: dict[tuple[str, str], Cloud] = {}  # by source and name, of one source
 
     def expect(self, scan: NamedScan) -> None:
         """Announce a scan; call this for the scans of a source in their order."""
@@ -147,16 +143,17 @@ class FileReader:
 
         if self.is_normalising:
             self.normaliser.measure(scan.source)
-        kept = self._kept.pop((scan.source, scan.name), None)
-        cloud = scan.read() if kept is None else kept
+        cloud = self._clouds.pop((scan.source, scan.name), None)
+        if cloud is None:
+            cloud = scan.read()
         return LoadedScan(self.normaliser(cloud, scan.source), cloud.xyz)
 
     def _read_and_keep(self, scan: NamedScan) -> Cloud:
         """Read one of the first scans of a source, and forget those of others."""
-        if any(source != scan.source for source, _ in self._kept):
-            self._kept.clear()
+        if any(source != scan.source for source, _ in self._clouds):
+            self._clouds.clear()
         cloud = scan.read()
-        self._kept[scan.source, scan.name] = cloud
+        self._clouds[scan.source, scan.name] = cloud
         return cloud
 
 
@@ -182,7 +179,7 @@ class FileScan:
         return self.reader.read(self.scan)
 
     def read_labels(self, path: Path, count: int, taxonomy: Taxonomy) -> np.ndarray:
-        """Read the (N,) train ids of the scan's points; raise InputError if they cannot be read.
+        """Read the (N,) train ids of the points; raise InputError if they cannot be read.
 
         Args:
             path: a label file, or a folder of predictions.
@@ -190,8 +187,7 @@ class FileScan:
             taxonomy: turns raw ids into train ids.
         """
         if path.is_dir():
-            stem = path / self.name
-            paths = [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]
+            paths = [path / self.labels_path(kind) for kind in KINDS]
             path = next(filter(Path.is_file, paths), paths[0])
         return read_scan_labels(path, count, taxonomy)
 
@@ -243,8 +239,8 @@ def list_inputs(
     reader = FileReader(normaliser)
     scans: list[InputScan] = []
     taxonomies: list[Taxonomy] = []
-    for text in inputs:
-        dataset = open_if_dataset(text, taxonomy)
+    for spec in inputs:
+        dataset = open_if_dataset(spec, taxonomy)
         if dataset is not None:
             if isinstance(dataset, OwnScans) and normaliser is not None:
                 dataset = normalised_by(normaliser, dataset)
@@ -254,11 +250,11 @@ def list_inputs(
             continue
 
         is_alone = len(inputs) == 1
-        files = list(list_scans(text, options.topic, options.layout, is_alone))
-        for scan in files:
+        named_scans = list(list_scans(spec, options.topic, options.layout, is_alone))
+        for scan in named_scans:
             reader.expect(scan)
             scans.append(FileScan(scan, reader))
-        is_nuscenes = files[0].ending == NUSCENES_ENDING
+        is_nuscenes = named_scans[0].ending == NUSCENES_ENDING
         taxonomies.append(taxonomy or (NUSCENES if is_nuscenes else SEMANTICKITTI))
 
     if len({input_taxonomy.classes for input_taxonomy in taxonomies}) > 1:

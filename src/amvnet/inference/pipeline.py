@@ -138,12 +138,7 @@ class Pipeline:
         return [entries[_key(scan)] for scan in self.scans if _key(scan) in entries], faults
 
     def _check_output(self, earlier: Mapping[str, Entry]) -> None:
-        """Check the names of the files, and that only those of an earlier run are replaced.
-
-        Raises:
-            InputError: if another file would be replaced, two scans have the same files, or a file
-                would lie outside the folder.
-        """
+        """Raise InputError if a file may not be written: only those of `earlier` are replaced."""
         folder = self.output.folder
         _check_names(self.scans)
         new_paths: list[Path] = []
@@ -158,10 +153,10 @@ class Pipeline:
         check_free(new_paths, self.output.overwrite or is_killed)
 
     def _still_done(self, earlier: Mapping[str, Entry]) -> dict[str, Entry]:
-        """Return what an earlier run has done that is as this run would do it.
+        """Return the entries of an earlier run whose scans need not be segmented again.
 
-        The files have to be there, and the scan has to be the same, and normalised by the same
-        first ones of its recording.
+        Their files are there, and neither they nor the first scans of their recordings, by which
+        they are normalised, have changed.
         """
         done = dict(earlier)
         for scan in self.scans:
@@ -196,8 +191,8 @@ class Pipeline:
         """Read, segment and write scans, of which only a few are in memory at a time.
 
         Args:
-            write: takes each outcome, in order but for scans that cannot be read, which may come
-                before their turn; called in other threads, as many as `writers`.
+            write: takes each outcome in order; only scans that cannot be read may come earlier.
+                It is called in `writers` other threads.
 
         Yields:
             What `write` returns.
@@ -214,7 +209,7 @@ class Pipeline:
         with closing(groups), ThreadPoolExecutor(writers) as pool:
             for outcome in chain.from_iterable(groups):
                 writing.append(pool.submit(write, outcome))
-                # Those that are written are yielded at once, so that the journal has them.
+                # Yield what is written at once, so that the journal has it.
                 while writing and (len(writing) > AHEAD or writing[0].done()):
                     yield writing.popleft().result()
             while writing:
@@ -302,7 +297,7 @@ def _check_names(scans: Sequence[InputScan]) -> None:
 
 
 def _check_folder(scan: InputScan, output: OutputOptions) -> None:
-    """Raise InputError if output files would lie among the scans and could be taken for scans."""
+    """Raise InputError if output files would lie among the scans and look like scans."""
     labels_look_like_scans = f".{output.kind}" in COLUMN_READERS
     scores_look_like_scans = output.scores and scan.path.suffix.lower() == ".npz"
     folder = (output.folder / scan.scores_path).parent

@@ -11,12 +11,7 @@ from typing import Any
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import (
-    OutputOptions,
-    Pipeline,
-    Segment,
-    check_faults,
-)
+from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_faults
 from amvnet.inference.reading import normaliser_for
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
@@ -25,7 +20,7 @@ from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 
-NAMED = 10  # recordings with doubtful labels, each in a line
+NAMED = 10  # doubtful recordings, each in a line
 # What to try if the labels are doubtful.
 ADVICE = (
     "check what was assumed, and try --height, --axes, --rotate or --intensity-scale, "
@@ -86,7 +81,7 @@ def predict(
 
 
 def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment:
-    """Return what segments scans of the inputs; those that are normalised, by their rings.
+    """Return a function that segments scans; the rows of normalised ones are their rings.
 
     Args:
         classes: maps the labels to other classes; None leaves them.
@@ -98,8 +93,8 @@ def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment
         results: list[Segmentation] = []
         pairs = zip(inputs, scans, strict=True)
         for is_normalised, group in groupby(pairs, key=lambda pair: pair[0].is_normalised):
-            fitting = by_ring if is_normalised else segmenter
-            results += fitting.many([scan for _, scan in group])
+            group_segmenter = by_ring if is_normalised else segmenter
+            results += group_segmenter.many([scan for _, scan in group])
 
         if table is None:
             return results
@@ -113,20 +108,20 @@ def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
     points: Counter[str] = Counter()
     uncertain: Counter[str] = Counter()
     for entry in entries:
-        points[entry.sensor] += entry.points
-        uncertain[entry.sensor] += entry.uncertain
-    if not points.total():
+        if entry.points:
+            points[entry.sensor] += entry.points
+            uncertain[entry.sensor] += entry.uncertain
+    if not points:
         return
 
-    sensors = +points  # those with points
     doubtful = {}
-    for sensor in sensors:
+    for sensor in points:
         verdict = Verdict(uncertain[sensor] / points[sensor], usual)
         if verdict.is_doubtful:
             doubtful[sensor] = verdict
 
     verdict = Verdict(uncertain.total() / points.total(), usual)
-    if len(sensors) == 1 or not doubtful:
+    if len(points) == 1 or not doubtful:
         say(f"warning: {verdict}; {ADVICE}" if verdict.is_doubtful else verdict.shares)
         return
 
@@ -134,7 +129,8 @@ def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
     for sensor in list(doubtful)[:NAMED]:
         say(f"warning: {sensor}: {doubtful[sensor]}")
     others = len(doubtful) - NAMED
-    say(f"warning: {f'as in {others} more; ' if others > 0 else ''}{ADVICE}")
+    more = f"as in {others} more; " if others > 0 else ""
+    say(f"warning: {more}{ADVICE}")
 
 
 def _settings(

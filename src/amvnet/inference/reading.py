@@ -15,7 +15,7 @@ from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
 from amvnet.progress import Say, say_nothing
-from amvnet.scan import Scan
+from amvnet.scan import Scan, check_scan
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
 from amvnet.sensors.lidars import Sensor, make_sensor
 from amvnet.sensors.normalise import Expectation, Normaliser, rows_of
@@ -25,10 +25,25 @@ from amvnet.weights.file import Weights
 MOST_COLUMNS = 64  # of an array of points; one with more is transposed
 
 
+def checked_scan(
+    points: np.ndarray | Scan,
+    columns: str | None = None,
+    trained: TrainedIntensity | None = None,
+) -> Scan:
+    """Return a scan, or that of an array (`array_scan`), if it has a point to segment.
+
+    Raises:
+        InputError: as `array_scan`, or if no point is valid.
+    """
+    if isinstance(points, np.ndarray):
+        points = array_scan(points, columns, trained)
+    return check_scan(points)
+
+
 def array_scan(
     points: np.ndarray, columns: str | None = None, trained: TrainedIntensity | None = None
 ) -> Scan:
-    """Return the scan of an array, whose columns are those that a file of them would have.
+    """Return the scan of an array with the columns that a scan file may have.
 
     Args:
         points: (N, 3 or more): x, y, z in metres, intensity in [0, 1], ring.
@@ -55,7 +70,7 @@ def array_scan(
         intensity = np.zeros(len(array)) if trained is None else trained.filler(len(array))
         warnings.warn(
             f"the scan has no intensity: {describe_filler(trained)}; give a fourth column",
-            stacklevel=3,
+            stacklevel=4,
         )
 
     table = np.empty((len(array), 4), np.float32)
@@ -83,31 +98,34 @@ def normaliser_for(
     return Normaliser(expected, sensor, say)
 
 
-def open_for_weights(spec: str, weights: Weights, dataset: Dataset | None = None) -> Dataset:
-    """Open a dataset whose scans are read as some weights expect them.
-
-    The scans of the benchmarks are as they are; a user's own are normalised as `predict` does.
+def open_for_weights(spec: str, weights: Weights) -> Dataset:
+    """Open a dataset with the classes of some weights, its scans `normalised_for` these.
 
     Args:
         spec: as `open_dataset` takes it.
-        dataset: the dataset, if it is open.
 
     Raises:
         InputError: as `open_with_classes`.
     """
-    dataset = dataset or open_with_classes(spec, weights.taxonomy)
+    return normalised_for(weights, open_with_classes(spec, weights.taxonomy))
+
+
+def normalised_for(weights: Weights, dataset: Dataset) -> Dataset:
+    """Return a dataset whose scans are read as some weights expect them.
+
+    The scans of the benchmarks are as they are; a user's own are normalised as `predict` does.
+    """
     if isinstance(dataset, OwnScans):
         return normalised_by(normaliser_for(weights), dataset)
     return dataset
 
 
 def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
-    """Return a user's own scans, normalised as those of its folders would be.
+    """Return a user's own scans, normalised as scan files are.
 
     Args:
-        normaliser: as for scan files.
-        dataset: the scans. What its file says of the sensor counts, unless the normaliser knows
-            more.
+        normaliser: that of scan files. If it knows nothing of the sensor, what the dataset's file
+            says of it counts.
 
     Raises:
         InputError: if the file describes an impossible sensor.
@@ -142,18 +160,14 @@ class WithRows(Dataset):
         self.view = view
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of a split."""
         return self.dataset.sequences(split)
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
-        """Return the scans of these sequences."""
         return self.dataset.records(sequences)
 
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the scan that takes the place of a scan in an epoch."""
         return self.dataset.at_epoch(record, epoch)
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
-        """Read one scan."""
         scan = self.dataset.read(record, labels)
         return dataclasses.replace(scan, ring=rows_of(scan, self.view))

@@ -1,4 +1,4 @@
-"""Read scans ahead and compute on several at the same time: the way of every command."""
+"""Read scans ahead, and compute on several at the same time, as every command does."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def stream_scans(
 class CallingThread(Executor):
     """Computes in the thread that submits, with all of torch's threads.
 
-    A second thread would start its own team of OpenMP threads, which would halve the speed of both.
+    A second thread would start its own team of OpenMP threads, and halve the speed of both.
     """
 
     def submit(self, function: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:

@@ -55,9 +55,11 @@ class ScoreFolder:
             )
 
     def find(self, prediction: Path) -> Path:
-        """Return the file of a scan's scores, which is named as its predicted labels are.
+        """Return the file of a scan's scores.
 
-        `prediction` is the path of these in a folder of predictions; its ending is ignored.
+        Args:
+            prediction: the path of the scan's labels in a folder of predictions; the file has the
+                same one, apart from the ending.
 
         Raises:
             InputError: if there is no such file.
@@ -139,7 +141,7 @@ class ScorePair:
         return self.a.read(prediction, scan, classes), self.b.read(prediction, scan, classes)
 
     def digests(self, records: Sequence[ScanRecord]) -> dict[str, str]:
-        """Return a digest of each model's scores of some scans, the same wherever the files lie."""
+        """Return a digest of each model's scores of some scans, wherever the files lie."""
         return {scores.side: _digest(scores, records) for scores in (self.a, self.b)}
 
 

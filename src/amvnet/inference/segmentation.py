@@ -145,7 +145,7 @@ class Segmentation:
 
     @property
     def raw_ids(self) -> NDArray[np.uint32]:
-        """(N,) the labels as the benchmark's files number them (10 is a car of SemanticKITTI)."""
+        """(N,) the labels as the benchmark's files have them (10 is a car of SemanticKITTI)."""
         raw: NDArray[np.uint32] = self.require_origin().taxonomy.to_raw(self.labels)
         return raw
 
@@ -187,7 +187,7 @@ class Segmentation:
                 f"found {path.suffix or 'no ending'}; rename it"
             )
         if origin.path is not None and path.resolve() == origin.path.resolve():
-            raise InputError(f"{path}: expected another file than the scan's; rename it")
+            raise InputError(f"{path}: expected another file than the scan's, found it; rename it")
 
         xyz = origin.scan.points[:, :3] if origin.file_xyz is None else origin.file_xyz
         return write_scan_labels(
@@ -241,7 +241,10 @@ def fetch(scores: Scores) -> tuple[Tensor, Scores]:
 def unpack(valid: np.ndarray, labels: Tensor, scores: Scores, points: slice) -> Segmentation:
     """Return the result for one scan of a batch.
 
-    Of its points, those that are valid, (N,) bool, have the places `points` in the batch.
+    Args:
+        valid: (N,) bool, the scan's valid points.
+        labels, scores: those of all points in the batch.
+        points: the places of the valid points in the batch.
     """
     return Segmentation(
         labels=expand_to_scan(labels[points], valid),

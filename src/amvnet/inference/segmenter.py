@@ -16,7 +16,7 @@ from amvnet.data.datasets.base import Dataset
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
-from amvnet.inference.reading import array_scan, normaliser_for
+from amvnet.inference.reading import checked_scan, normaliser_for
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
 from amvnet.models.amvnet import AMVNet, Scores
 from amvnet.models.assertion import Disagreement
@@ -30,12 +30,12 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import vote
 from amvnet.runtime.memory import available_memory, return_freed_memory
 from amvnet.runtime.threads import survive_forks
-from amvnet.scan import Scan, check_scan
+from amvnet.scan import Scan
 from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
 from amvnet.weights.file import Weights, load
 
-EACH = 2**30  # bytes that a scan may take; one of 120,000 points takes half, at the paper's size
-LARGE = 1_000_000  # points; freed memory of so large scans is returned: it would not be used again
+SCAN_BYTES = 2**30  # that a scan may take; one of 120,000 points takes half, at the paper's size
+LARGE = 1_000_000  # points; memory freed by larger scans is returned: no other scan could use it
 
 
 class Segmenter:
@@ -87,7 +87,7 @@ class Segmenter:
         self.engine = "torch"
         self.at_once = 1
         if self.device == "cpu":
-            self.at_once = max(min(torch.get_num_threads(), available_memory() // EACH), 1)
+            self.at_once = max(min(torch.get_num_threads(), available_memory() // SCAN_BYTES), 1)
 
         # Weights that were trained with other intensities take them, too.
         self.intensity = trained_intensity(self.weights.training, self.weights.sensor)
@@ -121,7 +121,7 @@ class Segmenter:
 
     @property
     def usual_uncertain(self) -> float | None:
-        """The share of uncertain points in the scans of the validation; None for another tau."""
+        """The share of uncertain points in the validation; None for another tau."""
         return self.weights.usual_uncertain_at(self.tau)
 
     def __repr__(self) -> str:
@@ -144,10 +144,8 @@ class Segmenter:
                 the model needs a ring index and there is none, or a file cannot be read or holds
                 several scans.
         """
-        if isinstance(points, np.ndarray):
-            points = array_scan(points, columns, self.intensity)
         if not isinstance(points, Path | str):
-            return self.many([points])[0]
+            return self._segment([checked_scan(points, columns, self.intensity)])[0]
 
         scans, assumed = self._open(points)
         if len(scans) > 1:
@@ -160,21 +158,22 @@ class Segmenter:
         """Segment several scans in one pass of the networks, which suits a GPU.
 
         Raises:
-            InputError: if one of them cannot be segmented; segment them one by one to see which.
+            InputError: if one cannot be segmented; segment them one by one to see which.
         """
         checked = []
-        for values in scans:
-            if isinstance(values, np.ndarray):
-                values = array_scan(values, trained=self.intensity)
-            checked.append(check_scan(values))
-        is_large = sum(map(len, checked)) >= LARGE
-        memory = return_freed_memory() if is_large else nullcontext()
-        with memory:
-            batch = self.batch(checked)
+        for scan in scans:
+            checked.append(checked_scan(scan, trained=self.intensity))
+        return self._segment(checked)
+
+    def _segment(self, scans: Sequence[Scan]) -> list[Segmentation]:
+        """Segment scans in one pass of the networks; each has a valid point."""
+        is_large = sum(map(len, scans)) >= LARGE
+        with return_freed_memory() if is_large else nullcontext():
+            batch = self.batch(scans)
             labels, scores = fetch(self.run(batch))
 
         results = []
-        for scan, points in zip(checked, batch.slices(), strict=True):
+        for scan, points in zip(scans, batch.slices(), strict=True):
             result = unpack(scan.valid, labels, scores, points)
             origin = Origin(scan, self.taxonomy, self.method, self.usual_uncertain)
             results.append(replace(result, origin=origin))
@@ -233,7 +232,7 @@ class Segmenter:
         return segmenter
 
     def for_dataset(self, dataset: Dataset) -> Segmenter:
-        """Return the segmenter for the scans of a dataset: `by_ring` if these are normalised."""
+        """Return the segmenter for a dataset: `by_ring` if its scans are normalised."""
         return self.by_ring() if dataset.is_normalised else self
 
     @torch.inference_mode()

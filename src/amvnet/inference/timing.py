@@ -33,26 +33,26 @@ Write = Callable[[np.ndarray], object]
 
 @dataclass(frozen=True)
 class Timing:
-    """The seconds of each stage and of `MEAN`, and the numbers of points and uncertain points."""
+    """The seconds of each stage and of `MEAN`; how many points there are, and uncertain ones."""
 
     seconds: dict[str, float]
     points: int
     uncertain: int
 
     @property
-    def all(self) -> float:
+    def total(self) -> float:
         """Seconds from the file to the written labels."""
         return sum(self.seconds[stage] for stage in STAGES)
 
     def share_of(self, stages: Sequence[str]) -> float:
         """Return the share of some stages in this time."""
-        return sum(self.seconds[stage] for stage in stages) / self.all
+        return sum(self.seconds[stage] for stage in stages) / self.total
 
 
 def time_runs(
     segmenter: Segmenter, read: Read, write: Write, runs: int, progress: Progress = no_progress
 ) -> dict[str, Any]:
-    """Call `run_once` some times, at least once, and return a report for JSON."""
+    """Time at least one run, after those that warm up; return a report for JSON."""
     timings = []
     for run in range(runs + WARM_UP):
         timings.append(run_once(segmenter, read, write))
@@ -127,7 +127,7 @@ def _report(segmenter: Segmenter, timings: Sequence[Timing]) -> dict[str, Any]:
         "points": timings[0].points,
         "uncertain": timings[0].uncertain,
         "stages_ms": stages,
-        "all_ms": _spread([1e3 * timing.all for timing in timings]),
+        "all_ms": _spread([1e3 * timing.total for timing in timings]),
         "fusion_share": _spread([timing.share_of(FUSION) for timing in timings]),
         "peak_memory_mib": memory / MEBIBYTE,
     }

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from amvnet.errors import reason_of
+
 WARM_UP = 2  # runs before the capture, in which libraries choose their algorithms
 MOST_SHAPES = 8  # that are captured for a network; its memory grows with each
 
@@ -31,8 +33,8 @@ class Captured(nn.Module):
 
     The network maps one tensor on a GPU to another. Its shapes must follow from the shape of the
     input, and it must not wait for the GPU. If it cannot be captured, a warning says so once, and
-    from then on its kernels are launched one by one; so they are with gradients and for further
-    shapes than the first `MOST_SHAPES`. Several threads may call it.
+    its kernels are launched one by one from then on. This also happens, without a warning, with
+    gradients and for shapes beyond the first `MOST_SHAPES`. Several threads may call it.
     """
 
     def __init__(self, net: Network) -> None:
@@ -69,10 +71,10 @@ class Captured(nn.Module):
             self._graphs[key] = self._capture(x)
         except RuntimeError as error:  # also if the memory does not suffice
             self._can_capture = False
-            reason = (str(error).splitlines() or [""])[0]
             warnings.warn(
-                f"a network could not be captured as a CUDA graph ({reason}); its kernels are "
-                "launched one by one, which is slower; graphs=False avoids this warning",
+                f"a network could not be captured as a CUDA graph ({reason_of(error)}); its "
+                "kernels are launched one by one, which is slower; graphs=False avoids this "
+                "warning",
                 RuntimeWarning,
                 stacklevel=2,
             )
@@ -94,7 +96,7 @@ class Captured(nn.Module):
         if self._pool is None:
             self._pool = torch.cuda.graph_pool_handle()
         graph = torch.cuda.CUDAGraph()
-        # Other threads may go on using the GPU, as the one that reads scans into pinned memory.
+        # Other threads may go on using the GPU, such as one that reads scans into pinned memory.
         with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
             output = self.net(static)
         return Graph(static, output, graph.replay)

@@ -26,7 +26,7 @@ class RingConv2d(nn.Conv2d):
         super().__init__(channels, out, kernel, stride, padding=(kernel // 2, 0), bias=False)
         self.strides = stride
         self.wrap = kernel // 2
-        # Of `upsampled_conv`, by scale, made from the weight; None while that may still change.
+        # The kernels of `upsampled_conv` by scale; None while the weight may still change.
         self.kernels: dict[tuple[int, int], Tensor] | None = None
 
     def forward(self, input: Tensor) -> Tensor:
@@ -135,12 +135,12 @@ class AzimuthGRU(nn.Module):
     """A GRU that runs once around the sensor over the cells of a map (section 3.1).
 
     A unidirectional GRU of hidden size C reads the map (B, C, H, W) column by column, each from
-    top to bottom. Its outputs form a map (B, C, H, W) again. The last columns are also put before
-    the first, so that the hidden state has seen the other end of the scan; their outputs are
+    top to bottom. Its outputs form a map (B, C, H, W) again. Copies of the last columns come before
+    the first one, so that the hidden state knows the other end of the scan; their outputs are
     dropped.
 
     Args:
-        padding: the columns put before the first, as a share of the width.
+        padding: the columns that are copied, as a share of the width.
     """
 
     def __init__(self, channels: int, padding: float) -> None:

@@ -43,17 +43,17 @@ BOTH_NETWORKS = ("range_net", "polar_net")
 
 
 def geometric_mean(f: Tensor, g: Tensor) -> Tensor:
-    """Return the ensemble that AMVNet uses for certain points."""
+    """Return the geometric mean, AMVNet's ensemble of certain points."""
     return (f * g).sqrt_()
 
 
 def arithmetic_mean(f: Tensor, g: Tensor) -> Tensor:
-    """Return an ensemble to compare with."""
+    """Return the arithmetic mean, an ensemble to compare with."""
     return (f + g) / 2
 
 
 def maximum(f: Tensor, g: Tensor) -> Tensor:
-    """Return an ensemble to compare with."""
+    """Return the larger probabilities, an ensemble to compare with."""
     return f.maximum(g)
 
 
@@ -92,7 +92,7 @@ PAPER_METHODS: tuple[MethodName, ...] = ("rv", "bev", "ensemble", "amvnet")  # T
 
 
 def title_of(name: str) -> str:
-    """Return the title of a method; other names, such as `labels`, are their own title."""
+    """Return the title of a method, or another name, such as `labels`, as it is."""
     return METHODS[name].title if name in METHODS else name
 
 

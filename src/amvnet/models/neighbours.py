@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 FREQUENT_TIES = 0.001  # share of the queries with a tie; chance alone causes fewer
-LEAF = 32  # points; more than pykdtree's 16, which takes longer to build and not less to search
+LEAF = 32  # points; pykdtree's own 16 take longer to build and no less to search
 AT_ONCE = 2**17  # queries whose distances are in memory: a scan may have millions
 
 # Takes (Q, 3) queries; returns the (Q, m) indices of the nearest points, and whether others are as
@@ -36,17 +36,18 @@ def nearest_others(xyz: np.ndarray, own: np.ndarray, n: int) -> np.ndarray:
         query = _query_by_pykdtree(xyz, m)
     except ImportError:  # not required by `onnx_runner`
         query = _query_by_scipy(xyz, m)
-    is_tied = _search(query, xyz, own, np.arange(len(own)), nearest)
+    is_tied = _search(query, xyz, own, rows=np.arange(len(own)), nearest=nearest)
 
     if is_tied.mean() > FREQUENT_TIES:
-        _search(_query_by_scipy(xyz, m), xyz, own, is_tied.nonzero()[0], nearest)
+        query = _query_by_scipy(xyz, m)
+        _search(query, xyz, own, rows=is_tied.nonzero()[0], nearest=nearest)
     return nearest
 
 
 def _search(
     query: Query, xyz: np.ndarray, own: np.ndarray, rows: np.ndarray, nearest: np.ndarray
 ) -> np.ndarray:
-    """Write the rows `rows` (R,) of the result of `nearest_others`, a part of them at a time.
+    """Write rows (R,) of `nearest`, the result of `nearest_others`, a part of them at a time.
 
     Returns:
         (R,) bool, as a `Query` returns it.
@@ -54,8 +55,9 @@ def _search(
     is_tied = np.empty(len(rows), dtype=bool)
     for start in range(0, len(rows), AT_ONCE):
         part = rows[start : start + AT_ONCE]
-        found, is_tied[start : start + AT_ONCE] = query(xyz[own[part]])
-        nearest[part] = _drop_self(found, own[part], nearest.shape[1])
+        indices, ties = query(xyz[own[part]])
+        nearest[part] = _drop_self(indices, own[part], nearest.shape[1])
+        is_tied[start : start + AT_ONCE] = ties
     return is_tied
 
 
@@ -74,7 +76,7 @@ def _query_by_pykdtree(xyz: np.ndarray, m: int) -> Query:
 
 
 def _query_by_scipy(xyz: np.ndarray, m: int) -> Query:
-    """Return a search for the m nearest of the points (P, 3); it says nothing of ties."""
+    """Return a search for the m nearest of points (P, 3) that does not look for ties."""
     # An unbalanced tree takes a third of the time to build, and a tenth more to query.
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
 

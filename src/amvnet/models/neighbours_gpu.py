@@ -86,7 +86,7 @@ def split_into_blocks(xyz: Tensor) -> Blocks:
     low, high = padded[index].aminmax(dim=1)
     slots = F.pad(xyz, (0, 0, 0, count - len(xyz)), value=torch.inf)
     points = slots[index].transpose(1, 2).contiguous()
-    return Blocks(slots, index, points, low, high)
+    return Blocks(xyz=slots, index=index, points=points, low=low, high=high)
 
 
 def _cut(index: Tensor, positions: Tensor, ways: int) -> Tensor:

@@ -169,11 +169,7 @@ def head_features(
 
 
 def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
-    """Return (U, n) indices of the n nearest others of each point `index` (U,) of points (P, 4).
-
-    If a scan has fewer than n other points, the farthest is repeated. A lone point is its own
-    neighbour.
-    """
+    """Return the indices (U, n) of the `nearest_others` of points `index` (U,) of points (P, 4)."""
     if points.is_cuda:
         return nearest_others_by_blocks(points[:, :3], index, n)
 

@@ -18,9 +18,7 @@ Arrangement = Callable[[Score, Score], tuple[Tensor, Tensor]]
 
 def one_after_the_other(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
     """Run the range view's network first, then the bird's-eye view's."""
-    f = score_range()
-    g = score_polar()
-    return f, g
+    return score_range(), score_polar()
 
 
 def side_by_side(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:

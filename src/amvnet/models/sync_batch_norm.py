@@ -31,7 +31,7 @@ class SyncedBatchNorm(_BatchNorm):
 
     @classmethod
     def of(cls, norm: _BatchNorm) -> SyncedBatchNorm:
-        """Return one with the parameters and running statistics of another batch norm."""
+        """Return a batch norm over all processes, with the state of another one."""
         weight = norm.weight
         synced = cls(
             norm.num_features, norm.eps, norm.momentum, device=weight.device, dtype=weight.dtype
@@ -45,7 +45,7 @@ class SyncedBatchNorm(_BatchNorm):
             return super().forward(input)
 
         x = input.to(torch.promote_types(input.dtype, torch.float32))
-        shape = (1, -1, *[1] * (x.ndim - 2))  # of one value per channel, to broadcast
+        shape = (1, -1, *[1] * (x.ndim - 2))  # in which one value per channel broadcasts
         axes = (0, *range(2, x.ndim))  # all but the channels
 
         # One exchange for two things: the sums of the channels, and the number of their values.

@@ -44,7 +44,7 @@ def convolve_joined(convolution: RingConv2d, coarse: Tensor, fine: Tensor) -> Te
 def _kernels(convolution: RingConv2d, weight: Tensor, scale: tuple[int, int]) -> Tensor:
     """Return the kernels (s * s * C', C, taps, taps) for upsampled maps, of a weight (C', C, 3, 3).
 
-    Those of a frozen convolution are kept. An exporter has to see how they are made.
+    A frozen convolution keeps them. An exporter has to see how they are made.
     """
     may_keep = not torch.is_grad_enabled() and not torch.compiler.is_compiling()
     kept = convolution.kernels if may_keep else None

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# How long a process waits for the others. One may read for hours; if one dies, all are ended.
+# How long a process waits for the others. One may read for hours; if one dies, all of them end.
 PATIENCE = timedelta(days=7)
 
 

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
-# Threads sleep while they wait. GNU's and LLVM's OpenMP read the first, LLVM's and Intel's the last
-# one; GNU's reads the second instead of the first.
+# By these variables, threads sleep while they wait. GNU's and LLVM's OpenMP read the first, LLVM's
+# and Intel's the last one. The second replaces the first for GNU's, so that it stays unset.
 WAITING = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": None, "KMP_BLOCKTIME": "0"}
 
 Part = TypeVar("Part")
@@ -46,14 +46,14 @@ def run_parts(run: Callable[[Part], Result], parts: Sequence[Part]) -> list[Resu
     """Run the parts of a computation on a CPU; return their results in order.
 
     A thread that sleeps has to be woken for its share of each operation. In a part of many short
-    operations this takes longer than the share, so that every thread takes whole parts instead, or
-    if there are more threads than parts, a share of the threads takes each.
-    Threads that spin need no waking, and would keep the processors from the threads of the parts.
+    operations this takes longer than the share. So every thread takes whole parts instead; if there
+    are fewer parts than threads, each part gets equally many. Threads that spin need no waking, and
+    would keep the processors from the threads of the parts.
     """
     import torch
 
-    is_plain = torch.compiler.is_compiling() or torch.is_grad_enabled() or not do_threads_sleep()
-    threads = 1 if is_plain else torch.get_num_threads()
+    in_turn = torch.compiler.is_compiling() or torch.is_grad_enabled() or not do_threads_sleep()
+    threads = 1 if in_turn else torch.get_num_threads()
     workers = min(threads, len(parts))
     if workers < 2:
         return [run(part) for part in parts]

@@ -56,13 +56,14 @@ def _with_neighbours(weights: Weights, count: int) -> Weights:
 def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[str, Any]]]:
     """Train the range-view network with and without GRU and class weights (Table 5 of the paper).
 
-    Each is kept in a folder of the plan's.
+    Args:
+        plan: how the networks are trained; each is kept in a folder of the plan's.
 
     Yields:
         Whether with the GRU, whether with class weights, and the figures of `metrics`.
 
     Raises:
-        InputError: if OUT holds runs on other scans or of another recipe.
+        InputError: if a folder holds a run on other scans or of another recipe.
     """
     for gru, weighted in ((False, False), (True, False), (False, True), (True, True)):
         name = "rv" + ("-gru" if gru else "") + ("-weights" if weighted else "")

@@ -67,8 +67,8 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
 def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
     """Replace a sector of a scan with the same sector of another scan (Xiao et al., 2022).
 
-    The sector spans a quarter to three quarters of the circle. The scan is returned as it is if no
-    point would be left.
+    The sector spans a quarter to three quarters of the circle. A scan that would have no point left
+    is returned as it is.
     """
     start = rng.uniform(-np.pi, np.pi)
     width = rng.uniform(0.5, 1.5) * np.pi
@@ -82,8 +82,8 @@ def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
 def mix_lasers(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
     """Replace every second band of elevation with that of another scan (Kong et al., 2023).
 
-    The bands are equally high and cover both scans. The scan is returned as it is if no point would
-    be left.
+    The bands are equally high and cover both scans. A scan that would have no point left is
+    returned as it is.
     """
     bands = int(rng.integers(BANDS[0], BANDS[1] + 1))
     first = int(rng.integers(2))
@@ -123,8 +123,7 @@ def disturb(scores: Tensor, points: Tensor, rng: np.random.Generator) -> Tensor:
 
     All probabilities are softened by one softmax temperature. Then a part of the probability of
     some classes goes to another class, more in some directions and at some ranges than in others.
-    A head that learns from such scores cannot rely on a network's every word, as it could on scans
-    like those of the network's training.
+    So the head learns not to trust the networks as far as on scans like those of their training.
 
     Args:
         scores: (P, K) probabilities, as is the result.
@@ -256,7 +255,7 @@ def _elevations(scan: Scan) -> np.ndarray:
 
 
 def _spread(values: np.ndarray) -> np.ndarray:
-    """Return the lowest and the highest finite value without `OUTLIERS`, or zeros without any."""
+    """Return the lowest and the highest value without `OUTLIERS`; zeros if none is finite."""
     finite = values[np.isfinite(values)]
     if len(finite) == 0:
         return np.zeros(2)

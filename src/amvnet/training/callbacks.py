@@ -17,7 +17,7 @@ from amvnet.progress import Say
 from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.loaders import sensor_record
 from amvnet.training.plan import Plan
-from amvnet.training.run_folder import PART_OF, SETTINGS, description, stage_settings, write_yaml
+from amvnet.training.run_folder import PART_OF, SETTINGS, stage_record, stage_settings, write_yaml
 from amvnet.weights.file import Weights, part_state, save
 
 
@@ -30,8 +30,8 @@ class AverageWeights(Callback):
     Args:
         decay: share of the average that a step keeps. Early steps keep less, so that the initial
             weights are soon forgotten. 0 keeps the weights of the last step alone.
-        initial_share: of the weights that the training begins with in what is validated and
-            written (WiSE-FT: Wortsman et al., Robust fine-tuning of zero-shot models, 2022).
+        initial_share: share of the initial weights in those that are validated and written
+            (WiSE-FT: Wortsman et al., Robust fine-tuning of zero-shot models, 2022).
     """
 
     def __init__(self, decay: float, initial_share: float = 0.0) -> None:
@@ -56,9 +56,10 @@ class AverageWeights(Callback):
             self.average = _copies(weights)
             self.initial = _copies(weights) if self.initial_share else {}
 
-        for kept in (self.initial, self.average):
-            for name in kept:
-                kept[name] = kept[name].to(weights[name].device)
+        # Those of a checkpoint are in the CPU's memory.
+        for tensors in (self.initial, self.average):
+            for name in tensors:
+                tensors[name] = tensors[name].to(weights[name].device)
 
     @torch.no_grad()
     def on_train_batch_end(
@@ -96,11 +97,9 @@ class AverageWeights(Callback):
 
 
 class KeepWeights(Callback):
-    """Writes the weights of a stage after each epoch, and keeps those with the highest mIoU.
+    """Writes last.safetensors, best.safetensors and `SETTINGS` of a stage after each epoch.
 
-    Without validation the last weights are kept as the best.
-
-    The folder of the stage receives last.safetensors, best.safetensors and `SETTINGS`.
+    The best weights have the highest validation mIoU, or without validation are the last.
     """
 
     def __init__(
@@ -110,10 +109,10 @@ class KeepWeights(Callback):
         self.part = PART_OF[name]
         self.weights = weights
         self.settings = stage_settings(plan, name, weights)
-        self.description: dict[str, Any] = {}
+        self.record: dict[str, Any] = {}
         if plan.processes.first:  # the others do not write
             sensor = sensor_record(plan.scans.dataset, plan.scans.train, intensity)
-            self.description = description(plan, self.settings, sensor)
+            self.record = stage_record(plan, self.settings, sensor)
         self.started = time.time()
         self.highest = -1.0  # mIoU of the best weights so far
 
@@ -151,13 +150,13 @@ class KeepWeights(Callback):
         return dataclasses.replace(
             self.weights,
             tensors=part_state(self.part, state),
-            training={self.part: {**self.description, "seconds": seconds}},
+            training={self.part: {**self.record, "seconds": seconds}},
             metrics={self.part: metrics},
         )
 
 
 class SeedBatches(Callback):
-    """Seeds PyTorch before each training batch, so that a resumed run repeats the random draws."""
+    """Seeds PyTorch before each training batch, so that a resumed run repeats its draws."""
 
     def __init__(self, seed: int, rank: int = 0) -> None:
         self.seed = seed
@@ -174,7 +173,7 @@ class SeedBatches(Callback):
 
 
 class EpochLines(Callback):
-    """Prints one line per epoch; used if there is no terminal for a progress bar."""
+    """Says one line per epoch; used if there is no terminal for a progress bar."""
 
     def __init__(self, say: Say, name: str) -> None:
         self.say = say

@@ -27,12 +27,10 @@ VAL_FACTOR = 64  # a validation batch is as large as this many training batches
 class HeadStage(Stage):
     """Stage `head`: it learns from scores gathered beforehand, so that the networks stay frozen.
 
-    Args:
-        head: the point head.
-        train: the points to train with.
-        val: the points to validate with, or None for no validation.
+    The arguments that are not named here are those of `Stage`.
 
-    The other arguments are those of `Stage`.
+    Args:
+        train, val: the points to train and to validate with; None for no validation.
     """
 
     name = "head"
@@ -101,16 +99,18 @@ def train_head(plan: Plan, weights: Weights) -> None:
     config = training.head
     folder = plan.out / "head"
 
-    # Gather the uncertain points of all scans, with their scores and neighbours. Other models
-    # scored the scans as they are, so that intensities are not brought to those of a training.
-    for part in BOTH_NETWORKS if plan.scores is None else ():
-        if part not in weights.parts:
-            raise InputError(
-                f"expected trained networks for the head, found no {part}; train it, or give --init"
-            )
+    # Other models scored the scans as they are; networks need the intensities they learnt.
     intensity = None
     if plan.scores is None:
+        for part in BOTH_NETWORKS:
+            if part not in weights.parts:
+                raise InputError(
+                    f"expected trained networks for the head, found no {part}; train it, or give "
+                    "--init"
+                )
         intensity = trained_intensity(weights.training, weights.sensor)
+
+    # Gather the uncertain points of all scans, with their scores and neighbours.
     gatherer = PointGatherer(plan, weights, intensity)
     train = gatherer.gather(plan.scans.train, folder / "train", config.views, plan.say)
     val = gatherer.gather(plan.scans.val, folder / "val") if plan.scans.val else None

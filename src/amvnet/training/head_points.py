@@ -47,7 +47,7 @@ class HeadPoints:
     Args:
         paths: the files of the points, one for each process that scored scans.
         dtype: of a point.
-        files: (U,) which file has a point; in its file, the points have the same order.
+        files: (U,) the index of each point's file; the points of a file are in their order here.
         labels: (U,) train ids.
         certain: (K + 1, K + 1) confusion matrix of the ensemble over the certain points.
         uncertain_share: share of the labelled points that are uncertain.
@@ -141,11 +141,11 @@ class PointGatherer:
     """Scores scans by two networks, and keeps their uncertain points on disk for the head.
 
     Attributes:
-        plan: of the run; all of its processes must see the folder of the points. Two other models'
-            scores in it take the place of those of the networks.
+        plan: of the run; all of its processes must see the folder of the points. If it has two
+            other models' scores, these are used instead of the networks'.
         weights: the networks.
-        intensity: of the training of the networks, to which intensities are brought before the
-            augmentation; None for other models' scores.
+        intensity: of the networks' training; those of each scan are brought to it before the
+            augmentation. None for other models' scores.
     """
 
     plan: Plan
@@ -257,10 +257,10 @@ class PointGatherer:
         certain, uncertain = np.sum(processes.gather(matrices), axis=0)
         labelled = certain[1:].sum() + uncertain.sum()
         return HeadPoints(
-            [folder / str(rank) for rank in range(processes.size)],
-            self._dtype,
-            np.concatenate(files),
-            np.concatenate(ordered),
+            paths=[folder / str(rank) for rank in range(processes.size)],
+            dtype=self._dtype,
+            files=np.concatenate(files),
+            labels=np.concatenate(ordered),
             certain=certain,
             uncertain_share=float(uncertain.sum() / max(labelled, 1)),
         )
@@ -272,9 +272,8 @@ class PointGatherer:
         """Score one scan, and draw at most `most` of its uncertain points.
 
         Returns:
-            (U,) points, their (U,) uint8 train ids, and the (2, K + 1, K + 1)
-            confusion matrices of the ensemble over the certain and over all uncertain points of the
-            scan.
+            (U,) points, their (U,) uint8 train ids, and the (2, K + 1, K + 1) confusion matrices
+            of the ensemble over the certain and over all uncertain points of the scan.
         """
         device = self._device
         seeds = [self.plan.recipe.training.seed, *key]
@@ -326,7 +325,7 @@ class PointGatherer:
 
 
 def _everywhere(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
-    """The assertion that finds every point uncertain."""
+    """Find every point uncertain: an `Assertion`."""
     return torch.ones(len(f), dtype=torch.bool, device=f.device)
 
 

@@ -37,7 +37,7 @@ from amvnet.sensors.record import AS_IS, measure_sensor, normalised_record
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.augment import augment, mix, mix_lasers, paste
 
-SAMPLED_SCANS = 60  # that are measured: the heights of simulated sensors differ by centimetres
+SAMPLED_SCANS = 60  # to measure: enough for the mean height of simulated sensors
 
 Key = tuple[int, int]  # epoch, index in the list of scans
 
@@ -64,7 +64,7 @@ PASTED = frozenset(
 class ScanSet(data.Dataset[Scan]):
     """Labelled scans by epoch and index.
 
-    The augmentation depends on nothing but seed, epoch and index: it is the same on any number of
+    The augmentation depends only on seed, epoch and index: it is the same on any number of
     processes. Augmented scans are those of the epoch (`Dataset.at_epoch`).
 
     Args:
@@ -213,16 +213,16 @@ def count_classes(
     processes: Processes = ALONE,
     say: Say = say_nothing,
 ) -> np.ndarray:
-    """Return the (K,) int64 numbers of points of each class in some scans.
+    """Return how many points of each class some scans have, (K,) int64.
 
-    They are read from `path`, an .npz file, if it has those of these scans, else written to it.
+    The counts are read from the .npz file `path` if it is of these scans, else written to it.
     """
     source = {
         "scans": [record.name for record in records],
         "classes": list(dataset.taxonomy.classes),
     }
 
-    # The first process reads for all, as others might already see the file that it writes below.
+    # The first process reads for all: others might already see the file that it writes below.
     earlier = processes.gather(_read_counts(path, source))[0]
     if earlier is not None:
         return earlier
@@ -249,11 +249,11 @@ def count_classes(
 def sensor_record(
     dataset: Dataset, records: Sequence[ScanRecord], intensity: TrainedIntensity | None = None
 ) -> dict[str, Any]:
-    """Return what weights carry of the sensor of their training scans.
+    """Return what weights record of the sensor, measured on some of their training scans.
 
-    These are the quantiles of the intensities at `sensors.intensity.PROBABILITIES`, on average over
-    a sample of the scans and empty if no scan has usable ones, and the measures of
-    `sensors.record`. Broken scans are left out: the training names them.
+    These are the measures of `sensors.record`, and the mean quantiles of the intensities at
+    `sensors.intensity.PROBABILITIES`, empty if no scan has usable ones. Broken scans are left out:
+    the training names them.
 
     Args:
         intensity: what the intensities of the scans are brought to.

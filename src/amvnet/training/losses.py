@@ -74,9 +74,9 @@ class Targets:
     @classmethod
     def of(cls, classes: Tensor, scan: Tensor, shape: tuple[int, int]) -> Targets:
         """Return the targets of B scans and K classes, given `shape`: (B, K)."""
-        scans, kinds = shape
-        counts = classes.new_zeros(scans * kinds)
-        counts.scatter_add_(0, scan * kinds + classes, torch.ones_like(classes))
+        scans, class_count = shape
+        counts = classes.new_zeros(scans * class_count)
+        counts.scatter_add_(0, scan * class_count + classes, torch.ones_like(classes))
         return cls(classes, scan, counts.view(shape))
 
     def shares(self, dtype: torch.dtype) -> Tensor:
@@ -113,19 +113,19 @@ def network_loss(
     targets = Targets.of(classes, scan, (scored.scans, logits.shape[1]))
 
     # Each point counts by the weight of its class, in proportion to all points of its scan.
-    by_class = targets.counts.to(logits) if weights is None else targets.counts * weights
-    per_class = logits.new_ones(logits.shape[1]) if weights is None else weights.to(logits)
-    totals = by_class.sum(dim=1).clamp_min(torch.finfo(logits.dtype).tiny)
-    shares = per_class[classes] / (totals[scan] * scored.scans)
+    weighted_counts = targets.counts.to(logits) if weights is None else targets.counts * weights
+    weight_of_class = logits.new_ones(logits.shape[1]) if weights is None else weights.to(logits)
+    totals = weighted_counts.sum(dim=1).clamp_min(torch.finfo(logits.dtype).tiny)
+    shares = weight_of_class[classes] / (totals[scan] * scored.scans)
     cross_entropy = (F.cross_entropy(logits, classes, reduction="none") * shares).sum()
     return cross_entropy + region * region_loss(logits.softmax(dim=1), targets)
 
 
 def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> Tensor:
-    """Return the most frequent train id of the points of each cell.
+    """Return the most frequent train id of the points in each cell.
 
-    Points without a label (id 0) count only if their cell has no others. Of equally frequent ids,
-    the lowest is returned.
+    Points without a label (id 0) count only if their cell has no others. If ids are equally
+    frequent, the lowest one is returned.
 
     Args:
         cells: (P,) int64 cell of each point, 0..count - 1.
@@ -148,8 +148,8 @@ def majority_labels(cells: Tensor, labels: Tensor, count: int, classes: int) -> 
 def dice(probabilities: Tensor, targets: Targets) -> Tensor:
     """Return the soft Dice loss: 1 - 2 |p t| / (|p| + |t|), averaged over the classes present.
 
-    The probabilities p are (P, K), and t is the one-hot encoding of the classes of the P points.
-    The loss is a scalar, the mean over the scans.
+    The probabilities p are (P, K), and t is the one-hot encoding of the classes. The loss is a
+    scalar, the mean over the scans.
     """
     truth = F.one_hot(targets.classes, probabilities.shape[1]).to(probabilities)
     members = F.one_hot(targets.scan, len(targets.counts)).to(probabilities).T  # (B, P)

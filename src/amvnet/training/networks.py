@@ -39,9 +39,10 @@ REGION_LOSSES: dict[str, RegionLoss] = {"dice": dice, "lovasz": lovasz_softmax}
 class NetworkStage(Stage):
     """The base of the two networks' stages, which learn from batches of scans by AdamW.
 
-    A subclass defines `logits`. The other arguments are those of `Stage`.
+    A subclass defines `logits`. The arguments that are not named here are those of `Stage`.
 
     Args:
+        view, net: the projection, and the network on it.
         weights: (K,) class weights of the loss, or None for equal weights.
     """
 
@@ -64,7 +65,7 @@ class NetworkStage(Stage):
         self.register_buffer("class_weights", tensor, persistent=False)
 
     def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
-        """Return what the loss is computed on, and the (P, K) logits of all points.
+        """Return what the loss is over, and the (P, K) logits of all points.
 
         Args:
             labels: (P,) train ids.
@@ -72,8 +73,7 @@ class NetworkStage(Stage):
         raise NotImplementedError
 
     def loss(self, scored: Scored) -> Tensor:
-        """Return the mean loss of some scans."""
-        # The mean over scans stays the same if a batch is split, over processes or to save memory.
+        """Return the mean loss over scans: it does not change if a batch is split."""
         region_loss = REGION_LOSSES.get(self.config.region_loss, self.default_region_loss)
         return network_loss(scored, self.class_weights, self.config.region, region_loss)
 
@@ -84,7 +84,7 @@ class NetworkStage(Stage):
 
         self.check_finite(loss, f"at the scans {', '.join(points.names)}")
         self.log("train/loss", loss, prog_bar=True, batch_size=points.count)
-        return loss * self.share_of_step(points.count, index)
+        return loss * self.step_factor(points.count, index)
 
     def validation_step(self, batch: Batch, index: int) -> None:
         points, labels = batch
@@ -92,15 +92,15 @@ class NetworkStage(Stage):
         prediction = (logits.argmax(dim=1) + 1).cpu().numpy()
         self.matrix += confusion(labels.cpu().numpy(), prediction, self.taxonomy.size)
 
-    def share_of_step(self, count: int, index: int) -> float:
+    def step_factor(self, count: int, index: int) -> float:
         """Return the factor that makes the gradient of a step the mean over its scans.
 
         Lightning divides the loss of each part of a batch by the number of parts. In the last batch
         of an epoch there may be fewer parts, and fewer scans in the last of them.
 
         Args:
-            count: scans of this part.
-            index: number of the part in the epoch.
+            count: scans in this part.
+            index: which part of the epoch it is, from 0.
         """
         parts = self.trainer.accumulate_grad_batches
         loader = self.trainer.train_dataloader
@@ -139,9 +139,12 @@ class RangeStage(NetworkStage):
 
         # Pixels without a point have no label.
         index = (view.nearest >= 0).nonzero()[:, 0]
-        scan = index // (len(pixels) // batch.count)
-        pixel_labels = labels[view.nearest[index]]
-        scored = Scored(pixels.index_select(0, index), pixel_labels, scan, batch.count)
+        scored = Scored(
+            logits=pixels.index_select(0, index),
+            labels=labels[view.nearest[index]],
+            scan=index // (len(pixels) // batch.count),
+            scans=batch.count,
+        )
         return scored, pixels[view.pixel]
 
 
@@ -170,10 +173,11 @@ def _score_voxels(view: PolarGrid, scores: Tensor, labels: Tensor) -> Scored:
     logits = scores.unflatten(1, (vertical, -1)).flatten(0, 1)  # (M * Z, K)
     voxels, (cells,) = occurring(len(logits), view.slot * vertical + view.voxel)
     voxel_logits = logits.index_select(0, voxels)
-    voxel_labels = majority_labels(cells, labels, len(voxels), logits.shape[1])
+    classes = logits.shape[1]
+    voxel_labels = majority_labels(cells, labels, count=len(voxels), classes=classes)
 
     scan = view.occupied[voxels // vertical] // (radial * angular)
-    return Scored(voxel_logits, voxel_labels, scan, scans)
+    return Scored(logits=voxel_logits, labels=voxel_labels, scan=scan, scans=scans)
 
 
 def train_network(plan: Plan, name: str, weights: Weights) -> None:
@@ -184,7 +188,6 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
             not suffice.
     """
     config = getattr(plan.recipe.training, name)
-    # Before the scans are read for the class weights.
     if config.initial and PART_OF[name] not in weights.parts:
         raise InputError(
             f"training.{name}.initial: expected weights to begin with, found none; give "

@@ -13,7 +13,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.reading import WithRows, open_for_weights
+from amvnet.inference.reading import WithRows, normalised_for
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Say, say_nothing
@@ -34,8 +34,8 @@ class Plan:
         say: prints a line about what happens.
         bars: show progress bars instead of a line for each epoch.
         processes: those that share the run; all must see its folder.
-        scores: two other models' scores of the scans; the head is trained on them instead of on
-            those of the networks. None without other models.
+        scores: two other models' scores of the scans, to train the head on instead of on the
+            networks'; None without other models.
 
     Raises:
         InputError: if the processes cannot share the scans or the batches, or the recipe is for
@@ -63,9 +63,9 @@ class Plan:
             config = getattr(self.recipe.training, name)
             if config.batch % (size * config.accumulate):
                 raise InputError(
-                    f"expected a batch for {size} processes, each in {config.accumulate} parts, "
-                    f"found {config.batch}; set --training.{name}.batch or "
-                    f"--training.{name}.accumulate"
+                    f"expected a batch that {size} processes can share, each in "
+                    f"{config.accumulate} parts, found {config.batch} scans; set "
+                    f"--training.{name}.batch or --training.{name}.accumulate"
                 )
 
         taxonomy = self.scans.dataset.taxonomy.name
@@ -116,9 +116,9 @@ def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
 
 
 def without_mean(recipe: Recipe, init: Weights | None, classes: Taxonomy, say: Say) -> Recipe:
-    """Return a recipe that keeps no share of initial weights if these have other classes.
+    """Return a recipe whose networks are no mean with initial weights that have other classes.
 
-    Their last layers are new then, and of no use in a mean.
+    Their last layers would be new, and of no use in a mean.
     """
     if init is None or init.taxonomy.classes == classes.classes:
         return recipe
@@ -146,22 +146,24 @@ def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None
     earlier = init or _earlier_weights(out)
     if earlier is not None:
         weights = dataclasses.replace(weights, training=earlier.training)
-    return open_for_weights(data, weights, dataset)
+    return normalised_for(weights, dataset)
 
 
 def open_parts(
     specs: Sequence[str], recipe: Recipe, out: Path, init: Weights | None
 ) -> tuple[Dataset, list[TrainingScans]]:
-    """Open the datasets of a training; return the first, and those to mix in with their scans."""
+    """Open the datasets of a training; return the first, and the scans of the others to mix in."""
     first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
-    if first.is_normalised:
-        view = recipe.model.range_view
-        others = [each if each.is_normalised else WithRows(each, view) for each in others]
-    return first, [TrainingScans(dataset, training_records(dataset), []) for dataset in others]
+    parts = []
+    for dataset in others:
+        if first.is_normalised and not dataset.is_normalised:
+            dataset = WithRows(dataset, recipe.model.range_view)
+        parts.append(TrainingScans(dataset, training_records(dataset), val=[]))
+    return first, parts
 
 
 def _earlier_weights(out: Path) -> Weights | None:
-    """Return weights that an earlier call has written into the folder of a run; None if none."""
+    """Return weights that an earlier call has written into the folder; None without any."""
     for name in ("weights", "rv/last", "bev/last"):
         path = out / f"{name}.safetensors"
         if path.is_file():

@@ -73,7 +73,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
     else:
         train_network(plan, name, weights)
 
-    # The first process has written the weights; the others read them too.
+    # The first process has written the weights that all read.
     plan.processes.wait()
     trained = with_trained(plan, name, weights)
     if plan.processes.first:
@@ -84,7 +84,7 @@ def train_stage(plan: Plan, name: str, weights: Weights) -> Weights:
 def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> Weights:
     """Return fresh weights with the parts of `init`, and of this folder's finished stages.
 
-    If `init` has other classes, its parts are only taken for the stages that are to be trained.
+    If `init` has other classes, its parts are only taken for the stages to train.
     """
     weights = Weights(plan.recipe.model, plan.scans.dataset.taxonomy, plan.recipe.sensor)
     for name in _stages_of_folder(plan):

@@ -35,16 +35,13 @@ def is_finished(plan: Plan, name: str) -> bool:
 
 
 def with_trained(plan: Plan, name: str, weights: Weights) -> Weights:
-    """Return weights with the part that a stage has trained: the best or the last, as planned."""
+    """Return weights with the part that a stage has trained, best or last as the recipe says."""
     path = plan.out / name / f"{plan.recipe.training.keep}.safetensors"
     return weights.replace_part(PART_OF[name], load(path))
 
 
 def write_record(plan: Plan, stage: str, init: Weights | None) -> None:
-    """Write recipe.yaml, and the entry of a stage (or "all") in run.yaml.
-
-    The entry names the data, the versions and the weights to begin with.
-    """
+    """Write recipe.yaml, and in run.yaml an entry for a stage or "all"."""
     dataset = plan.scans.dataset
     entry: dict[str, Any] = {
         "versions": {name: version(name) for name in PACKAGES},
@@ -103,7 +100,7 @@ def stage_settings(plan: Plan, name: str, weights: Weights) -> dict[str, Any]:
     return settings
 
 
-def description(plan: Plan, settings: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
+def stage_record(plan: Plan, settings: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
     """Return the record of a stage's training that its weights carry."""
     scans = plan.scans
     scores = {"scores": settings["scores"]} if "scores" in settings else {}
@@ -133,11 +130,12 @@ def check_begun(folder: Path, settings: dict[str, Any], resume: bool) -> None:
     begun = _entries(folder / SETTINGS)
     if begun != settings:
         changes = describe_changes(begun, settings)
+        others = len(changes) - MOST_CHANGES
+        more = f" and {others} more" if others > 0 else ""
         raise InputError(
             f"{folder}: expected the settings of the earlier run ({SETTINGS}), found "
-            f"{', '.join(changes[:MOST_CHANGES])}"
-            + (f" and {len(changes) - MOST_CHANGES} more" if len(changes) > MOST_CHANGES else "")
-            + "; resume it with those, or give another folder"
+            f"{', '.join(changes[:MOST_CHANGES])}{more}; resume it with those, or give another "
+            "folder"
         )
 
 

@@ -55,7 +55,7 @@ class Stage(L.LightningModule):
 
     name: str  # the value of --stage
     trained: nn.Module  # the part of the model that this stage trains
-    in_float32 = False  # whatever precision the recipe has
+    in_float32 = False  # whether to compute in float32 whatever precision the recipe names
 
     def __init__(
         self,
@@ -166,8 +166,9 @@ def fit(
     Raises:
         InputError: if a scan cannot be read, or the loss is not finite.
     """
-    for name in ("lightning.pytorch", "lightning.fabric"):  # which set their levels when imported
+    for name in ("lightning.pytorch", "lightning.fabric"):  # set their levels when imported
         logging.getLogger(name).setLevel(logging.ERROR)
+
     stage.train()
     train, val = loaders
     device = device_of(plan.recipe.training.accelerator)
@@ -186,7 +187,7 @@ def fit(
         # Lightning sets the sampler's epoch only after the reading processes have begun to draw.
         train.sampler.set_epoch(_epochs_done(begun))  # type: ignore[attr-defined]
 
-    # The statistics of synchronised batch norms are the same everywhere, and processes may validate
+    # Synchronised batch norms have the same statistics everywhere, and processes may validate
     # unequal shares.
     ddp = DDPStrategy(broadcast_buffers=False)
     trainer = L.Trainer(
@@ -267,7 +268,7 @@ def _multiplies_bfloat16(device: str) -> bool:
 
 
 def _epochs_done(checkpoint: Path) -> int:
-    """Return how many epochs a checkpoint has seen; raise InputError if it is broken."""
+    """Return how many epochs a checkpoint has behind it; raise InputError if it is broken."""
     try:
         state = torch.load(checkpoint, map_location="cpu", weights_only=True)
         return state["epoch"] + 1

@@ -23,7 +23,7 @@ from amvnet.config.bounds import check_text
 from amvnet.config.nested import from_dict, to_dict
 from amvnet.config.schema import ModelConfig
 from amvnet.data.taxonomy import Taxonomy
-from amvnet.errors import InputError, did_you_mean, shown
+from amvnet.errors import InputError, did_you_mean, reason_of, shown
 from amvnet.files import atomic_write
 from amvnet.models.amvnet import AMVNet, build_amvnet
 from amvnet.models.point_head import PointHead
@@ -85,10 +85,7 @@ class Weights:
 
     @property
     def usual_uncertain(self) -> float:
-        """The share of uncertain points in the scans of the validation, in [0, 1].
-
-        `USUAL_UNCERTAIN` if the file does not say.
-        """
+        """The share of uncertain points in the validation, in [0, 1]; else `USUAL_UNCERTAIN`."""
         metrics = self.metrics.get("point_head")
         share = metrics.get(UNCERTAIN) if isinstance(metrics, Mapping) else None
         if isinstance(share, int | float) and 0 <= share <= 1:
@@ -129,7 +126,8 @@ class Weights:
         """
         if name not in other.parts:
             raise InputError(
-                f"expected weights with the part {name}, found {', '.join(other.parts) or 'none'}"
+                f"expected weights with the part {name}, found {', '.join(other.parts) or 'none'}; "
+                "train it first"
             )
 
         if self.taxonomy.classes != other.taxonomy.classes:
@@ -205,8 +203,8 @@ class Weights:
     def build(self, with_head: bool = False) -> AMVNet:
         """Return the model, in evaluation mode.
 
-        A network that the weights lack is initialised at random. If they lack the point head, it is
-        too if `with_head`, else `point_head` of the model is None.
+        A network that the weights lack is initialised at random, as is the point head if
+        `with_head`; else the model has none.
 
         Raises:
             InputError: if the parameters do not fit the sizes.
@@ -272,7 +270,7 @@ def save(weights: Weights, path: Path | str) -> Path:
         try:
             save_file(dict(weights.tensors), part, metadata={KEY: json.dumps(description)})
         except SafetensorError as error:  # such as a full disk
-            raise OSError(errno.EIO, str(error).splitlines()[0], str(path)) from None
+            raise OSError(errno.EIO, reason_of(error), str(path)) from None
 
     return Path(path)
 
@@ -305,11 +303,7 @@ def load(name_or_path: str | Path) -> Weights:
 
 
 def _from_description(text: str) -> Weights:
-    """Return weights without parameters: what the description in a file says.
-
-    Raises:
-        InputError: if it is not a description of this format, or a value is out of its range.
-    """
+    """Return weights without parameters: what the description in a file says."""
     description = None
     if len(text) <= LONGEST:
         with suppress(ValueError, RecursionError):

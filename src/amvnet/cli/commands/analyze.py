@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import (
-    LabelledChoice,
-)
+from amvnet.cli.options import LabelledChoice
 from amvnet.config.bounds import Range
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute

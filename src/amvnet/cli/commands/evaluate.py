@@ -8,10 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say, show
-from amvnet.cli.options import (
-    LabelledChoice,
-    join_processes,
-)
+from amvnet.cli.options import LabelledChoice, join_processes
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
 from amvnet.models.methods import PAPER_METHODS, Compute, MethodName, widest_method
@@ -51,12 +48,12 @@ def evaluate(
             mapped: coarse, or a YAML file.
     """
     from amvnet.data.class_maps import class_map
-    from amvnet.data.datasets.open import open_dataset
+    from amvnet.data.datasets.open import open_dataset, open_with_classes
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
     from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
-    from amvnet.inference.reading import open_for_weights
+    from amvnet.inference.reading import normalised_for
     from amvnet.models.precision import choose_device
     from amvnet.weights.file import load
 
@@ -64,8 +61,8 @@ def evaluate(
     mapping = None if classes is None else class_map(classes)
     if weights is not None and predictions is None:
         loaded = load(weights)
-        opened = None if mapping is None else open_dataset(data)
-        dataset = open_for_weights(data, loaded, opened)
+        opened = open_with_classes(data, loaded.taxonomy) if mapping is None else open_dataset(data)
+        dataset = normalised_for(loaded, opened)
         records = choice.records(dataset)
         # The head runs only if AMVNet is among the methods.
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]

@@ -24,8 +24,8 @@ def export(weights: str, out: Path, int8: str | None = None, overwrite: bool = F
     check_free(possible_files(out), overwrite)
     with progress("exporting") as step:
         graphs = export_weights(weights, out, step, int8)
-    differences = [graph["difference"] for graph in graphs.values() if "difference" in graph]
     say(f"{len(graphs)} graphs and amvnet.json in {out}")
+    differences = [graph["difference"] for graph in graphs.values() if "difference" in graph]
     if differences:
         say(f"those in float32 differ from torch by at most {max(differences):.1e}")
     for name, graph in graphs.items():

@@ -6,10 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import (
-    ScanChoice,
-    SensorChoice,
-)
+from amvnet.cli.options import ScanChoice, SensorChoice
 from amvnet.config.bounds import Count, Share
 from amvnet.errors import InputError, import_optional
 from amvnet.models.methods import Compute, MethodName

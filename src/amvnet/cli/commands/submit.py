@@ -44,7 +44,7 @@ def submit(
 
     check_free([out], overwrite)
     with progress("packing") as step:
-        count = pack.write(rules, predictions, out, use_external, step)
+        count = pack.write(rules, predictions, out, use_external=use_external, progress=step)
     packed = counted(count, "prediction")
     fit = "keeps" if count == 1 else "keep"
     say(f"{out}: {packed} {fit} to the rules of {rules.taxonomy.name}")

@@ -28,7 +28,7 @@ def train(
         data: the dataset: semantickitti:PATH, nuscenes:PATH, or a path with one of these layouts;
             a YAML file that describes scans and classes of your own (docs/own_data.md);
             simulated-hdl64e:FOLDER or simulated-hdl32e:FOLDER for streets that are simulated during
-            the training, with their cache in the folder. If given several times, the first is split
+            the training, with their cache in the folder. If there are several, the first is split
             and validated, and the training scans of the others are mixed in: all of them, or as
             many as --training.others says.
         out: folder of the run.

@@ -115,7 +115,14 @@ class PointBatch:
         if all(scan.ring is not None for scan in scans):
             ring = torch.empty(count, dtype=torch.int64, pin_memory=is_pinned)
 
-        batch = cls(points, scan_index, len(scans), ring, tuple(s.name for s in scans), sizes)
+        batch = cls(
+            points=points,
+            scan=scan_index,
+            count=len(scans),
+            ring=ring,
+            names=tuple(scan.name for scan in scans),
+            sizes=sizes,
+        )
         for index, (scan, mask, part) in enumerate(zip(scans, valid, batch.slices(), strict=True)):
             which = slice(None) if mask.all() else mask  # a slice is not copied first
             points.numpy()[part] = scan.points[which]

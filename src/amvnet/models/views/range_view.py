@@ -131,5 +131,5 @@ def _nearest(distance: Tensor, pixel: Tensor, pixels: int, least: float) -> Tens
     empty = torch.iinfo(torch.int64).max  # its lower half is -1
     if least > 0:
         key = torch.where(distance < least, empty, key)
-    first = torch.full((pixels,), empty, device=key.device).scatter_reduce_(0, pixel, key, "amin")
-    return first.view(torch.int32)[::2]
+    keys = torch.full((pixels,), empty, device=key.device).scatter_reduce_(0, pixel, key, "amin")
+    return keys.view(torch.int32)[::2]  # the lower halves
