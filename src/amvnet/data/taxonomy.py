@@ -246,7 +246,8 @@ def _built_in() -> dict[str, Taxonomy]:
         entries = table["classes"].values()
         raw_to_train = []
         for train_id, entry in enumerate(entries):
-            raw_to_train += [(raw, train_id) for raw in entry["raw"]]
+            for raw in entry["raw"]:
+                raw_to_train.append((raw, train_id))
 
         fields = {
             "name": name,

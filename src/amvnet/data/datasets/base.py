@@ -1,4 +1,4 @@
-"""What every dataset offers: its scans, their labels, and predictions in its official layout."""
+"""What every dataset offers: scans, labels, and predictions in its official layout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""nuScenes and nuScenes-lidarseg in their official layout, read straight from the JSON tables."""
+"""nuScenes and nuScenes-lidarseg in their official layout, read from the JSON tables."""
 
 from __future__ import annotations
 

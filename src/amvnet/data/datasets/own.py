@@ -83,10 +83,8 @@ class OwnScans(Dataset):
 
     Args:
         description: what the YAML file says.
-        normalise: brings the scans to the frame, height, intensities and rows that some weights
-            expect, or only turns them; None reads them as they are.
-        is_normalised: whether `normalise` brings them to weights, so that `ring` is the row of each
-            point.
+        normalise: makes scans of the points in the files; None takes them as they are.
+        is_normalised: whether it makes them fit weights, so that `ring` is the row of each point.
     """
 
     def __init__(

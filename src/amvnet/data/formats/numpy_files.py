@@ -108,8 +108,8 @@ def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
 def member_names(path: Path) -> list[str]:
     """Return the names of the arrays in an archive; raise InputError if it is no archive."""
     with reading(path, "a NumPy archive", ARCHIVE_ADVICE), zipfile.ZipFile(path) as archive:
-        files = [name for name in archive.namelist() if name.endswith(".npy")]
-        return [name.removesuffix(".npy") for name in files]
+        names = archive.namelist()
+        return [name.removesuffix(".npy") for name in names if name.endswith(".npy")]
 
 
 def read_array(path: Path, key: str | None = None) -> np.ndarray:

@@ -129,8 +129,7 @@ def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     """Return whether (N, 5) values can be x, y, z, intensity and ring.
 
     The ring holds whole numbers, at least two different ones, and the coordinates do not.
-    Intensities are never negative. Unless the name of the file says so, the last column is a ring
-    only if it does not look like labels.
+    Intensities are never negative. If not `is_named`, the ring must not look like labels, either.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]

@@ -77,10 +77,7 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
     """Return a function for each scan of a bag that reads it. Reading in order is fastest.
 
-    Args:
-        path: the file, or the folder of a ROS 2 bag.
-        ending: as `ending_of` returns it.
-        topic: None means the only topic with scans.
+    `Bag` documents the arguments.
 
     Raises:
         InputError: if the bag is broken, has no scan, or needs a package that is missing.
