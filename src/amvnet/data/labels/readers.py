@@ -124,8 +124,9 @@ def _read_integers(path: Path, count: int) -> np.ndarray:
 def _read_numbers(path: Path) -> np.ndarray:
     """Read a text with a number in each line; the first line may be a title."""
     with path.open(encoding="utf-8-sig") as file:
+        first = file.readline()
         with suppress(ValueError):  # a title or a comment is not read again
-            float(file.readline())
+            float(first)
             file.seek(0)
         return np.loadtxt(file, delimiter=",", max_rows=MAX_POINTS + 1, ndmin=1)
 
