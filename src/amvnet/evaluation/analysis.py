@@ -136,7 +136,7 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
     truth = scan.labels
     assert truth is not None
     evaluation = Evaluation(segmenter.taxonomy)
-    evaluation.add(scan.points, truth, ids, uncertain)
+    evaluation.add(scan.points, truth, ids, uncertain=uncertain)
     size = segmenter.taxonomy.size + 1
     return Analysis(
         evaluation,

@@ -99,7 +99,7 @@ def evaluate(
         labels_by_name, uncertain = labels
         ids = {name: table[values] for name, values in labels_by_name.items()}
 
-        evaluation.add(scan.points, truth, ids, uncertain)
+        evaluation.add(scan.points, truth, ids, uncertain=uncertain)
         if pictures is not None and record.name in pictured:
             view = TopView(
                 scan.points, taxonomy, ids, truth, title=record.name, uncertain=uncertain

@@ -192,7 +192,7 @@ def are_of_one_range(a: np.ndarray | None, b: np.ndarray | None) -> bool:
         return a is None and b is None
     if is_constant(a) or is_constant(b):
         return is_constant(a) and is_constant(b)
-    return _are_alike(a, b, ONE_RANGE, least=DARKEST * max(a[-1], b[-1]))
+    return _are_alike(a, b, factor=ONE_RANGE, least=DARKEST * max(a[-1], b[-1]))
 
 
 def _are_alike(
@@ -261,7 +261,9 @@ def intensity_map(
         return IntensityMap(text, trained=trained)
     if trained is not None and trained.is_matched:  # the segmenter matches them, scan by scan
         return dataclasses.replace(linear, text=f"{linear.text}, spread as in the training")
-    if trained is None or _are_alike(quantiles / scale, trained.quantiles, ALIKE, DARKEST):
+    if trained is None or _are_alike(
+        quantiles / scale, trained.quantiles, factor=ALIKE, least=DARKEST
+    ):
         return linear
 
     text = (

@@ -85,7 +85,7 @@ class Recording:
         self._is_learnt = bool(self._first)
 
     def estimate(self, cloud: Cloud) -> tuple[Estimate, bool]:
-        """Return what to assume about a scan, and whether it is of the usual sensor."""
+        """Return what to assume about a scan, and whether its sensor is as expected."""
         if self._is_learnt and self.usual is not None and self.usual.is_steady:
             if self._recognises(cloud, self.usual):
                 return self.usual, True

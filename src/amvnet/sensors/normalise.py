@@ -236,7 +236,8 @@ def _intensity_map(
     if known_scale is None and quantiles is not None:
         assert cloud.intensity is not None
         scale = usual_scale(quantiles[-1], is_integer=cloud.intensity.dtype.kind in "iu")
-    return intensity_map(quantiles, scale, expected.intensity, known_scale is not None)
+    is_given = known_scale is not None
+    return intensity_map(quantiles, scale, expected.intensity, is_given=is_given)
 
 
 def _row_view(

@@ -110,7 +110,8 @@ def list_scans(
         except InputError as error:
             if is_alone and len(files) == 1 and not is_dead_link(file):
                 raise
-            scans = [NamedScan(name, str(file), file, "", partial(_refuse, str(error)))]
+            refuse = partial(_refuse, str(error))
+            scans = [NamedScan(name, source=str(file), path=file, ending="", read=refuse)]
         yield from scans
 
 
@@ -129,11 +130,13 @@ def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> li
     ending = ending_of(file)
     if ending not in (FOLDER, *BAGS):
         source = str(file.parent / f"*{ending}")
-        return [NamedScan(name, source, file, ending, partial(read_file, file, ending, layout))]
+        read = partial(read_file, file, ending, layout)
+        return [NamedScan(name, source, path=file, ending=ending, read=read)]
 
     scans = []
-    for index, read in enumerate(open_bag(file, ending, topic)):
-        scans.append(NamedScan(f"{name}/{index:06d}", str(file), file, ending, read))
+    for index, read_one in enumerate(open_bag(file, ending, topic)):
+        name_in_bag = f"{name}/{index:06d}"
+        scans.append(NamedScan(name_in_bag, str(file), path=file, ending=ending, read=read_one))
     return scans
 
 
