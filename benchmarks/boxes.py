@@ -5,8 +5,8 @@
 DATA is a nuScenes dataset. BOXES is a folder with a file NAME_boxseg.bin for each NAME.pcd.bin: one
 uint8 per point, the train id of the box that the point is in, 0 in a box of another class and 255
 in no box. For each class, and for cars, trucks and buses together, print the share of the points in
-its boxes that each method labels so. A box also holds some points of the ground, and nothing says
-what lies outside of boxes, so that these shares tell less than an IoU.
+its boxes that each method gives this class. These shares tell less than an IoU: a box also holds
+some points of the ground, and the classes outside of the boxes are unknown.
 """
 
 from __future__ import annotations

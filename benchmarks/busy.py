@@ -1,12 +1,12 @@
 """Measure a call of the segmenter and the commands while other programs use the processors.
 
-python benchmarks/busy.py [--scan FILE] [--calls N] [--scans N] [--busy 0,1,2]
-                          [--settings "passive,one thread"] [--commands predict,evaluate]
+    python benchmarks/busy.py [--scan FILE] [--calls N] [--scans N] [--busy 0,1,2]
+        [--settings "passive,one thread"] [--commands predict,evaluate]
 
 The last table has the time of each command as it is, next to its time with passive waiting.
 
-Each setting runs in a process of its own. The busy processes only count; each keeps one processor
-busy if it gets one. Run this on a machine that has nothing else to do.
+Each setting runs in a process of its own. The busy processes run empty loops, to keep a processor
+busy each. Run this on a machine that has nothing else to do.
 """
 
 from __future__ import annotations

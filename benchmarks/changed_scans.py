@@ -1,11 +1,11 @@
-"""Measure what the usual changes of a scan cost: units, frames and intensities of other tools.
+"""Measure what units, frames and intensities of other tools cost.
 
     python benchmarks/changed_scans.py DATA [WEIGHTS] [--scans 10]
 
 DATA is a dataset in the layout of SemanticKITTI, such as semantickitti:PATH; the scans are spread
 evenly over its sequences. Each is changed and then labelled as `amvnet predict` labels a file of
-it: without any option, and, if that refuses scans or costs more than a tenth of the accuracy, with
-the option that mends the change. An offset is always tried, as it must not hurt. Print the
+it: without options, and, if scans are then refused or more than a tenth of the accuracy is lost,
+with the option that undoes the change. Offsets are always tried, as they must not hurt. Print the
 accuracy, and its share of the accuracy on the unchanged scans.
 """
 
@@ -40,7 +40,7 @@ class Change:
     Attributes:
         title: for the table.
         apply: returns the changed cloud, given (N, 3) coordinates and (N,) intensities.
-        options: of `amvnet predict`, those that mend it, as attributes of a `Sensor`.
+        options: the options of `amvnet predict` that undo it, as attributes of a `Sensor`.
     """
 
     title: str
@@ -105,10 +105,10 @@ CHANGES = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a change comes to.
+    """The result of labelling changed scans.
 
     Attributes:
-        accuracies: share of the labelled points that are right, for each scan that was not refused.
+        accuracies: share of the labelled points that are right, of each scan that was not refused.
         refusal: the message of the last scan that was refused; empty if none was.
         said: what was assumed of the last scan.
     """

@@ -1,6 +1,6 @@
 """Compare the scans of two datasets, for example real and simulated ones.
 
-python benchmarks/compare_scans.py DATA_A DATA_B [PICTURE.png]
+    python benchmarks/compare_scans.py DATA_A DATA_B [PICTURE.png]
 
 Print points, lasers, ranges, classes, intensity, height and relief of both; draw a few scans of
 each side by side if a picture is asked for.
@@ -87,7 +87,7 @@ def add_scan(figures: Figures, scan: Scan, rng: np.random.Generator) -> None:
 def lasers_of(scan: Scan) -> np.ndarray | None:
     """Return the (N,) laser of each point, 0 = top; None if it cannot be told.
 
-    It is told by the ring or, in KITTI's files, by where the azimuth starts again from 0.
+    The ring tells or, in KITTI's files, where the azimuth starts again from 0.
     """
     if scan.ring is not None:
         return scan.ring.max() - scan.ring.astype(int)

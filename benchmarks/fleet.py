@@ -1,7 +1,7 @@
 """Check and time `predict --ray` on simulated scans in an S3 server on this machine.
 
-python benchmarks/fleet.py [--scans 400] [--workers 2]
-python benchmarks/fleet.py --names 10000000
+    python benchmarks/fleet.py [--scans 400] [--workers 2]
+    python benchmarks/fleet.py --names 10000000
 
 The first prints what `predict` and `--ray` take to start and for each scan, from files; then it
 compares the labels in a bucket with those of `predict`, also after a worker and the driver are

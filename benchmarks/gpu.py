@@ -188,7 +188,8 @@ def time_batch(segmenter: Segmenter, scans: Sequence[Scan], options: Options) ->
     A graph is one launch of many kernels. On a CPU, operators count as kernels.
     """
     is_gpu = options.device != "cpu"
-    memory = busy_time = ""
+    memory = ""
+    busy_time = ""
     if is_gpu:
         torch.cuda.reset_peak_memory_stats(options.device)
     seconds = median_seconds(lambda: segmenter.many(scans), options) / len(scans)
@@ -258,6 +259,7 @@ def measure_training(folder: Path, options: Options) -> None:
     batch, workers, epochs = (2, 0, (1, 2)) if options.quick else (STEP, WORKERS, EPOCHS)
     names = ("rv",) if options.quick else ("rv", "bev")
     accelerator = "cpu" if options.device == "cpu" else "gpu"
+
     rows = []
     for stage in names:
         seconds = []
@@ -272,8 +274,10 @@ def measure_training(folder: Path, options: Options) -> None:
                     *("--training.accelerator", accelerator),
                 )
             )
+
         scans = len(list((folder / "city").glob("sequences/0[012]/velodyne/*")))
         rows.append([stage, rate_of((epochs[1] - epochs[0]) * scans, seconds[1] - seconds[0])])
+
     title = f"training of simulated-compact, {batch} scans a step, {workers} workers, validation"
     print_table(f"{title} included", ["network", "scans/s"], rows)
 

@@ -2,8 +2,8 @@
 
 Prints the mIoU of each method, and the time of each graph and of a whole scan.
 
-amvnet export --weights W --out FLOAT && amvnet export --weights W --out INT8 --int8 simulated
-python benchmarks/int8.py FLOAT INT8 DATA [THREADS]
+    amvnet export --weights W --out FLOAT && amvnet export --weights W --out INT8 --int8 simulated
+    python benchmarks/int8.py FLOAT INT8 DATA [THREADS]
 """
 
 from __future__ import annotations

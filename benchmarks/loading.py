@@ -2,7 +2,7 @@
 
 Measured with 0, 1, 2, ... reading processes:
 
-python benchmarks/loading.py DATA [RECIPE] [PROCESSES]
+    python benchmarks/loading.py DATA [RECIPE] [PROCESSES]
 """
 
 from __future__ import annotations

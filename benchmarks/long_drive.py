@@ -1,6 +1,6 @@
 """Run predict on a drive of 1,000 scans: measure its memory, and compare with a run that is killed.
 
-python benchmarks/long_drive.py FOLDER [SCANS] [METHOD]
+    python benchmarks/long_drive.py FOLDER [SCANS] [METHOD]
 
 The drive is simulated in FOLDER. One run is left alone, another is killed twice and resumed.
 """

@@ -1,6 +1,6 @@
 """Measure how many scans a second `predict` segments, next to the two networks alone.
 
-python benchmarks/many_scans.py FOLDER [--engines torch,int8] [--at-once 1,2] [--rounds N]
+    python benchmarks/many_scans.py FOLDER [--engines torch,int8] [--at-once 1,2] [--rounds N]
 
 FOLDER holds ten scan files or more, such as *.bin. The rate of `predict` is that of the label files
 after the first few, without the start of the program.

@@ -1,10 +1,10 @@
-"""Measure what fitting is worth: segment simulated scans of sensors that the weights do not know.
+"""Measure what normalising is worth on simulated scans of sensors that the weights do not know.
 
     python benchmarks/other_sensors.py [FOLDER] [WEIGHTS]
 
-Each scan is segmented as it is, and as `amvnet predict` fits it to the weights. FOLDER
-(other_sensors) keeps the scans: six for each sensor, of three streets that no training has seen.
-WEIGHTS is a name or a file (sim-hdl64e).
+Each scan is segmented as it is, and normalised as by `amvnet predict`. FOLDER (other_sensors) keeps
+the scans: six for each sensor, of three streets that no training has seen. WEIGHTS is a name or a
+file (sim-hdl64e).
 """
 
 from __future__ import annotations
@@ -57,24 +57,24 @@ OTHERS = {
 
 
 def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
-    """Print mIoU over the classes present and accuracy of AMVNet, without and with fitting."""
+    """Print mIoU over the classes present and accuracy of AMVNet, as it is and normalised."""
     dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
-    fit = normaliser_for(segmenter.weights)
+    normalise = normaliser_for(segmenter.weights)
     segment_by_ring = segmenter.by_ring()
-    unfitted = Evaluation(dataset.taxonomy)
-    fitted = Evaluation(dataset.taxonomy)
+    as_it_is = Evaluation(dataset.taxonomy)
+    normalised = Evaluation(dataset.taxonomy)
 
     for record in dataset.records(dataset.sequences("all")):
         scan = dataset.read(record)
         assert scan.labels is not None
         labels = segmenter(scan).labels
-        unfitted.add(scan.points, scan.labels, {"amvnet": labels}, None)
+        as_it_is.add(scan.points, scan.labels, {"amvnet": labels})
 
         cloud = Cloud(scan.points[:, :3], scan.points[:, 3], name=name)
-        labels = segment_by_ring(fit(cloud, name)).labels
-        fitted.add(scan.points, scan.labels, {"amvnet": labels}, None)
+        labels = segment_by_ring(normalise(cloud, name)).labels
+        normalised.add(scan.points, scan.labels, {"amvnet": labels})
 
-    for title, evaluation in (("as it is", unfitted), ("measured", fitted)):
+    for title, evaluation in (("as it is", as_it_is), ("measured", normalised)):
         report = evaluation.report(name)["methods"]["amvnet"]
         miou = 100 * report["miou_present"]
         accuracy = 100 * report["accuracy"]

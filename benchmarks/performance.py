@@ -2,7 +2,7 @@
 
 Also measure what each optimisation gives, by taking it away.
 
-python benchmarks/performance.py [--scan FILE] [--rounds N] [--runs N] [--engines torch,onnx]
+    python benchmarks/performance.py [--scan FILE] [--rounds N] [--runs N] [--engines torch,onnx]
 """
 
 from __future__ import annotations
@@ -175,7 +175,6 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--engines", default="torch")
-    # Share of the points; by default as the networks disagree
     parser.add_argument("--short", action="store_true")  # the engines alone
     parser.add_argument("--variant")  # to measure in this process; for `run_variant`
     options = parser.parse_args()

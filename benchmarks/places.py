@@ -1,7 +1,6 @@
-"""Score weights place by place, as one easy place may carry the mean over all of them.
+"""Score weights place by place, as an easy place may hide what the others lack.
 
-    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--methods M,...]
-        [--every N]
+    python benchmarks/places.py DATA WEIGHTS [--no-intensity] [--methods M,...] [--every N]
 
 DATA is a dataset such as semantickitti:PATH; each of its sequences is a place. Print mIoU over all
 classes and accuracy of each method, and the share of uncertain points, for each place and for all.
@@ -84,7 +83,9 @@ def main() -> None:
         records = [record for record in chosen if record.sequence == place]
         if not records:
             continue
-        evaluation = score(dataset, records, segmenter, methods, not options.no_intensity)
+        evaluation = score(
+            dataset, records, segmenter, methods=methods, intensity=not options.no_intensity
+        )
         add_row(table, place, evaluation, dataset.taxonomy.size)
         total += evaluation
     add_row(table, "all", total, dataset.taxonomy.size)

@@ -14,7 +14,8 @@ ROOT = Path(__file__).parents[1]
 # All but the tests, the loggers of other services, and the fleet.
 EXTRAS = ("simulate", "formats", "export", "hub")
 
-# constraints.txt pins torch, which pins these itself, and not all of them are on every machine.
+# Left out: torch, which constraints.txt pins, and the packages that torch itself pins, not all of
+# which exist for every machine.
 OF_TORCH = ("cuda-", "nvidia-", "torch", "triton")
 KEPT = ("torchmetrics",)
 HEADER = f"""\
@@ -23,7 +24,7 @@ HEADER = f"""\
 
 
 def main() -> None:
-    """Ask pip what it would install, and print it."""
+    """Print what pip would install."""
     package = f"{ROOT}[{','.join(EXTRAS)}]"
     constraints = ["--constraint", str(ROOT / "constraints.txt")]
     options = ["--dry-run", "--ignore-installed", "--quiet", "--report", "-"]

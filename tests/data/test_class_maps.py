@@ -75,6 +75,7 @@ def fake_taxonomy() -> Taxonomy:
         ({"a": ["car"], "b": ["car"]}, "car twice"),
         ({"a": [1]}, "names of classes"),
         ({"a": {"from": "car", "id": 1.5}}, "whole number"),
+        ({"a": {"from": "car", "id": [1]}}, "whole number"),
         ({"a": {"from": "car", "id": 2}, "b": {"id": 2}}, "no id twice"),
         ({"a": {"color": "red"}}, "color"),
     ],

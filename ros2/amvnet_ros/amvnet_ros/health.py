@@ -1,4 +1,4 @@
-"""What the node tells about itself once a second: how many clouds, how fast, how sure."""
+"""What the node reports about itself once a second: how many clouds, how fast, how certain."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class Labelled:
     Attributes:
         seconds: from its arrival to its labels.
         age: seconds from its stamp to its labels.
-        points: how many it has.
-        uncertain: the share of points on which the networks disagree; None for a single network.
+        points: number of its points.
+        uncertain: share of points on which the networks disagree; None for a single network.
     """
 
     seconds: float
@@ -110,7 +110,7 @@ class Health:
 
 
 def _describe(period: _Period, seconds: float) -> dict[str, str]:
-    """Return the values of a period; those of its clouds are medians, or maxima if so named."""
+    """Return the values of a period; they are medians over its clouds, or maxima if so named."""
     labelled = period.labelled
     rate = len(labelled) / seconds if seconds > 0 else 0.0
     values = {"clouds labelled per second": f"{rate:.2f}"}
@@ -130,6 +130,7 @@ def _describe(period: _Period, seconds: float) -> dict[str, str]:
 
 
 def _judge(period: _Period, usual_uncertain: float) -> tuple[Level, str]:
+    """Return level and message of the report on a period."""
     if period.refusal:
         return Level.ERROR, period.refusal
     if not period.received and not period.labelled:
@@ -137,7 +138,7 @@ def _judge(period: _Period, usual_uncertain: float) -> tuple[Level, str]:
 
     uncertain = _uncertain(period)
     if uncertain is not None:
-        # Late, so that the node can set the environment before torch reads it.
+        # Imported late: the node sets the environment before torch reads it.
         from amvnet.inference.segmentation import Verdict
 
         verdict = Verdict(uncertain, usual_uncertain)

@@ -20,7 +20,7 @@ ALIGNMENT = 4  # bytes: every field of an encoded point starts at a multiple, as
 
 @dataclass(frozen=True)
 class Message:
-    """The message that a cloud is from.
+    """What the labels of a cloud take over from its message.
 
     Attributes:
         stamp: when the points were measured, nanoseconds since the epoch.
@@ -77,10 +77,10 @@ def encode_labels(
     Args:
         types: the classes of PointCloud2, PointField, Header and Time by name, such as `types` of a
             type store of rosbags.
-        origin: the message with the scan, whose header and rows are taken.
-        points: the points; NaN stays NaN.
+        origin: gives the header and the rows.
+        points: the points and their labels; NaN stays NaN.
         has_points: whether the message has x, y, z and rgb.
-        to_bytes: turns (B,) uint8 into what the library takes as bytes.
+        to_bytes: turns (B,) uint8 into the type of the library for bytes.
     """
     columns: dict[str, np.ndarray] = {}
     if has_points:

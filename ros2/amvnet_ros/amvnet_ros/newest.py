@@ -13,8 +13,8 @@ class NewestOnly(Generic[T]):
     """Works on one item at a time, and then on the newest one: nothing queues.
 
     Args:
-        work: is called with each item, in the thread.
-        fail: called with the exception that ended the thread; the later items are dropped.
+        work: called with each item, in the thread.
+        fail: called with the exception that ended the thread; later items are dropped.
     """
 
     def __init__(self, work: Callable[[T], None], fail: Callable[[Exception], None]) -> None:
@@ -27,7 +27,7 @@ class NewestOnly(Generic[T]):
         self._thread.start()
 
     def put(self, item: T) -> bool:
-        """Let the item be the next one to work on; return whether this drops one that waited."""
+        """Make the item the next to work on; return whether this drops an item that waited."""
         with self._changed:
             drops = bool(self._waiting)
             self._waiting = [item]
@@ -35,7 +35,7 @@ class NewestOnly(Generic[T]):
         return drops
 
     def close(self) -> None:
-        """End the thread after the item that it works on; the one that waits is dropped."""
+        """End the thread after the item that it works on; an item that waits is dropped."""
         with self._changed:
             self._is_open = False
             self._changed.notify()

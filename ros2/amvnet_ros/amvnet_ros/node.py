@@ -121,7 +121,7 @@ class SegmentNode(Node):
             self.get_logger().error(str(error), throttle_duration_sec=REFUSAL_PERIOD)
             return
 
-        # Encoding takes time, too.
+        # Encoding takes time, so that only messages with a subscriber are encoded.
         if self._labels.get_subscription_count():
             self._labels.publish(to_ros(labelled, has_points=False))
         if self._cloud.get_subscription_count():
@@ -138,8 +138,8 @@ class SegmentNode(Node):
         )
 
     def _fail(self, error: Exception) -> None:
-        """End the node: an error that is not the message's would come again."""
-        if not self.context.ok():  # stopped while it labelled: there is nobody to publish to
+        """End the node: an error that is not due to the message would come again."""
+        if not self.context.ok():  # the node was stopped while it labelled
             return
         self.exit_code = FAILED
         self.get_logger().fatal("".join(traceback.format_exception(error)))
@@ -167,7 +167,7 @@ class SegmentNode(Node):
 def newest_cloud_profile() -> QoSProfile:
     """Return the profile for sensor data, but with only the newest cloud.
 
-    A new one for each topic: rclpy writes what the user overrides for a topic into its profile.
+    Each topic needs its own: rclpy writes what the user overrides for a topic into its profile.
     """
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,

@@ -20,9 +20,9 @@ def _parameter(default: Any, description: str) -> Any:
 
 @dataclass(frozen=True)
 class Settings:
-    """The parameters of the node. ROS has no None: what is to be measured is empty or out of range.
+    """The parameters of the node, with the meaning of the options of `amvnet predict`.
 
-    Their meaning is that of the options of `amvnet predict`.
+    ROS has no None: a parameter is empty, 0 or negative if its value is to be measured.
     """
 
     weights: str = _parameter("sim-hdl64e", "a name, a path, or hf-hub:OWNER/NAME")
@@ -57,9 +57,9 @@ class LabelledCloud:
     """The points of a message with their labels, in their order.
 
     Attributes:
-        origin: of the message.
-        points: with the raw ids, 0 for lost points, and the colours of the classes.
-        uncertain_share: of the points that are not lost; None for a single network.
+        origin: what the labels take over from the message.
+        points: with raw ids, 0 for lost points, and the colours of the classes.
+        uncertain_share: share of uncertain points, without lost points; None for a single network.
     """
 
     origin: Message
@@ -75,20 +75,21 @@ class CloudSegmenter:
 
     Attributes:
         taxonomy: the classes.
+        hardware: what computes, in words.
         usual_uncertain: the share of uncertain points in the scans that the weights were validated
             on, in [0, 1].
 
     Args:
         settings: the parameters of the node.
-        topic: where the messages come from, for what is said.
-        say: called once with what was assumed of the sensor.
+        topic: where the messages come from, for messages to people.
+        say: called once with what was assumed about the sensor.
 
     Raises:
         InputError: if a parameter is wrong.
     """
 
     def __init__(self, settings: Settings, topic: str, say: Callable[[str], None]) -> None:
-        # Late, so that the node can set the environment before torch reads it.
+        # Imported late: the node sets the environment before torch reads it.
         import torch
 
         import amvnet

@@ -1,1 +1,1 @@
-"""The benchmarks: readers, label tables, catalogue, augmentation."""
+"""Classes, datasets, and files of scans and labels."""

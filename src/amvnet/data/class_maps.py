@@ -23,25 +23,25 @@ class ClassMap:
 
     Attributes:
         target: the classes of the result.
-        sources: the train id in `target` by the name of a class.
+        sources: train ids in `target`, by the name of a class.
     """
 
     target: Taxonomy
     sources: Mapping[str, int]
 
     def table(self, taxonomy: Taxonomy) -> np.ndarray:
-        """Return the (K + 1,) uint8 train ids in `target` by those of a taxonomy.
+        """Return the (K + 1,) uint8 train ids in `target`, indexed by those of a taxonomy.
 
-        Classes that the map does not name are ignored (0), but for classes with the name of a
-        target class.
+        A class that the map does not name becomes the target class of the same name, or is ignored
+        (0) if there is none.
 
         Raises:
             InputError: if the map names none of the classes.
         """
         train_ids = [0]
         for name in taxonomy.classes:
-            own = self.target.classes.index(name) + 1 if name in self.target.classes else 0
-            train_ids.append(self.sources.get(name, own))
+            same_name = self.target.classes.index(name) + 1 if name in self.target.classes else 0
+            train_ids.append(self.sources.get(name, same_name))
         if not any(train_ids):
             raise InputError(
                 f"--classes {self.target.name}: expected a map of the classes of {taxonomy.name} "
@@ -52,7 +52,7 @@ class ClassMap:
 
 
 def class_map(name: str) -> ClassMap:
-    """Return the map `coarse`, or that of a YAML file; raise InputError if there is none."""
+    """Return the map `coarse` or the one in a YAML file; raise InputError if there is none."""
     if name == COARSE_NAME:
         text = (resources.files("amvnet.data") / "coarse.yaml").read_text(encoding="utf-8")
         return _parse(name, parse_yaml(text, name))
@@ -68,6 +68,7 @@ def class_map(name: str) -> ClassMap:
 
 
 def _parse(name: str, tree: Any) -> ClassMap:
+    """Return the map that a YAML file describes."""
     classes = tree.get("classes") if isinstance(tree, Mapping) else None
     entries = class_entries(classes, "from", "ground: [road, sidewalk]")
 
@@ -84,7 +85,13 @@ def _parse(name: str, tree: Any) -> ClassMap:
             if source in sources:
                 raise InputError(f"expected each class once, found {source} twice; correct the map")
             sources[source] = train_id
-        raw_ids.append(values.get("id", train_id))
-        raw_to_train[raw_ids[-1]] = train_id
+
+        raw_id = values.get("id", train_id)
+        if type(raw_id) is not int:
+            raise InputError(
+                f"{title}: expected a whole number as id, found {shown(raw_id)}; correct it"
+            )
+        raw_ids.append(raw_id)
+        raw_to_train[raw_id] = train_id
 
     return ClassMap(user_taxonomy(name, entries, raw_to_train, raw_ids), sources)

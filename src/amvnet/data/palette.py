@@ -1,4 +1,4 @@
-"""The colours of all drawings: those of the classes, and of points that are marked.
+"""The colours of all drawings: of the classes, and of points that are marked.
 
 Label files carry the official colours, some of which cannot be told apart in a picture.
 """
@@ -10,7 +10,7 @@ from amvnet.data.taxonomy import Color, Taxonomy
 WRONG: Color = (255, 64, 54)
 UNCERTAIN: Color = (255, 150, 180)  # unlike the colours of all classes of both benchmarks
 
-# What is drawn for official colours that are like those of other classes.
+# What is drawn instead of official colours that look like those of other classes.
 DRAWN: dict[str, dict[str, Color]] = {
     "semantickitti": {"other-ground": (75, 150, 90), "traffic-sign": (135, 150, 0)},
     "nuscenes": {"motorcycle": (255, 30, 225), "trailer": (0, 135, 255), "truck": (225, 150, 255)},

@@ -21,7 +21,7 @@ from amvnet.errors import InputError, one_line_errors, shown
 # The lower 16 bits of a raw SemanticKITTI label hold the class, the upper 16 the instance.
 INSTANCE_MASK = 0xFFFF
 MOST_CLASSES = 255  # train ids are uint8
-# The colours of a user's classes without one: each next hue is far from all earlier ones.
+# The colours of a user's classes that have none: each hue is far from all earlier ones.
 SATURATION = 0.65
 VALUE = 0.95
 GOLDEN_ANGLE = 0.381966  # of the circle of hues
@@ -81,7 +81,7 @@ class Taxonomy:
             self._check(not twice, f"no {kind} twice", twice[:1])
 
     def _check(self, holds: bool, expected: str, found: Any) -> None:
-        """Raise an InputError unless a condition holds: a file of a stranger may hold anything."""
+        """Raise an InputError unless a condition holds: a stranger's file may hold anything."""
         if not holds:
             raise InputError(
                 f"taxonomy {self.name}: expected {expected}, found {shown(found)}; "
@@ -117,7 +117,7 @@ class Taxonomy:
         return table
 
     def to_train(self, raw: np.ndarray) -> np.ndarray:
-        """Return the (N,) uint8 train ids of (N,) raw ids, whose upper 16 bits are dropped.
+        """Return the (N,) uint8 train ids of (N,) raw ids; only their lower 16 bits count.
 
         Raises:
             InputError: if a raw id is not in the table.
@@ -136,7 +136,7 @@ class Taxonomy:
             raise InputError(
                 f"expected the raw ids of {self.name} "
                 f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; write its raw "
-                "ids, or give the label map (YAML) that they are of"
+                "ids, or describe your own in a YAML file (docs/own_data.md)"
             )
         return train_ids.astype(np.uint8)
 
@@ -152,12 +152,12 @@ class Taxonomy:
         return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON, whose keys are text: `raw_to_train` as a list of pairs."""
+        """Return the fields for JSON, with `raw_to_train` as pairs: keys in JSON are texts."""
         return {**dataclasses.asdict(self), "raw_to_train": list(self.raw_to_train.items())}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Taxonomy:
-        """Return the taxonomy of what `to_dict` returned; raise InputError if it is wrong."""
+        """Return the taxonomy from what `to_dict` returned; raise InputError if it is wrong."""
 
         def message(error: BaseException) -> str:
             return (
@@ -165,7 +165,7 @@ class Taxonomy:
                 f"{shown(error)}; use a weights file of this package"
             )
 
-        # AttributeError: a table that is none; OverflowError: .inf as an id.
+        # AttributeError if a table is missing, OverflowError if an id is .inf.
         faults = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
         with one_line_errors(message, only=faults):
             return cls(
@@ -180,15 +180,15 @@ class Taxonomy:
 
 
 def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, Any]]:
-    """Return what a user's YAML file says of each class, by name: values by key, with a colour.
+    """Return the entries of a user's classes, by name, each as a mapping with a colour.
 
     Args:
-        classes: of the file; the entry of a class is a mapping, or only the value of `key`.
-        key: the only one that a class must have.
-        example: of an entry, for the message.
+        classes: the entries in a YAML file: mappings, or only the value of `key`.
+        key: the key that every class must have.
+        example: an entry, for the message.
 
     Raises:
-        InputError: if there are no classes, or a colour is no list of three whole numbers.
+        InputError: if there are no classes, or a colour is not a list of three whole numbers.
     """
     if not isinstance(classes, Mapping) or not classes:
         raise InputError(
@@ -238,7 +238,7 @@ def _rgb(values: Iterable[Any]) -> Color:
 
 
 def _built_in() -> dict[str, Taxonomy]:
-    """Return the classes of the benchmarks by name."""
+    """Return the taxonomies of both benchmarks by name."""
     text = (resources.files("amvnet.data") / "benchmarks.toml").read_text(encoding="utf-8")
 
     taxonomies = {}

@@ -23,8 +23,7 @@ from amvnet.progress import Progress, no_progress
 from amvnet.scan import Scan, check_scan
 
 BINS = 100  # of the cosine similarity, which lies in [0, 1]
-SWEPT = 98  # lowest bins of points that the head settles: tau is swept up to 0.98
-
+SWEPT = 98  # bins that the head settles at the largest tau, 0.98
 
 # AMVNet with one value of a parameter: the value, and in percent the uncertain points, the mIoU and
 # the accuracy.
@@ -38,9 +37,9 @@ class Analysis:
     Attributes:
         evaluation: of every method that the weights have, the three ensembles included.
         tau: of the weights.
-        points: (BINS,) the number of points by similarity, labelled or not.
+        points: (BINS,) numbers of points by similarity, labelled or not.
         ensemble: (BINS, K + 1, K + 1) confusion matrices of the geometric mean, by similarity.
-        head: (SWEPT, K + 1, K + 1) the same of the point head.
+        head: (SWEPT, K + 1, K + 1) confusion matrices of the point head, by similarity.
     """
 
     evaluation: Evaluation
@@ -78,7 +77,7 @@ def analyze(
     segmenter: Segmenter,
     progress: Progress = no_progress,
 ) -> Analysis:
-    """Score labelled scans by every method, and by the head wherever some tau asks it.
+    """Score labelled scans by every method, and by the head wherever some tau asks for it.
 
     Raises:
         InputError: if the weights lack a part, or a scan has no ground truth.
@@ -110,7 +109,7 @@ def analyze(
 
 @torch.inference_mode()
 def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> Analysis:
-    """Score a scan by every method, and by the head wherever some tau asks it."""
+    """Score a scan by every method, and by the head wherever some tau asks for it."""
 
     def is_asked(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
         return (_bins(f, g) < SWEPT) | assertion(f, g, points)
@@ -131,13 +130,13 @@ def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> 
     uncertain = expand_to_scan(assertion(f, g, batch.points), scan.valid)
     ids["amvnet"] = np.where(uncertain, head, ids["ensemble"])
 
-    # Points that no network has seen count as agreed on, with id 0, whatever tau is.
+    # The networks agree on points that they do not see (id 0), whatever tau is.
     bins = np.where(scan.valid, expand_to_scan(_bins(f, g), scan.valid), BINS - 1)
 
     truth = scan.labels
     assert truth is not None
     evaluation = Evaluation(segmenter.taxonomy)
-    evaluation.add(scan.points, truth, ids, uncertain)
+    evaluation.add(scan.points, truth, ids, uncertain=uncertain)
     size = segmenter.taxonomy.size + 1
     return Analysis(
         evaluation,

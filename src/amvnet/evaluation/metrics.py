@@ -102,13 +102,13 @@ class Evaluation:
 
     Attributes:
         taxonomy: the classes.
-        matrices: method -> (bins + 1, K + 1, K + 1) counts; the first matrix is over all
-            distances, the others are of the bins between `EDGES`. Points exactly on an edge are in
-            no bin, as in SemanticKITTI's tool.
+        matrices: (bins + 1, K + 1, K + 1) counts by method: first of all points, then of the points
+            between each two `EDGES`. Points exactly on an edge are in no bin, as in SemanticKITTI's
+            tool.
         scans: number of scans that were added.
         points: number of points in these scans, labelled or not.
         uncertain: number of uncertain points.
-        asked: number of points of which it is known whether they are uncertain.
+        asked: number of points for which it is known whether they are uncertain.
     """
 
     taxonomy: Taxonomy
@@ -130,11 +130,11 @@ class Evaluation:
         Args:
             points: (N, 3 or more) x, y, z in metres.
             truth: (N,) train ids.
-            predictions: method -> (N,) train ids.
+            predictions: (N,) train ids by method.
             uncertain: (N,) bool, or None if it is not known which points are uncertain.
 
         Raises:
-            InputError: as `confusion`. The scan is then not counted at all.
+            InputError: as `confusion`; the scan is then not counted at all.
         """
         size = self.taxonomy.size
         distances = np.linalg.norm(points[:, :3], axis=1)

@@ -45,9 +45,9 @@ class Labeller:
     Attributes:
         label: labels a scan by one or several methods.
         taxonomy: the classes of the labels.
-        classes: maps these, and those of the data, to the classes that are scored; None if they
-            are the same.
-        at_once: scans that it labels at the same time, each in a thread.
+        classes: maps the classes of the labels and of the data to those that are scored; None if
+            all are the same.
+        at_once: number of scans that it labels at the same time, each in a thread.
     """
 
     label: Callable[[ScanRecord, Scan], MethodLabels]
@@ -56,7 +56,7 @@ class Labeller:
     at_once: int = 1
 
     def table(self, taxonomy: Taxonomy) -> np.ndarray:
-        """Return the (K + 1,) uint8 train ids that are scored, by those of a taxonomy."""
+        """Return the (K + 1,) uint8 train ids to score, indexed by those of a taxonomy."""
         if self.classes is None:
             return np.arange(taxonomy.size + 1, dtype=np.uint8)
         return self.classes.table(taxonomy)
@@ -99,7 +99,7 @@ def evaluate(
         labels_by_name, uncertain = labels
         ids = {name: table[values] for name, values in labels_by_name.items()}
 
-        evaluation.add(scan.points, truth, ids, uncertain)
+        evaluation.add(scan.points, truth, ids, uncertain=uncertain)
         if pictures is not None and record.name in pictured:
             view = TopView(
                 scan.points, taxonomy, ids, truth, title=record.name, uncertain=uncertain
@@ -135,7 +135,7 @@ def label_by_weights(
     methods: Sequence[str] = PAPER_METHODS,
     classes: ClassMap | None = None,
 ) -> Labeller:
-    """Return what labels scans by several methods."""
+    """Return a labeller that runs some weights by several methods."""
     segmenter = segmenter.for_dataset(dataset)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
@@ -147,10 +147,10 @@ def label_by_weights(
 def labels_by_method(
     segmenter: Segmenter, scan: Scan, methods: Sequence[str] = PAPER_METHODS
 ) -> MethodLabels:
-    """Label the N points of a scan by a segmenter's method and by those that it includes.
+    """Label the N points of a scan by a segmenter's method and by the methods that it includes.
 
-    AMVNet includes the ensembles and each network alone; an ensemble includes the other ensembles
-    and each network alone; others of `methods` are left out. The networks run once.
+    AMVNet and the ensembles include all ensembles and each network alone. Those of `methods` that
+    are not included are left out. The networks run once.
     """
     batch = segmenter.batch([scan])
     scores = segmenter.run(batch)
@@ -170,7 +170,7 @@ def labels_by_method(
 
 @torch.inference_mode()
 def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatch) -> Tensor | None:
-    """Return the scores (P, K) by another method than the segmenter's; None if it lacks one."""
+    """Return the scores (P, K) by another method; None if the segmenter does not include it."""
     f = scores.rv
     g = scores.bev
     ensemble = METHODS[name].ensemble
@@ -187,7 +187,7 @@ def _scores_by(name: str, segmenter: Segmenter, scores: Scores, batch: PointBatc
 
 
 def label_from_files(dataset: Dataset, folder: Path, classes: ClassMap | None = None) -> Labeller:
-    """Return what reads labels from a folder; raise InputError if there is no such folder."""
+    """Return a labeller that reads predictions; raise InputError if there is no such folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 

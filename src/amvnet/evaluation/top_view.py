@@ -50,7 +50,7 @@ class TopView:
         points: (N, 3 or more) x, y, z in metres.
         taxonomy: names and colours of the classes.
         predictions: (N,) train ids by title.
-        truth: (N,) train ids.
+        truth: (N,) train ids of the ground truth.
         title: a line above all panels.
         uncertain: (N,) bool, or None.
     """
@@ -63,7 +63,7 @@ class TopView:
     uncertain: np.ndarray | None = None
 
 
-def draw_scan(path: Path | str, view: TopView) -> Path:
+def draw_scan(path: Path, view: TopView) -> Path:
     """Draw one scan from above, x to the right and y up, 50 m to each side; return the path.
 
     The first row shows the truth and each prediction. Below each prediction are its errors
@@ -87,7 +87,6 @@ def draw_scan(path: Path | str, view: TopView) -> Path:
     figure.suptitle(view.title, fontsize=13)
     _draw_legend(figure, entries, columns)
 
-    path = Path(path)
     with atomic_write(path) as part:
         figure.savefig(part, format="png", dpi=DOTS_PER_INCH)
     return path

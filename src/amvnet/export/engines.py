@@ -44,7 +44,7 @@ def make_segmenter(
 
     Args:
         tau: as for `Segmenter`.
-        say: takes lines about the device, and about work that takes long.
+        say: called with lines about the device, and about work that takes long.
 
     Raises:
         InputError: as `Segmenter` and `use_engine`.
@@ -61,9 +61,9 @@ def make_segmenter(
 
 
 def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> None:
-    """Let an engine run the networks of a segmenter, which were set up for torch.
+    """Let an engine run the networks of a segmenter that was made for torch.
 
-    Everything around the networks stays with torch. `onnx` exports the networks once, in half a
+    Torch still does everything around the networks. `onnx` exports the networks once, in half a
     minute, and keeps them in `cache_folder`. It takes scans one by one, and computes on a GPU if
     the installed ONNX Runtime can. `int8` does the same on the CPU with convolutions in 8-bit
     integers, which it calibrates once, in a few minutes, on simulated scans of the weights' sensor.
@@ -91,7 +91,7 @@ def use_engine(segmenter: Segmenter, engine: str, say: Say = say_nothing) -> Non
     parts = METHODS[segmenter.method].parts
     model = segmenter.model
     folder = exported(segmenter, SIMULATED if engine == "int8" else None, say)
-    # A GPU does not take the unsigned activations of the int8 graphs.
+    # GPUs cannot run int8 graphs, whose activations are unsigned.
     providers: Sequence[str] = PROVIDERS[-1:]
     if engine == "onnx":
         import onnxruntime
@@ -118,7 +118,7 @@ def cache_folder() -> Path:
 
 
 def exported(segmenter: Segmenter, int8: str | None = None, say: Say = say_nothing) -> Path:
-    """Return the folder of a segmenter's exported networks, which are exported if necessary."""
+    """Return the folder of a segmenter's exported networks; export them if it is not there."""
     check_libraries()
     weights = segmenter.weights
     digests = [weights.digest(part) for part in weights.parts]
@@ -163,7 +163,7 @@ class OnnxGraph(nn.Module):
         return self.sessions[threads]
 
     def forward(self, x: Tensor) -> Tensor:
-        # The runtime's threads are not part of a forked process, which would wait for them forever.
+        # A forked process has none of the runtime's threads, and would wait for them forever.
         if os.getpid() != self.process:
             raise InputError(
                 "expected the process that loaded an engine of ONNX Runtime, found one forked "

@@ -22,13 +22,13 @@ from amvnet.onnx_runner import OnnxSegmenter
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import match_scan
 
-SIMULATED = "simulated"  # instead of scans: simulated streets, seen by the weights' sensor
+SIMULATED = "simulated"  # the name of simulated streets, seen by the weights' sensor
 SEED = 20_261_121  # of these streets, far from the seeds of any training
 SCANS = 20  # used at most, evenly spaced
-CHECK_EVERY = 5  # the first of every five scans checks, the others calibrate
+CHECK_EVERY = 5  # the first of every five scans is for the check, the others to calibrate
 LEAST_AGREEMENT = 0.9  # of labels before and after; far less than a good calibration gives
-# The graphs of convolutions, which take nearly all of the time; True if the first layer stays in
-# float32. The range view's input has metres next to a mask of 0 and 1: 256 steps are too few.
+# The graphs of convolutions, which take nearly all of the time, and whether their first layer stays
+# in float32: the range view's input has metres and a mask of 0 and 1, for which 256 steps are few.
 FIRST_KEPT = {"range_net": True, "polar_map": False}
 
 
@@ -58,7 +58,8 @@ def quantise(
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Replace exported graphs by quantised ones, one after the other.
 
-    Of the scans, the first of every five checks, the others calibrate. A single one does both.
+    The first of every five scans is for the check, the others are to calibrate. A single scan does
+    both.
 
     Args:
         folder: the output folder of `amvnet export`.
@@ -76,7 +77,7 @@ def quantise(
     recorder = _Recorder(folder)
     for name in names:
         expected = _labels(recorder, name, checking)
-        recorder.recorded[name].clear()  # the inputs of the scans that only check
+        recorder.recorded[name].clear()  # of the scans for the check
         _labels(recorder, name, calibrating)
         path = folder / f"{name}.onnx"
         _write(path, recorder.recorded.pop(name))
@@ -174,7 +175,7 @@ def _write(path: Path, inputs: list[dict[str, np.ndarray]]) -> None:
 
 
 def _first_layer(path: Path) -> list[str]:
-    """Return the names of the nodes up to the first activation; none if there is no activation."""
+    """Return the names of the nodes up to the first activation; none if there is none."""
     import onnx
 
     names = []

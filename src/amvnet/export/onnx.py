@@ -1,4 +1,4 @@
-"""Write trained networks as ONNX, check them, and describe all that a program needs to use them."""
+"""Write trained networks as ONNX, check them, and describe how to use them."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from amvnet.weights.file import Weights, load
 
 EXTRA = ("onnx", "onnxscript", "onnxruntime")
 OPSET = 18  # the least that PyTorch's exporter writes; TensorRT 10 and ONNX Runtime 1.14 read it
-LARGEST_DIFFERENCE = 1e-4  # from torch: of probabilities, and of features by `_shares`
+LARGEST_DIFFERENCE = 1e-4  # from torch, of probabilities or of features as `_shares`
 LARGEST_WEIGHTS = 2**28  # bytes of a tensor of weights
 POINTS = 5000  # of the artificial scan that the graphs are traced and checked with
-# The graphs whose first axis may have any length, and the name of this axis.
+# Names of the first axis of the graphs in which it may have any length.
 DYNAMIC = {
     "polar_points": "points",
     "polar_pillars": "pillars",
@@ -51,10 +51,10 @@ class Graph:
     """One part of the method, to be exported.
 
     Attributes:
-        module: computes it in torch.
+        module: the part in torch.
         inputs: an example of each input, by name.
         output: the output's name.
-        compared: turns outputs into values to compare with torch: probabilities, or features by
+        compared: turns outputs into values to compare with torch: probabilities, or features as
             `_shares`.
     """
 
@@ -90,8 +90,8 @@ def export(
             them, or `simulated`.
 
     Returns:
-        The descriptions of the graphs, by name: those in float32 with the largest `difference` from
-        torch, those in int8 with the `agreement`, the share of the labels that stay.
+        The descriptions of the graphs, by name. Graphs in float32 have the largest `difference`
+        from torch, graphs in int8 the `agreement`, the share of the labels that stay.
 
     Raises:
         InputError: if a library is missing, the weights have no network or need labels, there are
@@ -110,7 +110,7 @@ def export(
     temporary.mkdir()
     try:
         description = _write_all(segmenter, scans, temporary, progress)
-        # An interruption must not leave the old description with new graphs.
+        # After an interruption, the old description must not describe new graphs.
         (out / DESCRIPTION).unlink(missing_ok=True)
         graphs: dict[str, dict[str, Any]] = description["graphs"]
         for name in graphs:
@@ -131,7 +131,7 @@ def possible_files(out: Path) -> list[Path]:
 def _write_all(
     segmenter: Segmenter, scans: Sequence[Scan], folder: Path, progress: Progress
 ) -> dict[str, Any]:
-    """Write the graphs, their convolutions in int8 if there are scans; return the description."""
+    """Write the graphs, with convolutions in int8 if there are scans; describe them."""
     written: dict[str, dict[str, Any]] = {}
     with torch.no_grad():
         graphs = _graphs(segmenter)
@@ -142,7 +142,7 @@ def _write_all(
             written[name] = _write(graph, name, folder / f"{name}.onnx")
 
     description = describe_export(segmenter, written)
-    _save(description, folder / DESCRIPTION)  # the calibration runs the graphs by it
+    _save(description, folder / DESCRIPTION)  # the calibration runs the graphs with it
     progress(len(graphs), total)
 
     for count, (name, changes) in enumerate(quantise(folder, convolutions, scans), len(graphs) + 1):
@@ -231,6 +231,7 @@ def _graphs(segmenter: Segmenter) -> dict[str, Graph]:
 
 
 def _polar_graphs(model: AMVNet, batch: PointBatch, classes: int) -> dict[str, Graph]:
+    """Return the parts of the bird's-eye-view network, between which points are pooled."""
     net = model.polar_net
     assert isinstance(net, PolarNet)
     grid = model.polar_view.project(batch)
@@ -314,8 +315,8 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
             verbose=False,
         )
         assert program is not None
-        # Compute weights that are sums of others (`models.upsampled_conv`) once and for all. By
-        # default, only small tensors count as constants.
+        # Compute weights that are sums of others (`models.upsampled_conv`) once: by default, only
+        # small tensors count as constants.
         optimize(program.model, input_size_limit=LARGEST_WEIGHTS, output_size_limit=LARGEST_WEIGHTS)
         program.save(path, external_data=False)
     strip(path)
@@ -338,7 +339,7 @@ def _write(graph: Graph, name: str, path: Path) -> dict[str, Any]:
 
 
 def _run(path: Path, graph: Graph) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Tensor]:
-    """Run a file on the examples; return descriptions of inputs and outputs, and the result."""
+    """Run a graph on its examples; return descriptions of inputs and outputs, and the result."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])

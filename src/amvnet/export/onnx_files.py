@@ -1,4 +1,4 @@
-"""Tame the libraries that write ONNX: their warnings, and notes in the files."""
+"""Handle ONNX files and the libraries that write them, with their warnings and notes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def digest(path: Path) -> str:
 
 
 def strip(path: Path) -> None:
-    """Remove the notes of the writing library from a graph; they contain paths of this machine."""
+    """Remove a library's notes from a graph, which contain paths of this machine."""
     import onnx
 
     model = onnx.load(path)
@@ -29,7 +29,7 @@ def strip(path: Path) -> None:
 
 @contextmanager
 def quiet(name: str) -> Iterator[None]:
-    """Suppress warnings, and what the logger `name` of a library says below errors."""
+    """Suppress warnings, and what the logger `name` of a library says besides errors."""
     logger = logging.getLogger(name)
     level = logger.level
     logger.setLevel(logging.ERROR)

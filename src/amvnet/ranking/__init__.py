@@ -1,1 +1,1 @@
-"""Which scans to look at next: those whose labels look wrong."""
+"""Labels that may be wrong, the most doubtful first."""

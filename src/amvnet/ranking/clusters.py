@@ -1,4 +1,4 @@
-"""Cluster points: a cluster is a set of connected points of one kind."""
+"""Cluster points: a cluster is a set of points of one kind that are connected."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 CELL = 0.4  # metres: side of a cell; points of the same cell or of touching cells are connected
-# In cells: cells that touch, even only at a corner, are at most sqrt(3) apart, others at least 2.
+# Distances in cells: cells that touch, if only at a corner, are at most sqrt(3) apart, others at
+# least 2. Points of different kinds count as farther apart.
 TOUCHING = 1.75
-APART = 4.0  # in cells: least distance between points of different kinds
+APART = 4.0
 
 
 def cluster(xyz: np.ndarray, kind: np.ndarray) -> np.ndarray:

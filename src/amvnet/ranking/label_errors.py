@@ -1,6 +1,6 @@
-"""Rank labelled points that may be labelled wrongly: both views contradict their labels.
+"""Rank points that may be labelled wrongly, because both views contradict their labels.
 
-These points are grouped into clusters, and the most doubtful clusters come first.
+The points are grouped into clusters, and the most doubtful clusters come first.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ from amvnet.progress import Progress, no_progress
 from amvnet.ranking.clusters import cluster
 from amvnet.scan import Scan, check_scan
 
-# Metres: points nearer to the sensor than this belong to its vehicle and are never doubted.
-NEAR = 1.5
-# Number of points with doubt 0 that are added to each cluster for its mean doubt, so that clusters
-# of a few stray points do not rank first.
+NEAR = 1.5  # metres: points nearer to the sensor belong to its vehicle and are never doubted
+# Points with doubt 0 that count as part of each cluster for its mean doubt, so that clusters of a
+# few stray points do not rank first.
 FEW = 20.0
 # Scores are divided by the number of clusters of the same kind, raised to this power: a
 # contradiction that occurs often is more likely a mistake of the views than of the labels.
@@ -64,7 +63,7 @@ class Doubts:
         label: (N,) train ids of the labels.
         kind: (N,) the label and the class that both views agree on, as one number. All points of
             a cluster have the same kind.
-        whole: (N,) number of points of the labelled thing to which each point belongs.
+        whole: (N,) number of points in the labelled thing that the point is a part of.
     """
 
     xyz: np.ndarray
@@ -83,8 +82,6 @@ def rank(
     progress: Progress = no_progress,
 ) -> np.ndarray:
     """Return the doubtful clusters of some labelled scans, the most doubtful first.
-
-    A few scans are in memory at a time, and 35 bytes for each cluster.
 
     Returns:
         (C,) rows of `ROW`.
@@ -212,7 +209,7 @@ def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.
 
 
 def _most_common(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
-    """Return the most common id in each of `count` groups; the lowest id if there are several."""
+    """Return the most common id in each of `count` groups, or the lowest of several."""
     table = np.zeros((count, 256), dtype=np.int32)
     np.add.at(table, (group, ids), 1)
     return table.argmax(axis=1)

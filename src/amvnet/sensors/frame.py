@@ -14,12 +14,12 @@ from amvnet.sensors.ground import Ground, find_ground
 from amvnet.sensors.lidars import AXES, Sensor, rotation_from_degrees
 
 # The median distance of the points tells the unit: in metres it is 2 to 40 with all sensors.
-FARTHEST_MEDIAN = 200.0  # of a scan in metres
-MIN_MILLIMETRES = 4000.0  # of one in millimetres; between the two, centimetres or millimetres
+FARTHEST_MEDIAN = 200.0  # up to here, the unit is metres
+MIN_MILLIMETRES = 4000.0  # from here on, millimetres; in between, centimetres or millimetres
 # The origin is near the sensor if near points (5 %) are nearer than this share of far ones (95 %).
 AROUND = 0.5
 
-UP_AXES = ("z-down", "z-forward", "y-up")  # are tried if no ground is found below
+UP_AXES = ("z-down", "z-forward", "y-up")  # to try if no ground is found below
 SAME_TILT = 3.5  # degrees: roads slope by up to 3.1 as seen from the cars of the datasets
 STEADY_TILT = 3.0  # degrees: if tilts in a recording differ by more, each scan gets its own
 SAME_HEIGHT = 0.15  # metres: training moves the sensor up and down by as much
@@ -28,15 +28,15 @@ LOWEST = 0.3  # metres: if the origin is lower, it lies on the ground and not at
 
 @dataclass(frozen=True)
 class Frame:
-    """What was found of the frame of a file, as far as the user did not describe it.
+    """What was found out about the frame of a file, as far as the user did not describe it.
 
     Attributes:
         unit: of the coordinates, a name in `UNITS`.
         axes: which way they point, a name in `AXES`.
-        pitch, roll: degrees that turn the scan level after that; 0 if it is level enough, or the
-            user described the rotation.
-        height: metres of the origin over the ground then; None if no ground was found.
-        tilt: degrees of the ground before, for messages.
+        pitch, roll: degrees that turn the scan level, once its axes are the package's; 0 if it is
+            level enough, or the user described the rotation.
+        height: metres of the origin over the ground in the level scan; None without a ground.
+        tilt: degrees of the ground before the scan is turned level, for messages.
     """
 
     unit: str = "m"
@@ -49,7 +49,7 @@ class Frame:
     def complete(self, sensor: Sensor) -> Sensor:
         """Return the sensor with everything about its frame known.
 
-        What the user described is applied first; the rest turns the scan about the sensor.
+        What the user described comes first; pitch and roll turn the scan about the sensor.
         """
         if sensor.rotate is not None:
             return dataclasses.replace(sensor, unit=self.unit)
@@ -73,21 +73,21 @@ class Frame:
 
         Args:
             sensor: what is known of it.
-            usual_height: metres over the ground of a sensor that is not at the origin, if nothing
-                says how high it is; None if that is unknown, too.
+            usual_height: metres over the ground of the sensor that the weights know, and of a
+                sensor of unknown height that is not at the origin; None if unknown.
 
         Returns:
-            The rise after which the sensor is at the origin, and the one after which it is
-            `usual_height` over the ground.
+            The rise that brings the sensor to the origin, and the rise that brings the ground
+            `usual_height` below the origin.
         """
         known = sensor.height
         if self.is_on_ground(sensor):
             assert self.height is not None
-            above = known if known is not None else usual_height
-            if above is None:
+            sensor_height = known if known is not None else usual_height
+            if sensor_height is None:
                 return 0.0, 0.0
-            target = above if usual_height is None else usual_height
-            return self.height - above, self.height - target
+            target = sensor_height if usual_height is None else usual_height
+            return self.height - sensor_height, self.height - target
 
         height = known if known is not None else self.height
         if height is None or usual_height is None or abs(height - usual_height) < SAME_HEIGHT:
@@ -103,13 +103,12 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
         sensor: what the user described; only the rest is guessed.
 
     Raises:
-        InputError: if the unit is none of metres and millimetres, and the user did not give it.
+        InputError: if the user did not give the unit, and it is neither metres nor millimetres.
     """
     unit = sensor.unit or _find_unit(xyz)
     frame = Frame(unit, sensor.axes or "x-forward")
     level = frame.complete(dataclasses.replace(sensor, unit=unit)).to_level(xyz)
     level = level.astype(np.float64)
-
     ground = find_ground(level)
 
     is_described = sensor.axes is not None or sensor.rotate is not None
@@ -121,7 +120,6 @@ def find_frame(xyz: np.ndarray, sensor: Sensor) -> Frame:
 
     if ground is None:
         return frame
-
     if sensor.rotate is None and ground.is_sure and ground.tilt > SAME_TILT:
         return _level(frame, level, ground)
     return dataclasses.replace(frame, height=ground.height, tilt=ground.tilt)
@@ -131,11 +129,10 @@ def _find_unit(xyz: np.ndarray) -> str:
     """Tell metres from millimetres by the distances of (N, 3) points."""
     if not len(xyz):
         return "m"
-    near, median, far = np.quantile(
-        np.linalg.norm(xyz.astype(np.float64), axis=1), (0.05, 0.5, 0.95)
-    )
+    distances = np.linalg.norm(xyz.astype(np.float64), axis=1)
+    near, median, far = np.quantile(distances, (0.05, 0.5, 0.95))
 
-    # Map coordinates are all far away; they are refused with another message.
+    # Points far from the origin are map coordinates, which `check_usable` refuses.
     if not median > FARTHEST_MEDIAN or near > AROUND * far:
         return "m"
     if median > MIN_MILLIMETRES:
@@ -149,7 +146,7 @@ def _find_unit(xyz: np.ndarray) -> str:
 def _find_axes(xyz: np.ndarray) -> str:
     """Return the axes by which the (N, 3) points have a ground, if only one of `UP_AXES` does.
 
-    In a corridor, the walls on both sides look like it.
+    In a corridor, more than one does: its walls look like a ground.
     """
     sure = []
     for axes in UP_AXES:
@@ -162,8 +159,7 @@ def _find_axes(xyz: np.ndarray) -> str:
 def _level(frame: Frame, level: np.ndarray, ground: Ground) -> Frame:
     """Return the frame with the rotation that levels a tilted scan.
 
-    The lowest points of the cells of a tilted scan are not those of the level one: the ground is
-    found a second time.
+    The ground is found a second time in the level scan, whose cells have other lowest points.
     """
     turn = rotation_from_degrees(0, *_levelling(ground.up))
     again = find_ground(level @ turn.T) or ground
@@ -184,8 +180,8 @@ def median_frame(frames: Sequence[Frame]) -> Frame:
     """Return the frame of a recording, given those of its first scans."""
     unit = mode(frame.unit for frame in frames)
     axes = mode(frame.axes for frame in frames)
-    alike = [frame for frame in frames if (frame.unit, frame.axes) == (unit, axes)] or list(frames)
-    turns = [(frame.pitch, frame.roll, frame.tilt) for frame in alike]
+    alike = [frame for frame in frames if (frame.unit, frame.axes) == (unit, axes)]
+    turns = [(frame.pitch, frame.roll, frame.tilt) for frame in alike or frames]
     pitch, roll, tilt = np.median(turns, axis=0).tolist()
     heights = [frame.height for frame in frames if frame.height is not None]
 

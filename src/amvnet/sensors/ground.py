@@ -20,15 +20,15 @@ MIN_AGREEMENT = 0.25  # weighted share of the cells that must lie in the plane
 # Which side of the plane is up: the ground has things on it, and little below it
 OFF_PLANE = 0.3  # metres from the plane within which points belong to it, at the sensor
 CURVED = 0.02  # metres more for each metre of distance from the sensor
-MAX_BELOW = 0.1  # share of the points below the plane, if not even more are above it
+MAX_BELOW = 0.1  # share of the points that may be below the plane, unless more are above it
 MIN_HEIGHT = -0.5  # metres of the origin over the plane; if it is lower, the plane must be sure
 MAX_HEIGHT = 10.0  # metres of the origin over the plane; if it is higher, the plane is a wall
 
-# Planes that are sure enough to turn a scan by. Over real scans in all orientations, the ground has
-# 0.3 to 0.7 of the points within `TOLERANCE` and 0.4 to 0.8 of the cells, a wall at most 0.15.
+# When a plane is sure enough to turn a scan by it. In real scans in all orientations, the ground
+# has 0.3 to 0.7 of the points within `TOLERANCE` and 0.4 to 0.8 of the cells, a wall at most 0.15.
 SURE_AGREEMENT = 0.3  # weighted share of the cells
 SURE_CELLS = 40  # square metres, weighted by their distance
-SURE_SHARE = 0.2  # of all points that must lie in the plane
+SURE_SHARE = 0.2  # of the points within `RADIUS` that must lie in the plane
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Ground:
     Attributes:
         up: (3,) its normal, of length 1.
         height: metres of the origin over it, along z.
-        is_sure: whether it is certainly the ground.
+        is_sure: whether it is certain enough to turn the scan by it.
     """
 
     up: np.ndarray
@@ -54,8 +54,8 @@ class Ground:
 def find_ground(xyz: np.ndarray) -> Ground | None:
     """Find the ground of a scan whose z axis points more or less up; None if there is none.
 
-    It is the plane through three low points that most low points agree with and few are below,
-    refined by least squares. Near points count more.
+    The ground is the plane through three low points that has many low points in it and few below
+    it, refined by least squares. Near points count more.
 
     Args:
         xyz: (N, 3) finite points, metres.
@@ -124,7 +124,8 @@ def _lowest_points(xyz: np.ndarray) -> np.ndarray:
 def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
     """Return (a, b, c) of the plane z = a x + b y + c that most (M, 3) low points agree with.
 
-    None if every plane is too steep. The draws are seeded: the same points give the same plane.
+    Return None if every plane is too steep. The draws are seeded: the same points give the same
+    plane.
     """
     rng = np.random.default_rng(0)
     triples = low[rng.choice(len(low), (TRIES, 3), p=weight / weight.sum())]  # (tries, 3, 3)
@@ -134,7 +135,6 @@ def _best_plane(low: np.ndarray, weight: np.ndarray) -> np.ndarray | None:
 
     slopes = np.hypot(planes[:, 0], planes[:, 1])
     planes = planes[slopes < np.tan(np.radians(MAX_SLOPE))]
-
     if not len(planes):
         return None
 

@@ -1,8 +1,7 @@
-"""Intensities as some weights know them: the range, the distribution, a filler if there are none.
+"""Bring intensities to the range and the distribution that some weights know.
 
-Sensors, drivers and tools write intensities as fractions, in 8 or 16 bits, calibrated or not. What
-a network needs is their distribution in its training, so that is what they are brought to. All
-decisions rest on quantiles: a few wild values change nothing.
+Sensors and tools write them as fractions or in 8 or 16 bits, calibrated or not. All decisions rest
+on quantiles, so that a few outliers change nothing.
 """
 
 from __future__ import annotations
@@ -18,14 +17,17 @@ from amvnet.data.formats.cloud import WILD_SHARE
 from amvnet.errors import InputError, shown
 from amvnet.scan import Scan
 
-# The distribution of intensities is described by their quantiles at these probabilities. The ends
-# leave out a thousandth: outliers, and the few retroreflectors that decide the maximum of a scan.
+# The quantiles at these probabilities describe a distribution of intensities. They leave out a
+# thousandth at both ends: outliers, and the few retroreflectors that decide the maximum of a scan.
 PROBABILITIES = (0.001, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999)
-COMPARED = (5, 7)  # of these: the median, and the quantile of the bright tenth
-ALIKE = 2.0  # factor: distributions are alike if these quantiles differ by less
+MEDIAN = PROBABILITIES.index(0.5)
+BRIGHT = PROBABILITIES.index(0.9)
 DARKEST = 0.004  # one step of 8 bits: below it, factors mean nothing
+# Factors by which the median or the bright quantile of two distributions that are alike may differ,
+# and of two scans whose intensities have the same range.
+ALIKE = 2.0
+ONE_RANGE = 8.0
 CONSTANT = 0.01  # share of the median: if 98 % of the intensities differ by less, they say nothing
-OWN_RANGE = 8.0  # factor: a scan whose median or bright tenth differs by more is of another range
 BLIND_SHARE = 0.2  # networks that saw this share of their scans without intensity need none
 
 # Quantiles of the intensities in simulated training scans, for weights that do not carry theirs.
@@ -34,9 +36,10 @@ QUANTILES = {
     "hdl32e": (0.0, 0.0, 0.005, 0.007, 0.011, 0.039, 0.066, 0.11, 0.17, 0.265, 0.792),
 }
 LARGEST = 1e9  # no device writes larger intensities
-KEY = "intensity_quantiles"  # of a part's training record
-NO_INTENSITY = [0.0] * len(PROBABILITIES)  # of scans without intensities, as they are trained on
-MATCHED = "match_intensity"  # of a part's training record, see `TrainedIntensity.is_matched`
+# Keys of a part's training record: the quantiles, and `TrainedIntensity.is_matched`
+KEY = "intensity_quantiles"
+MATCHED = "match_intensity"
+NO_INTENSITY = [0.0] * len(PROBABILITIES)  # the quantiles of training scans without intensities
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,8 @@ class TrainedIntensity:
     Attributes:
         quantiles: of the intensities of the training scans in [0, 1], at `PROBABILITIES`.
         is_optional: whether the networks learnt to do without intensities, as zeros.
-        is_matched: whether each scan's intensities are brought to this distribution, as those of a
-            simulated training are distributed as no real sensor's.
+        is_matched: whether the intensities of each scan are brought to this distribution, as after
+            a training on simulated scans, whose distribution no real sensor has.
     """
 
     quantiles: Sequence[float]
@@ -57,8 +60,8 @@ class TrainedIntensity:
     def filler(self, count: int) -> np.ndarray:
         """Return (count,) float32 intensities for a scan that has none.
 
-        They are zeros for networks that learnt that these stand for no intensity. Others take any
-        constant for a material: they get seeded draws from the distribution of their training.
+        They are zeros for networks that learnt to do without intensities. Other networks would take
+        a constant for a material, and get seeded draws from the distribution of their training.
         """
         if self.is_optional:
             return np.zeros(count, np.float32)
@@ -111,10 +114,10 @@ def simulated_intensity(sensor: str) -> TrainedIntensity:
 
 
 def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
-    """Return a scan whose intensities have the distribution of a training.
+    """Return a scan with its intensities brought to the distribution of a training.
 
-    The scan stays as it is if the training does not ask for it (`TrainedIntensity.is_matched`), or
-    if its intensities say nothing, such as zeros everywhere.
+    The scan stays as it is if the training does not ask for this (`TrainedIntensity.is_matched`),
+    or if its intensities say nothing, such as zeros everywhere.
     """
     if trained is None or not trained.is_matched:
         return scan
@@ -132,9 +135,9 @@ def match_scan(scan: Scan, trained: TrainedIntensity | None) -> Scan:
 
 
 def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the quantiles of a source, increasing, and what they become; linear in between.
+    """Return the different quantiles of some scans, and what they become, linearly in between.
 
-    Equal quantiles of the source, such as many zeros, become the mean of those of the training.
+    Equal quantiles, as of many zeros, become the mean of the training's quantiles in their place.
     """
     levels, index = np.unique(quantiles, return_inverse=True)
     becomes = np.bincount(index, weights=trained) / np.bincount(index)
@@ -142,7 +145,7 @@ def matching(quantiles: np.ndarray, trained: Sequence[float]) -> tuple[np.ndarra
 
 
 def are_quantiles(values: Any) -> TypeGuard[list[float]]:
-    """Return whether a value of a file can be quantiles at `PROBABILITIES`: different ones."""
+    """Return whether a value from a file can be quantiles at `PROBABILITIES`, not all equal."""
     if not isinstance(values, list) or len(values) != len(PROBABILITIES):
         return False
     if not all(type(value) in (int, float) and 0 <= value < LARGEST for value in values):
@@ -155,8 +158,8 @@ def check_quantiles(values: Any, source: str) -> list[float]:
     """Return the quantiles that a file holds; raise InputError if they cannot be quantiles."""
     if not are_quantiles(values):
         raise InputError(
-            f"{source}: expected {len(PROBABILITIES)} quantiles of the intensities, different "
-            f"ones from 0 on, found {shown(values)}; train or export again"
+            f"{source}: expected {len(PROBABILITIES)} quantiles of the intensities, ascending and "
+            f"not all equal, found {shown(values)}; train or export again"
         )
     return values
 
@@ -172,30 +175,31 @@ def quantiles_of(intensity: np.ndarray | None) -> np.ndarray | None:
     if not len(finite):
         return None
 
-    ascending = np.sort(finite).astype(np.float64)  # from which NumPy takes a quarter of the time
+    ascending = np.sort(finite).astype(np.float64)  # NumPy's quantiles are four times as fast
     return np.quantile(ascending, PROBABILITIES)
 
 
 def is_constant(quantiles: np.ndarray | Sequence[float]) -> bool:
     """Return whether nearly all intensities are the same, so that they say nothing."""
-    spread = quantiles[9] - quantiles[1]
-    return bool(spread <= CONSTANT * abs(quantiles[5]))
+    low = quantiles[PROBABILITIES.index(0.01)]
+    high = quantiles[PROBABILITIES.index(0.99)]
+    return bool(high - low <= CONSTANT * abs(quantiles[MEDIAN]))
 
 
 def are_of_one_range(a: np.ndarray | None, b: np.ndarray | None) -> bool:
-    """Return whether the intensities of two scans, by their quantiles, can be scaled alike."""
+    """Return whether the intensities of two scans have the same range, by their quantiles."""
     if a is None or b is None:
         return a is None and b is None
     if is_constant(a) or is_constant(b):
         return is_constant(a) and is_constant(b)
-    return _are_alike(a, b, OWN_RANGE, least=DARKEST * max(a[-1], b[-1]))
+    return _are_alike(a, b, factor=ONE_RANGE, least=DARKEST * max(a[-1], b[-1]))
 
 
 def _are_alike(
     a: np.ndarray | Sequence[float], b: np.ndarray | Sequence[float], factor: float, least: float
 ) -> bool:
-    """Return whether compared quantiles differ by at most a factor, or are both below `least`."""
-    for index in COMPARED:
+    """Return whether compared quantiles, raised to `least`, differ by at most a factor."""
+    for index in (MEDIAN, BRIGHT):
         low, high = sorted((max(a[index], least), max(b[index], least)))
         if high > factor * low:
             return False
@@ -204,14 +208,13 @@ def _are_alike(
 
 @dataclass(frozen=True)
 class IntensityMap:
-    """How the intensities of a source become those that some weights know.
+    """How the intensities of some scans become those that some weights know.
 
     Attributes:
         text: describes the map to the user.
         scale: the divisor of the intensities; None if they are matched or filled in.
-        matched: quantiles of the source, increasing, and what they become; None if they are not
-            matched.
-        trained: fills in missing intensities; None: they become zeros.
+        matched: what `matching` returns; None if the intensities are not matched.
+        trained: fills in missing intensities; if None, they become zeros.
     """
 
     text: str
@@ -236,7 +239,7 @@ def intensity_map(
     trained: TrainedIntensity | None,
     is_given: bool = False,
 ) -> IntensityMap:
-    """Decide how to map the intensities of a source.
+    """Decide how to map the intensities of some scans.
 
     They are divided by their scale. If their distribution then differs from that of the training,
     it is matched by its quantiles instead, unless the user gave the scale.
@@ -254,23 +257,25 @@ def intensity_map(
     if is_given:
         return linear
     if is_constant(quantiles):
-        text = f"intensity {quantiles[5]:g} everywhere, so none ({describe_filler(trained)})"
+        text = f"intensity {quantiles[MEDIAN]:g} everywhere, so none ({describe_filler(trained)})"
         return IntensityMap(text, trained=trained)
-    if trained is not None and trained.is_matched:  # by the segmenter, scan by scan
+    if trained is not None and trained.is_matched:  # the segmenter matches them, scan by scan
         return dataclasses.replace(linear, text=f"{linear.text}, spread as in the training")
-    if trained is None or _are_alike(quantiles / scale, trained.quantiles, ALIKE, DARKEST):
+    if trained is None or _are_alike(
+        quantiles / scale, trained.quantiles, factor=ALIKE, least=DARKEST
+    ):
         return linear
 
     text = (
         f"intensity 0 to {scale:g}, spread as in the training: half of it was below "
-        f"{quantiles[5] / scale:.2g}, now {trained.quantiles[5]:.2g} "
+        f"{quantiles[MEDIAN] / scale:.2g}, now {trained.quantiles[MEDIAN]:.2g} "
         f"(--intensity-scale {scale:g} keeps it)"
     )
     return IntensityMap(text, matched=matching(quantiles, trained.quantiles))
 
 
 def describe_filler(trained: TrainedIntensity | None) -> str:
-    """Return what stands in for missing intensities."""
+    """Return in words what stands in for missing intensities."""
     if trained is None:
         return "0 instead"
     if trained.is_optional:

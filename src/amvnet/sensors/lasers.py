@@ -15,7 +15,7 @@ from amvnet.sensors.lidars import Sensor
 MIN_POINTS = 100  # fewer say nothing about the sensor
 FOV_PERCENTILES = (0.5, 99.5)  # of the elevations: the ends of the field of view
 
-# Whether two sensors are of one kind
+# When two sensors are of one kind
 SAME_ANGLE = 6.0  # degrees: fields of view are alike if both ends differ by less
 SAME_BEAMS = 1.4  # factor: numbers of lasers are alike if they differ by less
 
@@ -27,7 +27,7 @@ class SensorGeometry:
     """The geometry of a sensor as far as it is known; None stands for an unknown value.
 
     Attributes:
-        beams: number of lasers; measured only if the points have rings.
+        beams: number of lasers; measured if the points have rings.
         fov_up, fov_down: ends of the field of view, degrees above the horizon.
         height: metres of the sensor over the ground.
     """
@@ -39,7 +39,7 @@ class SensorGeometry:
 
     @property
     def field_of_view(self) -> tuple[float, float] | None:
-        """Upper and lower end, degrees; None if one is unknown or they are swapped."""
+        """Its upper and lower end, degrees; None if one is unknown or they are swapped."""
         if self.fov_up is None or self.fov_down is None or self.fov_up <= self.fov_down:
             return None
         return self.fov_up, self.fov_down
@@ -59,11 +59,11 @@ class SensorGeometry:
         return cls(**medians)
 
     def has_ends_of(self, other: SensorGeometry) -> bool:
-        """Return whether the field of view is that of another sensor, as far as both are known."""
+        """Return whether the fields of view are alike, as far as both are known."""
         return _is_near(self.fov_up, other.fov_up) and _is_near(self.fov_down, other.fov_down)
 
     def is_like(self, other: SensorGeometry) -> bool:
-        """Return whether the lasers are those of another sensor, as far as both are known."""
+        """Return whether the lasers are alike, as far as both are known."""
         if self.beams and other.beams:
             ratio = self.beams / other.beams
             if not 1 / SAME_BEAMS < ratio < SAME_BEAMS:
@@ -75,7 +75,7 @@ class SensorGeometry:
         return {key: value for key, value in vars(self).items() if value is not None}
 
     def override(self, sensor: Sensor) -> SensorGeometry:
-        """Return the geometry with what is known of the sensor in place of what was measured."""
+        """Return the geometry with the known values of a sensor in place of its own."""
         changes = {}
         for key in MEASURES:
             if getattr(sensor, key) is not None:

@@ -16,7 +16,7 @@ import numpy as np
 from amvnet.errors import InputError, errors_of, shown
 from amvnet.files import read_yaml
 
-# Metres over the ground on the cars of the datasets that weights are trained for: KITTI, nuScenes.
+# Metres over the ground on the cars that recorded KITTI and nuScenes.
 HEIGHTS = {"hdl64e": 1.73, "hdl32e": 1.84}
 
 # Matrices that turn a file's x, y, z into forward, left, up.
@@ -34,7 +34,7 @@ LARGEST = 1e9  # of the numbers that describe a sensor
 
 @dataclass(frozen=True)
 class Sensor:
-    """What is known of a LiDAR and the frame of its scans; None stands for a value to be measured.
+    """What is known of a LiDAR and the frame of its scans; None stands for a value to measure.
 
     Attributes:
         name: for messages.
@@ -44,9 +44,9 @@ class Sensor:
         intensity_scale: the largest possible intensity.
         unit: of the coordinates, a name in `UNITS`.
         axes: which way the axes point, a name in `AXES`.
-        rotate: yaw, pitch and roll in degrees, applied after `axes`: they turn the scan level, with
-            +x forward.
-        offset: metres added to x, y and z after that, which brings the sensor to the origin.
+        rotate: yaw, pitch and roll in degrees, which turn the scan level and +x forward after
+            `axes`.
+        offset: metres added to x, y and z after `rotate`, which bring the sensor to the origin.
 
     Raises:
         InputError: if a value is impossible.
@@ -95,8 +95,8 @@ class Sensor:
     def to_level(self, xyz: np.ndarray) -> np.ndarray:
         """Return the (N, 3) points of a file in metres and in the package's axes.
 
-        An unknown unit, rotation or offset changes nothing. Points that are scaled, turned or moved
-        are float64, and lost points, at the file's origin, become NaN.
+        Unknown values change nothing. If points are scaled, turned or moved, they are float64, and
+        lost points, which are at the file's origin, become NaN.
         """
         scale = UNITS[self.unit or "m"]
         turn = self.turn
@@ -104,7 +104,7 @@ class Sensor:
         if scale == 1 and not offset.any() and np.array_equal(turn, np.eye(3)):
             return xyz
 
-        # Numbers too large to be scaled or turned become infinite, which makes points invalid.
+        # Numbers that become too large are infinite, and their points invalid.
         with np.errstate(over="ignore", invalid="ignore"):
             level = xyz.astype(np.float64) * scale @ turn.T + offset
         level[(xyz == 0).all(axis=1)] = np.nan
@@ -143,9 +143,9 @@ def make_sensor(sensor: str | Mapping[Any, Any] | None = None, **options: Any) -
     """Return a sensor with some attributes overridden.
 
     Args:
-        sensor: a name in `SENSORS`, a YAML file with attributes of `Sensor`, or these; None stands
+        sensor: a name in `SENSORS`, attributes of `Sensor`, or a YAML file with them; None stands
             for an unknown sensor.
-        options: attributes of `Sensor` that override those; None overrides nothing. `rotate` and
+        options: attributes of `Sensor`, which take precedence unless they are None. `rotate` and
             `offset` may be texts of three numbers separated by commas.
 
     Raises:
@@ -190,7 +190,7 @@ def _read_sensor(text: str) -> Sensor:
 
 
 def _to_triple(value: Any) -> Any:
-    """Return three numbers of a list, or of a text with commas; `Sensor` refuses anything else."""
+    """Return three numbers from a list or a text; anything else as it is: `Sensor` refuses it."""
     try:
         a, b, c = map(float, value.split(",") if isinstance(value, str) else value)
     except (TypeError, ValueError, OverflowError):

@@ -1,4 +1,4 @@
-"""Measure the sensor of a recording: its frame, lasers, field of view, height and intensities."""
+"""Measure the sensor of a recording: its frame, height, lasers and intensities."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from amvnet.sensors.intensity import are_of_one_range, quantiles_of
 from amvnet.sensors.lasers import SensorGeometry, measure_lasers
 from amvnet.sensors.lidars import Sensor
 
-MEASURED = 5  # scans of a recording that are measured; later ones get the median of these
+MEASURED = 5  # first scans of a recording that are measured; later scans get their median
 STEADY = 0.4  # metres: if heights in a recording differ by more, each scan gets its own height
 QUICK_STEP = 7  # every 7th point suffices for most sensors; 7 divides no usual number of lasers
 
@@ -27,9 +27,9 @@ class Estimate:
     """What was measured of the sensor of a scan, or of several scans as their median.
 
     Attributes:
-        frame: of the coordinates in the files.
-        lasers: of the sensor, without its height.
-        quantiles: of the intensities as they are in the files; None if there are none.
+        frame: the frame of the coordinates in the files.
+        lasers: the sensor's lasers, without its height.
+        quantiles: of the intensities in the files; None if there are none.
         is_steady: whether the scans were recorded in one frame, at one height.
     """
 
@@ -39,15 +39,15 @@ class Estimate:
     is_steady: bool = True
 
     def is_like(self, other: Estimate) -> bool:
-        """Return whether scans are of one sensor: by their lasers and ranges of intensity."""
+        """Return whether two estimates are of one sensor, by lasers and ranges of intensity."""
         is_of_one_range = are_of_one_range(self.quantiles, other.quantiles)
         return is_of_one_range and self.lasers.is_like(other.lasers)
 
 
 class Recording:
-    """What is assumed of the scans of one source, by what is measured of the first ones.
+    """What is assumed about the scans of one recording, measured in the first of them.
 
-    Its scans get the median of the first `MEASURED` estimates. If these are of several sensors,
+    Each scan gets the median of the first `MEASURED` estimates. If these are of several sensors,
     each scan gets its own estimate, and so does a later scan of another sensor.
 
     Args:
@@ -55,7 +55,7 @@ class Recording:
         usual_height: as for `Frame.rises`.
 
     Attributes:
-        usual: the median; None as long as nothing is measured, and for several sensors.
+        usual: the median; None before anything is measured, or if there are several sensors.
     """
 
     def __init__(self, sensor: Sensor, usual_height: float | None) -> None:
@@ -71,12 +71,12 @@ class Recording:
         return self._is_learnt and self.usual is None
 
     def recall(self, usual: Estimate | None) -> None:
-        """Take what was measured before; with None, each scan gets its own estimate."""
+        """Take `usual` from another process; if None, each scan gets its own estimate."""
         self.usual = usual
         self._is_learnt = True
 
     def learn(self, first: Sequence[Callable[[], Cloud]]) -> None:
-        """Measure the first scans, given what reads them; later ones add nothing."""
+        """Measure the first scans, given functions that read them; later scans add nothing."""
         for read in first:
             if not self._is_learnt:
                 with suppress(InputError):
@@ -85,7 +85,7 @@ class Recording:
         self._is_learnt = bool(self._first)
 
     def estimate(self, cloud: Cloud) -> tuple[Estimate, bool]:
-        """Return what to assume of a scan, and whether its sensor is that of the first scans."""
+        """Return what to assume about a scan, and whether its sensor is as expected."""
         if self._is_learnt and self.usual is not None and self.usual.is_steady:
             if self._recognises(cloud, self.usual):
                 return self.usual, True
@@ -94,6 +94,7 @@ class Recording:
         measured = self._measure(cloud)
         if not self._is_learnt:
             self._add(measured)
+
         if self.usual is None:
             return measured, True
         if not measured.is_like(self.usual):
@@ -111,7 +112,7 @@ class Recording:
 
     def _measure_in(self, frame: Frame, cloud: Cloud) -> Estimate:
         """Measure lasers and intensities of a scan whose frame is known."""
-        # The points as the sensor saw them; a point without an intensity was seen, too.
+        # The points as the sensor saw them, also those without an intensity.
         scan = level_scan(cloud, frame.complete(self._sensor))
         to_sensor, _ = frame.rises(self._sensor, self._usual_height)
         seen = raise_points(scan, to_sensor)
@@ -120,9 +121,9 @@ class Recording:
         return Estimate(frame, lasers, quantiles_of(cloud.intensity))
 
     def _recognises(self, cloud: Cloud, usual: Estimate) -> bool:
-        """Return whether a scan is of an estimate's sensor, in the estimate's frame.
+        """Return whether a scan is of the usual sensor, if it is in the usual frame.
 
-        For most scans, some of the points are enough.
+        For most scans, some of the points are enough to tell.
         """
         for step in (QUICK_STEP, 1):
             part = dataclasses.replace(
@@ -165,12 +166,11 @@ def _are_steady(frames: Sequence[Frame]) -> bool:
     if heights and max(heights) - min(heights) >= STEADY:
         return False
     turns = np.array([(frame.pitch, frame.roll) for frame in frames])
-
     return bool((np.ptp(turns, axis=0) < STEADY_TILT).all())
 
 
 def level_scan(cloud: Cloud, sensor: Sensor, intensity: np.ndarray | None = None) -> Scan:
-    """Return a scan in the package's axes, with (N,) intensities in [0, 1] or else zeros."""
+    """Return a scan in the package's axes, with (N,) intensities in [0, 1] or zeros."""
     xyz = sensor.to_level(cloud.xyz)
     return dataclasses.replace(cloud, xyz=xyz, intensity=intensity).to_scan(1.0)
 
@@ -181,5 +181,5 @@ def raise_points(scan: Scan, rise: float) -> Scan:
         return scan
 
     offset = np.array([0, 0, rise, 0], np.float32)
-    with np.errstate(invalid="ignore"):  # points that are not valid may be any NaN
+    with np.errstate(invalid="ignore"):  # invalid points may be signalling NaN
         return dataclasses.replace(scan, points=scan.points + offset)

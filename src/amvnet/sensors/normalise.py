@@ -29,7 +29,7 @@ from amvnet.sensors.measure import (
 )
 
 HIGHEST = 4.5  # metres: no vehicle carries its sensor higher; the coordinates may be in feet
-OUTSIDE = 0.16  # if a larger share of the points is outside a field of view, it is too narrow
+OUTSIDE = 0.16  # largest share of the points outside a field of view that is wide enough
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class Expectation:
 
     Attributes:
         view: the range view of the weights.
-        sensor: the one that they were trained for, as far as it is known (`trained_sensor`).
+        sensor: the sensor that they were trained for, as far as it is known (`trained_sensor`).
         intensity: the intensities that they were trained with; None if unknown.
-        as_is: whether they were trained on scans that were not normalised. Scans of the same field
-            of view then have their rows as in the training, however many points are outside.
+        as_is: whether they were trained on scans that were not normalised. Scans with the same
+            field of view then keep the rows of the training, however many points are outside.
     """
 
     view: RangeViewConfig
@@ -58,13 +58,12 @@ class Expectation:
 def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> Scan:
     """Return a scan as some weights expect it; its points keep their order and number.
 
-    Intensities are brought to the distribution of the training, the axes are turned level, and the
-    scan is moved up or down until its sensor is as high over the ground as that of the training.
-    `ring` becomes the row of each point in the range image, 0 the lowest, for `Segmenter.by_ring`.
-    The row follows the elevation at which the sensor saw the point, before the move.
+    The scan is turned level and moved to the height of the training's sensor. `ring` becomes the
+    row of each point in the range image, 0 the lowest, for `Segmenter.by_ring`. It follows from the
+    elevation before the move, as the sensor saw the point.
 
     Args:
-        sensor: what is known of it, and takes precedence over the estimate.
+        sensor: what is known of it, which takes precedence over the estimate.
 
     Raises:
         InputError: if no point is usable.
@@ -84,7 +83,7 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
 
 
 def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
-    """Return a line on what is assumed of a scan, and whether the weights know such a sensor."""
+    """Say in a line what is assumed about a scan, and whether the weights know its sensor."""
     lasers = estimate.lasers.override(sensor)
     assumed = [
         cloud.note,
@@ -112,8 +111,8 @@ class Normaliser:
     """Normalises the scans of recordings, each by what is measured of its first scans.
 
     Args:
-        expected: what the weights expect; None turns scans only as the sensor says, for people to
-            look at.
+        expected: what the weights expect; if None, scans are only turned as the sensor says, for
+            people to look at.
         sensor: what is known of the sensor of the scans; the rest is measured.
         say: called with what was assumed, once for each recording and once for other sensors in it.
     """
@@ -129,13 +128,12 @@ class Normaliser:
         self._say = say
         self._first: dict[str, list[Callable[[], Cloud]]] = {}
         self._recordings: dict[str, Recording] = {}
-        self._said: set[str] = set()  # of which recordings
+        self._said: set[str] = set()  # recordings about which something was said
 
     def expect(self, source: str, read: Callable[[], Cloud]) -> None:
-        """Announce the next scan of a source, before any is normalised.
+        """Announce the next scan of a source, before any scan is normalised.
 
-        The first ones are measured even if another scan is normalised before them, as after an
-        interruption or in one of several processes.
+        The first ones are then measured even if another process or run normalises them.
         """
         first = self._first.setdefault(source, [])
         if len(first) < MEASURED:
@@ -167,13 +165,13 @@ class Normaliser:
         return scan
 
     def measure(self, source: str) -> Recording:
-        """Return what is measured of a source: the first time, of the scans that were announced."""
+        """Return the recording of a source; measure its announced scans the first time."""
         if source not in self._recordings:
             self._begin(source).learn(self._first.pop(source, []))
         return self._recordings[source]
 
     def recall(self, source: str, usual: Estimate | None) -> None:
-        """Normalise the scans of a source by what `measure` found before, in another process."""
+        """Normalise the scans of a source by what `measure` found in another process."""
         self._begin(source).recall(usual)
 
     def _begin(self, source: str) -> Recording:
@@ -183,14 +181,14 @@ class Normaliser:
         return recording
 
     def for_sensor(self, sensor: Sensor) -> Normaliser:
-        """Return a normaliser to the same weights for scans of a described sensor."""
+        """Return a normaliser for the same weights and the scans of a described sensor."""
         return Normaliser(self.expected, sensor, self._say)
 
     def target(self) -> dict[str, float]:
-        """Return what weights that are trained on the normalised scans should carry of the sensor.
+        """Return the sensor's measures for weights that are trained on the normalised scans.
 
-        The height is the one that the scans are moved to. The lasers are the scans' own; if the
-        rows of the range image are lasers, the lasers that decide the rows.
+        The height is the height that the scans are moved to. The lasers are those of the scans, or,
+        if the rows of the range image are lasers, those that decide the rows.
         """
         assert self.expected is not None
         recordings = self._recordings.values()
@@ -215,7 +213,7 @@ class Normaliser:
             )
 
     def _turn(self, cloud: Cloud, source: str) -> Scan:
-        """Return a scan turned as the sensor says, and otherwise as it is."""
+        """Return a scan only turned as the sensor says."""
         xyz = self.sensor.to_level(cloud.xyz)
         scale = self.sensor.intensity_scale or cloud.intensity_scale()
         scan = dataclasses.replace(cloud, xyz=xyz).to_scan(scale)
@@ -238,7 +236,8 @@ def _intensity_map(
     if known_scale is None and quantiles is not None:
         assert cloud.intensity is not None
         scale = usual_scale(quantiles[-1], is_integer=cloud.intensity.dtype.kind in "iu")
-    return intensity_map(quantiles, scale, expected.intensity, known_scale is not None)
+    is_given = known_scale is not None
+    return intensity_map(quantiles, scale, expected.intensity, is_given=is_given)
 
 
 def _row_view(
@@ -246,8 +245,8 @@ def _row_view(
 ) -> RangeViewConfig | None:
     """Return the range view that gives (P, 4) points their rows by elevation.
 
-    It is that of the weights, but with the sensor's field of view if too many points are outside.
-    None if the rows are lasers and their elevations are unknown.
+    It is the view of the weights, but with the sensor's field of view if too many points are
+    outside. Return None if the rows are lasers and their elevations are unknown.
     """
     view = _trained_view(lasers, expected)
     if view is None or (expected.as_is and lasers.has_ends_of(expected.lasers)):
@@ -264,8 +263,8 @@ def _row_view(
 def _trained_view(lasers: SensorGeometry, expected: Expectation) -> RangeViewConfig | None:
     """Return the range view of the weights with rows by elevation.
 
-    If the rows are lasers, the highest one gets the first row and the lowest one the last. None if
-    their elevations are unknown.
+    If the rows are lasers, the highest laser gets the first row and the lowest one the last. Return
+    None if their elevations are unknown.
     """
     view = expected.view
     if view.rows != "ring":
@@ -292,7 +291,7 @@ def _rows(
 ) -> np.ndarray | None:
     """Return each point's (N,) row in the range image, 0 the lowest; 0 for lost points.
 
-    None if the weights need rings, and neither the scan nor its elevations give them.
+    Return None if the weights need rings, and neither the scan nor its elevations give them.
     """
     ring = scan.ring if expected.view.rows == "ring" else None
     # Lasers that no data sheet describes need not be evenly spaced.
@@ -319,14 +318,12 @@ def rows_of(scan: Scan, config: RangeViewConfig) -> np.ndarray:
 
 
 def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:
-    """Return what was guessed of the frame, each as a text with its option."""
+    """Return what was guessed about the frame, each guess with its option."""
     texts = []
     if sensor.unit is None and frame.unit != "m":
         texts.append(f"--unit {frame.unit}")
-
     if sensor.axes is None and frame.axes != "x-forward":
         texts.append(f"--axes {frame.axes}")
-
     if frame.pitch or frame.roll:
         texts.append(
             f"a tilt of {frame.tilt:.0f} degrees (levelled, --rotate "
@@ -352,7 +349,7 @@ def _describe_height(frame: Frame, sensor: Sensor, usual_height: float | None) -
 
 
 def describe_lasers(lasers: SensorGeometry) -> str:
-    """Return the number of lasers and the field of view, for people."""
+    """Return the number of lasers and the field of view in words."""
     count = "lasers" if lasers.beams is None else f"{lasers.beams} lasers"
     if lasers.fov_up is None or lasers.fov_down is None:
         return count if lasers.beams else "field of view not found"

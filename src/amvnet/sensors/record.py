@@ -1,9 +1,9 @@
-"""The sensor that weights were trained for: what their training record says of it, or its name."""
+"""The sensor that weights were trained for: by their training records, or else by its name."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,36 +19,37 @@ from amvnet.sensors.lidars import HEIGHTS, SENSORS, Sensor
 from amvnet.sensors.normalise import Normaliser
 
 KEY = "sensor"  # of a part's training record
-AS_IS = "as_is"  # in it: whether the scans of the training were not normalised as files are
-MEASURED_RECORDINGS = 20  # of a user's own scans, whose sensor is measured for the weights
+AS_IS = "as_is"  # key under `KEY`: whether the scans of the training were not normalised
+MEASURED_RECORDINGS = 20  # recordings of a user's own scans in which the sensor is measured
 LARGEST = 1e6  # no measure of a sensor is larger
 
 
 def trained_sensor(training: Mapping[str, Any], name: str) -> Sensor:
-    """Return the sensor that weights were trained for; what is not known of it is None.
+    """Return the sensor that weights were trained for; None stands for unknown values.
 
     Args:
         training: the training records of the weights by part.
-        name: of the sensor, as the weights carry it; counts only for what no record tells.
+        name: the name of the sensor in the weights, for the values that no record has.
     """
     known = dataclasses.replace(SENSORS.get(name, Sensor(name)), height=HEIGHTS.get(name))
-    for _, record in network_records(training):
-        carried = record.get(KEY)
-        if isinstance(carried, Mapping):
-            known = _replace(known, carried)
+    for record in _sensor_records(training):
+        known = _with_measures(known, record)
     return known
 
 
 def is_trained_as_is(training: Mapping[str, Any]) -> bool:
-    """Return whether weights were trained on scans that were not normalised, by their records."""
+    """Return whether a network was trained on scans that were not normalised."""
+    return any(record.get(AS_IS) is True for record in _sensor_records(training))
+
+
+def _sensor_records(training: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """Yield what the networks' training records say about the sensor."""
     for _, record in network_records(training):
-        carried = record.get(KEY)
-        if isinstance(carried, Mapping) and carried.get(AS_IS) is True:
-            return True
-    return False
+        if isinstance(record.get(KEY), Mapping):
+            yield record[KEY]
 
 
-def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
+def _with_measures(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
     """Return the sensor with the measures of a record, if they are possible."""
     measures: dict[str, Any] = {}
     for key in MEASURES:
@@ -57,19 +58,20 @@ def _replace(sensor: Sensor, record: Mapping[str, Any]) -> Sensor:
             continue
         if abs(value) < LARGEST:  # also false for NaN
             measures[key] = round(value) if key == "beams" else float(value)
+
     measured = SensorGeometry(fov_up=measures.get("fov_up"), fov_down=measures.get("fov_down"))
     sheet = SensorGeometry(fov_up=sensor.fov_up, fov_down=sensor.fov_down)
     if measures and not measured.has_ends_of(sheet):
-        measures.setdefault("beams", None)  # the sensor is not that of the data sheet
+        measures.setdefault("beams", None)  # not the sensor of the data sheet
 
     try:
         return dataclasses.replace(sensor, **measures)
-    except InputError:  # a file of a stranger may hold any numbers
+    except InputError:  # a stranger's file may hold any numbers
         return sensor
 
 
 def measure_sensor(scans: Iterable[Scan]) -> dict[str, float]:
-    """Return the medians of the sensor's measures over some scans, as weights carry them.
+    """Return the medians of the sensor's measures in some scans, for the weights to carry.
 
     If the scans have rings, the field of view ends at the highest and the lowest laser.
     """
@@ -90,7 +92,7 @@ def _with_laser_ends(
     """Return the geometry with the median elevations of the highest and the lowest laser."""
     if ring is None or geometry.fov_up is None:
         return geometry
-    # Sensors report lost returns as points next to them, at any elevation.
+    # Sensors report lost returns as points near the origin, at any elevation.
     is_distant = np.hypot(points[:, 0], points[:, 1]) > MIN_DISTANCE
     elevation = elevations(points[is_distant])
     ring = ring[is_distant]
@@ -102,9 +104,9 @@ def _with_laser_ends(
 
 
 def normalised_record(dataset: OwnScans) -> dict[str, Any]:
-    """Return what weights that are trained on a user's normalised scans carry of their sensor.
+    """Return the entries of a training record on the sensor of a user's normalised scans.
 
-    With it, other scans are normalised as these.
+    With them, the weights normalise other scans in the same way.
     """
     normaliser = dataset.normalise
     if not isinstance(normaliser, Normaliser) or normaliser.expected is None:

@@ -15,7 +15,7 @@ from amvnet.submission.rules import LIDAR_ALONE, Rules
 
 ENDING = ".zip"
 LEVEL = 6  # of deflate: 9 takes five to eight times as long and saves a sixth
-# Time of every entry, the earliest of the format: the same content gives the same bytes.
+# The time of every entry, so that the same content gives the same bytes.
 LONG_AGO = (1980, 1, 1, 0, 0, 0)
 UNIX = 3  # code of the system that wrote an entry
 FOLDER_BIT = 0x10  # of an entry's MS-DOS attributes
@@ -30,14 +30,13 @@ def write(
 ) -> int:
     """Check a folder of predictions and pack it; return their number.
 
-    The same predictions give the same bytes.
-    Files that have no place in the archive (scores, other splits) are left out. One scan is in
-    memory at a time.
+    The same predictions give the same bytes. Files that do not belong into the archive (scores,
+    other splits) are left out. One scan is in memory at a time.
 
     Args:
         folder: predictions, under the file names of `rules`.
         out: NAME.zip; it appears whole or not at all.
-        use_external: whether the method learnt from other data, too, if the benchmark asks for it.
+        use_external: whether the method also learnt from other data, if the benchmark asks.
         progress: called before each file and at the end.
 
     Raises:
@@ -53,7 +52,14 @@ def write(
         raise InputError(f"{folder}: expected a folder of predictions, found none; check the path")
 
     names = sorted(rules.points)
-    _check_missing(names, folder)
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        others = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(
+            f"{folder}: expected a prediction for each of {len(names)} scans, "
+            f"found no {missing[0]}{others}; predict these scans too, "
+            "or select predicted ones with --sequences or --split"
+        )
     for name in names:
         size = (folder / name).stat().st_size
         check_size(folder / name, size, rules.points[name], rules.dtype)
@@ -75,20 +81,8 @@ def write(
     return len(names)
 
 
-def _check_missing(names: list[str], folder: Path) -> None:
-    """Raise InputError if a prediction with one of these names is missing."""
-    missing = [name for name in names if not (folder / name).is_file()]
-    if missing:
-        others = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise InputError(
-            f"{folder}: expected a prediction for each of {len(names)} scans, "
-            f"found no {missing[0]}{others}; predict these scans too, "
-            "or select predicted ones with --sequences or --split"
-        )
-
-
 def _add(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
-    """Add a file, or a folder (NAME/), by an entry that is the same everywhere and at any time."""
+    """Add a file or a folder (NAME/) as an entry that is the same on all systems."""
     entry = zipfile.ZipInfo(name, LONG_AGO)
     entry.create_system = UNIX
 

@@ -1,4 +1,4 @@
-"""What each benchmark's server expects in an archive: which files, of what size, with which ids.
+"""What each benchmark's server expects in an archive: the files, their sizes and their ids.
 
 The rules are those of the official checkers: `validate_submission.py` (task "segmentation") and
 `evaluate_semantics.py` of PRBonn/semantic-kitti-api, and
@@ -34,15 +34,16 @@ LIDAR_ALONE = {
 
 @dataclass(frozen=True)
 class Rules:
-    """What an archive must contain and what it may contain.
+    """What an archive must and may contain.
 
     Attributes:
-        points: the predictions that it must contain, by name, with the number of points of each.
+        taxonomy: the classes.
+        points: the number of points of each prediction that it must contain, by name.
         dtype: number type of the ids.
         unlabelled: whether points may have no class (train id 0).
-        folders: names of the folders' entries, outer ones first, each with a trailing slash.
+        folders: names of the folders' entries, outer folders first, each with a trailing slash.
         meta: name of submission.json, which says what the method uses; None if there is none.
-        official: how many predictions the server expects, or None if it has no fixed number.
+        official: the number of predictions that the server expects; None if it does not matter.
     """
 
     taxonomy: Taxonomy
@@ -54,7 +55,7 @@ class Rules:
     official: int | None = None
 
     def check_ids(self, data: bytes, path: Path) -> None:
-        """Raise InputError if a prediction of the right size has an id that it may not have."""
+        """Raise InputError if a prediction of the right size has an id that is not allowed."""
         ids = train_ids(path, np.frombuffer(data, dtype=self.dtype), self.taxonomy)
         if not self.unlabelled and not ids.all():
             raise InputError(
@@ -69,8 +70,8 @@ def rules_for(dataset: Dataset, split: str, sequences: Sequence[str] | None = No
 
     Args:
         dataset: its scans decide which predictions are required, and their sizes.
-        split: "test" is what the servers score; the others are for trials.
-        sequences: only these sequences or scenes, instead of a split.
+        split: "test" is the split that the servers score; the others are for trials.
+        sequences: sequences or scenes to pack instead of a split.
 
     Raises:
         InputError: if the dataset's benchmark has no server, or the dataset has no such scans.

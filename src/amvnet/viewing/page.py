@@ -26,14 +26,13 @@ from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
 from amvnet.viewing.shown_scans import RIGHT, UNLABELLED, UNSCORED, ShownScan, shown_scan
 
-# Points of one scan. Of larger scans the page shows every second or third point, so that phones
-# keep up.
+# Of larger scans the page shows every second or third point, so that phones keep up.
 MOST_POINTS = 400_000
-# Metres along each axis. Farther points are left out, so that int16 is off by 1.6 cm at most.
+# Metres along each axis. Farther points are left out, so that int16 is off by 0.8 cm at most.
 REACH = 500.0
 LEVELS = 32_767  # largest int16
 STOPS = 17  # colours between which the page interpolates a ramp
-# The colour map of Matplotlib for each ramp, and the part of it that is used, in [0, 1].
+# Matplotlib's colour map for each ramp, and the part of it that is used, in [0, 1].
 RAMPS = {"height": ("turbo", 0.06, 0.94), "intensity": ("inferno", 0.16, 1.0)}
 # From no disagreement to full disagreement of the networks, RGB in 0..255.
 UNCERTAINTY_RAMP = (RIGHT, (122, 104, 132), (190, 124, 158), UNCERTAIN, (255, 205, 220))
@@ -57,10 +56,10 @@ class Packed:
 
     Attributes:
         about: name, number of points and the like, for the page's JSON.
-        planes: the values of its points as `pack` lays them out, deflated and in base64.
-        present: ids of the classes that appear in its ground truth and labels.
-        heights: metres, of the lowest points, the ground and the highest points.
-        intensity: in [0, 1]; almost no point has more.
+        planes: the values of the points as `pack` lays them out, deflated and in base64.
+        present: train ids that appear in the ground truth and the labels.
+        heights: of the lowest points, the ground and the highest points, metres.
+        intensity: the largest in [0, 1], outliers left out.
     """
 
     about: dict[str, Any]
@@ -71,9 +70,9 @@ class Packed:
 
 
 def show(result: Segmentation, path: Path | str | None = None, open_browser: bool = True) -> Path:
-    """Write a self-contained HTML page that shows a segmented scan in 3D, open it, return its path.
+    """Write a page that shows a segmented scan in 3D, open it, and return its path.
 
-    It shows the labels, those of each network, uncertain points, and errors if the scan has labels.
+    It has the labels, also of each network, uncertain points, and errors if the scan has labels.
 
     Args:
         path: the file, NAME.html; by default in a temporary folder.
@@ -194,7 +193,7 @@ def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
 
 
 def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, Any]:
-    """Return what the page's scripts need to know besides the points."""
+    """Return what the page's scripts need to know about all scans, for its JSON."""
     present: set[int] = set()
     planes: set[str] = set()
     for scan in packed:
@@ -204,8 +203,8 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     sources = []
     for name in ("truth", *METHODS, "labels"):
         if name in planes:
-            method = title_of(name)
-            sources.append({"key": name, "title": method[:1].upper() + method[1:]})
+            words = title_of(name)
+            sources.append({"key": name, "title": words[:1].upper() + words[1:]})
 
     lows, grounds, highs = zip(*(scan.heights for scan in packed), strict=True)
     brightest = max(scan.intensity for scan in packed)
@@ -233,7 +232,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
 
 
 def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
-    """Return all values of the points but their positions, (N,) uint8 each, by name."""
+    """Return the values of the points besides their positions, (N,) uint8 each, by name."""
     planes = {"intensity": _to_bytes(np.nan_to_num(shown.points[:, 3]))}
 
     if shown.truth is not None:
@@ -253,7 +252,7 @@ def _to_bytes(values: np.ndarray) -> np.ndarray:
 
 
 def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the (3,) middle of the points, and the (3,) length of one int16 step, in metres."""
+    """Return the middle of the points and the length of an int16 step, (3,) metres each."""
     if not len(xyz):
         return np.zeros(3), np.ones(3)
 
@@ -265,8 +264,7 @@ def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _differences(steps: np.ndarray) -> bytes:
     """Return the differences of consecutive values, (N,) int16: all low bytes, then all high bytes.
 
-    The first value is kept, and differences are modulo 2^16. They deflate to half the size of the
-    values themselves.
+    The first value is kept, and differences are modulo 2^16. They deflate to half the size.
     """
     changes = np.diff(steps.view(np.uint16), prepend=np.uint16(0)).astype("<u2")
     return changes.view(np.uint8).reshape(-1, 2).T.tobytes()

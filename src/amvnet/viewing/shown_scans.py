@@ -20,8 +20,8 @@ from amvnet.models.methods import geometric_mean
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import check_scan
 
-# Colours for a dark background, RGB in 0..255. The official colour of points without a class is
-# black, which would hide them.
+# Colours for a dark background, RGB in 0..255: the official colour of points without a class is
+# black.
 UNLABELLED = (128, 136, 148)
 RIGHT = (78, 92, 112)
 UNSCORED = (40, 47, 58)
@@ -36,7 +36,7 @@ class ShownScan:
         points: (N, 4) float32 x, y, z in metres and intensity in [0, 1].
         valid: (N,) bool, the points that have a position.
         truth: (N,) train ids of the ground truth, or None if there is none.
-        labels: (N,) train ids by method; the method of labels from files is "labels".
+        labels: (N,) train ids by method, or by "labels" if they are from files.
         uncertain: (N,) bool, the points on which the two networks disagree; None without two
             networks.
         disagreement: (N,) float32 in [0, 1], 1 - the cosine similarity of the two networks' class
@@ -53,7 +53,7 @@ class ShownScan:
 
 
 def check_labels(labels: Path, count: int) -> None:
-    """Raise InputError if labels do not exist, or one file is named for several scans."""
+    """Raise InputError if there are no labels, or one file is given for several scans."""
     if not labels.exists():
         raise InputError(
             f"{labels}: expected a file or a folder of labels, found none; check the path"
@@ -108,7 +108,7 @@ def show_scans(
 def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
     """Return what is shown of a scan that was segmented.
 
-    It has the labels of the result, of each network, and of the ensemble if there are two.
+    These are the labels of the result, of each network, and, if there are two, of their ensemble.
     """
     scan = origin.scan
     valid = torch.from_numpy(scan.valid)

@@ -1,1 +1,1 @@
-"""The benchmarks' datasets, read in their official layouts."""
+"""Datasets: those of both benchmarks, simulated streets, and a user's own scans."""

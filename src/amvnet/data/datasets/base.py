@@ -1,4 +1,4 @@
-"""What every dataset offers: its scans, their labels, and predictions in its official layout."""
+"""What every dataset offers: scans, labels, and predictions in its official layout."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Dataset(ABC):
     Attributes:
         root: the folder that was opened.
         taxonomy: the classes of the labels.
-        spec: what `open_dataset` opens the same dataset with; by default the folder.
+        spec: the text by which `open_dataset` opens the same dataset; by default the folder.
         is_normalised: whether `ring` of each scan is the row of each point in the range image, 0
             the lowest.
     """
@@ -84,14 +84,14 @@ class Dataset(ABC):
         """
 
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the scan to train on in place of a scan in an epoch: most datasets, the scan."""
+        """Return the scan that takes a scan's place in an epoch: in most datasets, the scan."""
         return record
 
     def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
-        """Return the scans to train on or to score.
+        """Return the scans to train on or to score: all, unless the dataset may lack labels.
 
         Raises:
-            InputError: if all of them may be left out for lack of labels, and are.
+            InputError: if it may, and none of the scans has labels.
         """
         return list(records)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -27,9 +28,9 @@ class MixedRecord(ScanRecord):
     """A place in each epoch for a scan of a dataset that is mixed in.
 
     Attributes:
-        member: number of the dataset, 1 for the second.
-        place: number of the place among those of the dataset.
-        original: the scan of the first epoch.
+        member: index of the dataset among all, 1 for the first that is mixed in.
+        place: index of the place among those of the dataset.
+        original: the scan that takes the place.
     """
 
     member: int
@@ -40,9 +41,9 @@ class MixedRecord(ScanRecord):
 class Joined(Dataset):
     """Several datasets with the same classes. `Dataset` documents the methods and their errors.
 
-    Scans of the first dataset keep their records. Scans of the others have a `MixedRecord`, and
-    sequences named by the number of the dataset: "2/000012". A dataset with fewer places than scans
-    shows others of its scans in each epoch, all of them equally often.
+    Scans of the first dataset keep their records. Scans of the others have a `MixedRecord`, whose
+    sequence begins with the number of the dataset: "2/000012". A dataset with fewer places in an
+    epoch than scans shows other scans in the next epoch, and in the end all of them equally often.
 
     Args:
         scans: of the first dataset, which names the split, is validated, and takes predictions.
@@ -55,17 +56,16 @@ class Joined(Dataset):
         super().__init__(self.dataset.root, self.dataset.taxonomy, self.dataset.spec)
         self.is_normalised = self.dataset.is_normalised
         self.others = others
-        self.share = share / len(others)  # of each
-        self.places = _places(len(scans.train), others, share)  # of each, in an epoch
+        self.share = share / len(others)  # of each of the others
+        self.places = _places(len(scans.train), others, share)  # of each of the others, in an epoch
 
     @property
     def specs(self) -> list[str]:
-        """What all of them are opened with: PATH or PATH@SHARE."""
+        """The texts by which all of them are opened: PATH or PATH@SHARE."""
+        suffix = f"@{self.share:g}" if self.share else ""
         texts = [self.dataset.spec]
         for other in self.others:
-            texts.append(
-                f"{other.dataset.spec}@{self.share:g}" if self.share else other.dataset.spec
-            )
+            texts.append(other.dataset.spec + suffix)
         return texts
 
     def sequences(self, split: str) -> tuple[str, ...]:
@@ -77,7 +77,7 @@ class Joined(Dataset):
         return self.dataset.records(sequences)
 
     def mixed_records(self) -> list[MixedRecord]:
-        """Return the places of all others in an epoch."""
+        """Return the places of the others in an epoch, with the scans of the first epoch."""
         records = []
         for member, count in enumerate(self.places, start=1):
             for place in range(count):
@@ -115,10 +115,10 @@ class Joined(Dataset):
 def join(
     scans: TrainingScans, others: Sequence[TrainingScans], share: float = 0.0
 ) -> TrainingScans:
-    """Return scans to train on, with others mixed in; the scans to validate with stay.
+    """Return scans to train on, with others mixed in; those to validate with stay the same.
 
     Args:
-        share: of an epoch's scans, for the others, which have equal parts of it; 0 takes all of
+        share: the share of an epoch's scans that the others have, in equal parts; 0 takes each of
             their scans once per epoch.
 
     Raises:
@@ -142,13 +142,13 @@ def join(
 @cache
 def _order(member: int, count: int) -> np.ndarray:
     """Return the (count,) indices of the scans of a dataset in the order of their turns."""
-    blocks = np.random.default_rng([SEED, member]).permutation(-(-count // BLOCK))  # rounded up
+    blocks = np.random.default_rng([SEED, member]).permutation(math.ceil(count / BLOCK))
     indices = (blocks[:, None] * BLOCK + np.arange(BLOCK)).ravel()
     return indices[indices < count]
 
 
 def _places(first: int, others: Sequence[TrainingScans], share: float) -> list[int]:
-    """Return how many scans of an epoch each other dataset has, if the first has `first`."""
+    """Return how many places in an epoch each other dataset has, if the first has `first` scans."""
     if not share:
         return [max(len(other.train), 1) for other in others]
     if share >= 1:

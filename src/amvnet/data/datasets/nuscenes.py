@@ -1,4 +1,4 @@
-"""nuScenes and nuScenes-lidarseg in their official layout, read straight from the JSON tables."""
+"""nuScenes and nuScenes-lidarseg in their official layout, read from the JSON tables."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class NuScenes(Dataset):
         version: "v1.0-mini", "v1.0-trainval" or "v1.0-test".
 
     Raises:
-        InputError: if `root` does not have this layout, the version is ambiguous, or a table is
-            missing.
+        InputError: if `root` does not have this layout, has several versions and none is given, or
+            lacks a table.
     """
 
     def __init__(self, root: Path | str, version: str | None = None) -> None:
@@ -84,7 +84,7 @@ class NuScenes(Dataset):
         return any(root.glob("v1.0-*/sample_data.json"))
 
     def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the scenes of a split that are on disk, a name in `SPLITS`."""
+        """Return the scenes of a split of `SPLITS` that are on disk."""
         scenes = self.scenes(split)
         folder = self.root / "samples" / CHANNEL
         file_names = set(os.listdir(folder)) if folder.is_dir() else set()

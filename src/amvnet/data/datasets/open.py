@@ -52,21 +52,21 @@ def open_dataset(spec: str) -> Dataset:
 
 
 def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
-    """Open a dataset; raise InputError if it does not have the classes of some weights."""
+    """Open a dataset; raise InputError if it does not have these classes."""
     dataset = open_dataset(spec)
     check_classes(dataset, taxonomy)
     return dataset
 
 
 def open_if_dataset(spec: str, taxonomy: Taxonomy | None) -> Dataset | None:
-    """Open a dataset, with the classes of weights if there are any; None if it names scan files."""
+    """Open a dataset, with these classes if they are given; return None if it names scan files."""
     if not is_dataset(spec):
         return None
 
     dataset = open_dataset(spec)
     if taxonomy is None:
         return dataset
-    # Without its labels, a user's scan can be labelled by weights of any classes.
+    # If their own labels are left out, a user's scans can get labels of any classes.
     if isinstance(dataset, OwnScans) and dataset.taxonomy.classes != taxonomy.classes:
         return dataset.with_classes(taxonomy)
     check_classes(dataset, taxonomy)
@@ -88,7 +88,7 @@ def is_dataset(spec: str) -> bool:
 
 
 def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
-    """Raise InputError if a dataset has other classes than weights, or the user, name."""
+    """Raise InputError if a dataset has other classes than a taxonomy."""
     if taxonomy.classes != dataset.taxonomy.classes:
         raise InputError(
             f"{dataset.root}: expected the classes of {dataset.taxonomy.name}, found those of "

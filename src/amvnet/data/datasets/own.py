@@ -28,7 +28,7 @@ KEYS = (
 )
 SPLITS = ("train", "val", "test")
 
-# Turns what a file holds into a scan, given the recording that it is from.
+# Turns the points of a file into a scan, given the name of the recording.
 Normalise = Callable[[Cloud, str], Scan]
 
 
@@ -62,7 +62,7 @@ class Description:
         labels: where the labels are; None if there are none.
         split: names of folders and scans, and patterns, by split; empty if there is no split.
         sensor: name or attributes of the sensor; None if it is to be measured.
-        layout: of rows of numbers without names, what they hold.
+        layout: what rows of numbers without names hold.
     """
 
     path: Path
@@ -83,9 +83,8 @@ class OwnScans(Dataset):
 
     Args:
         description: what the YAML file says.
-        normalise: brings the scans to the frame, height, intensities and rows that some weights
-            expect; None reads them as they are.
-        is_normalised: whether it does, so that `ring` is the row of each point.
+        normalise: makes scans of the points in the files; None takes them as they are.
+        is_normalised: whether it makes them fit weights, so that `ring` is the row of each point.
     """
 
     def __init__(
@@ -187,7 +186,9 @@ class OwnScans(Dataset):
         try:
             matches = sorted(self.root.glob(pattern))
         except (ValueError, NotImplementedError, OSError) as error:
-            raise InputError(f"scans: expected a pattern, found {pattern!r} ({error})") from None
+            raise InputError(
+                f"{self.spec}: scans: expected a pattern, found {pattern!r} ({error}); correct it"
+            ) from None
         paths = [path for path in matches if path.is_file() and not path.name.startswith(".")]
 
         # Files of labels may match the pattern of the scans, too.
@@ -200,6 +201,7 @@ class OwnScans(Dataset):
         for path in paths:
             if path in label_paths:
                 continue
+
             for scan in list_scans(path, layout=self.description.layout):
                 name = (scan.path.parent.relative_to(self.root) / scan.name).as_posix()
                 if name in scans:
@@ -209,6 +211,7 @@ class OwnScans(Dataset):
                         "scans narrower"
                     )
                 scans[name] = scan
+
         if not scans:
             raise InputError(
                 f"{self.root}: expected scan files {pattern}, found none; correct scans or root"
@@ -244,7 +247,7 @@ class OwnScans(Dataset):
         return listing
 
     def _folder_of(self, name: str) -> str:
-        """Return the folder of a scan that names its sequence."""
+        """Return the name of the folder that is the sequence of a scan."""
         fixed = _fixed_part(self.description.scans)
         parts = Path(name).relative_to(fixed).parts
         if len(parts) > 1:
@@ -254,7 +257,8 @@ class OwnScans(Dataset):
     def _split_of(self, name: str, path: Path) -> str:
         """Return the split of a scan; "" if it is in none."""
         folders = map(Path.as_posix, Path(name).parents)
-        texts = {name, path.relative_to(self.root).as_posix(), self._folder_of(name), *folders}
+        file = path.relative_to(self.root).as_posix()
+        texts = {name, file, self._folder_of(name), *folders}
         splits = []
         for split, names in self.description.split.items():
             if texts & set(names) or any(fnmatchcase(name, pattern) for pattern in names):
@@ -325,14 +329,13 @@ def _parse(path: Path, tree: Any) -> Description:
 
 
 def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
-    """Return the classes: names with raw ids and, if the user likes, colours."""
+    """Return the classes: names, raw ids and, if the file has them, colours."""
     entries = class_entries(tree["classes"], "ids", "road: [1, 2]")
     train_to_raw = []
     raw_to_train: dict[int | str, int] = {}
     for train_id, (title, values) in enumerate(entries.items(), start=1):
         _check_keys(f"classes: {title}", values, ("ids", "color"), required=("ids",))
         ids = _ids(f"classes: {title}", values["ids"])
-
         if not ids:
             raise InputError(f"classes: {title}: expected ids, found none; name one or more")
         train_to_raw.append(ids[0])
@@ -343,7 +346,7 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
     for raw_id in ignored:
         _add(raw_to_train, raw_id, 0)
 
-    if not ignored:  # points without a label have to get some id
+    if not ignored:  # predictions need an id for points without a class
         ignored = [next(raw for raw in range(INSTANCE_MASK) if raw not in raw_to_train)]
         raw_to_train[ignored[0]] = 0
     return user_taxonomy(name, entries, raw_to_train, (ignored[0], *train_to_raw))

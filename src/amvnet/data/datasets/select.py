@@ -40,7 +40,7 @@ def split_records(
     to validate and the others to train.
 
     Args:
-        train, val: sequences; None for those of the official split.
+        train, val: sequences; None for the sequences of the official split.
         with_val: train on the sequences of `val`, too, and validate with none.
 
     Raises:

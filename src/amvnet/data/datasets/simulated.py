@@ -33,14 +33,13 @@ VAL_STREETS = 6
 FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
-# Each epoch of a training takes other streets, whose numbers are higher by this: they help, while
-# more scans of the same streets do not (docs/log/training.md).
+# The numbers of the streets rise by this from epoch to epoch: new streets help a training, more
+# scans of the same streets do not (docs/log/training.md).
 STREET_STEP = 1000
 
-SEED = 64  # other streets than those of `amvnet simulate`, whose seed is 0 by default
+SEED = 64  # `amvnet simulate`, whose seed is 0 by default, makes other streets
 CACHE_BYTES = 25 * 10**9
-ABANDONED = 3600  # seconds after which an unfinished street is that of a killed process
-
+ABANDONED = 3600  # seconds after which the process that was writing a street must have been killed
 
 # The simulator, with its errors as `InputError`.
 simulate = one_line_errors(str, only=(SimulationError,))(simulate_streets)
@@ -49,10 +48,10 @@ simulate = one_line_errors(str, only=(SimulationError,))(simulate_streets)
 class SimulatedStreets(Dataset):
     """Streets of a simulated sensor. `Dataset` documents the arguments and errors of its methods.
 
-    A sequence is a street, named by its number: "000012". Streets with any number exist. A street
-    is simulated when one of its scans is first read, and depends on its number alone. Several
-    processes may share the folder of the cache. If it exceeds `CACHE_BYTES`, the streets that have
-    not been read for the longest time are removed.
+    A sequence is a street, named by its number: "000012". There are streets for all numbers up to
+    `LAST_STREET`. A street depends only on its number, and is simulated when one of its scans is
+    first read. Several processes may share the folder of the cache. If it exceeds `CACHE_BYTES`,
+    the streets that were read longest ago are removed.
 
     Args:
         root: the folder of the cache; made if there is none.
@@ -81,7 +80,7 @@ class SimulatedStreets(Dataset):
         return records
 
     def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        """Return the same scan of an epoch's street; streets to validate with stay."""
+        """Return the same scan of the epoch's street; streets to validate with do not change."""
         number = int(record.sequence)
         if number >= FIRST_VAL_STREET:
             return record
@@ -94,7 +93,7 @@ class SimulatedStreets(Dataset):
         """Read one scan; simulate its street if it is not in the cache."""
         street = record.points_path.parent
         with suppress(FileNotFoundError):
-            os.utime(street)  # so that others do not remove it
+            os.utime(street)  # just read: other processes keep it
             return self._load(record, labels)
 
         self._simulate(int(record.sequence), street)
@@ -162,7 +161,7 @@ class SimulatedStreets(Dataset):
         _make_room(self.root, street)
 
     def _drive(self, number: int) -> Iterator[Scan]:
-        """Yield the scans of a street, as they are read from files of `amvnet simulate`."""
+        """Yield the scans of a street as if they were read from the files of `amvnet simulate`."""
         seed = np.random.SeedSequence((SEED, number))
         with one_line_errors(str, only=(SimulationError,)):
             for scan in drive_street(self.sensor, SCANS, seed):
@@ -182,7 +181,7 @@ def _name(number: int) -> str:
 
 @cache
 def _simulator() -> str:
-    """Return a digest of the simulator's code and tables: another one makes other streets."""
+    """Return a digest of the simulator's code and tables, which decide how the streets look."""
     digest = hashlib.sha256()
     for path in sorted(Path(inspect.getfile(drive_street)).parent.rglob("*")):
         if path.suffix in (".py", ".toml"):
@@ -216,7 +215,7 @@ def _put(part: Path, street: Path) -> None:
 
 
 def _make_room(root: Path, latest: Path) -> None:
-    """Make room: remove streets, those first that were read long ago, but not the latest one."""
+    """Remove the streets that were read longest ago, but not `latest`, until the cache is small."""
     for part in root.glob("streets-*/.*.part"):
         with suppress(FileNotFoundError):  # another process may be removing it
             if time.time() - part.stat().st_mtime > ABANDONED:
@@ -234,7 +233,7 @@ def _make_room(root: Path, latest: Path) -> None:
         if total <= CACHE_BYTES:
             return
         if street != latest:
-            # Renamed first: nobody may see a part of a street.
+            # Renamed first, so that no process sees a part of a street.
             removed = street.with_name(f".{uuid.uuid4().hex}.part")
             with suppress(FileNotFoundError):
                 street.rename(removed)

@@ -18,7 +18,7 @@ from amvnet.errors import InputError
 LISTED = 10  # topics in a message
 
 CHUNK = 1 << 20  # bytes that are unpacked at a time
-MIN_MESSAGE = 16  # bytes of a bag for each message, compressed ones too
+MIN_MESSAGE = 16  # bytes that each message takes in a bag, even if it is compressed
 EXPECTED = "a ROS bag"
 ADVICE = "repair it with ROS's own tools (rosbag reindex, ros2 bag reindex), or copy it again"
 
@@ -51,7 +51,7 @@ class Bag:
         self._topic = topic
         self._count = count
 
-        # For reading in order without a seek: the index of the next message, and the rest of them.
+        # The index of the next message, and the messages from there on, to read them in order.
         self._next = 0
         self._rest: Iterator[bytes] = iter(())
 
@@ -59,7 +59,7 @@ class Bag:
         return self._count
 
     def read(self, index: int) -> Cloud:
-        """Read the scan at this index; raise InputError if it is broken. In order is fastest."""
+        """Read a scan by its index, fastest in order; raise InputError if it is broken."""
         if index != self._next or self._next == 0:
             self._next = 0
             self._rest = self._messages()
@@ -77,9 +77,9 @@ class Bag:
 
     def _messages(self) -> Iterator[bytes]:
         with closing(_open_reader(self._path, self._ending)) as reader:
-            scans = _with_scans(reader.connections)
-            connections = [each for each in scans if each.topic == self._topic]
-            for _, _, data in reader.messages(connections=connections):
+            connections = _with_scans(reader.connections)
+            chosen = [connection for connection in connections if connection.topic == self._topic]
+            for _, _, data in reader.messages(connections=chosen):
                 yield data
 
     def _decode(self, data: bytes, name: str) -> Cloud:
@@ -98,7 +98,7 @@ def _open_reader(path: Path, ending: str) -> Any:
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
     def open_database(path: Path) -> Sqlite3Reader:
-        # rosbags makes a URI of the path, in which #, ? and % have a meaning.
+        # rosbags makes a URI from the path; #, ? and % have a meaning there.
         return Sqlite3Reader(Path(quote(str(path))))
 
     readers: dict[str, Callable[[Path], Any]] = {
@@ -118,7 +118,7 @@ def _open_reader(path: Path, ending: str) -> Any:
 def _check_unpacked(folder: Path) -> None:
     """Raise InputError if the compressed files of a bag would fill the disk.
 
-    rosbags unpacks all of them when it opens the bag; the process limits each file only.
+    rosbags unpacks all of them when it opens the bag, and the process only limits each of them.
     """
     from rosbags.rosbag2.reader import zstd
 
@@ -138,7 +138,7 @@ def _check_unpacked(folder: Path) -> None:
 
 @cache
 def types_of(is_ros1: bool) -> Any:
-    """Return the store of the types of messages of rosbags."""
+    """Return the types of messages of ROS 1 or ROS 2, as rosbags stores them."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)

@@ -12,16 +12,14 @@ import numpy as np
 from amvnet.errors import InputError, one_line_errors
 from amvnet.scan import FARTHEST, Scan
 
-# Points of one scan: 40 times as many as the largest sensors record. A header that claims more is
-# broken.
-MAX_POINTS = 10_000_000
+MAX_POINTS = 10_000_000  # of a scan: 40 times as many as the largest sensors record
 MAX_BYTES = 32 * MAX_POINTS  # of the points of a packed file
 MOST_RINGS = 256  # a column with larger values does not hold ring indices
 
 # The largest intensities that sensors write: fractions, 8 bits, 16 bits.
 FLOAT_RANGES = (1.0, 255.0, 65535.0)
 INTEGER_RANGES = (255.0, 65535.0)  # integers are not fractions
-WILD_SHARE = 0.001  # of the intensities, which may be larger than the range of the others
+WILD_SHARE = 0.001  # share of the intensities that may be above the range of the others
 
 Arrays = dict[str, np.ndarray]  # (N,) columns by key
 # The possible names of each column, by its key; the first that a file has is read.
@@ -41,7 +39,7 @@ COLUMN_NAMES: Names = {
     ),
     "ring": ("ring", "rings", "channel", "laser_id", "laser", "scalar_ring"),
 }
-OPTIONAL = ("intensity", "ring")  # columns that a file may lack
+OPTIONAL = ("intensity", "ring")  # keys of columns that a file may lack
 
 
 @dataclass(frozen=True)
@@ -65,9 +63,8 @@ class Cloud:
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.
 
-        The largest value in the scan decides, without the `WILD_SHARE` of outliers. Up to 1 (floats
-        only) the divisor is 1, up to 255 it is 255, up to 65535 it is 65535, and beyond that it is
-        the value itself.
+        It is the end of the usual range that the largest intensity lies in: 1 (floats only), 255 or
+        65535. Beyond these, it is that intensity itself. Outliers (`WILD_SHARE`) are left out.
         """
         if self.intensity is None:
             return None
@@ -107,7 +104,7 @@ class Cloud:
 
 
 def usual_scale(largest: float, is_integer: bool) -> float:
-    """Return the largest intensity of a usual range that holds the largest one of a scan."""
+    """Return the end of the narrowest usual range of intensities that holds the largest one."""
     ranges = INTEGER_RANGES if is_integer else FLOAT_RANGES
     for limit in ranges:
         if largest <= limit:
@@ -143,7 +140,7 @@ def check_point_count(count: int, path: Path | str, least: int = 0) -> int:
     """Return the number of points that a header claims, if it is plausible.
 
     Args:
-        least: the least size of a file with these points, bytes; 0 if unknown.
+        least: bytes that a file with these points has at least; 0 if unknown.
 
     Raises:
         InputError: if no scan has that many points, or the file is too short for them.
@@ -202,13 +199,13 @@ def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str
 def require_columns(
     names: Sequence[str], path: Path | str, wanted: Names = COLUMN_NAMES
 ) -> dict[str, int]:
-    """Find columns as `find_columns` does; raise InputError if one that is needed is missing."""
+    """Find columns as `find_columns` does; raise InputError if one of them must not be missing."""
     columns = find_columns(names, wanted)
-    expected = []
-    for key, aliases in wanted.items():
-        if key not in OPTIONAL:
-            expected.append(" or ".join(aliases))
     if not set(wanted) <= {*columns, *OPTIONAL}:
+        expected = []
+        for key, aliases in wanted.items():
+            if key not in OPTIONAL:
+                expected.append(" or ".join(aliases))
         listing = ", ".join(names[:20]) or "none"
         raise InputError(
             f"{path}: expected columns {', '.join(expected)}, found {listing[:200]!a}; "
@@ -223,6 +220,7 @@ def record_dtype(columns: Mapping[str, tuple[str, int]], size: int) -> np.dtype:
 
     Args:
         columns: for each column, its NumPy type and its offset in a record, bytes.
+        size: bytes of a record.
     """
     formats, offsets = zip(*columns.values(), strict=True)
     return np.dtype(
@@ -247,9 +245,9 @@ def make_cloud(columns: Mapping[str, np.ndarray], name: str) -> Cloud:
 
 @np.errstate(invalid="ignore")
 def ring_indices(values: np.ndarray | None) -> np.ndarray | None:
-    """Return (N,) values as int64 ring indices, 0 for those that are not finite.
+    """Return (N,) values as int64 ring indices, with 0 in place of NaN and infinity.
 
-    None if there are no values, all are the same, or one is negative, too large or not whole.
+    Return None if there are no values, or they are all equal, negative, too large or not whole.
     """
     if values is None or not len(values):
         return None

@@ -34,7 +34,7 @@ BEGINNINGS = {
     b"\x89MCAP0\r\n": ".mcap",
     b"SQLite format 3\x00": ".db3",
 }
-BEGINNING = 4096  # bytes in which they must be found
+BEGINNING = 4096  # bytes in which one of them must be found
 COMMENT_LINES = re.compile(rb"\A(?:#[^\n]*\n|\s*\n)+")  # before the header of a PCD file
 
 
@@ -47,8 +47,8 @@ def ending_of(path: Path) -> str:
     if path.is_dir():
         return FOLDER
     if not path.is_file():
-        content = "a link that leads nowhere" if is_dead_link(path) else "none"
-        raise InputError(f"{path}: expected a scan file, found {content}; check the path")
+        found = "a link that leads nowhere" if is_dead_link(path) else "none"
+        raise InputError(f"{path}: expected a scan file, found {found}; check the path")
 
     try:
         head = read_head(path)
@@ -93,5 +93,5 @@ def named_ending(path: Path) -> str | None:
 
 
 def is_dead_link(path: Path) -> bool:
-    """Return whether a path is that of a link to something that does not exist."""
+    """Return whether a path is a link to something that does not exist."""
     return path.is_symlink() and not path.exists()

@@ -22,9 +22,9 @@ class Fields:
     """The fields of a record, in order.
 
     Attributes:
-        names: of the fields; several may have the same.
-        dtypes: their NumPy types, with the byte order.
-        counts: how many values each has.
+        names: of the fields; several fields may have the same name.
+        dtypes: NumPy types of the fields, with the byte order.
+        counts: numbers of values of the fields.
     """
 
     names: Sequence[str]
@@ -50,7 +50,7 @@ class Fields:
         columns = [positions[index] for index in chosen.values()]
         table = np.zeros((0, len(columns)))
         lines = islice(filter(bytes.strip, file), count)
-        for first in lines:  # NumPy warns if there is none
+        for first in lines:  # at most once; NumPy would warn if there were no lines
             table = np.loadtxt(chain([first], lines), usecols=columns, comments=None, ndmin=2)
 
         if len(table) < count:

@@ -25,19 +25,20 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.formats.text import find_table, read_head
 from amvnet.errors import InputError
 
-POSE_COLUMNS = 12  # of poses as in KITTI: a 3 x 4 matrix in each line of a text file
+POSE_COLUMNS = 12  # KITTI's files of poses have a 3 x 4 matrix in each line
 
 
 @dataclass(frozen=True)
 class NamedScan:
-    """A scan in a file or a bag, not read yet.
+    """A scan in a file or a bag that has not been read yet.
 
     Attributes:
         name: unique among the scans of one input: `000000` for the file `000000.bin`,
             `drive/000000` for the first scan of the bag `drive.bag`.
-        source: the same for all scans of one recording: the bag, or the folder and the ending.
+        source: names the recording: the bag, or the folder and the ending of the files.
         path: the file or the bag.
-        ending: that the file should have, by its content (`ending_of`); empty if it is broken.
+        ending: of the format, by the file's content (`ending_of`); empty for a broken file.
+        read: reads the scan.
     """
 
     name: str
@@ -48,7 +49,7 @@ class NamedScan:
 
 
 def find_scans(path: Path | str) -> list[Path]:
-    """Return the scan files and bags that a text names, sorted by name.
+    """Return the scan files and bags that a path names, sorted by name.
 
     Args:
         path: a file, a folder of them, or a pattern such as `drive/*.bin` or `drives/**/*.pcd`.
@@ -84,15 +85,15 @@ def list_scans(
     layout: RowLayout = UNKNOWN,
     is_alone: bool = True,
 ) -> Iterator[NamedScan]:
-    """Yield the scans that a text names, as `find_scans` finds them; those of a bag in its order.
+    """Yield the scans of the files that `find_scans` finds; those of a bag in its order.
 
-    A link that leads nowhere, and one of several files whose format cannot be told, is yielded as
-    one scan, which cannot be read.
+    If one of several files cannot be opened, or is a link that leads nowhere, it counts as a scan:
+    reading it raises the error.
 
     Args:
         topic: of bags; None means the only topic with scans.
         layout: what rows of numbers without names hold, as far as the user says it.
-        is_alone: whether there are no other inputs, so that a single file is the only one.
+        is_alone: whether the user names no other path.
 
     Raises:
         InputError: if there is no scan, or the only file has an unknown format or is a bag that
@@ -109,12 +110,13 @@ def list_scans(
         except InputError as error:
             if is_alone and len(files) == 1 and not is_dead_link(file):
                 raise
-            scans = [NamedScan(name, str(file), file, "", partial(_refuse, str(error)))]
+            refuse = partial(_refuse, str(error))
+            scans = [NamedScan(name, source=str(file), path=file, ending="", read=refuse)]
         yield from scans
 
 
 def read_cloud(path: Path | str, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read the only scan that a text names; raise InputError if there are several."""
+    """Read the only scan that a path names; raise InputError if there are several."""
     scans = list(list_scans(path, layout=layout))
     if len(scans) > 1:
         raise InputError(
@@ -128,11 +130,13 @@ def _scans_of(file: Path, name: str, topic: str | None, layout: RowLayout) -> li
     ending = ending_of(file)
     if ending not in (FOLDER, *BAGS):
         source = str(file.parent / f"*{ending}")
-        return [NamedScan(name, source, file, ending, partial(read_file, file, ending, layout))]
+        read = partial(read_file, file, ending, layout)
+        return [NamedScan(name, source, path=file, ending=ending, read=read)]
 
     scans = []
-    for index, read in enumerate(open_bag(file, ending, topic)):
-        scans.append(NamedScan(f"{name}/{index:06d}", str(file), file, ending, read))
+    for index, read_one in enumerate(open_bag(file, ending, topic)):
+        name_in_bag = f"{name}/{index:06d}"
+        scans.append(NamedScan(name_in_bag, str(file), path=file, ending=ending, read=read_one))
     return scans
 
 
@@ -147,7 +151,7 @@ def _scans_in(folder: Path) -> list[Path]:
 
 
 def _matches(pattern: str) -> list[Path]:
-    """Return the scans that match a pattern, and those of the folders that match."""
+    """Return the scans that match a pattern, and the scans in folders that match."""
     paths: list[Path] = []
     for text in sorted(glob.glob(pattern, recursive=True)):
         path = Path(text)
@@ -160,7 +164,7 @@ def _matches(pattern: str) -> list[Path]:
 
 
 def _advice_to_find(path: Path) -> str:
-    """Return what to do if there is no scan in a folder."""
+    """Return the advice for a folder without scans."""
     for pattern in ("*/*", "*/*/*"):
         for deeper in sorted(path.glob(pattern)):
             if is_scan_file(deeper) and not deeper.parent.name.startswith("."):
@@ -176,7 +180,7 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def is_scan_file(path: Path) -> bool:
-    """Return whether a path in a folder is that of a scan or a bag, and not of predictions."""
+    """Return whether a path is a scan or a bag, and not a file of predictions."""
     if path.suffix == ".npz" and path.with_suffix(".label").exists():
         return False
     if path.is_dir():
@@ -185,10 +189,7 @@ def is_scan_file(path: Path) -> bool:
 
 
 def is_scan_name(name: str) -> bool:
-    """Return whether the name of a file is that of a scan or a bag.
-
-    Text files hold anything, so their names do not tell.
-    """
+    """Return whether a file is a scan or a bag by its name; a text file may be anything."""
     if name.startswith(".") or name.endswith(".uncertain.npy"):
         return False
     ending = named_ending(Path(name))
@@ -196,7 +197,7 @@ def is_scan_name(name: str) -> bool:
 
 
 def _is_text_scan(path: Path) -> bool:
-    """Return whether a path is that of a text file with points, and not with poses."""
+    """Return whether a path is a text file of points, and not of poses."""
     is_text = path.name.lower().endswith(TEXT) and not path.name.startswith(".")
     if not is_text or not path.is_file():
         return False

@@ -1,7 +1,7 @@
 """Dimensions of LAS and LAZ files, by laspy.
 
-On broken bytes, lazrs 0.8 can take any amount of memory or abort its process, so that files are
-read in the process with limits.
+lazrs 0.8 can take any amount of memory or abort its process if a file is broken. Files are
+therefore read in the process with limits.
 """
 
 from __future__ import annotations

@@ -30,17 +30,17 @@ from amvnet.data.formats.cloud import (
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
-# Names of the array to read, if there are several.
+# Names of the array of points, if an archive has several arrays.
 KEYS = ("points", "positions", "xyz", "scan", "arr_0")
-FEW = 10  # an array with as few rows and more columns is transposed
-MOST_COLUMNS = 200  # of an array without names; one is chosen by its number
-METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # in which NumPy packs archives
+FEW = 10  # an array with at most as many rows and more columns is transposed
+MOST_COLUMNS = 200  # of an array without names
+METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # by which NumPy packs archives
 ADVICE = "save it again with np.save"
 ARCHIVE_ADVICE = "save it again with np.savez"
 
 
 def read_npy(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read one array, whose columns are those of the layout, if it says any.
+    """Read an array, whose columns are those of the layout if it has any.
 
     Raises:
         InputError: if it is not an array of numbers, has an unsuitable shape or is truncated.
@@ -59,8 +59,8 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     with reading(path, "a NumPy archive", ARCHIVE_ADVICE):
         names = member_names(path)
         arrays = find_columns(names)
+        columns = {}
         if {"x", "y", "z"} <= set(arrays):
-            columns = {}
             lengths = {}
             for key, index in arrays.items():
                 columns[key] = read_array(path, names[index]).ravel()
@@ -72,22 +72,21 @@ def read_npz(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
                 )
             return make_cloud(columns, str(path))
 
-        points = _choose_member(names, path)
-        cloud = _to_cloud(read_array(path, points), path, layout)
-        extra = {}
+        points = read_array(path, _choose_member(names, path))
+        cloud = _to_cloud(points, path, layout)
         for key in {"intensity", "ring"} & set(arrays):
             values = read_array(path, names[arrays[key]]).ravel()
             # An array of another size describes something else, such as the lasers.
             if len(values) == len(cloud.xyz):
-                extra[key] = values
+                columns[key] = values
 
-        intensity = extra.get("intensity") if cloud.intensity is None else cloud.intensity
-        ring = ring_indices(extra.get("ring")) if cloud.ring is None else cloud.ring
+        intensity = columns.get("intensity") if cloud.intensity is None else cloud.intensity
+        ring = ring_indices(columns.get("ring")) if cloud.ring is None else cloud.ring
         return replace(cloud, intensity=intensity, ring=ring)
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some columns of an array of points; those without names are called "0", "1", ..."""
+    """Read some columns of an array of points; columns without names are named "0", "1", ..."""
     return _columns_of(read_array(path), path, wanted)
 
 
@@ -107,9 +106,10 @@ def _columns_of(array: np.ndarray, path: Path, wanted: Names) -> Arrays:
 
 
 def member_names(path: Path) -> list[str]:
-    """Return the names of the arrays in an archive; raise InputError if the file is none."""
+    """Return the names of the arrays in an archive; raise InputError if it is no archive."""
     with reading(path, "a NumPy archive", ARCHIVE_ADVICE), zipfile.ZipFile(path) as archive:
-        return [n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")]
+        names = archive.namelist()
+        return [name.removesuffix(".npy") for name in names if name.endswith(".npy")]
 
 
 def read_array(path: Path, key: str | None = None) -> np.ndarray:
@@ -137,7 +137,7 @@ def read_array(path: Path, key: str | None = None) -> np.ndarray:
 
 
 def _choose_member(names: Sequence[str], path: Path) -> str:
-    """Return the name of the array of points, given those of all arrays of an archive."""
+    """Return the name of the array of points, given the names of all arrays in an archive."""
     if len(names) == 1:
         return names[0]
     for key in KEYS:
@@ -152,7 +152,7 @@ def _choose_member(names: Sequence[str], path: Path) -> str:
 
 
 def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
-    """Read the array that starts here, if `size` bytes can hold what its header claims."""
+    """Read the array in a file, if `size` bytes can hold what its header claims."""
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
         shape, _, dtype = np.lib.format.read_array_header_1_0(file)
@@ -180,6 +180,7 @@ def _load(file: BinaryIO, size: int, path: Path) -> np.ndarray:
 
 
 def _to_cloud(array: np.ndarray, path: Path, layout: RowLayout) -> Cloud:
+    """Return the points of a table (N, C), a range image (H, W, C) or an array of records."""
     if array.dtype.names is not None:
         return make_cloud(_columns_of(array.ravel(), path, COLUMN_NAMES), str(path))
     if array.ndim not in (2, 3) or array.shape[-1] < 3:

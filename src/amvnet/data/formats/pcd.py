@@ -1,6 +1,6 @@
 """Read point clouds in PCL's format: ascii, binary or binary_compressed, columns in any order.
 
-We do not use pypcd4: version 1.5 reads truncated files without an error, and ascii files only if
+pypcd4 is not used: version 1.5 reads truncated files without an error, and ascii files only if
 single spaces separate the numbers.
 """
 
@@ -33,14 +33,13 @@ TYPES = {
     "U": {1: "<u1", 2: "<u2", 4: "<u4", 8: "<u8"},
 }
 
-# The longest repetition that LZF can encode, and the length of its code. Nothing is packed more
-# tightly.
+# LZF packs nothing more tightly than the longest repetition into its code.
 LONGEST_REPETITION = 264  # bytes
 REPETITION_CODE = 3  # bytes
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some fields of the points; of a field of several values the first.
+    """Read some fields of the points: of a field with several values, the first.
 
     The points of an organised cloud (a grid) come row by row.
 
@@ -55,7 +54,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         encoding = entries["DATA"][0].lower()
 
         if encoding == "ascii":
-            # Each value takes at least one digit, and each but the last a separator.
+            # Each value takes a character, and one more between any two of them.
             check_point_count(points, path, 2 * sum(fields.counts) * points - 1)
             return fields.read_text(file, points, chosen, path)
 
@@ -71,7 +70,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
 
 def _read_header(file: BinaryIO, path: Path) -> dict[str, list[str]]:
-    """Return the words of each line of the header by its first, up to and including DATA."""
+    """Return the words of the lines of the header up to DATA, by the first word of each line."""
     entries: dict[str, list[str]] = {}
     while "DATA" not in entries:
         words = read_header_line(file, path, KIND, "line DATA")
@@ -102,6 +101,7 @@ def _count_points(entries: dict[str, list[str]]) -> int:
 def _read_compressed(
     file: BinaryIO, fields: Fields, points: int, chosen: dict[str, int], path: Path
 ) -> Arrays:
+    """Read the first value of chosen fields, by their index, from packed points."""
     packed_size, size = struct.unpack("<II", file.read(8))
     check_point_count(points, path, file.tell() + packed_size)
     expected = points * fields.record.itemsize
@@ -110,7 +110,7 @@ def _read_compressed(
         expected = min(expected, MAX_BYTES)
         raise InputError(f"{path}: expected {expected} bytes of points, found {size}; {ADVICE}")
 
-    # One field follows the other. Within a field, the values of a point are adjacent.
+    # Field by field: the values of all points, and the values of one point next to each other.
     data = unpack_lzf(file.read(packed_size), size)
     sizes = [fields.record[index].itemsize for index in range(len(fields.names))]
     arrays = {}

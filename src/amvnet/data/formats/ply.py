@@ -1,6 +1,6 @@
 """Point clouds in PLY files: the element `vertex`, ascii or binary of either byte order.
 
-We do not use plyfile: it allocates whatever a header claims, and is under the GPL.
+plyfile is not used: it allocates whatever a header claims, and is under the GPL.
 """
 
 from __future__ import annotations
@@ -13,23 +13,16 @@ from amvnet.data.formats.cloud import Arrays, Names, check_point_count, reading,
 from amvnet.data.formats.fields import Fields, read_header_line
 from amvnet.errors import InputError
 
+# NumPy types by both names of each.
 TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "uint": "u4",
-    "float": "f4",
-    "double": "f8",
-    "int8": "i1",
-    "uint8": "u1",
-    "int16": "i2",
-    "uint16": "u2",
-    "int32": "i4",
-    "uint32": "u4",
-    "float32": "f4",
-    "float64": "f8",
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
 }
 BYTE_ORDERS = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 KIND = "a PLY file"
@@ -38,7 +31,7 @@ ADVICE = "write the file again"
 
 @dataclass
 class Element:
-    """One element of a file, such as `vertex`, with `count` rows; the type of a list is "list"."""
+    """One element of a file, such as `vertex`, with `count` rows; "list" is the type of lists."""
 
     name: str
     count: int
@@ -46,7 +39,7 @@ class Element:
     types: list[str] = field(default_factory=list)
 
     def fields(self, order: str) -> Fields:
-        """Return its fields in a byte order, "<" or ">"; only if none is a list."""
+        """Return the fields of an element without lists, in the byte order "<" or ">"."""
         dtypes = [order + TYPES[kind] for kind in self.types]
         return Fields(self.properties, dtypes, [1] * len(dtypes))
 
@@ -71,8 +64,8 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
         fields = vertex.fields(BYTE_ORDERS[encoding])
         chosen = require_columns(vertex.properties, path, wanted)
         if encoding == "ascii":
-            # Each value, and each line before the vertices, takes at least one digit and, but for
-            # the last, a separator.
+            # Each value and each line before the vertices takes a character, and one more between
+            # any two of them.
             lines = sum(element.count for element in before)
             least = 2 * (lines + vertex.count * sum(fields.counts)) - 1
             check_point_count(lines + vertex.count, path, least)

@@ -21,16 +21,7 @@ from amvnet.errors import InputError
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"  # in ROS 2; rosbags uses this name for ROS 1, too
 
 # NumPy types by their number in a PointField.
-TYPES = {
-    1: "i1",
-    2: "u1",
-    3: "i2",
-    4: "u2",
-    5: "i4",
-    6: "u4",
-    7: "f4",
-    8: "f8",
-}
+TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
 
 def read_message(message: Any, name: str) -> Cloud:
@@ -56,7 +47,7 @@ def read_message(message: Any, name: str) -> Cloud:
     if count and (row_step < row_size or len(message.data) < size):
         raise InputError(
             f"{name}: expected {count} points of {message.point_step} bytes, "
-            f"found {len(message.data)} bytes"
+            f"found {len(message.data)} bytes; check the driver"
         )
 
     data = np.ascontiguousarray(message.data) if count else b""

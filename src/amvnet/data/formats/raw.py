@@ -20,13 +20,13 @@ KITTI_ROWS = RowLayout(NAMES[:KITTI_COLUMNS])
 NUSCENES_ROWS = RowLayout(NAMES)
 
 WIDEST = 8  # bytes of a number
-SAMPLE = 400_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # bytes: whole rows of either layout
-FEW = 4800  # bytes: the values of smaller files can fit any layout
+SAMPLE = 400_000 * KITTI_COLUMNS * NUSCENES_COLUMNS  # bytes to look at: whole rows of both layouts
+FEW = 4800  # bytes: the values of smaller files may fit any layout
 
-# Numbers in other columns or of another type are negative, or of any magnitude.
+# What tells coordinates and intensities from other columns, and float32 from other types.
 MAX_INTENSITY = 65535  # of any device
 NEAR = 500.0  # metres: coordinates of usual scans are smaller
-USUAL = 0.999  # share of the points that must have such values: some may be wild
+USUAL = 0.999  # share of the points that must have such values; the others may be outliers
 
 
 def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
@@ -46,11 +46,12 @@ def read_raw(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
     is_named = path.name.lower().endswith(NUSCENES_ENDING)
     usual = _usual_layout(data, is_named)
     if usual is None and len(data) >= FEW:
-        sizes = (KITTI_ROWS.record.itemsize, NUSCENES_ROWS.record.itemsize)
+        kitti = KITTI_ROWS.record.itemsize
+        nuscenes = NUSCENES_ROWS.record.itemsize
         found = "values that fit neither"
         advice = ADVICE
-        if all(len(data) % size for size in sizes):
-            found = f"{len(data)} bytes, which is a multiple of neither {sizes[0]} nor {sizes[1]}"
+        if len(data) % kitti and len(data) % nuscenes:
+            found = f"{len(data)} bytes, which is a multiple of neither {kitti} nor {nuscenes}"
             advice = f"copy the file again if it is truncated, or {ADVICE}"
         raise InputError(
             f"{path}: expected rows of float32 x, y, z, intensity (KITTI), ring (nuScenes), found "
@@ -86,7 +87,7 @@ def read_table(path: Path, dtype: DTypeLike, columns: int) -> np.ndarray:
 
 
 def count_rows(path: Path, dtype: DTypeLike, columns: int) -> int:
-    """Return the number of rows of such a file from its size; raise the errors of `read_table`."""
+    """Return the number of rows that `read_table` would read, from the size of the file."""
     if not path.is_file():
         raise InputError(
             f"{path}: expected a file, found none; check the path or complete the dataset"
@@ -112,22 +113,23 @@ def _usual_layout(data: np.ndarray, is_named: bool) -> RowLayout | None:
     """
     if not len(data):
         return None
+
     if len(data) % NUSCENES_ROWS.record.itemsize == 0:
         table = data[:SAMPLE].view(np.float32).reshape(-1, NUSCENES_COLUMNS)
         if _is_nuscenes(table, is_named):
             return NUSCENES_ROWS
-    if len(data) % KITTI_ROWS.record.itemsize:
-        return None
-    table = data[:SAMPLE].view(np.float32).reshape(-1, KITTI_COLUMNS)
-
-    return KITTI_ROWS if _is_kitti(table) else None
+    if len(data) % KITTI_ROWS.record.itemsize == 0:
+        table = data[:SAMPLE].view(np.float32).reshape(-1, KITTI_COLUMNS)
+        if _is_kitti(table):
+            return KITTI_ROWS
+    return None
 
 
 def _is_nuscenes(table: np.ndarray, is_named: bool) -> bool:
     """Return whether (N, 5) values can be x, y, z, intensity and ring.
 
     The ring holds whole numbers, at least two different ones, and the coordinates do not.
-    Intensities are never negative. Without the name, the ring must not look like labels, either.
+    Intensities are never negative. If not `is_named`, the ring must not look like labels, either.
     """
     xyz = table[:, :3]
     intensity = table[:, 3]

@@ -32,7 +32,7 @@ try:
 except ImportError:  # Windows has no limits
     resource = None  # type: ignore[assignment]
 
-# Limits, to which the bytes of a file add.
+# Limits, which grow with the bytes of the file.
 MEMORY = 700 << 20  # bytes of the process
 MEMORY_PER_BYTE = 10
 MOST_MEMORY = 4 << 30
@@ -50,9 +50,9 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
     """Call a function that reads a file, in the process with limits.
 
     Args:
-        function: of a module. It returns arrays, and values that JSON can hold.
-        path: its first argument: the file, or a folder of files.
-        arguments: its other arguments, values that JSON can hold.
+        function: a function of a module that returns arrays and values that JSON can hold.
+        path: the first argument: the file, or a folder of files.
+        arguments: the other arguments, which JSON can hold.
 
     Raises:
         InputError: if the function raises it, or needs more than the limits.
@@ -73,7 +73,7 @@ def call(function: Callable[..., dict[str, Any]], path: Path, *arguments: Any) -
 
         try:
             values = _process.exchange(request)
-        except BaseException as error:  # an interruption, too: its reply would go to the next call
+        except BaseException as error:  # an interrupt, too: the next call would get this reply
             reason = _process.stop()
             _process = None
             if not isinstance(error, (OSError, EOFError)):
@@ -95,18 +95,18 @@ def size_of(path: Path) -> int:
 
 
 class _Process:
-    """The process, seen from the one that needs it."""
+    """The process with limits, as its user sees it."""
 
     def __init__(self) -> None:
         self._folder = mkdtemp(prefix="amvnet-")
         environment = dict(os.environ, TMPDIR=self._folder)
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
-        # With one thread, because each would use up some of the memory.
+        # One thread: each takes some of the memory.
         environment["OMP_NUM_THREADS"] = "1"
         environment["OPENBLAS_NUM_THREADS"] = "1"
 
-        # In a session of its own, so that Ctrl-C reaches only this process, which then stops it.
-        # It ends by itself if this process ends.
+        # In a session of its own: Ctrl-C reaches only its user, which then stops it. If its user
+        # ends, so does the process.
         self._popen = subprocess.Popen(
             [sys.executable, "-P", "-c", CODE],
             env=environment,
@@ -134,7 +134,7 @@ class _Process:
         return values
 
     def stop(self) -> str:
-        """End the process, and return in words why it ended if it did so by itself."""
+        """End the process; return in words why it ended if it had already."""
         cast(BinaryIO, self._popen.stdin).close()
         try:
             code = self._popen.wait(PATIENCE)
@@ -154,7 +154,7 @@ _lock = Lock()
 
 
 def _forget() -> None:
-    """Forget the process: it belongs to the process that forked this one."""
+    """Forget the process with limits, which belongs to the parent of this forked process."""
     global _process, _lock
     _process = None
     _lock = Lock()
@@ -176,13 +176,13 @@ if hasattr(os, "register_at_fork"):
 def serve() -> None:
     """Answer the requests that come by standard input, until it ends."""
     replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print must not get between the replies
+    os.dup2(2, 1)  # libraries may print, but not between the replies
     if resource is not None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
     for line in sys.stdin.buffer:
         request = json.loads(line)
-        os.chdir(request["folder"])  # of the caller, which may have changed it
+        os.chdir(request["folder"])  # the caller may have changed its own
         _set_limits(request["size"])
 
         try:
@@ -192,7 +192,7 @@ def serve() -> None:
         except InputError as error:
             values = {"error": str(error)}
         _send(replies, values)
-        del values  # before the next file takes memory
+        del values  # to free the memory for the next file
 
 
 def _set_limits(size: int) -> None:

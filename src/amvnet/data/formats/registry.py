@@ -18,10 +18,10 @@ from amvnet.data.formats.reader_process import call
 from amvnet.data.formats.rows import RowLayout
 from amvnet.errors import InputError
 
-OPEN_FILES = 4  # that the process with limits keeps open
+OPEN_BAGS = 4  # that the process with limits keeps open
 
-# Readers by the endings of files: of rows, which need to know what the rows hold, and of named
-# columns.
+# By the endings of files: readers that need to know what rows without names hold, and readers of
+# named columns.
 ROW_READERS: dict[str, Callable[[Path, RowLayout], Cloud]] = {
     NUSCENES_ENDING: read_raw,
     ".bin": read_raw,
@@ -62,7 +62,7 @@ def read_file(path: Path, ending: str, layout: RowLayout) -> Cloud:
 
 
 def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
-    """Read some columns of a file of points: by key, a number for each point, in any shape.
+    """Read some columns of a file of points: for each key a number per point, in any shape.
 
     Args:
         ending: one of `COLUMN_READERS`.
@@ -75,26 +75,23 @@ def read_columns(path: Path, ending: str, wanted: Names) -> Arrays:
 
 
 def open_bag(path: Path, ending: str, topic: str | None) -> list[Callable[[], Cloud]]:
-    """Return what reads each scan of a bag. In order is fastest.
+    """Return a function for each scan of a bag that reads it. Reading in order is fastest.
 
-    Args:
-        path: the file, or the folder of a ROS 2 bag.
-        ending: as `ending_of` returns it.
-        topic: None means the only topic with scans.
+    `Bag` documents the arguments.
 
     Raises:
         InputError: if the bag is broken, has no scan, or needs a package that is missing.
     """
-    which = (ending, topic, uuid4().hex)
-    count = _call(measure_bag, path, ending, *which)["count"]
+    bag = (ending, topic, uuid4().hex)  # arguments of `_open`
     readers: list[Callable[[], Cloud]] = []
-    for index in range(count):
-        readers.append(partial(_read_one, path, ending, *which, index))
+    for index in range(_call(count_scans, path, ending, *bag)["count"]):
+        readers.append(partial(_read_scan, path, bag, index))
     return readers
 
 
-def _read_one(path: Path, ending: str, *which_and_index: Any) -> Cloud:
-    return Cloud(**_call(read_from_bag, path, ending, *which_and_index))
+def _read_scan(path: Path, bag: tuple[str, str | None, str], index: int) -> Cloud:
+    ending = bag[0]
+    return Cloud(**_call(read_from_bag, path, ending, index, *bag))
 
 
 def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any) -> Any:
@@ -114,18 +111,17 @@ def _call(function: Callable[..., Any], path: Path, ending: str, *arguments: Any
 # --- in the process with limits ---
 
 
-def measure_bag(path: Path, *which: Any) -> dict[str, int]:
+def count_scans(path: Path, *bag: Any) -> dict[str, int]:
     """Return the number of scans in a bag."""
-    return {"count": len(_open(path, *which))}
+    return {"count": len(_open(path, *bag))}
 
 
-def read_from_bag(path: Path, *which_and_index: Any) -> dict[str, Any]:
+def read_from_bag(path: Path, index: int, *bag: Any) -> dict[str, Any]:
     """Return the attributes of a cloud in a bag."""
-    *which, index = which_and_index
-    return vars(_open(path, *which).read(index))
+    return vars(_open(path, *bag).read(index))
 
 
-@lru_cache(OPEN_FILES)
-def _open(path: Path, ending: str, topic: str | None, _key: str) -> Bag:
-    """Open a bag; the key is another each time that it is opened, as it may have changed."""
+@lru_cache(OPEN_BAGS)
+def _open(path: Path, ending: str, topic: str | None, _opening: str) -> Bag:
+    """Open a bag, once for each `_opening` by `open_bag`: the file may have changed in between."""
     return Bag(path, ending, topic)

@@ -14,10 +14,11 @@ NAMES = ("x", "y", "z", "intensity", "ring")  # of the columns, in the usual ord
 USUAL_TYPE = "float32"
 ADVICE = "say what the rows hold, for example --columns x,y,z,intensity,ring --dtype float32"
 
-# Rings of whole scans have at most 2.1 times as many points as the mean of them, classes at least
-# 2.8 times. Elevations within a ring have at most 0.06 of the variance of all, within a class 0.34.
+# Measured on whole scans: the largest ring has at most 2.1 times as many points as the mean ring,
+# the largest class at least 2.8 times as many as the mean class. The variance of the elevations
+# within a ring is at most 0.06 of the variance of all, within a class 0.34.
 UNEVEN = 2.5
-FEWEST_LASERS = 8  # fewer classes can be as even
+FEWEST_LASERS = 8  # fewer classes can have similar numbers of points
 SPREAD = 0.1
 
 
@@ -33,9 +34,9 @@ class RowLayout:
     """What the user says about rows of numbers without names.
 
     Attributes:
-        columns: the name of each column, in order. Names that mean nothing to the readers, such as
-            "time" or "_", are left out. Empty if unknown.
-        dtypes: NumPy's name of the type of all columns, or that of each.
+        columns: the name of each column, in order; empty if unknown. Columns whose names mean
+            nothing to the readers, such as "time" or "_", are not read.
+        dtypes: NumPy's names of the types: one for all columns, or one for each.
 
     Raises:
         InputError: if a coordinate is missing or named twice, a type is unknown, or there are
@@ -75,7 +76,7 @@ class RowLayout:
         return np.dtype([(str(index), dtype) for index, dtype in enumerate(dtypes)])
 
     def describe(self) -> str:
-        """Return the layout in words."""
+        """Return the layout in words, for messages."""
         return f"rows of {len(self.columns)} {' '.join(self.dtypes)}, {describe(self.columns)}"
 
 
@@ -88,7 +89,7 @@ def parse_layout(columns: str | None, dtype: str | None) -> RowLayout:
 
 
 def describe(columns: Sequence[str]) -> str:
-    """Return the columns that are read, and how many are left out."""
+    """Return in words which columns are read, and how many are left out."""
     names = [columns[index] for index in sorted(find_columns(columns).values())]
     text = f"columns {' '.join(names)}"
     more = len(columns) - len(names)
@@ -98,11 +99,11 @@ def describe(columns: Sequence[str]) -> str:
 def named_cloud(
     columns: Sequence[np.ndarray], names: Sequence[str], name: str, note: str = ""
 ) -> Cloud:
-    """Return the cloud of (N,) columns with these names, which are those of a `RowLayout`.
+    """Return the cloud of (N,) columns with the names of a `RowLayout`.
 
     Args:
         name: where the scan comes from.
-        note: what was assumed of the file.
+        note: what was assumed about the file.
 
     Raises:
         InputError: if there are fewer columns than names.
@@ -119,7 +120,7 @@ def named_cloud(
 
 
 def name_columns(table: np.ndarray) -> tuple[str, ...]:
-    """Return the names of the columns of a (N, 3 or more) table; "_" for those of no known use."""
+    """Return names for the columns of an (N, 3 or more) table; "_" if the use is unknown."""
     count = table.shape[1]
     if _is_color(table[:, 3:6]):
         return (*"xyz", *"_" * (count - 3))
@@ -134,7 +135,7 @@ def name_columns(table: np.ndarray) -> tuple[str, ...]:
 def are_rings(xyz: np.ndarray, values: np.ndarray) -> bool:
     """Return whether (N,) values of (N, 3) points are ring indices, and not labels.
 
-    A laser has about as many points as any other, or one elevation: classes have neither.
+    Lasers have about as many points as each other, or each has one elevation; classes do not.
     """
     ring = ring_indices(values)
     if ring is None:

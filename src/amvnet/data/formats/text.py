@@ -23,10 +23,10 @@ from amvnet.data.formats.cloud import (
 from amvnet.data.formats.rows import UNKNOWN, RowLayout, describe, name_columns, named_cloud
 from amvnet.errors import InputError
 
-HEAD = 65_536  # bytes in which the columns must be found
+HEAD = 65_536  # bytes in which the first points must be found
 MOST_COLUMNS = 200
-CHECKED = 20  # lines that must be alike
-USED = 7  # columns without names that are looked at
+CHECKED = 20  # lines of points that must have the same columns
+USED = 7  # columns to look at if they have no names
 COMMENTS = ("#", "//", "%")
 # Numbers are ASCII; comments and names of columns may be in any encoding.
 ENCODING = "utf-8-sig"
@@ -42,13 +42,13 @@ ADVICE = "write a line x y z intensity per point"
 
 @dataclass(frozen=True)
 class TextTable:
-    """How the lines of a text file are to be read.
+    """The layout of a text file.
 
     Attributes:
         separator: between the values of a line; None for any white space.
         skipped: lines before the first point.
         count: the number of columns.
-        names: those of the columns; empty if there are none.
+        names: of the columns; empty if the file has none.
     """
 
     separator: str | None
@@ -58,10 +58,10 @@ class TextTable:
 
 
 def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
-    """Read a point of each line.
+    """Read a point from each line.
 
-    Columns are found by their names, if a line before the points has them; else they are x, y, z,
-    intensity and, if the values are whole numbers, the ring. Values are separated by white space,
+    Columns are found by their names, if a line before the points has them. Otherwise they are x, y,
+    z, intensity and, if its values can be rings, the ring. Values are separated by white space,
     commas or semicolons.
 
     Args:
@@ -92,7 +92,7 @@ def read_text_cloud(path: Path, layout: RowLayout = UNKNOWN) -> Cloud:
 
 
 def read_columns(path: Path, wanted: Names) -> Arrays:
-    """Read some columns of all points as float64; those without names are called "0", "1", ..."""
+    """Read some columns of all points as float64; columns without names are named "0", "1", ..."""
     with reading(path, EXPECTED, ADVICE):
         table = _require_table(path)
         names = table.names or tuple(map(str, range(table.count)))
@@ -109,13 +109,13 @@ def _require_table(path: Path) -> TextTable:
 
 
 def read_head(path: Path) -> bytes:
-    """Return the beginning of a file, in which the columns of a text must be found."""
+    """Return the beginning of a file, in which `find_table` looks for points."""
     with path.open("rb") as file:
         return file.read(HEAD)
 
 
 def find_table(head: bytes) -> TextTable | None:
-    """Return how the lines of a text are to be read, given its head; None if it has no points."""
+    """Return the layout of a text, given its head; None if it has no points."""
     lines = StringIO(_decode(head), newline=None).readlines()
     for separator in SEPARATORS:
         table = _match(lines, separator)
@@ -125,7 +125,7 @@ def find_table(head: bytes) -> TextTable | None:
 
 
 def _decode(head: bytes) -> str:
-    """Return the whole lines of the head of a file; no lines if it is binary."""
+    """Return the complete lines of the head of a text file; an empty text if it is binary."""
     text = head.decode(ENCODING, errors="replace")
     if len(head) == HEAD:
         text = text[: text.rfind("\n") + 1]
@@ -133,22 +133,23 @@ def _decode(head: bytes) -> str:
 
 
 def _match(lines: list[str], separator: str | None) -> TextTable | None:
-    """Return the table that starts after some lines, if it has this separator."""
+    """Return the layout of the first lines of numbers, if they have this separator."""
     names: tuple[str, ...] = ()
     for skipped, line in enumerate(lines):
         values = _split(line, separator)
         if _are_numbers(values, names):
-            alike = list(filter(str.strip, lines[skipped : skipped + CHECKED]))
+            points = list(filter(str.strip, lines[skipped : skipped + CHECKED]))
             # A header is not longer than the points; other text may end in a line of numbers.
-            if len(alike) < min(skipped, CHECKED):
+            if len(points) < min(skipped, CHECKED):
                 return None
-            for other in alike:
-                row = _split(other, separator)
+            for point in points:
+                row = _split(point, separator)
                 if len(row) != len(values) or not _are_numbers(row, names):
                     return None
 
-            is_named = len(names) == len(values)
-            return TextTable(separator, skipped, len(values), names if is_named else ())
+            if len(names) != len(values):
+                names = ()
+            return TextTable(separator, skipped, len(values), names)
 
         candidates = tuple(map(_clean_name, _split(_uncomment(line), separator)))
         if {"x", "y", "z"} <= set(find_columns(candidates)):
@@ -157,12 +158,12 @@ def _match(lines: list[str], separator: str | None) -> TextTable | None:
 
 
 def _split(line: str, separator: str | None) -> list[str]:
-    """Return the values of a line; a separator at its end adds none."""
+    """Return the values of a line; a separator at its end adds no empty value."""
     return line.strip().removesuffix(separator or "").split(separator, MOST_COLUMNS)
 
 
 def _uncomment(line: str) -> str:
-    """Return a line without the mark of a comment."""
+    """Return a line without the marks of a comment at its beginning."""
     stripped = line.strip()
     for mark in COMMENTS:
         stripped = stripped.removeprefix(mark)
@@ -180,7 +181,7 @@ def _clean_name(name: str) -> str:
 
 
 def _are_numbers(values: list[str], names: tuple[str, ...]) -> bool:
-    """Return whether the values of a line are numbers: those of the named columns, or else all."""
+    """Return whether the values of a line are numbers, at least those of the named columns."""
     if len(values) < 3:
         return False
     if len(names) == len(values):

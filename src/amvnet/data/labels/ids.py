@@ -1,6 +1,6 @@
-"""Files that hold nothing but the ids of a scan's points, as those of both benchmarks.
+"""Files of nothing but the ids of a scan's points, as in both benchmarks.
 
-What other tools write by mistake is recognised: another number type, another byte order, train ids
+Errors name what other tools write by mistake: another number type, another byte order, train ids
 instead of raw ids.
 """
 
@@ -19,10 +19,10 @@ WIDTHS = (1, 2, 4, 8)  # bytes of the number types that labels are written in by
 
 
 def read_ids(path: Path, dtype: DTypeLike, count: int) -> np.ndarray:
-    """Read the raw ids of one scan, (N,) of a number type.
+    """Read the (N,) raw ids of one scan.
 
     Raises:
-        InputError: if the file is missing, or as `check_size` raises it.
+        InputError: if the file is missing or has another size.
     """
     if not path.is_file():
         raise InputError(

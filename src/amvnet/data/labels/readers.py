@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,9 @@ from amvnet.errors import InputError
 
 # Types of the ids in files of nothing but ids, by bytes per point.
 INTEGERS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.int64}
-COLUMNS = ("class", "label", "scalar_class", "scalar_label")  # the latter by CloudCompare
-KEY = "labels"  # of the column in what a reader returns
+COLUMNS = ("class", "label", "scalar_class", "scalar_label")  # scalar_*: from CloudCompare
 ARRAYS = ("labels", "label", "class", "arr_0")  # of an archive
+KEY = "labels"  # key of the labels among the columns that a reader returns
 LARGEST = np.iinfo(np.uint32).max
 ADVICE = "write the labels again, one whole number per point"
 
@@ -121,11 +122,11 @@ def _read_integers(path: Path, count: int) -> np.ndarray:
 
 
 def _read_numbers(path: Path) -> np.ndarray:
-    """Read a text with a number in each line; a first line may be a title."""
+    """Read a text with a number in each line; the first line may be a title."""
     with path.open(encoding="utf-8-sig") as file:
         first = file.readline()
-        is_title = not first.strip().lstrip("+-").replace(".", "", 1).isdigit()
-        if not is_title or first.startswith("#"):
+        with suppress(ValueError):  # a title or a comment is not read again
+            float(first)
             file.seek(0)
         return np.loadtxt(file, delimiter=",", max_rows=MAX_POINTS + 1, ndmin=1)
 
