@@ -15,10 +15,9 @@ if [[ $# -gt 0 && $1 != --* ]]; then
     shift
 fi
 
-small=(--model.polar_view.radial 240 --model.polar_view.angular 180)
 case $sensor in
-    hdl64e) recipe=simulated-compact small+=(--model.range_view.width 1536) ;;
-    hdl32e) recipe=simulated-hdl32e-compact ;;
+    hdl64e) recipe=simulated-compact small=(--model.range_view.width 1536) ;;
+    hdl32e) recipe=simulated-hdl32e-compact small=(--model.polar_view.radial 240 --model.polar_view.angular 180) ;;
     *) echo "expected hdl64e or hdl32e, found $sensor" >&2 && exit 2 ;;
 esac
 train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --resume "${small[@]}")
