@@ -90,7 +90,7 @@ def test_labels_are_read_from_every_kind_of_file_and_field(site: Path) -> None:
         ("p.npy", lambda path: np.save(path, RAW[:, None])),
         ("p.npz", lambda path: np.savez(path, labels=RAW, other=points)),
         ("p.txt", lambda path: np.savetxt(path, RAW, fmt="%d")),
-        ("p.exponents.txt", lambda path: np.savetxt(path, RAW)),
+        ("p.txt", lambda path: np.savetxt(path, RAW)),  # with exponents
         ("p.csv", lambda path: np.savetxt(path, RAW, fmt="%d", header="label", comments="")),
     ):
         write(site / name)
