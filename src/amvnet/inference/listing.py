@@ -143,9 +143,8 @@ class FileReader:
 
         if self.is_normalising:
             self.normaliser.measure(scan.source)
-        cloud = self._clouds.pop((scan.source, scan.name), None)
-        if cloud is None:
-            cloud = scan.read()
+        key = (scan.source, scan.name)
+        cloud = self._clouds.pop(key) if key in self._clouds else scan.read()
         return LoadedScan(self.normaliser(cloud, scan.source), cloud.xyz)
 
     def _read_and_keep(self, scan: NamedScan) -> Cloud:
