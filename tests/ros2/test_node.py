@@ -221,7 +221,7 @@ def test_an_error_of_the_program_ends_the_node_with_its_traceback(
         raise ZeroDivisionError("of the test")
 
     node = start()
-    monkeypatch.setattr(Segmenter, "many", fail)
+    monkeypatch.setattr(Segmenter, "run", fail)
     receive, _ = node.callbacks["points"]
     receive(ros_message(scan(0)))
     node._worker._thread.join(WAIT)
