@@ -91,7 +91,7 @@ def _last_words(arguments: Sequence[str]) -> str:
 
 
 def _run_and_explain(arguments: Sequence[str]) -> int:
-    """Run the command line, and print its errors as one line each; return the exit code."""
+    """Run the command line, print its errors, and return the exit code."""
     if not arguments or arguments[0] in ("-h", "--help"):
         say_lines(_usage())
         return DONE if arguments else WRONG_INPUT

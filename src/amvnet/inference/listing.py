@@ -138,13 +138,14 @@ class FileReader:
     def read(self, scan: NamedScan) -> LoadedScan:
         """Read a scan; raise InputError if it cannot be read, or no point is usable."""
         if self.normaliser is None:
-            cloud = scan.read()
-            return LoadedScan(cloud.to_scan(), cloud.xyz)
+            unchanged = scan.read()
+            return LoadedScan(unchanged.to_scan(), unchanged.xyz)
 
         if self.is_normalising:
             self.normaliser.measure(scan.source)
-        key = (scan.source, scan.name)
-        cloud = self._clouds.pop(key) if key in self._clouds else scan.read()
+        cloud = self._clouds.pop((scan.source, scan.name), None)
+        if cloud is None:
+            cloud = scan.read()
         return LoadedScan(self.normaliser(cloud, scan.source), cloud.xyz)
 
     def _read_and_keep(self, scan: NamedScan) -> Cloud:

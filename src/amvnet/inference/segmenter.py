@@ -166,7 +166,7 @@ class Segmenter:
         return self._segment(checked)
 
     def _segment(self, scans: Sequence[Scan]) -> list[Segmentation]:
-        """Segment scans in one pass of the networks; each has a valid point."""
+        """Segment scans, each with a valid point, in one pass."""
         is_large = sum(map(len, scans)) >= LARGE
         with return_freed_memory() if is_large else nullcontext():
             batch = self.batch(scans)
