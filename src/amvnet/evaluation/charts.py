@@ -86,7 +86,7 @@ def write_ablation(rows: Sequence[tuple[bool, bool, dict[str, Any]]], path: Path
 
 
 def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
-    """Write Figure 5 of the paper: a histogram of the similarity of the two networks' scores."""
+    """Draw Figure 5 of the paper: a histogram of the networks' similarity."""
     edges = np.arange(BINS + 1) / BINS
     total = max(analysis.points.sum(), 1)
     rows: list[Sequence[Cell]] = []
@@ -106,7 +106,7 @@ def _write_similarity(analysis: Analysis, dataset: str, path: Path) -> list[Path
 
 
 def _write_distance(analysis: Analysis, dataset: str, path: Path) -> list[Path]:
-    """Write Figure 6 of the paper: mIoU over the classes present, by distance from the sensor."""
+    """Draw Figure 6 of the paper: mIoU of the classes present, by distance."""
     methods = analysis.evaluation.report(dataset)["methods"]
     table: list[list[Cell]] = []
     middles = []

@@ -181,7 +181,7 @@ def _resolve(row: dict[str, Any], folder: str) -> tuple[str, str, str]:
 
 
 def _read_batches(place: Place) -> Iterator[list[dict[str, Any]]]:
-    """Yield the rows of a manifest as dictionaries of texts; raise InputError if it is unusable."""
+    """Yield the rows of a manifest; raise InputError if it is unusable."""
     with reaching(place.url), place.filesystem.open_input_file(place.path) as file:
         if place.path.lower().endswith(".csv"):
             in_parts = pa.csv.ReadOptions(block_size=CSV_BYTES)

@@ -131,7 +131,7 @@ def _lock(folder: Path) -> Iterator[None]:
 
 
 def _check_alone(folder: Path) -> None:
-    """Raise InputError if another run is writing into the folder: it has locked its journal."""
+    """Raise InputError if another run has locked the journal."""
     with suppress(OSError), (folder / UNFINISHED).open() as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -266,7 +266,7 @@ def list_inputs(
 
 
 class Scans(Sequence[Scan]):
-    """The scans of a file, a bag, a folder or a dataset; each is read when it is asked for."""
+    """The scans of a file, a bag, a folder or a dataset, read on demand."""
 
     def __init__(self, path: Path | str, scans: Sequence[InputScan]) -> None:
         self.path = path

@@ -33,7 +33,7 @@ Write = Callable[[np.ndarray], object]
 
 @dataclass(frozen=True)
 class Timing:
-    """The seconds of each stage and of `MEAN`; how many points there are, and uncertain ones."""
+    """The seconds of each stage and of `MEAN`, and the numbers of points."""
 
     seconds: dict[str, float]
     points: int

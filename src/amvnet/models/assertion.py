@@ -33,7 +33,7 @@ class Disagreement:
 
 
 def cosine_similarity(f: Tensor, g: Tensor) -> Tensor:
-    """Return the (P,) similarity of class probabilities (P, K): 0 if disjoint, 1 if the same."""
+    """Return the (P,) cosine similarity of class probabilities (P, K)."""
     lengths = f.norm(dim=1) * g.norm(dim=1)
     similarity = torch.linalg.vecdot(f, g) / lengths.clamp_min(TINY)
     return similarity.clamp_max(1)  # rounding must not put a point beyond tau = 1

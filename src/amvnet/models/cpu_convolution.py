@@ -1,4 +1,4 @@
-"""Convolutions that are fast on a CPU: kernels of one cell, and the gradient of the weights."""
+"""Convolutions that are fast on a CPU."""
 
 from __future__ import annotations
 

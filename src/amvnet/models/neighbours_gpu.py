@@ -151,7 +151,7 @@ def _gaps(blocks: Blocks, queries: Tensor) -> Tensor:
 
 
 def _nearest_of_all(xyz: Tensor, own: Tensor, n: int) -> Tensor:
-    """Return (U, n) indices of the nearest others by the distances to all points, in float64."""
+    """Return (U, n) indices of the nearest others among all points."""
     points = xyz.T.double()
     parts = []
     for queries in _parts(own, len(xyz) * 6 * 8):  # offsets, distances, two copies to rank them

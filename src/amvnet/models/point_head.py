@@ -178,7 +178,7 @@ def nearest_neighbours(points: Tensor, index: Tensor, n: int) -> Tensor:
 
 
 def _layers(widths: tuple[int, ...]) -> list[nn.Module]:
-    """Return linear layers between these numbers of channels, each with batch norm and ReLU."""
+    """Return linear layers of these widths, each with batch norm and ReLU."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layers += [PointLinear(inputs, outputs), nn.BatchNorm1d(outputs), nn.ReLU(inplace=True)]

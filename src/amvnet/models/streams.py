@@ -22,7 +22,7 @@ def one_after_the_other(score_range: Score, score_polar: Score) -> tuple[Tensor,
 
 
 def side_by_side(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
-    """Run each network with half of a CPU's threads if threads sleep, else one after the other."""
+    """Run both at once if a CPU's threads sleep, else one after the other."""
     f, g = run_parts(lambda score: score(), (score_range, score_polar))
     return f, g
 

@@ -27,7 +27,7 @@ def synchronise_batch_norms(net: nn.Module, cuda: bool) -> nn.Module:
 
 
 class SyncedBatchNorm(_BatchNorm):
-    """Batch norm over the batches of all processes, on CPUs; the batches may differ in size."""
+    """Batch norm over the batches of all processes, which may differ in size."""
 
     @classmethod
     def of(cls, norm: _BatchNorm) -> SyncedBatchNorm:

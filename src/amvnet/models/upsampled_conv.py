@@ -1,4 +1,4 @@
-"""A convolution over a coarse map joined with a fine one, without upsampling the coarse map."""
+"""A convolution over an upsampled map joined with a fine one, at less cost."""
 
 from __future__ import annotations
 

@@ -199,7 +199,7 @@ def find_clusters(doubts: Doubts) -> np.ndarray:
 
 
 def _middle_points(xyz: np.ndarray, group: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return for each group the index of the point that is nearest to the mean of the group."""
+    """Return the index of the point nearest to the mean of each group."""
     mean = np.stack([np.bincount(group, axis) / sizes for axis in xyz.T], axis=1)
     squared_distance = ((xyz - mean[group]) ** 2).sum(axis=1)
     order = np.lexsort((squared_distance, group))
@@ -218,7 +218,7 @@ def _most_common(ids: np.ndarray, group: np.ndarray, count: int) -> np.ndarray:
 def write_clusters(
     clusters: np.ndarray, records: Sequence[ScanRecord], taxonomy: Taxonomy, path: Path
 ) -> None:
-    """Write the clusters of some scans to a CSV file, with their ranks as the first column."""
+    """Write clusters to a CSV file, with their ranks as the first column."""
     names = ("", *taxonomy.classes)
     with atomic_write(path) as part, part.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -85,7 +85,7 @@ ALONE = Processes()
 
 
 def environment() -> ClusterEnvironment:
-    """Return Lightning's environment for what started the processes: torchrun, srun or nothing."""
+    """Return Lightning's environment: that of torchrun, srun or neither."""
     from lightning.fabric.plugins.environments import (
         LightningEnvironment,
         SLURMEnvironment,

@@ -155,7 +155,7 @@ def are_quantiles(values: Any) -> TypeGuard[list[float]]:
 
 
 def check_quantiles(values: Any, source: str) -> list[float]:
-    """Return the quantiles that a file holds; raise InputError if they cannot be quantiles."""
+    """Return the quantiles in a file; raise InputError if they are wrong."""
     if not are_quantiles(values):
         raise InputError(
             f"{source}: expected {len(PROBABILITIES)} quantiles of the intensities, ascending and "

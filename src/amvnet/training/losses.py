@@ -196,7 +196,7 @@ def lovasz_softmax(probabilities: Tensor, targets: Targets) -> Tensor:
 
 
 def _order(group: Tensor, errors: Tensor) -> Tensor:
-    """Return the order that sorts errors (M,) by group (M,), and within it the largest first."""
+    """Return the order of errors (M,) by group (M,), the largest first."""
     # Numbers from 0 are ordered as their bits are: one sort of whole numbers does both.
     bits = errors.to(torch.float32).view(torch.int32).long()
     return (group * 2**32 - bits).argsort()

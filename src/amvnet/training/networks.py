@@ -126,7 +126,7 @@ class NetworkStage(Stage):
 
 
 class RangeStage(NetworkStage):
-    """Stage `rv`: the loss is over pixels, each with the label of the point that represents it."""
+    """Stage `rv`: the loss is over pixels, labelled by the points they show."""
 
     name = "rv"
     view: RangeView

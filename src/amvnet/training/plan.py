@@ -152,7 +152,7 @@ def open_for_training(data: str, recipe: Recipe, out: Path, init: Weights | None
 def open_parts(
     specs: Sequence[str], recipe: Recipe, out: Path, init: Weights | None
 ) -> tuple[Dataset, list[TrainingScans]]:
-    """Open the datasets of a training; return the first, and the scans of the others to mix in."""
+    """Open the datasets of a training: the first, and the others to mix in."""
     first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
     parts = []
     for dataset in others:

@@ -35,7 +35,7 @@ def is_finished(plan: Plan, name: str) -> bool:
 
 
 def with_trained(plan: Plan, name: str, weights: Weights) -> Weights:
-    """Return weights with the part that a stage has trained, best or last as the recipe says."""
+    """Return weights with the best or last part of a stage, as the recipe says."""
     path = plan.out / name / f"{plan.recipe.training.keep}.safetensors"
     return weights.replace_part(PART_OF[name], load(path))
 

@@ -74,7 +74,7 @@ class Stage(L.LightningModule):
         return tuple(map(self._in_precision, batch))
 
     def check_finite(self, loss: Tensor, where: str) -> None:
-        """Check a loss before it spoils the weights; raise InputError if it is infinite or NaN."""
+        """Raise InputError if a loss is not finite, before it spoils the weights."""
         if not torch.isfinite(loss):
             option = f"--training.{self.name}.lr"
             raise InputError(

@@ -131,7 +131,7 @@ def predict(
 
 
 def _layout(choice: ScanChoice) -> RowLayout:
-    """Return what rows of numbers hold; raise InputError if options are of datasets or bags."""
+    """Return the layout of rows; raise InputError if it does not apply."""
     options = choice.parse()
     if choice != ScanChoice(columns=choice.columns, dtype=choice.dtype):
         raise InputError(

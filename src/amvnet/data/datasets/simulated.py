@@ -1,4 +1,4 @@
-"""Simulated streets as a dataset: made when they are first read, and cached in a folder."""
+"""Simulated streets as a dataset, made on first use and cached."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ class SimulatedStreets(Dataset):
         _make_room(self.root, street)
 
     def _drive(self, number: int) -> Iterator[Scan]:
-        """Yield the scans of a street as if they were read from the files of `amvnet simulate`."""
+        """Yield the scans of a street as the files of `amvnet simulate` have them."""
         seed = np.random.SeedSequence((SEED, number))
         with one_line_errors(str, only=(SimulationError,)):
             for scan in drive_street(self.sensor, SCANS, seed):
@@ -181,7 +181,7 @@ def _name(number: int) -> str:
 
 @cache
 def _simulator() -> str:
-    """Return a digest of the simulator's code and tables, which decide how the streets look."""
+    """Return a digest of the simulator's code and tables."""
     digest = hashlib.sha256()
     for path in sorted(Path(inspect.getfile(drive_street)).parent.rglob("*")):
         if path.suffix in (".py", ".toml"):
@@ -199,14 +199,14 @@ def _write(folder: Path, scan: Scan) -> None:
 
 
 def _as_nuscenes(points: np.ndarray) -> np.ndarray:
-    """Return points with nuScenes' axes (x right, y forward), and intensities in steps of 1/255."""
+    """Return points with nuScenes' axes and intensities in steps of 1/255."""
     x, y, z, intensity = points.T
     steps = np.round(intensity * FULL_INTENSITY)
     return np.column_stack([-y, x, z, steps / FULL_INTENSITY]).astype(np.float32)
 
 
 def _put(part: Path, street: Path) -> None:
-    """Rename a finished folder, unless another process has put the same street there before."""
+    """Rename a finished folder, unless another process has made the street."""
     try:
         part.rename(street)
     except OSError:
@@ -215,7 +215,7 @@ def _put(part: Path, street: Path) -> None:
 
 
 def _make_room(root: Path, latest: Path) -> None:
-    """Remove the streets that were read longest ago, but not `latest`, until the cache is small."""
+    """Remove the streets that were read longest ago, but not `latest`."""
     for part in root.glob("streets-*/.*.part"):
         with suppress(FileNotFoundError):  # another process may be removing it
             if time.time() - part.stat().st_mtime > ABANDONED:

@@ -1,4 +1,4 @@
-"""The points of a scan file, before anything is assumed about the sensor that recorded them."""
+"""The points of a scan file, before anything is assumed of the sensor."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def find_columns(names: Sequence[str], wanted: Names = COLUMN_NAMES) -> dict[str
 def require_columns(
     names: Sequence[str], path: Path | str, wanted: Names = COLUMN_NAMES
 ) -> dict[str, int]:
-    """Find columns as `find_columns` does; raise InputError if one of them must not be missing."""
+    """Find columns as `find_columns` does; raise InputError if a needed one is missing."""
     columns = find_columns(names, wanted)
     if not set(wanted) <= {*columns, *OPTIONAL}:
         expected = []

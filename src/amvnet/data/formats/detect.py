@@ -75,7 +75,7 @@ def ending_of(path: Path) -> str:
 
 
 def _begins_as(beginning: bytes) -> str | None:
-    """Return the ending that belongs to the first bytes of a file; None if they are unknown."""
+    """Return the ending of files with these first bytes; None if unknown."""
     without_comments = COMMENT_LINES.sub(b"", beginning, 1)
     for text in (beginning, without_comments):
         for known, ending in BEGINNINGS.items():

@@ -45,7 +45,7 @@ class Fields:
         return {key: records[str(index)][:, 0] for key, index in chosen.items()}
 
     def read_text(self, file: BinaryIO, count: int, chosen: dict[str, int], path: Path) -> Arrays:
-        """Read chosen fields of the next lines of numbers; raise InputError if some are missing."""
+        """Read fields of the next lines; raise InputError if some are missing."""
         positions = list(accumulate(self.counts, initial=0))
         columns = [positions[index] for index in chosen.values()]
         table = np.zeros((0, len(columns)))

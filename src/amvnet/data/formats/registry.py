@@ -1,4 +1,4 @@
-"""The readers of all formats, and where they run: in this process, or in the one with limits."""
+"""The readers of all formats, in this process or in the one with limits."""
 
 from __future__ import annotations
 

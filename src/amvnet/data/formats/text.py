@@ -1,4 +1,4 @@
-"""Scans in text files: a line of numbers per point, with or without the names of the columns."""
+"""Scans in text files: a line of numbers per point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Read the labels of single scans in any format: files of labels, and fields of scan files."""
+"""Read the labels of single scans, from files of labels or scan files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write the labels of a single scan: alone, or with its points, in colour, for other programs."""
+"""Write the labels of a single scan, alone or with its coloured points."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def write_scan_labels(
 
 
 def write_uncertain(path: Path, uncertain: np.ndarray) -> Path:
-    """Write which points are uncertain, (N,) bool, as `.npy`; the file appears whole or not."""
+    """Write which points are uncertain, (N,) bool, as `.npy`."""
     with atomic_write(path) as part:
         np.save(part, np.asarray(uncertain, dtype=bool))
     return path

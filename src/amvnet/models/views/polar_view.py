@@ -98,7 +98,7 @@ class PolarGrid:
 
 
 def _pillar_maximum(features: Tensor, slot: Tensor, pillars: int) -> Tensor:
-    """Return the maximum (F, C) of features (S, C), each row belonging to the pillar `slot`."""
+    """Return the maximum (F, C) of features (S, C) by their pillars `slot`."""
     zeros = features.new_zeros(pillars, features.shape[1])
     index = slot[:, None].expand_as(features)
     return zeros.scatter_reduce(0, index, features, "amax", include_self=False)

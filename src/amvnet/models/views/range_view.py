@@ -1,4 +1,4 @@
-"""The range view: a scan as an image with the lasers as rows and the azimuth as columns."""
+"""The range view: a scan as an image of lasers by azimuth."""
 
 from __future__ import annotations
 
