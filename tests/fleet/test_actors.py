@@ -147,7 +147,12 @@ def test_a_full_disk_is_fatal(
     assert row["error"] == "/full/000000.label: No space left on device"
 
 
-def test_a_bucket_that_takes_no_labels_is_fatal(labelling: Labelling, fleet: Path) -> None:
+def test_a_bucket_that_takes_no_labels_is_fatal(
+    labelling: Labelling, fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")  # where nothing listens
+    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "anybody")
+    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "anything")
     worker = LabelScans(replace(labelling, out="s3://no-such-bucket/out"))
     (row,) = worker(pa.table({"path": [f"{fleet}/scans/drive0/000000.bin"]})).to_pylist()
     assert row["is_fatal"]
