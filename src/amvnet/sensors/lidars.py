@@ -190,7 +190,7 @@ def _read_sensor(text: str) -> Sensor:
 
 
 def _to_triple(value: Any) -> Any:
-    """Return three numbers from a list or a text; `Sensor` refuses others."""
+    """Return three numbers from a list or a text, and anything else as it is."""
     try:
         a, b, c = map(float, value.split(",") if isinstance(value, str) else value)
     except (TypeError, ValueError, OverflowError):

@@ -204,7 +204,7 @@ class Normaliser:
         return dataclasses.replace(lasers, height=height).known()
 
     def _check_height(self, cloud: Cloud, frame: Frame) -> None:
-        """Raise InputError if the ground is too far below for metres."""
+        """Raise InputError if the ground is too deep for coordinates in metres."""
         is_known = self.sensor.height is not None or self.sensor.unit is not None
         if not is_known and frame.height is not None and frame.height > HIGHEST:
             raise InputError(

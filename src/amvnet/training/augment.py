@@ -151,7 +151,7 @@ def disturb(scores: Tensor, points: Tensor, rng: np.random.Generator) -> Tensor:
 
 
 def yaw_rotation(yaw: float) -> np.ndarray:
-    """Return the (2, 2) matrix that turns x, y by `yaw` radians to the left."""
+    """Return the (2, 2) matrix that rotates x, y by `yaw` radians, counter-clockwise."""
     cos = np.cos(yaw)
     sin = np.sin(yaw)
     return np.array([[cos, -sin], [sin, cos]])

@@ -131,7 +131,7 @@ def predict(
 
 
 def _layout(choice: ScanChoice) -> RowLayout:
-    """Return the layout of rows; raise InputError if it does not apply."""
+    """Return the layout of rows; raise InputError for options of datasets."""
     options = choice.parse()
     if choice != ScanChoice(columns=choice.columns, dtype=choice.dtype):
         raise InputError(

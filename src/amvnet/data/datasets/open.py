@@ -59,7 +59,7 @@ def open_with_classes(spec: str, taxonomy: Taxonomy) -> Dataset:
 
 
 def open_if_dataset(spec: str, taxonomy: Taxonomy | None) -> Dataset | None:
-    """Open a dataset, with these classes if given; None for scan files."""
+    """Open a dataset, with these classes if given; return None for scan files."""
     if not is_dataset(spec):
         return None
 

@@ -215,7 +215,7 @@ def _put(part: Path, street: Path) -> None:
 
 
 def _make_room(root: Path, latest: Path) -> None:
-    """Remove the streets that were read longest ago, but not `latest`."""
+    """Remove the streets that were read longest ago until the cache is small."""
     for part in root.glob("streets-*/.*.part"):
         with suppress(FileNotFoundError):  # another process may be removing it
             if time.time() - part.stat().st_mtime > ABANDONED:

@@ -150,7 +150,7 @@ def _with_scans(connections: Iterable[Any]) -> list[Any]:
 
 
 def _choose_topic(connections: Iterable[Any], topic: str | None, path: Path) -> tuple[str, int]:
-    """Return the topic to read and its number of scans."""
+    """Return the topic to read, by default the only one, and its number of scans."""
     counts: dict[str, int] = {}
     for connection in _with_scans(connections):
         counts[connection.topic] = counts.get(connection.topic, 0) + connection.msgcount

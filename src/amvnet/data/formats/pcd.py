@@ -70,7 +70,7 @@ def read_columns(path: Path, wanted: Names) -> Arrays:
 
 
 def _read_header(file: BinaryIO, path: Path) -> dict[str, list[str]]:
-    """Return the words of the header's lines, by the first of each."""
+    """Return the words of the header's lines up to DATA, by the first of each."""
     entries: dict[str, list[str]] = {}
     while "DATA" not in entries:
         words = read_header_line(file, path, KIND, "line DATA")
