@@ -41,13 +41,13 @@ done
 wait %1
 wait %2
 
-# Class weights make the networks name rare classes too often on real streets.
-shifted=$out/shifted.safetensors
-python "$(dirname "$0")/shift_priors.py" "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$shifted"
+# Class weights make the networks name rare classes too often on real streets, and RV is too sure of itself.
+calibrated=$out/calibrated.safetensors
+python "$(dirname "$0")/calibrate.py" "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$calibrated"
 
 # The head learns on streets that the networks have not seen, under stronger changes of the sensor and from
 # disturbed scores: on streets like their own the networks are too sure, and the head would rely on them.
-"${train[@]}" --out "$out/head" --init "$shifted" --stage head \
+"${train[@]}" --out "$out/head" --init "$calibrated" --stage head \
     --train-sequences "$(seq -s, 800000 800154)" --training.head.views 1 --training.head.points 600000 \
     --training.head.epochs 10 --training.head.disturb 0.3 \
     --training.augment.tilt 4 --training.augment.height 0.4 --training.augment.drop 0.5 \

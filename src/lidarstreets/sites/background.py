@@ -74,13 +74,17 @@ def close_ends(site: Site) -> None:
             continue
 
         is_wild = rng.random() < 0.33
-        layer, _ = draw_boundary(rng).layers[0]
-        for t in np.arange(-reach, reach, SEGMENT):
+        boundary = draw_boundary(rng)
+        for t in np.arange(-reach, reach, SEGMENT) + SEGMENT / 2:
+            away = rng.uniform(1.5, 2.0)
             if is_wild:
-                segment = plants.bush(rng, rng.uniform(0.8, 1.8))
-            else:
+                bush = plants.bush(rng, rng.uniform(0.8, 1.8))
+                site.put(bush, x + outwards * away, t, np.pi / 2)
+                continue
+
+            for layer, offset in boundary.layers:
                 segment = layer.segment(rng, SEGMENT)
-            site.put(segment, x + outwards * rng.uniform(1.5, 2.0), t + 1.2, np.pi / 2)
+                site.put(segment, x + outwards * (away + offset), t, np.pi / 2)
 
 
 def line_side_road(site: Site, road: SideRoad, side: int) -> None:
@@ -95,9 +99,11 @@ def line_side_road(site: Site, road: SideRoad, side: int) -> None:
     last = min(road.length, first + rng.uniform(6, 22))
 
     if rng.random() < 0.75:
-        layer, _ = draw_boundary(rng).layers[0]
+        boundary = draw_boundary(rng)
         for along in np.arange(first, last, SEGMENT):
-            _put_along(site, road, layer.segment(rng, SEGMENT), along, side * (edge + 0.4))
+            for layer, offset in boundary.layers:
+                segment = layer.segment(rng, SEGMENT)
+                _put_along(site, road, segment, along, side * (edge + 0.4 + offset))
 
     has_houses = ground.style.kind in BUILT_UP
 
