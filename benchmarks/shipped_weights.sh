@@ -16,8 +16,16 @@ if [[ $# -gt 0 && $1 != --* ]]; then
 fi
 
 case $sensor in
-    hdl64e) recipe=simulated-compact small=(--model.range_view.width 1536) ;;
-    hdl32e) recipe=simulated-hdl32e-compact small=(--model.polar_view.radial 240 --model.polar_view.angular 180) ;;
+    hdl64e)
+        recipe=simulated-compact
+        small=(--model.range_view.width 1536)
+        calibration=()
+        ;;
+    hdl32e)
+        recipe=simulated-hdl32e-compact
+        small=(--model.polar_view.radial 240 --model.polar_view.angular 180)
+        calibration=(--prior 0 --bev 0.75)
+        ;;
     *) echo "expected hdl64e or hdl32e, found $sensor" >&2 && exit 2 ;;
 esac
 train=(amvnet train $recipe --data "simulated-$sensor:$out/streets" --resume "${small[@]}")
@@ -43,7 +51,7 @@ wait %2
 
 # Class weights make the networks name rare classes too often on real streets, and RV is too sure of itself.
 calibrated=$out/calibrated.safetensors
-python "$(dirname "$0")/calibrate.py" "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$calibrated"
+python "$(dirname "$0")/calibrate.py" "$out/run/weights.safetensors" "$out/run/class_counts.npz" "$calibrated" "${calibration[@]}"
 
 # The head learns on streets that the networks have not seen, under stronger changes of the sensor and from
 # disturbed scores: on streets like their own the networks are too sure, and the head would rely on them.
