@@ -49,9 +49,9 @@ DEVICES = [
 
 @pytest.fixture(scope="module")
 def simulated_scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
-    """Simulate a scan of an HDL-64E."""
+    """Simulate a scan of an HDL-64E with nothing large beside the sensor."""
     folder = tmp_path_factory.mktemp("streets")
-    simulate(folder, scans=1, seed=3)
+    simulate(folder, scans=1, seed=4)
     return read_scan(folder / "sequences/00/velodyne/000000.bin")
 
 
