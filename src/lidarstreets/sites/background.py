@@ -78,8 +78,7 @@ def close_ends(site: Site) -> None:
         for t in np.arange(-reach, reach, SEGMENT) + SEGMENT / 2:
             away = rng.uniform(1.5, 2.0)
             if is_wild:
-                bush = plants.bush(rng, rng.uniform(0.8, 1.8))
-                site.put(bush, x + outwards * away, t, np.pi / 2)
+                site.put(plants.bush(rng, rng.uniform(0.8, 1.8)), x + outwards * away, t, np.pi / 2)
                 continue
 
             for layer, offset in boundary.layers:
