@@ -12,7 +12,7 @@ import numpy as np
 import plyfile
 import pytest
 
-from amvnet.cli.commands import predict as verbs
+from amvnet.cli.options import FormatName
 from amvnet.data.formats.find import read_cloud
 from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
@@ -91,7 +91,7 @@ def check_coordinates(xyz: np.ndarray | None, expected: np.ndarray) -> None:
 
 def test_every_kind_has_a_reader_here_and_is_offered_by_the_command_line() -> None:
     assert set(READERS) == set(KINDS)
-    assert set(KINDS) == set(get_args(verbs.FormatName))
+    assert set(KINDS) == set(get_args(FormatName))
 
 
 @pytest.mark.parametrize("with_uncertain", [True, False])

@@ -8,18 +8,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from amvnet.cli.console import silence
+from amvnet.config.bounds import Share
 from amvnet.errors import InputError
+from amvnet.models.methods import Compute, MethodName
 from amvnet.progress import counted
 
 if TYPE_CHECKING:
     from amvnet.data.datasets.base import Dataset, ScanRecord
     from amvnet.data.datasets.select import TrainingScans
     from amvnet.inference.listing import ScanOptions
+    from amvnet.inference.request import LabellingRequest
     from amvnet.inference.scores import ScorePair
     from amvnet.runtime.distributed import Processes
     from amvnet.sensors.lidars import Sensor
+    from amvnet.weights.file import Weights
 
 Split = Literal["train", "val", "test", "all", "mini_train", "mini_val"]  # the last two: nuScenes
+
+FormatName = Literal["label", "npy", "ply"]  # of scan files' labels
 
 WEIGHTS = "sim-hdl64e"  # the built-in weights that are used by default
 SHOWN = 20  # names of sequences in a line
@@ -119,6 +125,52 @@ class SensorChoice:
         from amvnet.sensors.lidars import make_sensor
 
         return make_sensor(**asdict(self))
+
+
+@dataclass(frozen=True)
+class LabelChoice:
+    """How points are labelled, and which files are written for each scan."""
+
+    method: MethodName = "amvnet"
+    """the whole of AMVNet, or a part of it."""
+    tau: Share | None = None
+    """points whose probabilities by the two networks have a cosine similarity of at most this go to
+    the head, in [0, 1]; fewer points take less time; default: that of the weights."""
+    format: FormatName = "label"
+    """of scan files' labels: raw ids alone (label, npy), or coloured points (ply)."""
+    classes: str | None = None
+    """write the ids of these classes, to which those of the weights are mapped: coarse, or a YAML
+    file."""
+    scores: bool = False
+    """also write the probabilities of both networks."""
+    uncertain: bool = False
+    """also write which points the two networks disagree on, as NAME.uncertain.npy."""
+
+    def parse(
+        self, weights: Weights, choice: ScanChoice, known: SensorChoice, compute: Compute
+    ) -> LabellingRequest:
+        """Return the request for labels of some weights.
+
+        Raises:
+            InputError: if a value cannot be parsed, or does not fit the weights.
+        """
+        from amvnet.data.class_maps import class_map
+        from amvnet.inference.request import LabellingRequest
+
+        return LabellingRequest(
+            weights,
+            self.method,
+            self.tau,
+            precision=compute.precision,
+            engine=compute.engine,
+            sensor=known.parse(),
+            layout=choice.parse().layout,
+            topic=choice.topic,
+            classes=None if self.classes is None else class_map(self.classes),
+            kind=self.format,
+            scores=self.scores,
+            uncertain=self.uncertain,
+        )
 
 
 @dataclass(frozen=True)

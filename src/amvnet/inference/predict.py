@@ -6,19 +6,19 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import groupby
-from typing import Any
+from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import DatasetScan, InputScan, ScanOptions, list_inputs
-from amvnet.inference.pipeline import OutputOptions, Pipeline, Segment, check_faults
+from amvnet.inference.pipeline import Pipeline, Segment, check_faults
 from amvnet.inference.reading import normaliser_for
+from amvnet.inference.request import LabellingRequest
 from amvnet.inference.segmentation import Segmentation, Verdict
 from amvnet.inference.segmenter import Segmenter
-from amvnet.models.methods import METHODS, check_two_networks
+from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, Say, no_progress, say_nothing
 from amvnet.scan import Scan
-from amvnet.sensors.lidars import Sensor
 
 NAMED = 10  # doubtful recordings, each in a line
 # What to try if the labels are doubtful.
@@ -30,12 +30,15 @@ ADVICE = (
 
 def predict(
     inputs: Sequence[str],
+    request: LabellingRequest,
     segmenter: Segmenter,
-    output: OutputOptions,
-    options: ScanOptions = ScanOptions(),
+    folder: Path,
+    *,
+    sequences: Sequence[str] | None = None,
+    split: str = "all",
     batch: int = 1,
-    sensor: Sensor | None = None,
-    classes: ClassMap | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
     progress: Progress = no_progress,
     say: Say = say_nothing,
 ) -> int:
@@ -43,9 +46,13 @@ def predict(
 
     Args:
         inputs: each a dataset as `open_dataset` takes it, a scan file, a bag, or a folder of these.
+        request: how they are labelled, and what is written for each.
+        segmenter: computes the labels, with the weights, method and tau of the request.
+        folder: receives the files.
+        sequences, split: which scans of datasets, as `ScanOptions` takes them.
         batch: scans that go through the networks together.
-        sensor: what is known of the sensor of scan files; the rest is measured.
-        classes: maps the classes of the weights to those that are written; None writes these.
+        overwrite: replace files that exist.
+        resume: leave out the scans that an earlier run with an equal request has done.
         say: takes lines about what was assumed of the sensor, and at the end how sure the labels
             are, if there are two networks.
 
@@ -54,25 +61,29 @@ def predict(
 
     Raises:
         InputError: before anything is written, if an input is missing, its folder is that of the
-            output, a file of the user would be replaced, or the method has no uncertain points to
-            write; at the end, if every scan is broken.
+            output, or a file of the user would be replaced; at the end, if every scan is broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
-    if output.uncertain:
-        check_two_networks(segmenter.method)
-
-    normaliser = normaliser_for(segmenter.weights, sensor, say)
+    request = replace(request, precision=segmenter.precision)  # not "auto"
+    classes = request.classes
+    normaliser = normaliser_for(request.weights, request.sensor, say)
+    options = ScanOptions(sequences, split, request.topic, request.layout)
     scans, taxonomy = list_inputs(inputs, options, segmenter.taxonomy, normaliser)
-    settings = _settings(segmenter, output, normaliser.sensor, options, classes)
     if classes is not None:
         for scan in scans:
             if isinstance(scan, DatasetScan):
                 scan.written = classes.target
         taxonomy = classes.target
 
-    segment = segment_by(segmenter, classes)
-    pipeline = Pipeline(scans, segment, output, taxonomy, batch=batch, at_once=segmenter.at_once)
-    entries, faults = pipeline.run(settings, progress)
+    pipeline = Pipeline(
+        scans,
+        segment_by(segmenter, classes),
+        request.output(folder, overwrite=overwrite, resume=resume),
+        taxonomy,
+        batch=batch,
+        at_once=segmenter.at_once,
+    )
+    entries, faults = pipeline.run(request.settings, progress)
 
     if METHODS[segmenter.method].has_two_networks:
         report(entries, segmenter.usual_uncertain, say)
@@ -131,27 +142,3 @@ def report(entries: Sequence[Entry], usual: float | None, say: Say) -> None:
     others = len(doubtful) - NAMED
     more = f"as in {others} more; " if others > 0 else ""
     say(f"warning: {more}{ADVICE}")
-
-
-def _settings(
-    segmenter: Segmenter,
-    output: OutputOptions,
-    sensor: Sensor,
-    options: ScanOptions,
-    classes: ClassMap | None,
-) -> dict[str, Any]:
-    """Return what the written files depend on, as JSON types."""
-    return {
-        "weights": segmenter.weights.digests(),
-        "method": segmenter.method,
-        "precision": segmenter.precision,
-        "engine": "int8" if segmenter.engine == "int8" else None,  # no other one changes labels
-        "tau": segmenter.tau,
-        "sensor": repr(sensor),
-        "topic": options.topic,
-        "layout": repr(options.layout),
-        "classes": None if classes is None else repr(classes),
-        "scores": output.scores,
-        "uncertain": output.uncertain,
-        "format": output.kind,
-    }

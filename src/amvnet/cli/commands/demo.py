@@ -24,8 +24,8 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
     from amvnet.data.datasets.semantickitti import SemanticKitti
     from amvnet.data.datasets.simulated import simulate
     from amvnet.evaluation.scoring import evaluate, label_by_weights
-    from amvnet.inference.pipeline import OutputOptions
     from amvnet.inference.predict import predict
+    from amvnet.inference.request import LabellingRequest
     from amvnet.inference.segmenter import Segmenter
 
     segmenter = Segmenter(weights)
@@ -35,7 +35,8 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
 
     predictions = out / "predictions"
     with progress("segmenting") as step:
-        predict([str(data)], segmenter, OutputOptions(predictions, overwrite=True), progress=step)
+        request = LabellingRequest(segmenter.weights)
+        predict([str(data)], request, segmenter, predictions, overwrite=True, progress=step)
 
     dataset = SemanticKitti(data)
     records = dataset.records(dataset.sequences("all"))

@@ -1,0 +1,109 @@
+"""What a user asks for: how scans are labelled, and which files are written for each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from amvnet.config.bounds import Checked
+from amvnet.data.class_maps import ClassMap
+from amvnet.data.formats.rows import UNKNOWN, RowLayout
+from amvnet.data.labels.writers import check_kind
+from amvnet.data.taxonomy import Taxonomy
+from amvnet.inference.pipeline import OutputOptions
+from amvnet.models.assertion import Disagreement
+from amvnet.models.methods import (
+    EngineName,
+    MethodName,
+    Precision,
+    check_method,
+    check_two_networks,
+)
+from amvnet.sensors.lidars import Sensor
+from amvnet.weights.file import Weights
+
+UNKNOWN_SENSOR = Sensor()
+
+
+@dataclass(frozen=True)
+class LabellingRequest(Checked):
+    """All that the label files of a scan depend on, apart from the scan and its recording.
+
+    Attributes:
+        weights: trained weights.
+        method, tau, precision: as `Segmenter` takes them.
+        engine: what runs the networks.
+        sensor: what is known of the sensor of scan files; the rest is measured.
+        layout: what the columns of files without names hold.
+        topic: the topic of bags; None stands for the only one with scans.
+        classes: maps the classes of the weights to the classes that are written; without it, the
+            classes of the weights are written.
+        kind: the format of scan files' labels, one of `writers.KINDS`.
+        scores: whether to write the probabilities of both networks.
+        uncertain: whether to write which points are uncertain.
+
+    Raises:
+        InputError: if the weights lack a part that the method needs, the method has no uncertain
+            points to write, the format is unknown, `classes` names no class of the weights, or
+            `tau` is out of range.
+    """
+
+    weights: Weights
+    method: MethodName = "amvnet"
+    tau: float | None = None
+    precision: Precision = "auto"
+    engine: EngineName = "torch"
+    sensor: Sensor = UNKNOWN_SENSOR
+    layout: RowLayout = UNKNOWN
+    topic: str | None = None
+    classes: ClassMap | None = None
+    kind: str = "label"
+    scores: bool = False
+    uncertain: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_kind(self.kind)
+        check_method(self.method, self.weights.parts)
+        if self.tau is not None:
+            Disagreement(self.tau)
+        if self.uncertain:
+            check_two_networks(self.method)
+        if self.classes is not None:
+            self.classes.table(self.weights.taxonomy)
+
+    @property
+    def taxonomy(self) -> Taxonomy:
+        """The classes that are written."""
+        return self.weights.taxonomy if self.classes is None else self.classes.target
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """The request as JSON types: an earlier run is resumed only with equal settings."""
+        return {
+            "weights": self.weights.digests(),
+            "method": self.method,
+            "precision": self.precision,
+            "engine": "int8" if self.engine == "int8" else None,  # the others give equal labels
+            "tau": self.tau,
+            "sensor": repr(self.sensor),
+            "topic": self.topic,
+            "layout": repr(self.layout),
+            "classes": None if self.classes is None else repr(self.classes),
+            "scores": self.scores,
+            "uncertain": self.uncertain,
+            "format": self.kind,
+        }
+
+    def output(self, folder: Path, overwrite: bool = False, resume: bool = False) -> OutputOptions:
+        """Return what is written for each scan, and into which folder."""
+        return OutputOptions(
+            folder,
+            self.kind,
+            scores=self.scores,
+            uncertain=self.uncertain,
+            overwrite=overwrite,
+            resume=resume,
+        )

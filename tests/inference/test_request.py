@@ -1,0 +1,61 @@
+"""The request for labels: whatever changes a label file changes its settings."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.class_maps import class_map
+from amvnet.data.formats.rows import parse_layout
+from amvnet.inference.request import LabellingRequest
+from amvnet.sensors.lidars import Sensor
+
+from fixtures.worlds import fails, fresh_weights
+
+OTHERS: dict[str, Any] = {
+    "weights": fresh_weights(seed=1),
+    "method": "rv",
+    "tau": 0.5,
+    "precision": "bfloat16",
+    "engine": "int8",
+    "sensor": Sensor(height=2.0),
+    "layout": parse_layout("x,y,z,ring", "float64"),
+    "topic": "/points",
+    "classes": class_map("coarse"),
+    "kind": "ply",
+    "scores": True,
+    "uncertain": True,
+}
+
+
+def test_each_field_changes_the_settings() -> None:
+    request = LabellingRequest(fresh_weights())
+    assert set(OTHERS) == {field.name for field in fields(request)}
+    for name, value in OTHERS.items():
+        other = replace(request, **{name: value})
+        assert other.settings != request.settings, name
+        assert json.loads(json.dumps(other.settings)) == other.settings
+
+
+def test_equal_requests_have_equal_settings() -> None:
+    request = LabellingRequest(fresh_weights())
+    assert LabellingRequest(fresh_weights()).settings == request.settings
+    assert replace(request, engine="onnx").settings == request.settings
+
+
+def test_a_request_that_does_not_fit_is_refused_in_one_line() -> None:
+    request = LabellingRequest(fresh_weights())
+    without_head = {
+        name: tensor
+        for name, tensor in request.weights.tensors.items()
+        if not name.startswith("point_head")
+    }
+    incomplete = replace(request.weights, tensors=without_head)
+    fails(lambda: replace(request, kind="mcap"), "mcap")
+    fails(lambda: replace(request, tau=2.0), "tau")
+    fails(lambda: replace(request, tau=float(np.nan)), "tau")
+    fails(lambda: replace(request, method="rv", uncertain=True), "--uncertain")
+    fails(lambda: LabellingRequest(incomplete), "point_head")
