@@ -122,14 +122,14 @@ class Labeller:
     """Labels normalised scans; the same scan only once, as many changes are undone exactly."""
 
     def __init__(self, weights: str) -> None:
-        self.segmenter = Segmenter(weights).by_ring()
+        self.segmenter = Segmenter(weights)
         self._labels: dict[str, np.ndarray] = {}
 
     def __call__(self, scan: Scan) -> np.ndarray:
         """Return the (N,) train ids."""
         digest = hashlib.sha256(scan.points.tobytes())
-        if scan.ring is not None:
-            digest.update(scan.ring.tobytes())
+        if scan.row is not None:
+            digest.update(scan.row.tobytes())
         key = digest.hexdigest()
         if key not in self._labels:
             self._labels[key] = self.segmenter(scan).labels

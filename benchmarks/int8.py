@@ -50,9 +50,9 @@ class Runner(OnnxSegmenter):
     def label(self, scan: Scan) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Return the finite points' labels by method, and which of them are uncertain."""
         scan = match_scan(scan, self.intensity)
-        points = scan.points[scan.valid]
-        ring = None if scan.ring is None else scan.ring[scan.valid]
-        f = self.score_range_view(points, ring)
+        valid = scan.select(scan.valid)
+        points = valid.points
+        f = self.score_range_view(valid)
         g = self.score_polar_view(points)
         uncertain = disagree(self.assertion, f, g)
 

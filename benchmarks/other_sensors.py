@@ -60,7 +60,6 @@ def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
     """Print mIoU over the classes present and accuracy of AMVNet, as it is and normalised."""
     dataset = SemanticKitti(simulate(folder, sensor=name, sequences=3, scans=2, seed=SEED))
     normalise = normaliser_for(segmenter.weights)
-    segment_by_ring = segmenter.by_ring()
     as_it_is = Evaluation(dataset.taxonomy)
     normalised = Evaluation(dataset.taxonomy)
 
@@ -71,7 +70,7 @@ def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
         as_it_is.add(scan.points, scan.labels, {"amvnet": labels})
 
         cloud = Cloud(scan.points[:, :3], scan.points[:, 3], name=name)
-        labels = segment_by_ring(normalise(cloud, name)).labels
+        labels = segmenter(normalise(cloud, name)).labels
         normalised.add(scan.points, scan.labels, {"amvnet": labels})
 
     for title, evaluation in (("as it is", as_it_is), ("measured", normalised)):

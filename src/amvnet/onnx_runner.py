@@ -16,6 +16,7 @@ import numpy as np
 
 from amvnet.config.nested import from_dict
 from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConfig, RangeViewConfig
+from amvnet.data.laser_order import with_lasers
 from amvnet.errors import InputError, reason_of
 from amvnet.models.neighbours import nearest_others
 from amvnet.scan import Scan
@@ -85,11 +86,13 @@ class OnnxSegmenter:
             self._graphs[name] = _open_session(folder, description["graphs"][name], providers)
         self._check_sizes(folder, len(description["classes"]) - 1)
 
-    def __call__(self, points: np.ndarray, ring: np.ndarray | None = None) -> OnnxSegmentation:
+    def __call__(
+        self, points: np.ndarray | Scan, ring: np.ndarray | None = None
+    ) -> OnnxSegmentation:
         """Segment one scan.
 
         Args:
-            points: (N, 4) x, y, z in metres and intensity in [0, 1].
+            points: (N, 4) x, y, z in metres and intensity in [0, 1]; or a `Scan`.
             ring: (N,) index of the laser, 0 is the lowest. Needed if the rows of the exported
                 range view are rings.
 
@@ -97,8 +100,13 @@ class OnnxSegmenter:
             InputError: if no point is finite, the shapes do not fit, or rings are missing or out of
                 range.
         """
-        ring = None if ring is None else np.asarray(ring)
-        scan = Scan(np.asarray(points, dtype=np.float32), ring=ring)
+        if isinstance(points, Scan):
+            scan = points
+        else:
+            ring = None if ring is None else np.asarray(ring)
+            scan = Scan(np.asarray(points, dtype=np.float32), ring=ring)
+        if scan.row is None:
+            scan = with_lasers(scan, self.range_view.lasers)
         scan = match_scan(scan, self.intensity)
         valid = scan.valid
         if not valid.any():
@@ -106,8 +114,7 @@ class OnnxSegmenter:
                 "expected points to segment, found none that is finite; leave the scan out"
             )
 
-        valid_ring = None if scan.ring is None else scan.ring[valid]
-        scores, uncertain = self._scores(scan.points[valid], valid_ring)
+        scores, uncertain = self._scores(scan.select(valid))
         labels = scores.argmax(axis=1).astype(np.uint8) + 1
         return OnnxSegmentation(
             labels=_fill_in(labels, valid),
@@ -137,15 +144,16 @@ class OnnxSegmenter:
                     f"{folder}: expected {name} of size {expected}, found {size}; export again"
                 )
 
-    def _scores(self, points: np.ndarray, ring: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def _scores(self, scan: Scan) -> tuple[np.ndarray, np.ndarray]:
         """Return (P, K) probabilities of finite points, and (P,) bool: which are uncertain."""
+        points = scan.points
         nowhere = np.zeros(len(points), dtype=bool)
         if self.method == "rv":
-            return self.score_range_view(points, ring), nowhere
+            return self.score_range_view(scan), nowhere
         if self.method == "bev":
             return self.score_polar_view(points), nowhere
 
-        f = self.score_range_view(points, ring)
+        f = self.score_range_view(scan)
         g = self.score_polar_view(points)
         uncertain = disagree(self.assertion, f, g)
         merged = np.sqrt(f * g)
@@ -153,9 +161,9 @@ class OnnxSegmenter:
             merged[uncertain] = self._settle(points, f, g, uncertain)
         return merged, uncertain
 
-    def score_range_view(self, points: np.ndarray, ring: np.ndarray | None = None) -> np.ndarray:
-        """Return (P, K) class probabilities of finite points (P, 4) by the range view."""
-        image, pixel = range_image(self.range_view, points, ring)
+    def score_range_view(self, scan: Scan) -> np.ndarray:
+        """Return (P, K) class probabilities of finite points by the range view."""
+        image, pixel = range_image(self.range_view, scan)
         scores = self._run("range_net", image)[0]  # (K, H, W)
         return softmax(scores.reshape(len(scores), -1)[:, pixel].T)
 
@@ -213,28 +221,21 @@ def _read_intensity(folder: Path, description: Mapping[str, Any]) -> TrainedInte
     return TrainedIntensity(check_quantiles(quantiles, str(folder)), is_matched=True)
 
 
-def range_image(
-    view: RangeViewConfig, points: np.ndarray, ring: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Project finite points (P, 4) to a range image.
+def range_image(view: RangeViewConfig, scan: Scan) -> tuple[np.ndarray, np.ndarray]:
+    """Project P finite points to a range image.
 
     Returns:
         The image (1, 6, H, W) float32, and each point's pixel (P,), counted row by row.
 
     Raises:
-        InputError: if rows are lasers and `ring` is missing or out of range.
+        InputError: if rows are rings, and the scan has none or one is out of range.
     """
-    xyz = points[:, :3]
-    x, y, z = xyz.astype(np.float64).T
+    points = scan.points
+    x, y, _ = points[:, :3].astype(np.float64).T
     distance = distances(points)
     column = _cells(0.5 - np.arctan2(y, x) / (2 * math.pi), view.width)
 
-    if view.rows == "ring":
-        row = view.height - 1 - _check_rings(ring, view.height)
-    else:
-        elevation = np.degrees(np.arctan2(z, np.sqrt(x * x + y * y)))
-        row = _cells((view.fov_up - elevation) / (view.fov_up - view.fov_down), view.height)
-    pixel = row * view.width + column
+    pixel = image_rows(view, scan) * view.width + column
 
     # Written from the farthest to the nearest point, so that a pixel keeps the nearest one, and
     # the first of equally near ones.
@@ -243,6 +244,24 @@ def range_image(
     image = np.zeros((view.height * view.width, CHANNELS), dtype=np.float32)
     image[pixel[order]] = np.column_stack([points, distance, np.ones_like(distance)])[order]
     return np.ascontiguousarray(image.T).reshape(1, CHANNELS, view.height, view.width), pixel
+
+
+def image_rows(view: RangeViewConfig, scan: Scan) -> np.ndarray:
+    """Return the rows (P,) of P finite points in the range image, 0 the top.
+
+    Raises:
+        InputError: as `range_image`.
+    """
+    if scan.row is not None and (scan.row >= 0).all():
+        return scan.row
+    if view.rows == "ring":
+        return view.height - 1 - _check_rings(scan.ring, view.height)
+    if view.rows == "laser" and scan.ring is not None and view.has_laser_per_row(scan.ring.max()):
+        return view.height - 1 - scan.ring
+
+    x, y, z = scan.points[:, :3].astype(np.float64).T
+    elevation = np.degrees(np.arctan2(z, np.sqrt(x * x + y * y)))
+    return _cells((view.fov_up - elevation) / (view.fov_up - view.fov_down), view.height)
 
 
 def distances(points: np.ndarray) -> np.ndarray:

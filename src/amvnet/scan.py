@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,10 @@ class Scan:
             a value is not finite, or a coordinate is larger than any LiDAR sees: it keeps its place
             and gets id 0.
         labels: (N,) uint8 train ids (0 = ignored, 1..K), or None if there are no labels.
-        ring: (N,) int64 index of the laser (0 = lowest), or None if the format has none.
+        ring: (N,) int64 index of the laser (0 = lowest, -1 = unknown), or None if the format has
+            none.
+        row: (N,) int64 row of each point in the range image of some weights (0 = top, -1 =
+            unknown), or None. The range view finds rows that are unknown.
         name: the origin of the scan, for messages.
 
     Raises:
@@ -31,6 +34,7 @@ class Scan:
     labels: np.ndarray | None = None
     ring: np.ndarray | None = None
     name: str = ""
+    row: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 4:
@@ -41,6 +45,7 @@ class Scan:
 
         self._check_count("labels", self.labels)
         self._check_count("ring indices", self.ring)
+        self._check_count("rows", self.row)
 
     def _check_count(self, kind: str, values: np.ndarray | None) -> None:
         """Raise an InputError unless there is one value per point, or no values at all."""
@@ -63,7 +68,19 @@ class Scan:
             parts.append("labels")
         if self.ring is not None:
             parts.append("rings")
+        if self.row is not None:
+            parts.append("rows")
         return f"<{title}: {', '.join(parts)}>"
+
+    def select(self, which: np.ndarray) -> Scan:
+        """Return the scan of some of the points: (N,) bool, or (M,) indices."""
+        return replace(
+            self,
+            points=self.points[which],
+            labels=None if self.labels is None else self.labels[which],
+            ring=None if self.ring is None else self.ring[which],
+            row=None if self.row is None else self.row[which],
+        )
 
     @property
     def valid(self) -> np.ndarray:

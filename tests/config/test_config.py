@@ -122,7 +122,7 @@ def test_an_empty_tree_gives_the_defaults() -> None:
         ("model: {range_view: {height: true}}", "height"),
         ("model: {range_view: {fov_up: up}}", "fov_up"),
         ("model: {range_view: {fov_up: true}}", "fov_up"),
-        ("model: {range_view: {rows: colour}}", "rows.*elevation, ring.*colour"),
+        ("model: {range_view: {rows: colour}}", "rows.*elevation, laser, ring.*colour"),
         ("model: {range_view: {rows: [ring]}}", "rows"),
         ("training: {rv: {region_loss: focal}}", "region_loss.*dice, lovasz.*focal"),
         ("model: {range_net: {gru: 1}}", "gru"),

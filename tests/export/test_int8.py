@@ -20,6 +20,7 @@ from amvnet.data.taxonomy import NUSCENES
 from amvnet.export import int8 as int8_export
 from amvnet.export import onnx as onnx_export
 from amvnet.onnx_runner import OnnxSegmenter
+from amvnet.scan import Scan
 from amvnet.weights.file import Weights, save
 
 from fixtures.worlds import fails, files, fresh_weights, street, succeed, without
@@ -155,9 +156,9 @@ def test_the_description_says_which_graphs_are_in_int8(exported: Folders, scans:
     equal: dict[str, list[np.ndarray]] = {"range_net": [], "polar_map": []}
     for name in ("000000.bin", "000005.bin"):  # the first of every five scans checks
         points = read_points(scans / name)
-        f = before.score_range_view(points).argmax(axis=1)
+        f = before.score_range_view(Scan(points)).argmax(axis=1)
         g = before.score_polar_view(points).argmax(axis=1)
-        equal["range_net"].append(f == after.score_range_view(points).argmax(axis=1))
+        equal["range_net"].append(f == after.score_range_view(Scan(points)).argmax(axis=1))
         equal["polar_map"].append(g == after.score_polar_view(points).argmax(axis=1))
     for name, parts in equal.items():
         agreement = graphs[name]["agreement"]

@@ -127,7 +127,7 @@ def test_the_networks_alone_say_what_torch_says(exported: Exports, rows: str) ->
     assert expected.bev is not None
 
     runner = OnnxSegmenter(exported[rows].folder)
-    f = runner.score_range_view(scan.points[valid], scan.ring[valid])
+    f = runner.score_range_view(scan.select(valid))
     g = runner.score_polar_view(scan.points[valid])
     assert np.abs(f - expected.rv[valid]).max() <= 1e-4
     assert np.abs(g - expected.bev[valid]).max() <= 1e-4

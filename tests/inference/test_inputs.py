@@ -150,7 +150,7 @@ def test_recordings_of_a_run_are_judged_on_the_command_line(
         (tmp_path / name).mkdir()
         table.tofile(tmp_path / name / f"{name}.bin")
         scan = normaliser_for(weights)(Cloud(table[:, :3], table[:, 3], name=name), name)
-        result = Segmenter(weights).by_ring()(scan)
+        result = Segmenter(weights)(scan)
         shares[name] = f"{result.uncertain.mean():.1%}"
 
     path = save(weights, tmp_path / "w.safetensors")
@@ -224,8 +224,8 @@ def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> N
     np.save(tmp_path / "a.npy", points)
 
     scan = normaliser_for(weights)(Cloud(points[:, :3], points[:, 3], name="a"), "a")
-    expected = segmenter.by_ring()(scan).labels
-    assert np.mean(segmenter(replace(scan, ring=None)).labels != expected) > 0.02
+    expected = segmenter(scan).labels
+    assert np.mean(segmenter(replace(scan, row=None)).labels != expected) > 0.02
 
     path = save(weights, tmp_path / "w.safetensors")
     succeed(f"predict {tmp_path}/a.npy --weights {path} --out {tmp_path}")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ from amvnet import InputError, Scan, Segmentation, Segmenter, fuse
 from amvnet.data.taxonomy import NUSCENES
 from amvnet.evaluation.scoring import labels_by_method
 from amvnet.models.methods import METHODS, MethodName
-from amvnet.weights.file import save
+from amvnet.weights.file import Weights, save
 
 from fixtures.worlds import THRESHOLD, fails, fresh_weights, street, without
 
@@ -311,33 +311,40 @@ def test_rows_by_ring_need_a_ring() -> None:
     assert segmenter(Scan(POINTS, ring=ring)).labels.max() <= 16
 
 
-def test_normalised_scans_are_segmented_by_their_rings_and_others_by_elevation() -> None:
+def test_the_rows_of_a_scan_take_precedence_over_its_elevations_and_rings() -> None:
     """By elevation, the lasers of another sensor would be in other rows."""
+    for weights in (WEIGHTS, fresh_weights(NUSCENES)):
+        segmenter = Segmenter(weights)
+        height = weights.model.range_view.height
+        ring = np.random.default_rng(0).integers(0, height, len(POINTS))
+        others = np.random.default_rng(1).integers(0, height, len(POINTS))
+        by_ring = segmenter_by_ring(weights)(Scan(POINTS, ring=ring)).scores
+        assert by_ring is not None
+
+        by_row = segmenter(Scan(POINTS, ring=others, row=height - 1 - ring)).scores
+        assert np.array_equal(by_row, by_ring)
+        assert not np.array_equal(segmenter(Scan(POINTS, ring=others)).scores, by_ring)
+
+
+def segmenter_by_ring(weights: Weights) -> Segmenter:
+    """Return a segmenter whose rows are the rings of the scans."""
+    view = replace(weights.model.range_view, rows="ring")
+    return Segmenter(replace(weights, model=replace(weights.model, range_view=view)))
+
+
+def test_scans_with_rows_and_without_go_through_the_networks_together() -> None:
     segmenter = Segmenter(WEIGHTS)
-    for is_normalised, rows in ((True, "ring"), (False, "elevation")):
-        dataset = SimpleNamespace(is_normalised=is_normalised)
-        chosen = segmenter.for_dataset(dataset)  # type: ignore[arg-type]
-        assert chosen.model.range_view.config.rows == rows
-    assert segmenter.model.range_view.config.rows == "elevation"
+    height = WEIGHTS.model.range_view.height
+    row = np.random.default_rng(0).integers(0, height, len(POINTS))
+    scans = [Scan(POINTS), Scan(POINTS, row=row), Scan(POINTS, ring=row)]
+    for scan, result in zip(scans, segmenter.many(scans), strict=True):
+        np.testing.assert_allclose(result.scores, segmenter(scan).scores, atol=1e-5)
 
 
-@pytest.mark.parametrize("is_normalised", [True, False])
-def test_a_scan_of_a_file_is_segmented_by_its_rings_if_it_is_normalised(
-    is_normalised: bool,
-) -> None:
-    segmenter = Segmenter(WEIGHTS)
-    height = segmenter.model.range_view.config.height
-    scan = Scan(POINTS, ring=np.random.default_rng(0).integers(0, height, len(POINTS)))
-    loaded = SimpleNamespace(scan=scan, file_xyz=None)
-    source: Any = SimpleNamespace(
-        load=lambda labels: loaded, is_normalised=is_normalised, path=Path("a.bin")
-    )
-    actual = segmenter._segment_input(source, []).scores
-
-    by_ring = segmenter.by_ring()(scan).scores
-    by_elevation = segmenter(scan).scores
-    assert np.array_equal(actual, by_ring if is_normalised else by_elevation)
-    assert not np.array_equal(by_ring, by_elevation)
+def test_rows_of_other_weights_are_refused() -> None:
+    row = np.full(len(POINTS), WEIGHTS.model.range_view.height)
+    with pytest.raises(InputError, match="rows from 0 to"):
+        Segmenter(WEIGHTS)(Scan(POINTS, row=row))
 
 
 # ---- fusion of scores

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,9 +71,11 @@ def range_view_by_loop(scan: Scan, c: RangeViewConfig) -> tuple[list[int], list[
     for i, (x, y, z, intensity) in enumerate(scan.points.tolist()):
         degrees = math.degrees(math.atan2(z, math.sqrt(x * x + y * y)))
         row = cell_of((c.fov_up - degrees) / (c.fov_up - c.fov_down), c.height)
-        if c.rows == "ring":
+        if c.rows == "ring" or (c.rows == "laser" and scan.ring is not None):
             assert scan.ring is not None
             row = c.height - 1 - int(scan.ring[i])
+        if scan.row is not None and scan.row[i] >= 0:
+            row = int(scan.row[i])
         column = cell_of((math.pi - math.atan2(y, x)) / (2 * math.pi), c.width)
         pixel = row * c.width + column
         pixels.append(pixel)
@@ -232,10 +235,41 @@ def test_every_point_gets_the_scores_of_its_pixel(random_scan: RandomScan) -> No
         assert torch.equal(point_scores[i], scores[batch.scan[i], :, rows[i], columns[i]])
 
 
-@pytest.mark.parametrize("ring", [-1, 16, 1000])
+@pytest.mark.parametrize("ring", [16, 1000])
 def test_a_ring_out_of_range_is_an_input_error(ring: int) -> None:
     with pytest.raises(InputError, match=f"0 to 15, found {ring}"):
         project_to_image(scan_of((1, 0, 0), ring=ring), BY_RING)
+
+
+@pytest.mark.parametrize("rows", ["elevation", "laser", "ring"])
+def test_rows_and_lasers_are_taken_where_they_are_known(rows: Any, random_scan: RandomScan) -> None:
+    config = replace(BY_RING, rows=rows)
+    scan = random_scan(400)
+    assert scan.ring is not None
+    assert scan.ring.max() < config.height
+    assert_equals_the_loop(scan, config)
+
+    row = np.random.default_rng(0).integers(0, config.height, len(scan))
+    assert_equals_the_loop(replace(scan, row=row), config)
+    row[::3] = -1
+    assert_equals_the_loop(replace(scan, row=row), config)
+
+
+def test_rows_are_lasers_only_of_a_sensor_with_a_laser_for_each_row() -> None:
+    scan = scan_of(*[(10, y, y / 5) for y in range(-8, 8)])
+    view = RangeView(replace(BY_RING, rows="laser"))
+    by_elevation = view.rows(PointBatch.of([scan]))
+    for highest, counts in ((15, True), (12, True), (11, False), (7, False), (16, False)):
+        ring = np.arange(16) * highest // 15
+        rows = view.rows(PointBatch.of([replace(scan, ring=ring)]))
+        expected = torch.from_numpy(15 - ring) if counts else by_elevation
+        assert torch.equal(rows, expected)
+
+    # In a batch each scan counts for itself.
+    ring = np.arange(16)
+    rows = view.rows(PointBatch.of([scan, replace(scan, ring=ring), replace(scan, ring=ring // 2)]))
+    expected = torch.cat([by_elevation, torch.from_numpy(15 - ring), by_elevation])
+    assert torch.equal(rows, expected)
 
 
 def test_rows_by_ring_without_a_ring_is_an_input_error() -> None:
@@ -377,10 +411,17 @@ def test_slices_say_where_each_scan_stands(random_scan: RandomScan) -> None:
     assert batch.count == 4
 
 
-def test_a_batch_has_rings_only_if_all_scans_have(random_scan: RandomScan) -> None:
+def test_rings_and_rows_that_a_scan_of_a_batch_lacks_are_minus_one(random_scan: RandomScan) -> None:
     scan = random_scan(4)
-    assert PointBatch.of([scan, replace(scan, ring=None)]).ring is None
-    assert PointBatch.of([replace(scan, ring=None)]).ring is None
+    assert scan.ring is not None
+    without = replace(scan, ring=None)
+    batch = PointBatch.of([scan, without, replace(without, row=np.arange(4))])
+    assert batch.ring is not None
+    assert batch.row is not None
+    assert batch.ring.tolist() == [*scan.ring.tolist(), *[-1] * 8]
+    assert batch.row.tolist() == [*[-1] * 8, 0, 1, 2, 3]
+    assert PointBatch.of([without]).ring is None
+    assert PointBatch.of([scan]).row is None
 
 
 def test_the_range_view_without_the_cars_own_body_equals_a_loop(random_scan: RandomScan) -> None:

@@ -45,9 +45,9 @@ def normalise(xyz: np.ndarray, sensor: Sensor | None = None) -> tuple[Scan, str]
 
 def assert_alike(scan: Scan, expected: Scan, atol: float) -> None:
     np.testing.assert_allclose(scan.points, expected.points, atol=atol)
-    assert scan.ring is not None
-    assert expected.ring is not None
-    assert np.abs(scan.ring - expected.ring).max() <= 1
+    assert scan.row is not None
+    assert expected.row is not None
+    assert np.abs(scan.row - expected.row).max() <= 1
 
 
 @pytest.mark.parametrize("axes", UP)

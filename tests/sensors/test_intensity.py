@@ -147,7 +147,7 @@ def test_scans_of_several_sensors_in_a_source_are_measured_one_by_one() -> None:
         alone, _ = normalise([cloud])
         scan = normaliser(cloud, "a")
         np.testing.assert_array_equal(scan.points, alone[0].points)
-        np.testing.assert_array_equal(scan.ring, alone[0].ring)
+        np.testing.assert_array_equal(scan.row, alone[0].row)
         assert ground_height(scan.points) == pytest.approx(1.73, abs=0.05)
     (line,) = lines
     assert "a has scans of other sensors" in line

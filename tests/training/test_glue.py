@@ -17,13 +17,10 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.models.point_head import PointHead
-from amvnet.models.views.range_view import RangeView
 from amvnet.training import networks
 from amvnet.training.head import HeadStage
-from amvnet.training.head_points import PointGatherer
 from amvnet.training.losses import class_weights
 from amvnet.training.networks import NetworkStage
-from amvnet.training.plan import Plan
 from amvnet.weights.file import save
 
 from fixtures.worlds import fresh_weights, make_streets, run_cli, write_recipe
@@ -167,25 +164,3 @@ def test_every_scan_of_a_step_has_the_same_share_of_its_gradient(
             # Lightning divides by the number of parts, and the loss is a mean over the part.
             share_of_scan = stage.step_factor(size, index) / parts / size
             assert share_of_scan == pytest.approx(1 / sum(in_step))
-
-
-@pytest.mark.parametrize("is_normalised", [False, True])
-def test_every_part_of_a_training_takes_normalised_scans_by_their_rings(
-    monkeypatch: pytest.MonkeyPatch, is_normalised: bool
-) -> None:
-    views: list[RangeView] = []
-
-    def by_ring(view: RangeView) -> RangeView:
-        views.append(view)
-        return view
-
-    monkeypatch.setattr(RangeView, "by_ring", by_ring)
-    weights = fresh_weights()
-    dataset = SimpleNamespace(is_normalised=is_normalised)
-    plan: Any = SimpleNamespace(scans=SimpleNamespace(dataset=dataset), scores=None)
-    plan.build = lambda weights: Plan.build(plan, weights)
-    gatherer: Any = SimpleNamespace(plan=plan, weights=weights, _device="cpu")
-
-    Plan.build(plan, weights)  # of all stages
-    PointGatherer._scorer(gatherer)  # of the points of the head
-    assert len(views) == 2 * is_normalised

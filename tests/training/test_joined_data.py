@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.record import AS_IS
 from amvnet.sensors.record import KEY as SENSOR
+from amvnet.training.augment import mix
 from amvnet.training.loaders import sensor_record
 from amvnet.training.plan import open_parts, sized_by_init, without_mean
 from amvnet.weights.file import load, save
@@ -125,16 +127,25 @@ def test_streets_mixed_into_ones_own_scans_keep_their_rows(tmp_path: Path, own_f
     for record in mixed:
         batch = PointBatch.of([scans.dataset.read(record)])
         as_is = PointBatch.of([open_dataset(str(streets)).read(record.original)])
-        assert batch.ring is not None
-        assert torch.equal(view.by_ring().rows(batch), view.rows(as_is))
+        assert torch.equal(view.rows(batch), view.rows(as_is))
 
 
-def test_ones_own_scans_are_the_first_of_a_mixture(tmp_path: Path, own_file: Path) -> None:
-    """Only then do all of them have the rows that the weights expect."""
+def test_ones_own_scans_may_come_after_others(tmp_path: Path, own_file: Path) -> None:
+    """Scans with rows and scans without are mixed point by point."""
     scans = joined(tmp_path, 0)
     own = open_for_weights(str(own_file), fresh_weights())
-    with pytest.raises(InputError, match="name them first"):
-        join(scans, [TrainingScans(own, own.records(own.sequences("all")), [])])
+    mixed = join(scans, [TrainingScans(own, own.records(own.sequences("all")), [])])
+    a, b = (mixed.dataset.read(record) for record in (mixed.train[0], mixed.train[-1]))
+    assert a.row is None
+    assert b.row is not None
+
+    both = PointBatch.of([mix(a, b, np.random.default_rng(0))])
+    view = RangeView(fresh_weights().model.range_view)
+    assert both.row is not None
+    known = both.row >= 0
+    assert 0 < known.sum() < len(known)
+    assert torch.equal(view.rows(both)[known], both.row[known])
+    assert torch.equal(view.rows(both)[~known], view.rows(replace(both, row=None))[~known])
 
 
 def test_weights_of_two_datasets_of_ones_own_carry_what_their_scans_were_brought_to(

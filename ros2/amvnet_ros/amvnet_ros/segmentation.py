@@ -115,7 +115,7 @@ class CloudSegmenter:
         self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
         self._normalise = normaliser_for(segmenter.weights, sensor, say)
-        self._segment = segmenter.by_ring()
+        self._segment = segmenter
         self._colors = np.asarray(self.taxonomy.colors, np.uint8)
 
     def __call__(self, message: Any) -> LabelledCloud:

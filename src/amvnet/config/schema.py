@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from amvnet.config.bounds import Checked, Count, NotNegative, Obsolete, Positive, Range, Share
 
@@ -19,6 +19,7 @@ MOST_CHANNELS = 8192
 Channels = Annotated[int, Range(1, MOST_CHANNELS)]
 Cells = Annotated[int, Range(1, 16384)]  # along one side of a view
 MOST_CELLS = 2**22  # of a view; the paper's range image has 2**18
+LASERS_SEEN = 0.75  # least share of a sensor's lasers that have returns in every scan
 Degrees = Annotated[float, Range(-90, 90)]  # above the horizon
 Metres = Annotated[float, Range(-1000, 1000)]
 
@@ -35,8 +36,10 @@ def _check_cells(view: Checked, *sides: int) -> None:
 class RangeViewConfig(Checked):
     """The range image (section 3.1 of the paper; its sizes: 4.2)."""
 
-    rows: Literal["elevation", "ring"] = "elevation"
-    """What sets a point's row: its elevation in the field of view, or the index of its laser."""
+    rows: Literal["elevation", "laser", "ring"] = "elevation"
+    """What sets a point's row: its elevation in the field of view; its laser, if the lasers of the
+    scan are known and as many as the rows, else its elevation; or the index of its laser (ring),
+    which every scan must have."""
     height: Cells = 64
     """Rows of the range image: the lasers of the sensor."""
     width: Cells = 4096
@@ -57,6 +60,21 @@ class RangeViewConfig(Checked):
             found=f"{self.fov_up} and {self.fov_down}",
         )
         _check_cells(self, self.height, self.width)
+
+    @property
+    def lasers(self) -> int:
+        """Lasers to look for in a scan without rings: one a row; 0 if rows are no lasers."""
+        return self.height if self.rows == "laser" else 0
+
+    def has_laser_per_row(self, highest: Any) -> Any:
+        """Return whether a sensor has a laser for each row, by the highest ring index of a scan.
+
+        The highest lasers may look into the sky, without a return.
+
+        Args:
+            highest: an integer, or an array or tensor of integers.
+        """
+        return (highest >= LASERS_SEEN * self.height) & (highest < self.height)
 
 
 @dataclass(frozen=True)
@@ -106,6 +124,8 @@ class RangeNetConfig(Checked):
 
     stem: Channels = 32
     """Channels at full resolution."""
+    stem_blocks: Annotated[int, Range(0, 16)] = 0
+    """Residual blocks at full resolution."""
     widths: tuple[Channels, ...] = (96, 128, 224, 384, 384, 384, 384)
     """Channels at the width strides 2, 4, 8, ..., one entry per stride."""
     blocks: tuple[Annotated[int, Range(1, 16)], ...] = (2, 4, 4, 4, 2, 2, 2)
@@ -244,6 +264,8 @@ class AugmentConfig(Checked):
     """Probability of removing the intensity of a scan (open)."""
     drop: Annotated[float, Range(0, 0.99)] = 0.0
     """Largest share of the points that is dropped from a scan at random (open)."""
+    no_lasers: Share = 0.0
+    """Probability of forgetting the lasers of a scan, so that elevations set its rows (open)."""
     laser_drop: Share = 0.0
     """Probability of dropping every second laser of a scan, or up to half of them (open)."""
     block_drop: Share = 0.0

@@ -89,7 +89,6 @@ def analyze(
             "train these"
         )
 
-    segmenter = segmenter.for_dataset(dataset)
     size = dataset.taxonomy.size + 1
     total = Analysis(
         Evaluation(dataset.taxonomy),

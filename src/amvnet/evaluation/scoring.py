@@ -136,7 +136,6 @@ def label_by_weights(
     classes: ClassMap | None = None,
 ) -> Labeller:
     """Return a labeller that runs some weights by several methods."""
-    segmenter = segmenter.for_dataset(dataset)
 
     def label(record: ScanRecord, scan: Scan) -> MethodLabels:
         return labels_by_method(segmenter, check_scan(scan), methods)

@@ -129,12 +129,11 @@ def _labels(runner: OnnxSegmenter, name: str, scans: Sequence[Scan]) -> np.ndarr
     """
     labels = []
     for scan in scans:
-        points = scan.points[scan.valid]
+        valid = scan.select(scan.valid)
         if name == "range_net":
-            ring = None if scan.ring is None else scan.ring[scan.valid]
-            scores = runner.score_range_view(points, ring)
+            scores = runner.score_range_view(valid)
         else:
-            scores = runner.score_polar_view(points)
+            scores = runner.score_polar_view(valid.points)
         labels.append(scores.argmax(axis=1))
 
     return np.concatenate(labels)

@@ -69,8 +69,6 @@ class DatasetScan:
         source: the recording that it is from: a sequence, a bag or a folder.
         path: the file that the scan is read from.
         scores_path: of the `.npz` of its scores, relative to a folder of predictions.
-        is_normalised: whether `ring` is the row of each point in the range image, for
-            `Segmenter.by_ring`.
     """
 
     def __init__(self, dataset: Dataset, record: ScanRecord) -> None:
@@ -82,7 +80,6 @@ class DatasetScan:
         self.source = record.sequence
         self.path = record.points_path
         self.scores_path = Path(record.prediction).with_suffix(".npz")
-        self.is_normalised = dataset.is_normalised
 
     def labels_path(self, kind: str) -> Path:
         """Return the path of the file of its labels, relative to a folder of predictions."""
@@ -168,7 +165,6 @@ class FileScan:
         self.source = scan.source
         self.path = scan.path
         self.scores_path = Path(f"{scan.name}.npz")
-        self.is_normalised = reader.is_normalising
 
     def labels_path(self, kind: str) -> Path:
         """Return the path of its labels in a format, relative to a folder of predictions."""

@@ -175,7 +175,7 @@ class Pipeline:
         first_of: dict[str, list[Any]] = {}  # by recording
         for scan in self.scans:
             first = first_of.setdefault(scan.source, [])
-            if scan.is_normalised and len(first) < MEASURED:
+            if len(first) < MEASURED:
                 first.append((scan.name, *_size_and_time(scan.path)))
 
         origins = {}

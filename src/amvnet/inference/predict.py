@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby
 from pathlib import Path
 
 from amvnet.data.class_maps import ClassMap
@@ -92,21 +91,15 @@ def predict(
 
 
 def segment_by(segmenter: Segmenter, classes: ClassMap | None = None) -> Segment:
-    """Return a function that segments scans; the rows of normalised ones are their rings.
+    """Return a function that segments scans.
 
     Args:
         classes: maps the labels to other classes; None leaves them.
     """
-    by_ring = segmenter.by_ring()
     table = None if classes is None else classes.table(segmenter.taxonomy)
 
     def segment(inputs: Sequence[InputScan], scans: Sequence[Scan]) -> list[Segmentation]:
-        results: list[Segmentation] = []
-        pairs = zip(inputs, scans, strict=True)
-        for is_normalised, group in groupby(pairs, key=lambda pair: pair[0].is_normalised):
-            group_segmenter = by_ring if is_normalised else segmenter
-            results += group_segmenter.many([scan for _, scan in group])
-
+        results = segmenter.many(scans)
         if table is None:
             return results
         return [replace(result, labels=table[result.labels]) for result in results]

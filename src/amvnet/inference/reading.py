@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
-from collections.abc import Sequence
 
 import numpy as np
 
-from amvnet.config.schema import RangeViewConfig
-from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_with_classes
 from amvnet.data.datasets.own import OwnScans
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
@@ -18,7 +15,7 @@ from amvnet.progress import Say, say_nothing
 from amvnet.scan import Scan, check_scan
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
 from amvnet.sensors.lidars import Sensor, make_sensor
-from amvnet.sensors.normalise import Expectation, Normaliser, rows_of
+from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
 
@@ -138,36 +135,4 @@ def normalised_by(normaliser: Normaliser, dataset: OwnScans) -> OwnScans:
     for source, scans in dataset.recordings().items():
         for scan in scans:
             normaliser.expect(source, scan.read)
-    is_normalised = normaliser.expected is not None
-    return OwnScans(dataset.description, normaliser, is_normalised)
-
-
-class WithRows(Dataset):
-    """A dataset to mix with normalised scans: each point's ring is its row in the range image.
-
-    `Dataset` documents the methods and their errors.
-
-    Args:
-        dataset: whose scans are as the weights expect them.
-        view: of the weights.
-    """
-
-    is_normalised = True
-
-    def __init__(self, dataset: Dataset, view: RangeViewConfig) -> None:
-        super().__init__(dataset.root, dataset.taxonomy, dataset.spec)
-        self.dataset = dataset
-        self.view = view
-
-    def sequences(self, split: str) -> tuple[str, ...]:
-        return self.dataset.sequences(split)
-
-    def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
-        return self.dataset.records(sequences)
-
-    def at_epoch(self, record: ScanRecord, epoch: int) -> ScanRecord:
-        return self.dataset.at_epoch(record, epoch)
-
-    def read(self, record: ScanRecord, labels: bool = True) -> Scan:
-        scan = self.dataset.read(record, labels)
-        return dataclasses.replace(scan, ring=rows_of(scan, self.view))
+    return OwnScans(dataset.description, normaliser)

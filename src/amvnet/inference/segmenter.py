@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -12,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from amvnet.data.datasets.base import Dataset
+from amvnet.data.laser_order import with_lasers
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
@@ -211,29 +210,13 @@ class Segmenter:
     def _segment_input(self, scan: InputScan, assumed: list[str]) -> Segmentation:
         """Read and segment a scan of `_open`."""
         loaded = scan.load(labels=True)
-        segmenter = self.by_ring() if scan.is_normalised else self
-        result = segmenter(loaded.scan)
+        result = self(loaded.scan)
 
         assert result.origin is not None
         origin = replace(
             result.origin, path=scan.path, file_xyz=loaded.file_xyz, assumed="; ".join(assumed)
         )
         return replace(result, origin=origin)
-
-    def by_ring(self) -> Segmenter:
-        """Return a segmenter for scans whose `ring` is the row of each point, 0 the lowest.
-
-        It shares the networks with this one. The rows of its range view are rings even if those of
-        the weights' are elevations.
-        """
-        segmenter = copy.copy(self)
-        segmenter.model = copy.copy(self.model)
-        segmenter.model.range_view = self.model.range_view.by_ring()
-        return segmenter
-
-    def for_dataset(self, dataset: Dataset) -> Segmenter:
-        """Return the segmenter for a dataset: `by_ring` if its scans are normalised."""
-        return self.by_ring() if dataset.is_normalised else self
 
     @torch.inference_mode()
     def run(self, batch: PointBatch) -> Scores:
@@ -254,6 +237,7 @@ class Segmenter:
         """Return the valid points of some scans on the device, as the networks take them.
 
         The intensities of each scan are matched to those of the training, if the weights say so.
+        If the rows of the range image are lasers, they are looked for in scans without rings.
 
         Raises:
             InputError: if more than a few intensities are out of range.
@@ -262,6 +246,8 @@ class Segmenter:
         for scan in scans:
             if self._are_fractions:
                 scan = check_intensity(scan)
+            if scan.row is None:
+                scan = with_lasers(scan, self.weights.model.range_view.lasers)
             matched.append(match_scan(scan, self.intensity))
         return PointBatch.of(matched, self.device)
 

@@ -23,6 +23,7 @@ class RangeNet(nn.Module):
         c = config
         self.input_norm = nn.BatchNorm2d(CHANNELS)
         self.stem = ConvBlock(CHANNELS, c.stem)
+        self.stem_blocks = nn.Sequential(*_blocks(c.stem, c.stem_blocks))
         self.stages = nn.ModuleList(_stages(c))
 
         self.recurrent = nn.ModuleList()
@@ -40,8 +41,9 @@ class RangeNet(nn.Module):
         # bfloat16 resolves a coordinate of 20 m to 0.1 m only: too coarse to tell a hedge from a
         # wall.
         with torch.autocast(image.device.type, enabled=False):
-            full = self.stem(self.input_norm(image))  # (B, stem, H, W)
+            full = self.stem(self.input_norm(image))
 
+        full = self.stem_blocks(full)  # (B, stem, H, W)
         maps = self.encode(full)
         decoded = self.decode(maps[FIRST_DECODED:])  # (B, decoder, H, W / 4)
         x = joined(self.last, decoded, full)
@@ -77,8 +79,12 @@ def _stages(c: RangeNetConfig) -> list[nn.Module]:
     stages: list[nn.Module] = []
     channels = c.stem
     for width, blocks, stride in zip(c.widths, c.blocks, c.height_strides, strict=True):
-        rest = [ResidualBlock(width, width) for _ in range(blocks - 1)]
-        stages.append(nn.Sequential(ResidualBlock(channels, width, (stride, 2)), *rest))
+        first = ResidualBlock(channels, width, (stride, 2))
+        stages.append(nn.Sequential(first, *_blocks(width, blocks - 1)))
         channels = width
 
     return stages
+
+
+def _blocks(channels: int, count: int) -> list[ResidualBlock]:
+    return [ResidualBlock(channels, channels) for _ in range(count)]

@@ -91,7 +91,6 @@ def rank(
             has no labels.
     """
     check_classes(dataset, segmenter.taxonomy)
-    segmenter = segmenter.for_dataset(dataset)
     if not {"range_net", "polar_net"} <= set(segmenter.weights.parts):
         raise InputError("expected weights with both networks, found only one; train the other")
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from amvnet.config.schema import RangeViewConfig
 from amvnet.data.formats.cloud import Cloud, usual_scale
+from amvnet.data.laser_order import lasers_by_order
 from amvnet.errors import InputError
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
@@ -58,9 +59,9 @@ class Expectation:
 def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> Scan:
     """Return a scan as some weights expect it; its points keep their order and number.
 
-    The scan is turned level and moved to the height of the training's sensor. `ring` becomes the
-    row of each point in the range image, 0 the lowest, for `Segmenter.by_ring`. It follows from the
-    elevation before the move, as the sensor saw the point.
+    The scan is turned level and moved to the height of the training's sensor. Its `row` is by laser
+    if the weights' rows are lasers and the scan's lasers are known, else by the elevation before
+    the move, as the sensor saw the point.
 
     Args:
         sensor: what is known of it, which takes precedence over the estimate.
@@ -79,7 +80,10 @@ def normalise(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expect
     valid = scan.valid
     lasers = estimate.lasers.override(sensor)
     view = _row_view(seen.points[valid], lasers, expected)
-    return dataclasses.replace(moved, ring=_rows(seen, valid, view, expected))
+    row = _rows_by_laser(cloud, lasers, expected)
+    if row is None:
+        row = _rows(seen, valid, view, expected)
+    return dataclasses.replace(moved, row=row)
 
 
 def describe(cloud: Cloud, estimate: Estimate, sensor: Sensor, expected: Expectation) -> str:
@@ -289,32 +293,44 @@ def _by_elevation(view: RangeViewConfig, ends: tuple[float, float], steps: int) 
 def _rows(
     scan: Scan, valid: np.ndarray, view: RangeViewConfig | None, expected: Expectation
 ) -> np.ndarray | None:
-    """Return each point's (N,) row in the range image, 0 the lowest; 0 for lost points.
+    """Return each point's (N,) row by elevation, 0 the top; -1 for lost points.
 
-    Return None if the weights need rings, and neither the scan nor its elevations give them.
+    Return None if the weights need rings, and either the scan's rings are what they need, or
+    neither the scan nor its elevations give rows.
     """
     ring = scan.ring if expected.view.rows == "ring" else None
     # Lasers that no data sheet describes need not be evenly spaced.
     is_trusted = ring is not None and expected.sensor.name not in SENSORS
     if view is None or is_trusted:
-        return ring
+        return None
 
-    rows = rows_of(scan, view)
-    if ring is not None and np.median(np.abs(ring - rows)[valid]) < 1:  # most rings are the rows
-        return ring
+    rows = np.full(len(scan), -1)
+    rows[valid] = RangeView(view).rows(PointBatch.of([scan])).numpy()
+    if ring is not None:
+        by_ring = view.height - 1 - ring
+        if np.median(np.abs(by_ring - rows)[valid]) < 1:  # most rings are the rows
+            return None
     return rows
 
 
-def rows_of(scan: Scan, config: RangeViewConfig) -> np.ndarray:
-    """Return each point's (N,) row in a range image, 0 the lowest; 0 for lost points.
+def _rows_by_laser(
+    cloud: Cloud, lasers: SensorGeometry, expected: Expectation
+) -> np.ndarray | None:
+    """Return each point's (N,) row by its laser, 0 the top.
 
-    Raises:
-        InputError: if the rows are lasers, and the scan has no such rings.
+    Return None if the weights' rows are no lasers, the scan's lasers are unknown, or they are not
+    like the lasers of the training.
     """
-    rows = np.zeros(len(scan), dtype=np.int64)
-    top_down = RangeView(config).rows(PointBatch.of([scan])).numpy()
-    rows[scan.valid] = config.height - 1 - top_down
-    return rows
+    view = expected.view
+    if not view.lasers or not lasers.has_ends_of(expected.lasers):
+        return None
+
+    ring = cloud.ring
+    if ring is None:
+        ring = lasers_by_order(cloud.xyz, view.lasers)
+    if ring is None or not view.has_laser_per_row(ring.max()):
+        return None
+    return view.height - 1 - ring
 
 
 def _describe_frame(frame: Frame, sensor: Sensor) -> list[str]:

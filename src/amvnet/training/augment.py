@@ -36,6 +36,8 @@ def augment(scan: Scan, config: AugmentConfig, rng: np.random.Generator) -> Scan
     Intensities are scaled, distorted, shifted, or all set to zero.
     """
     # The order of the random draws decides which scan a seed gives: keep it.
+    if config.no_lasers and rng.random() < config.no_lasers:
+        scan = dataclasses.replace(scan, ring=None)
     if config.laser_drop and rng.random() < config.laser_drop:
         scan = _drop_lasers(scan, rng)
     if config.block_drop and rng.random() < config.block_drop:
@@ -73,8 +75,8 @@ def mix(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
     start = rng.uniform(-np.pi, np.pi)
     width = rng.uniform(0.5, 1.5) * np.pi
 
-    outside = _select(scan, ~_in_sector(scan, start, width))
-    inside = _select(other, _in_sector(other, start, width))
+    outside = scan.select(~_in_sector(scan, start, width))
+    inside = other.select(_in_sector(other, start, width))
     mixed = _join(outside, inside)
     return mixed if len(mixed) else scan
 
@@ -95,7 +97,7 @@ def mix_lasers(scan: Scan, other: Scan, rng: np.random.Generator) -> Scan:
 
     rows = np.searchsorted(borders, elevation, side="right")
     other_rows = np.searchsorted(borders, other_elevation, side="right")
-    mixed = _join(_select(scan, rows % 2 == first), _select(other, other_rows % 2 != first))
+    mixed = _join(scan.select(rows % 2 == first), other.select(other_rows % 2 != first))
     return mixed if len(mixed) else scan
 
 
@@ -106,7 +108,7 @@ def paste(scan: Scan, other: Scan, classes: Sequence[int], rng: np.random.Genera
     stays in the scan.
     """
     assert other.labels is not None
-    objects = _select(other, np.isin(other.labels, classes) & other.valid)
+    objects = other.select(np.isin(other.labels, classes) & other.valid)
     copies = [objects]
     for yaw in rng.uniform(-np.pi, np.pi, rng.integers(TURNS[0], TURNS[1] + 1)):
         points = objects.points.copy()
@@ -172,11 +174,13 @@ def tilt_rotation(roll: float, pitch: float) -> np.ndarray:
 def lasers(scan: Scan) -> np.ndarray:
     """Return the (N,) index of each point's laser, 0 or above.
 
-    Without ring indices, it is one of `ELEVATION_BINS` equal bins of elevation, which come near to
-    the lasers of an HDL-64E.
+    If the lasers are unknown, it is the row of the range image, or else one of `ELEVATION_BINS`
+    equal bins of elevation, which come near to the lasers of an HDL-64E.
     """
     if scan.ring is not None:
         return scan.ring
+    if scan.row is not None:
+        return scan.row
 
     elevation = np.nan_to_num(_elevations(scan))
     lowest, highest = _spread(elevation)
@@ -264,13 +268,7 @@ def _spread(values: np.ndarray) -> np.ndarray:
 
 def _keep(scan: Scan, mask: np.ndarray) -> Scan:
     """Return a part of a scan, or the scan itself if no point would be left."""
-    return _select(scan, mask) if mask.any() else scan
-
-
-def _select(scan: Scan, mask: np.ndarray) -> Scan:
-    labels = None if scan.labels is None else scan.labels[mask]
-    ring = None if scan.ring is None else scan.ring[mask]
-    return dataclasses.replace(scan, points=scan.points[mask], labels=labels, ring=ring)
+    return scan.select(mask) if mask.any() else scan
 
 
 def _join(scan: Scan, other: Scan) -> Scan:
@@ -278,12 +276,26 @@ def _join(scan: Scan, other: Scan) -> Scan:
     return dataclasses.replace(
         scan,
         points=np.concatenate([scan.points, other.points]),
-        labels=_concatenate(scan.labels, other.labels),
-        ring=_concatenate(scan.ring, other.ring),
+        labels=_join_labels(scan, other),
+        ring=_join_indices(scan.ring, other.ring, scan, other),
+        row=_join_indices(scan.row, other.row, scan, other),
     )
 
 
-def _concatenate(first: np.ndarray | None, second: np.ndarray | None) -> np.ndarray | None:
-    if first is None or second is None:
+def _join_labels(scan: Scan, other: Scan) -> np.ndarray | None:
+    if scan.labels is None or other.labels is None:
         return None
+    return np.concatenate([scan.labels, other.labels])
+
+
+def _join_indices(
+    first: np.ndarray | None, second: np.ndarray | None, scan: Scan, other: Scan
+) -> np.ndarray | None:
+    """Return the rings or rows of both scans, -1 for the points of a scan that has none."""
+    if first is None and second is None:
+        return None
+    if first is None:
+        first = np.full(len(scan), -1)
+    if second is None:
+        second = np.full(len(other), -1)
     return np.concatenate([first, second])

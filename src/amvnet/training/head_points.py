@@ -173,7 +173,14 @@ class PointGatherer:
             views = 0
         augment = training.augment if views > 0 else None
         dataset = self.plan.scans.dataset
-        scans = ScanSet(dataset, records, augment, training.seed, self.intensity)
+        scans = ScanSet(
+            dataset,
+            records,
+            augment,
+            training.seed,
+            intensity=self.intensity,
+            lasers=self.weights.model.range_view.lasers,
+        )
         keys = list(product(range(max(views, 1)), range(len(scans))))
         least = max(2, self.plan.processes.size)  # batch norm needs two, and each process one
 

@@ -17,6 +17,7 @@ from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.joined import Joined
 from amvnet.data.datasets.own import OwnScans
+from amvnet.data.laser_order import with_lasers
 from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
@@ -70,6 +71,7 @@ class ScanSet(data.Dataset[Scan]):
     Args:
         augment: how they are augmented, or None for scans as they are.
         intensity: what the intensities of each scan are brought to, before its augmentation.
+        lasers: number of lasers to look for in scans without rings (`with_lasers`); 0: none.
     """
 
     def __init__(
@@ -79,12 +81,14 @@ class ScanSet(data.Dataset[Scan]):
         augment: AugmentConfig | None = None,
         seed: int = 0,
         intensity: TrainedIntensity | None = None,
+        lasers: int = 0,
     ) -> None:
         self.dataset = dataset
         self.records = list(records)
         self.augment = augment
         self.seed = seed
         self.intensity = intensity
+        self.lasers = lasers
 
         classes = enumerate(dataset.taxonomy.classes, start=1)
         self.pasted = [train_id for train_id, name in classes if name in PASTED]
@@ -134,7 +138,9 @@ class ScanSet(data.Dataset[Scan]):
                 f"{scan.name}: expected at least two valid points to train with, found {valid}; "
                 "leave the scan out"
             )
-        # Not after the augmentation: it would undo the changes of the intensity.
+        # Not after the augmentation, which changes the order of the points and the intensity.
+        if self.lasers:
+            scan = with_lasers(scan, self.lasers)
         return match_scan(scan, self.intensity)
 
 
@@ -274,10 +280,8 @@ def sensor_record(
 
     # Normalised scans are as the weights will get them: record what they are normalised to.
     first = dataset.dataset if isinstance(dataset, Joined) else dataset
-    if isinstance(first, OwnScans) and first.is_normalised:
-        record |= normalised_record(first)
-    else:
-        record[SENSOR] = {**measure_sensor(scans), AS_IS: True}
+    normalised = normalised_record(first) if isinstance(first, OwnScans) else {}
+    record |= normalised or {SENSOR: {**measure_sensor(scans), AS_IS: True}}
     if intensity is not None and intensity.is_matched:
         record |= {INTENSITY: list(intensity.quantiles), MATCHED: True}
     return record

@@ -233,11 +233,12 @@ def make_loaders(
 
     # Scans that one process takes at a time.
     batch = config.batch // config.accumulate // plan.processes.size
-    train_set = ScanSet(scans.dataset, scans.train, training.augment, training.seed, intensity)
+    how: dict[str, Any] = {"intensity": intensity, "lasers": plan.recipe.model.range_view.lasers}
+    train_set = ScanSet(scans.dataset, scans.train, training.augment, training.seed, **how)
     train = make_loader(train_set, batch, shuffle=True, **shared)
     if not scans.val:
         return train, None
-    val_set = ScanSet(scans.dataset, scans.val, intensity=intensity)
+    val_set = ScanSet(scans.dataset, scans.val, **how)
     return train, make_loader(val_set, 1, shuffle=False, **shared)
 
 

@@ -13,7 +13,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans, training_records
 from amvnet.data.taxonomy import TAXONOMIES, Taxonomy
 from amvnet.errors import InputError
-from amvnet.inference.reading import WithRows, normalised_for
+from amvnet.inference.reading import normalised_for
 from amvnet.inference.scores import ScorePair
 from amvnet.models.amvnet import AMVNet
 from amvnet.progress import Say, say_nothing
@@ -79,19 +79,14 @@ class Plan:
     def build(self, weights: Weights) -> AMVNet:
         """Return the model of some weights; parts that they lack are initialised at random.
 
-        The rows of its range view are rings if the scans are normalised.
-
         Raises:
             InputError: if the parameters do not fit the sizes, which are those of the recipe for a
                 part to train.
         """
         try:
-            model = weights.build(with_head=True)
+            return weights.build(with_head=True)
         except InputError as error:
             raise InputError(f"{error}, or use the recipe of the weights") from None
-        if self.scans.dataset.is_normalised:
-            model.range_view = model.range_view.by_ring()
-        return model
 
 
 def sized_by_init(recipe: Recipe, init: Weights | None) -> Recipe:
@@ -156,8 +151,6 @@ def open_parts(
     first, *others = [open_for_training(spec, recipe, out, init) for spec in specs]
     parts = []
     for dataset in others:
-        if first.is_normalised and not dataset.is_normalised:
-            dataset = WithRows(dataset, recipe.model.range_view)
         parts.append(TrainingScans(dataset, training_records(dataset), val=[]))
     return first, parts
 

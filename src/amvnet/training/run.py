@@ -23,6 +23,7 @@ from amvnet.training.run_folder import (
     write_record,
 )
 from amvnet.weights.file import Weights, save
+from amvnet.weights.growth import deepened
 
 
 def train(
@@ -95,12 +96,24 @@ def _first_weights(plan: Plan, init: Weights | None, trained: Sequence[str]) -> 
         if name == "head" and name in trained and not init.fits(part, plan.recipe.model):
             plan.say("head: new, as that of the initial weights has other sizes")
             continue
+        begin = _deepened(plan, init, part) if name in trained else init
         if init.taxonomy.classes == weights.taxonomy.classes:
-            weights = weights.replace_part(part, init)
+            weights = weights.replace_part(part, begin)
         elif name in trained:
-            weights = weights.replace_part(part, _for_classes(plan, init, part))
+            weights = weights.replace_part(part, _for_classes(plan, begin, part))
 
     return _with_finished(plan, weights)
+
+
+def _deepened(plan: Plan, init: Weights, part: str) -> Weights:
+    """Return initial weights with as many residual blocks in a part as the recipe says."""
+    if part == "point_head" or init.fits(part, plan.recipe.model):
+        return init
+    deeper = deepened(init, part, plan.recipe.model, plan.recipe.training.seed)
+    if deeper is None:
+        return init
+    plan.say(f"{part}: the initial weights with new residual blocks, which begin as skips")
+    return deeper
 
 
 def _with_finished(plan: Plan, weights: Weights) -> Weights:

@@ -89,8 +89,7 @@ def show_scans(
     def show(scan_input: InputScan, loaded: LoadedScan) -> ShownScan:
         scan = check_scan(loaded.scan)
         if segmenter is not None:
-            fitting = segmenter.by_ring() if scan_input.is_normalised else segmenter
-            result = fitting(scan)
+            result = segmenter(scan)
             assert result.origin is not None
             return replace(shown_scan(result, result.origin), name=scan_input.title)
 

@@ -42,11 +42,7 @@ class Dataset(ABC):
         root: the folder that was opened.
         taxonomy: the classes of the labels.
         spec: the text by which `open_dataset` opens the same dataset; by default the folder.
-        is_normalised: whether `ring` of each scan is the row of each point in the range image, 0
-            the lowest.
     """
-
-    is_normalised = False
 
     def __init__(self, root: Path | str, taxonomy: Taxonomy, spec: str | None = None) -> None:
         self.root = Path(root)

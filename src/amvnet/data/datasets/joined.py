@@ -54,7 +54,6 @@ class Joined(Dataset):
     def __init__(self, scans: TrainingScans, others: Sequence[TrainingScans], share: float) -> None:
         self.dataset = scans.dataset
         super().__init__(self.dataset.root, self.dataset.taxonomy, self.dataset.spec)
-        self.is_normalised = self.dataset.is_normalised
         self.others = others
         self.share = share / len(others)  # of each of the others
         self.places = _places(len(scans.train), others, share)  # of each of the others, in an epoch
@@ -122,18 +121,12 @@ def join(
             their scans once per epoch.
 
     Raises:
-        InputError: if a dataset has other classes, scans of a user's own are mixed into others, or
-            the share leaves nothing for the first.
+        InputError: if a dataset has other classes, or the share leaves nothing for the first.
     """
     if not others:
         return scans
     for other in others:
         check_classes(other.dataset, scans.dataset.taxonomy)
-        if other.dataset.is_normalised != scans.dataset.is_normalised:
-            raise InputError(
-                f"{other.dataset.spec}: expected datasets in every --data, found scans of your "
-                "own (a YAML file) after one; name them first"
-            )
 
     joined = Joined(scans, others, share)
     return TrainingScans(joined, [*scans.train, *joined.mixed_records()], scans.val)

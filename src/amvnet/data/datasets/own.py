@@ -84,19 +84,16 @@ class OwnScans(Dataset):
     Args:
         description: what the YAML file says.
         normalise: makes scans of the points in the files; None takes them as they are.
-        is_normalised: whether it makes them fit weights, so that `ring` is the row of each point.
     """
 
     def __init__(
         self,
         description: Description,
         normalise: Normalise | None = None,
-        is_normalised: bool = False,
     ) -> None:
         super().__init__(description.root, description.taxonomy, str(description.path))
         self.description = description
         self.normalise = normalise
-        self.is_normalised = is_normalised
         self._counts: dict[str, int] = {}  # points of the scans that have been read, by name
 
     def sequences(self, split: str) -> tuple[str, ...]:
@@ -177,7 +174,7 @@ class OwnScans(Dataset):
     def with_classes(self, taxonomy: Taxonomy) -> OwnScans:
         """Return the scans for predictions of other classes, without their labels."""
         description = dataclasses.replace(self.description, taxonomy=taxonomy, labels=None)
-        return OwnScans(description, self.normalise, self.is_normalised)
+        return OwnScans(description, self.normalise)
 
     @cached_property
     def _scans(self) -> dict[str, NamedScan]:

@@ -138,7 +138,7 @@ class SimulatedStreets(Dataset):
             return Scan(
                 np.load(folder / "points.npy"),
                 labels=np.load(folder / "labels.npy") if labels else None,
-                ring=np.load(folder / "ring.npy").astype(np.int64) if self._is_nuscenes else None,
+                ring=np.load(folder / "ring.npy").astype(np.int64),
                 name=record.name,
             )
         except (ValueError, EOFError):
@@ -172,7 +172,7 @@ class SimulatedStreets(Dataset):
                     yield Scan(_as_nuscenes(scan.points), labels, scan.ring)
                 else:
                     labels = SEMANTICKITTI.to_train(scan.semantickitti_ids())
-                    yield Scan(scan.points, labels)
+                    yield Scan(scan.points, labels, scan.ring)
 
 
 def _name(number: int) -> str:

@@ -46,7 +46,10 @@ class PointBatch:
         points: (P, 4) float32: x, y, z in metres, intensity in [0, 1]; all finite.
         scan: (P,) int64: the scan that each point belongs to, 0..B - 1; ascending.
         count: B.
-        ring: (P,) int64: index of the laser; None if a scan has none.
+        ring: (P,) int64: index of the laser, 0 the lowest; -1 if it is unknown; None if no scan
+            has rings.
+        row: (P,) int64: row of the range image, 0 the top; -1 if it is unknown; None if no scan
+            has rows.
         names: the names of the scans.
         sizes: the number of points of each scan; empty if unknown, so that the CPU has to wait for
             a GPU to count them.
@@ -56,6 +59,7 @@ class PointBatch:
     scan: Tensor
     count: int
     ring: Tensor | None = None
+    row: Tensor | None = None
     names: tuple[str, ...] = ()
     sizes: tuple[int, ...] = ()
 
@@ -78,7 +82,9 @@ class PointBatch:
     def _map(self, function: Callable[[Tensor], Tensor]) -> PointBatch:
         """Return the batch with a function applied to each of its tensors."""
         ring = None if self.ring is None else function(self.ring)
-        return replace(self, points=function(self.points), scan=function(self.scan), ring=ring)
+        row = None if self.row is None else function(self.row)
+        points = function(self.points)
+        return replace(self, points=points, scan=function(self.scan), ring=ring, row=row)
 
     @cached_property
     def cylindrical(self) -> Tensor:
@@ -102,8 +108,8 @@ class PointBatch:
     def of(cls, scans: Sequence[Scan], device: torch.device | str = "cpu") -> PointBatch:
         """Return a batch of the valid points (`Scan.valid`) of one or more scans, in order.
 
-        The batch has ring indices only if every scan has them. On their way to a GPU, points are
-        copied once, into pinned memory, which torch reuses for the next batch.
+        On their way to a GPU, points are copied once, into pinned memory, which torch reuses for
+        the next batch.
         """
         valid = [scan.valid for scan in scans]
         sizes = tuple(int(np.count_nonzero(mask)) for mask in valid)
@@ -112,14 +118,18 @@ class PointBatch:
         points = torch.empty(count, 4, pin_memory=is_pinned)
         scan_index = torch.empty(count, dtype=torch.int64, device=device)
         ring = None
-        if all(scan.ring is not None for scan in scans):
-            ring = torch.empty(count, dtype=torch.int64, pin_memory=is_pinned)
+        if any(scan.ring is not None for scan in scans):
+            ring = torch.full((count,), -1, pin_memory=is_pinned)
+        row = None
+        if any(scan.row is not None for scan in scans):
+            row = torch.full((count,), -1, pin_memory=is_pinned)
 
         batch = cls(
             points=points,
             scan=scan_index,
             count=len(scans),
             ring=ring,
+            row=row,
             names=tuple(scan.name for scan in scans),
             sizes=sizes,
         )
@@ -129,4 +139,6 @@ class PointBatch:
             scan_index[part].fill_(index)
             if ring is not None and scan.ring is not None:
                 ring.numpy()[part] = scan.ring[which]
+            if row is not None and scan.row is not None:
+                row.numpy()[part] = scan.row[which]
         return batch.to(device)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -47,10 +47,6 @@ class RangeView:
     def __init__(self, config: RangeViewConfig) -> None:
         self.config = config
 
-    def by_ring(self) -> RangeView:
-        """Return the same view with the rings of the scans as rows, 0 the lowest."""
-        return RangeView(replace(self.config, rows="ring"))
-
     def project(self, batch: PointBatch) -> RangeImage:
         """Return the range images of a batch of scans.
 
@@ -60,8 +56,7 @@ class RangeView:
         (`RangeViewConfig.nearest`).
 
         Raises:
-            InputError: if rows are lasers, and the scans have no ring indices or one is out of
-                range.
+            InputError: as `rows`.
         """
         c = self.config
 
@@ -84,30 +79,79 @@ class RangeView:
         return _cells(0.5 - azimuth / (2 * math.pi), self.config.width)
 
     def rows(self, batch: PointBatch) -> Tensor:
-        """Return the (P,) rows by elevation or by laser; 0 is the top."""
-        if self.config.rows == "ring":
-            return self._rows_by_ring(batch.ring)
+        """Return the (P,) rows of the points; 0 is the top.
 
+        A scan's own rows (`Scan.row`) take precedence over what the configuration says.
+
+        Raises:
+            InputError: if a row is out of range; if rows are rings, and a scan without rows has no
+                ring indices or one is out of range.
+        """
+        if batch.row is None:
+            return self._configured_rows(batch)
+
+        lowest, highest = _range_of(batch.row)
+        if highest >= self.config.height:
+            raise InputError(
+                f"expected rows from 0 to {self.config.height - 1}, found {highest}; "
+                "normalise the scan for these weights"
+            )
+        if lowest >= 0:
+            return batch.row
+
+        is_unknown = batch.row < 0
+        return torch.where(is_unknown, self._configured_rows(batch, is_unknown), batch.row)
+
+    def _configured_rows(self, batch: PointBatch, which: Tensor | None = None) -> Tensor:
+        """Return the (P,) rows as the configuration says.
+
+        Args:
+            which: (P,) bool: the points whose rows are needed; by default all.
+        """
+        if self.config.rows == "ring":
+            return self._rows_by_ring(batch.ring, which)
+
+        rows = self._rows_by_elevation(batch)
+        if self.config.rows == "laser" and batch.ring is not None:
+            is_known = self._have_lasers(batch.ring, batch)[batch.scan] & (batch.ring >= 0)
+            rows = torch.where(is_known, self.config.height - 1 - batch.ring, rows)
+        return rows
+
+    def _rows_by_elevation(self, batch: PointBatch) -> Tensor:
         radius, _, height = batch.cylindrical
         elevation = torch.rad2deg(torch.atan2(height, radius))
         c = self.config
         return _cells((c.fov_up - elevation) / (c.fov_up - c.fov_down), c.height)
 
-    def _rows_by_ring(self, ring: Tensor | None) -> Tensor:
+    def _rows_by_ring(self, ring: Tensor | None, which: Tensor | None) -> Tensor:
         height = self.config.height
-        if ring is None:
+        lowest, highest = (-1, -1) if ring is None else _range_of(ring, which)
+        if ring is None or lowest < 0:
             raise InputError(
                 "expected a scan with a ring index, found none; use a model with rows by elevation"
             )
 
-        # Both bounds at once, so that the CPU waits for a GPU only once.
-        low, high = torch.stack(ring.aminmax()).tolist() if len(ring) else (0, 0)
-        if not 0 <= low <= high < height:
+        if highest >= height:
             raise InputError(
-                f"expected ring indices from 0 to {height - 1}, found {low} to {high}; "
+                f"expected ring indices from 0 to {height - 1}, found {lowest} to {highest}; "
                 "use a model for this sensor"
             )
         return height - 1 - ring  # ring 0 is the lowest laser
+
+    def _have_lasers(self, ring: Tensor, batch: PointBatch) -> Tensor:
+        """Return (B,) bool: the scans whose rings are those of a sensor with a laser a row."""
+        highest = ring.new_full((batch.count,), -1).scatter_reduce_(0, batch.scan, ring, "amax")
+        return self.config.has_laser_per_row(highest)
+
+
+def _range_of(values: Tensor, which: Tensor | None = None) -> tuple[int, int]:
+    """Return the least and the greatest of some integers; 0 and 0 if there are none."""
+    chosen = values if which is None else values[which]
+    if not len(chosen):
+        return 0, 0
+    # Both at once, so that the CPU waits for a GPU only once.
+    lowest, highest = torch.stack(chosen.aminmax()).tolist()
+    return lowest, highest
 
 
 def _cells(fractions: Tensor, cells: int) -> Tensor:

@@ -1,0 +1,64 @@
+"""The laser of each point, from the order of the points in a file."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from amvnet.scan import Scan
+
+SPREAD = 0.035  # about 2 degrees, as a slope: the mean deviation of one laser's slopes is below
+MIN_POINTS = 64  # per laser, on average; fewer do not show an order
+
+
+def with_lasers(scan: Scan, lasers: int) -> Scan:
+    """Return a scan with rings, if it has none and `lasers_by_order` finds them.
+
+    Args:
+        lasers: number of lasers of the sensor; 0 looks for none.
+    """
+    if not lasers or scan.ring is not None:
+        return scan
+    return dataclasses.replace(scan, ring=lasers_by_order(scan.points, lasers))
+
+
+@np.errstate(invalid="ignore", over="ignore", divide="ignore")
+def lasers_by_order(points: np.ndarray, lasers: int) -> np.ndarray | None:
+    """Return the (N,) laser of each point (0 = lowest), or None if the order does not show it.
+
+    KITTI's files hold one laser after the other, from the highest to the lowest. Each laser begins
+    at the front (+x) and turns to the left, so that the azimuth passes the front from right to left
+    where the next laser begins. The order counts only if it gives exactly as many lasers as the
+    sensor has, and each laser keeps to one elevation, below the laser before it.
+
+    Args:
+        points: (N, 3 or more) x, y, z in metres, as in the file.
+        lasers: number of lasers of the sensor.
+    """
+    if len(points) < MIN_POINTS * lasers:
+        return None
+
+    x, y, z = np.ascontiguousarray(points[:, :3].T)
+    slope = z / np.hypot(x, y)
+    is_known = np.isfinite(slope)  # false for a lost return at the origin
+    if not is_known.all():
+        x, y, slope = x[is_known], y[is_known], slope[is_known]
+
+    is_front = x > 0
+    is_right = is_front & (y < 0)
+    is_left = is_front & (y >= 0)
+    begins = is_right[:-1] & is_left[1:]
+    if np.count_nonzero(begins) != lasers - 1:
+        return None
+
+    starts = np.concatenate([[0], np.flatnonzero(begins) + 1])
+    sizes = np.diff(starts, append=len(slope))
+    means = np.add.reduceat(slope, starts) / sizes
+    deviations = np.add.reduceat(np.abs(slope - np.repeat(means, sizes)), starts) / sizes
+    if (np.diff(means) >= 0).any() or deviations.max() > SPREAD:
+        return None
+
+    ring = np.repeat(np.arange(lasers - 1, -1, -1), sizes)
+    # A lost return has the laser of the point before it.
+    return ring if is_known.all() else ring[np.maximum(np.cumsum(is_known) - 1, 0)]

@@ -1,0 +1,93 @@
+"""The laser of each point, from the order of the points in a file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from amvnet.data.laser_order import lasers_by_order, with_lasers
+from amvnet.scan import Scan
+
+LASERS = 16
+SHOTS = 200
+
+
+def turns(seed: int = 0, lasers: int = LASERS) -> tuple[np.ndarray, np.ndarray]:
+    """Return points laser by laser from the highest, as in KITTI's files, and their rings."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.linspace(0.001, 2 * np.pi - 0.001, SHOTS)
+    points = []
+    for elevation in np.radians(np.linspace(2, -24, lasers)):
+        distance = rng.uniform(3, 60, SHOTS)
+        flat = distance * np.cos(elevation)
+        xyz = [flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)]
+        points.append(np.column_stack([*xyz, rng.random(SHOTS)]))
+    ring = np.repeat(np.arange(lasers - 1, -1, -1), SHOTS)
+    return np.concatenate(points).astype(np.float32), ring
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_the_points_gives_their_lasers(seed: int) -> None:
+    points, ring = turns(seed)
+    kept = np.random.default_rng(seed).random(len(points)) < 0.8  # weak returns are missing
+    found = lasers_by_order(points[kept], LASERS)
+    assert found is not None
+    assert np.array_equal(found, ring[kept])
+
+
+def test_lost_returns_have_the_laser_of_the_point_before() -> None:
+    points, ring = turns()
+    lost = np.random.default_rng(1).random(len(points)) < 0.1
+    lost[[0, -1]] = True
+    for value in (0.0, np.nan, np.inf):
+        changed = points.copy()
+        changed[lost, :3] = value
+        found = lasers_by_order(changed, LASERS)
+        assert found is not None
+        assert np.array_equal(found[~lost], ring[~lost])
+        assert found.min() >= 0
+        assert found.max() < LASERS
+
+
+def test_another_order_or_number_of_lasers_gives_none() -> None:
+    points, _ = turns()
+    rng = np.random.default_rng(0)
+    assert lasers_by_order(points[rng.permutation(len(points))], LASERS) is None
+    assert lasers_by_order(points[::-1], LASERS) is None
+    assert lasers_by_order(points[np.argsort(points[:, 0])], LASERS) is None
+    assert lasers_by_order(points, LASERS + 1) is None
+    assert lasers_by_order(points, LASERS - 1) is None
+    assert lasers_by_order(points[: 20 * LASERS], LASERS) is None
+    assert lasers_by_order(np.zeros((0, 4), np.float32), LASERS) is None
+    assert lasers_by_order(np.zeros((2000, 4), np.float32), LASERS) is None
+
+
+def test_turns_that_do_not_keep_to_an_elevation_are_no_lasers() -> None:
+    points, _ = turns()
+    wild = points.copy()
+    wild[:, 2] = np.random.default_rng(0).normal(0, 5, len(points))
+    assert lasers_by_order(wild, LASERS) is None
+    upward = points.reshape(LASERS, SHOTS, 4)[::-1].reshape(-1, 4)  # from the lowest laser
+    assert lasers_by_order(upward, LASERS) is None
+
+
+def test_known_rings_stay() -> None:
+    points, ring = turns()
+    others = np.zeros_like(ring)
+    assert with_lasers(Scan(points, ring=others), LASERS).ring is others
+    assert with_lasers(Scan(points), 0).ring is None
+    found = with_lasers(Scan(points), LASERS).ring
+    assert found is not None
+    assert np.array_equal(found, ring)
+
+
+@pytest.mark.skipif("AMVNET_REAL_DATA" not in os.environ, reason="needs real scans")
+def test_the_lasers_of_every_real_kitti_scan_are_found() -> None:
+    paths = sorted(Path(os.environ["AMVNET_REAL_DATA"]).glob("semantickitti/**/velodyne/*.bin"))
+    assert paths
+    for path in paths:
+        points = np.fromfile(path, np.float32).reshape(-1, 4)
+        assert lasers_by_order(points, 64) is not None, path
