@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import os
 import re
 import tempfile
@@ -26,7 +27,7 @@ from amvnet.viewing import page as pages
 from amvnet.viewing.shown_scans import RIGHT, ShownScan
 from amvnet.weights.file import save
 
-from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page
+from fixtures.browser_pages import Browser, Page, browser, pixels_of, read_page, with_script
 from fixtures.scan_writers import write_bag1
 from fixtures.worlds import (
     GOLDEN,
@@ -72,7 +73,8 @@ def make_scan(
 
 
 def write_and_read(path: Path, *scans: ShownScan, title: str = "title") -> Page:
-    return read_page(pages.write_page(path, scans, SEMANTICKITTI, title))
+    pages.write_page(path, scans, SEMANTICKITTI, title)
+    return read_page(path)
 
 
 def scan_names(page: Page) -> list[str]:
@@ -113,6 +115,44 @@ def test_the_page_has_the_labels_of_every_method(world: Path, dataset: SemanticK
         for method, ids in labels.items():
             np.testing.assert_array_equal(planes[method], ids)
         np.testing.assert_array_equal(planes["uncertain"], uncertain)
+
+
+def test_the_page_has_the_probabilities_of_every_method(
+    world: Path, dataset: SemanticKitti
+) -> None:
+    segmentation = Segmenter(world / "w.safetensors")(dataset.read(dataset.records(["00"])[0]))
+    rv = segmentation.rv
+    bev = segmentation.bev
+    assert rv is not None
+    assert bev is not None
+    scores = {"rv": rv, "bev": bev, "ensemble": np.sqrt(rv * bev), "amvnet": segmentation.scores}
+
+    _, planes = read_page(world / "p.html").scan(0)
+    for method, values in scores.items():
+        shares = values / values.sum(axis=1, keepdims=True)
+        expected = shares[np.arange(len(shares)), planes[method] - 1]
+        np.testing.assert_allclose(planes[f"{method}-probability"] / 100, expected, atol=0.006)
+
+    shares = np.sort(shares, axis=1)
+    np.testing.assert_allclose(planes["second-probability"] / 100, shares[:, -2], atol=0.006)
+    assert (planes["second"] != planes["amvnet"]).mean() > 0.99  # unless two classes are equal
+
+
+def test_the_table_of_the_page_is_that_of_evaluate(world: Path, tmp_path: Path) -> None:
+    figures = tmp_path / "figures.json"
+    options = ("--weights", world / "w.safetensors", "--split", "all", "--json", figures)
+    assert run_cli("evaluate", world / "data", *options)[0] == 0
+    report = json.loads(figures.read_text())
+
+    table = read_page(world / "p.html").about["table"]
+    assert table["methods"] == ["RV", "BEV", "ensemble", "AMVNet"]
+    assert table["scans"] == report["scans"]
+    for column, method in enumerate(report["methods"].values()):
+        assert table["totals"][0]["values"][column] == pytest.approx(100 * method["miou"], abs=0.06)
+        for row in table["rows"]:
+            iou = method["iou"][SEMANTICKITTI.classes[row["class"] - 1]]
+            value = row["values"][column]
+            assert value == (None if iou is None else pytest.approx(100 * iou, abs=0.06))
 
 
 def test_disagreement_is_one_minus_the_cosine(world: Path, dataset: SemanticKitti) -> None:
@@ -180,18 +220,18 @@ def test_a_scan_of_120_thousand_points_takes_under_two_megabytes(tmp_path: Path)
 
     shown = make_scan(points, truth, **labels)
     shown = replace(shown, uncertain=disagreement > 0.1, disagreement=disagreement)
-    path = pages.write_page(tmp_path / "p.html", [shown], SEMANTICKITTI, "")
+    pages.write_page(tmp_path / "p.html", [shown], SEMANTICKITTI, "")
 
-    assert path.stat().st_size < 2e6
+    assert (tmp_path / "p.html").stat().st_size < 2e6
 
 
 def test_the_same_scans_give_the_same_bytes(tmp_path: Path) -> None:
     points, raw = street(3)
     shown = make_scan(points, labels=SEMANTICKITTI.to_train(raw))
-    first = pages.write_page(tmp_path / "a.html", [shown], SEMANTICKITTI, "t")
-    second = pages.write_page(tmp_path / "b.html", [shown], SEMANTICKITTI, "t")
+    for name in ("a.html", "b.html"):
+        pages.write_page(tmp_path / name, [shown], SEMANTICKITTI, "t")
 
-    assert first.read_bytes() == second.read_bytes()
+    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
 # ---- what the page must not do
@@ -241,7 +281,8 @@ def hostile_page(path: Path) -> Page:
     points, raw = street(5)
     shown = replace(make_scan(points, labels=SEMANTICKITTI.to_train(raw)), name=HOSTILE)
     taxonomy = replace(SEMANTICKITTI, classes=(HOSTILE, *SEMANTICKITTI.classes[1:]))
-    return read_page(pages.write_page(path, [shown], taxonomy, HOSTILE))
+    pages.write_page(path, [shown], taxonomy, HOSTILE)
+    return read_page(path)
 
 
 def test_names_stay_names(tmp_path: Path) -> None:
@@ -356,7 +397,8 @@ def test_scans_are_read_as_predict_reads_them(
 def test_one_network_alone_has_no_doubts(world: Path, tmp_path: Path) -> None:
     save(without(fresh_weights(), "polar_net", "point_head"), tmp_path / "rv.safetensors")
     page = view_page(tmp_path, world / "lone.bin", "--weights", tmp_path / "rv.safetensors")
-    assert page.about["scans"][0]["planes"] == ["intensity", "rv"]
+    planes = ["intensity", "rv", "rv-probability", "second", "second-probability"]
+    assert page.about["scans"][0]["planes"] == planes
 
 
 def test_nuscenes_is_shown_with_its_truth(tmp_path: Path) -> None:
@@ -462,15 +504,12 @@ def test_the_browser_draws_only_uncertain_points(world: Path, browser: Browser) 
 
 
 def test_a_click_on_a_class_hides_it(world: Path, tmp_path: Path, browser: Browser) -> None:
-    """Show the page without its policy, and with a script that clicks."""
     _, planes = read_page(world / "p.html").scan(0)
     road = SEMANTICKITTI.classes.index("road") + 1
     button = f"document.querySelector('#classes [data-id=\"{road}\"]')"
-    script = f"<script>setTimeout(() => {button}.click(), 500)</script>"
-    text = re.sub(r"<meta http-equiv[^>]*>", "", (world / "p.html").read_text())
-    (tmp_path / "p.html").write_text(text.replace("</body>", script + "</body>"))
+    page = with_script(world / "p.html", tmp_path / "p.html", f"{button}.click()")
 
-    state = browser.state(tmp_path / "p.html", "labels=truth")
+    state = browser.state(page, "labels=truth")
     assert state["drawn"] == count_by_class(planes["truth"], hidden=[road])
 
 
@@ -511,6 +550,7 @@ def test_a_hostile_name_is_shown_and_not_run(tmp_path: Path, browser: Browser) -
 
     assert state["title"] == HOSTILE
     assert state["drawn"] is not None
+    assert state["console"] == []
     assert "img" not in tags(state["dom"])
 
 
@@ -524,7 +564,7 @@ def test_five_real_scans_take_a_few_megabytes(tmp_path: Path) -> None:
     for scan in page.about["scans"]:
         assert scan["count"] > 100_000
 
-    assert (tmp_path / "out.html").stat().st_size < 5e6
+    assert (tmp_path / "out.html").stat().st_size < 6e6
 
 
 def test_the_commands_of_the_documentation_run(

@@ -13,17 +13,11 @@ from rich.table import Table
 
 from amvnet.config.recipes import recipe_names
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.evaluation.metrics import OVERALL
 from amvnet.inference.timing import MEAN, STAGES
 from amvnet.models.methods import title_of
 from amvnet.progress import counted
 from amvnet.weights.file import built_in
-
-OVERALL = {
-    "miou": "mIoU",
-    "miou_present": "mIoU, classes present",
-    "accuracy": "accuracy",
-    "fwiou": "fwIoU",
-}
 
 
 def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:

@@ -1,6 +1,7 @@
 """The colours of all drawings: of the classes, and of points that are marked.
 
-Label files carry the official colours, some of which cannot be told apart in a picture.
+Label files carry the official colours, some of which cannot be told apart, or not from a dark
+background, in a picture.
 """
 
 from __future__ import annotations
@@ -12,8 +13,17 @@ UNCERTAIN: Color = (255, 150, 180)  # unlike the colours of all classes of both 
 
 # What is drawn instead of official colours that look like those of other classes.
 DRAWN: dict[str, dict[str, Color]] = {
-    "semantickitti": {"other-ground": (75, 150, 90), "traffic-sign": (135, 150, 0)},
-    "nuscenes": {"motorcycle": (255, 30, 225), "trailer": (0, 135, 255), "truck": (225, 150, 255)},
+    "semantickitti": {
+        "sidewalk": (150, 90, 150),
+        "other-ground": (75, 150, 90),
+        "traffic-sign": (135, 150, 0),
+    },
+    "nuscenes": {
+        "sidewalk": (150, 90, 150),
+        "motorcycle": (255, 30, 225),
+        "trailer": (0, 135, 255),
+        "truck": (225, 150, 255),
+    },
 }
 
 

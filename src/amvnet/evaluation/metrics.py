@@ -15,6 +15,14 @@ from amvnet.errors import InputError
 # Metres; the distances of SemanticKITTI's evaluation by distance.
 EDGES = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
 
+# Titles of the figures over all classes, in the order of tables.
+OVERALL = {
+    "miou": "mIoU",
+    "miou_present": "mIoU, classes present",
+    "accuracy": "accuracy",
+    "fwiou": "fwIoU",
+}
+
 
 def confusion(truth: np.ndarray, prediction: np.ndarray, size: int) -> np.ndarray:
     """Count how often each true class was predicted as each class.

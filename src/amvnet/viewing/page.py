@@ -21,6 +21,7 @@ import numpy as np
 
 from amvnet.data.palette import UNCERTAIN, WRONG, class_colors
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.evaluation.metrics import OVERALL, Evaluation
 from amvnet.files import atomic_write
 from amvnet.inference.segmentation import Segmentation
 from amvnet.models.methods import METHODS, title_of
@@ -45,6 +46,8 @@ SCRIPTS = (
     "look.js",
     "panel.js",
     "point.js",
+    "measure.js",
+    "edit.js",
     "hands.js",
     "page.js",
 )
@@ -83,7 +86,8 @@ def show(result: Segmentation, path: Path | str | None = None, open_browser: boo
     origin = result.require_origin()
     title = Path(origin.scan.name).name or "scan"
     shown = shown_scan(result, origin)
-    page = write_page(path or temporary_page(), [shown], origin.taxonomy, title)
+    page = Path(path or temporary_page())
+    write_page(page, [shown], origin.taxonomy, title)
     if open_browser:
         open_page(page)
 
@@ -102,16 +106,25 @@ def open_page(path: Path) -> None:
 
 def write_page(
     path: Path | str, scans: Iterable[ShownScan], taxonomy: Taxonomy, title: str
-) -> Path:
+) -> Evaluation:
     """Write scans, in the order of the page's slider, as one self-contained page.
 
     The file appears whole or not at all.
+
+    Returns:
+        The evaluation of all labels that have a ground truth; the page shows it as a table.
     """
-    packed = [pack(shown) for shown in scans]
-    page = assemble(packed, taxonomy, title)
+    packed = []
+    evaluation = Evaluation(taxonomy)
+    for shown in scans:
+        packed.append(pack(shown))
+        if shown.truth is not None and shown.labels:
+            evaluation.add(shown.points, shown.truth, shown.labels, shown.uncertain)
+
+    page = assemble(packed, taxonomy, title, evaluation)
     with atomic_write(path) as part:
         part.write_bytes(page.encode("utf-8", "replace"))  # file names may not be Unicode
-    return Path(path)
+    return evaluation
 
 
 def pack(shown: ShownScan) -> Packed:
@@ -168,7 +181,7 @@ def pack(shown: ShownScan) -> Packed:
     )
 
 
-def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
+def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str, evaluation: Evaluation) -> str:
     """Return the text of the page, in which the names of files cannot act as HTML or script."""
     style = _source("page.css")
     script = "\n".join(map(_source, SCRIPTS))
@@ -186,7 +199,7 @@ def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str) -> str:
         "TITLE": html.escape(title),
         "STYLE": style,
         "SCRIPT": script,
-        "ABOUT": _json(_about(packed, taxonomy, title)),
+        "ABOUT": _json(_about(packed, taxonomy, title) | {"table": _table(evaluation)}),
         "SCANS": "\n".join(scans),
     }
     return _fill(_source("page.html"), parts)
@@ -213,6 +226,7 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
         "title": title,
         "classes": ["unlabelled", *taxonomy.classes],
         "colors": [UNLABELLED, *class_colors(taxonomy)[1:]],
+        "raw": taxonomy.train_to_raw,
         "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
         "present": sorted(present),
         "sources": sources,
@@ -231,6 +245,34 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
     }
 
 
+def _table(evaluation: Evaluation) -> dict[str, Any] | None:
+    """Return the page's table: a row of percentages for each class and overall, by method."""
+    if not evaluation.matrices:
+        return None
+
+    report = evaluation.report("")
+    figures = list(report["methods"].values())
+    rows = []
+    for index, name in enumerate(evaluation.taxonomy.classes):
+        rows.append({"class": index + 1, "values": [_percent(f["iou"][name]) for f in figures]})
+    totals = []
+    for key, words in OVERALL.items():
+        totals.append({"name": words, "values": [_percent(f[key]) for f in figures]})
+
+    return {
+        "methods": [title_of(name) for name in report["methods"]],
+        "rows": rows,
+        "totals": totals,
+        "scans": report["scans"],
+        "uncertain": _percent(report["uncertain_fraction"]),
+    }
+
+
+def _percent(share: float | None) -> float | None:
+    """Return a share as a percentage with one decimal."""
+    return None if share is None else round(100 * share, 1)
+
+
 def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
     """Return the values of the points besides their positions, (N,) uint8 each, by name."""
     planes = {"intensity": _to_bytes(np.nan_to_num(shown.points[:, 3]))}
@@ -239,6 +281,11 @@ def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
         planes["truth"] = shown.truth.astype(np.uint8)
     for method, ids in shown.labels.items():
         planes[method] = ids.astype(np.uint8)
+    for method, values in shown.probabilities.items():
+        planes[f"{method}-probability"] = _to_percent(values)
+    if shown.second is not None and shown.second_probability is not None:
+        planes["second"] = shown.second.astype(np.uint8)
+        planes["second-probability"] = _to_percent(shown.second_probability)
     if shown.uncertain is not None and shown.disagreement is not None:
         planes["uncertain"] = shown.uncertain.astype(np.uint8)
         planes["disagreement"] = _to_bytes(shown.disagreement)
@@ -249,6 +296,11 @@ def _byte_planes(shown: ShownScan) -> dict[str, np.ndarray]:
 def _to_bytes(values: np.ndarray) -> np.ndarray:
     """Map values in [0, 1] to 0..255."""
     return np.round(np.clip(values, 0, 1) * 255).astype(np.uint8)
+
+
+def _to_percent(values: np.ndarray) -> np.ndarray:
+    """Map values in [0, 1] to 0..100, which deflate better than 0..255."""
+    return np.round(np.clip(values, 0, 1) * 100).astype(np.uint8)
 
 
 def _quantisation(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

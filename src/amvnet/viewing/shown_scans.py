@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
@@ -37,6 +38,10 @@ class ShownScan:
         valid: (N,) bool, the points that have a position.
         truth: (N,) train ids of the ground truth, or None if there is none.
         labels: (N,) train ids by method, or by "labels" if they are from files.
+        probabilities: (N,) float32 in [0, 1], what each method gives its own label.
+        second: (N,) train ids of the class that the method of the weights finds second most
+            probable; None without weights.
+        second_probability: (N,) float32 in [0, 1], of `second`.
         uncertain: (N,) bool, the points on which the two networks disagree; None without two
             networks.
         disagreement: (N,) float32 in [0, 1], 1 - the cosine similarity of the two networks' class
@@ -48,6 +53,9 @@ class ShownScan:
     valid: np.ndarray
     truth: np.ndarray | None = None
     labels: dict[str, np.ndarray] = field(default_factory=dict)
+    probabilities: dict[str, np.ndarray] = field(default_factory=dict)
+    second: np.ndarray | None = None
+    second_probability: np.ndarray | None = None
     uncertain: np.ndarray | None = None
     disagreement: np.ndarray | None = None
 
@@ -107,25 +115,46 @@ def show_scans(
 def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
     """Return what is shown of a scan that was segmented.
 
-    These are the labels of the result, of each network, and, if there are two, of their ensemble.
+    These are the labels of the result, of each network, and, if there are two, of their ensemble,
+    each with its probability.
     """
     scan = origin.scan
     valid = torch.from_numpy(scan.valid)
-    probabilities = {}
+    scores = {}  # (P, K) by method
     for name, values in (("rv", result.rv), ("bev", result.bev)):
         if values is not None:
-            probabilities[name] = torch.from_numpy(values)[valid]  # (P, K)
-    has_two = len(probabilities) == 2
+            scores[name] = torch.from_numpy(values)[valid]
+    has_two = len(scores) == 2
     if has_two:
-        probabilities["ensemble"] = geometric_mean(probabilities["rv"], probabilities["bev"])
+        scores["ensemble"] = geometric_mean(scores["rv"], scores["bev"])
+    scores[origin.method] = torch.from_numpy(result.scores)[valid]
 
-    labels = {name: expand_labels(values, scan.valid) for name, values in probabilities.items()}
+    labels = {}
+    probabilities = {}
+    for name, values in scores.items():
+        labels[name] = expand_labels(values, scan.valid)
+        probabilities[name] = expand_to_scan(_shares(values).amax(dim=1), scan.valid)
     labels[origin.method] = result.labels
-    name = Path(scan.name).name or "scan"
-    shown = ShownScan(name, scan.points, scan.valid, truth=scan.labels, labels=labels)
+
+    second_probability, second = _shares(scores[origin.method]).topk(2, dim=1)
+    shown = ShownScan(
+        Path(scan.name).name or "scan",
+        scan.points,
+        scan.valid,
+        truth=scan.labels,
+        labels=labels,
+        probabilities=probabilities,
+        second=expand_to_scan(second[:, 1] + 1, scan.valid),
+        second_probability=expand_to_scan(second_probability[:, 1], scan.valid),
+    )
     if not has_two:
         return shown
 
-    similarity = cosine_similarity(probabilities["rv"], probabilities["bev"])
+    similarity = cosine_similarity(scores["rv"], scores["bev"])
     disagreement = expand_to_scan((1 - similarity).clamp(0, 1), scan.valid)
     return replace(shown, uncertain=result.uncertain, disagreement=disagreement)
+
+
+def _shares(scores: Tensor) -> Tensor:
+    """Scale the rows of scores (P, K) so that they sum to 1: a geometric mean does not."""
+    return scores / scores.sum(dim=1, keepdim=True).clamp(min=1e-12)

@@ -9,41 +9,35 @@ from amvnet.cli.console import progress, say
 from amvnet.cli.options import WEIGHTS
 
 SEED = 20_201_209  # far from the seeds of the streets that the built-in weights were trained on
-SCANS = 6
+SCANS = 3
 SEQUENCES = 3
 
 
 def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> None:
-    """Simulate streets, segment them, score the result and draw it.
+    """Simulate streets, segment them, score the labels, and write a page that shows all in 3D.
 
     Args:
-        out: folder for the scans, predictions and pictures.
+        out: folder for the scans, the page and the figures.
         seed: of the streets; the default gives streets the built-in weights were not trained on.
         weights: a weights file, or the name of a built-in one.
     """
-    from amvnet.data.datasets.semantickitti import SemanticKitti
     from amvnet.data.datasets.simulated import simulate
-    from amvnet.evaluation.scoring import evaluate, label_by_weights
-    from amvnet.inference.predict import predict
-    from amvnet.inference.request import LabellingRequest
+    from amvnet.inference.listing import list_inputs
     from amvnet.inference.segmenter import Segmenter
+    from amvnet.viewing.page import write_page
+    from amvnet.viewing.shown_scans import show_scans
 
     segmenter = Segmenter(weights)
     data = out / "data"
     with progress("simulating") as step:
         simulate(data, sequences=SEQUENCES, scans=SCANS, seed=seed, progress=step)
 
-    predictions = out / "predictions"
+    scans, taxonomy = list_inputs([str(data)], taxonomy=segmenter.taxonomy)
+    page = out / "index.html"
     with progress("segmenting") as step:
-        request = LabellingRequest(segmenter.weights)
-        predict([str(data)], request, segmenter, predictions, overwrite=True, progress=step)
+        shown = show_scans(scans, taxonomy, segmenter, progress=step)
+        evaluation = write_page(page, shown, taxonomy, "Simulated streets")
 
-    dataset = SemanticKitti(data)
-    records = dataset.records(dataset.sequences("all"))
-    pictures = out / "pictures"
-    with progress("scoring") as step:
-        label = label_by_weights(dataset, segmenter)
-        evaluation = evaluate(dataset, records, label, pictures, progress=step)
     metrics_path = out / "metrics.json"
     show_evaluation(evaluation, f"simulated streets, seed {seed}", metrics_path)
-    say(f"labels in {predictions}, pictures in {pictures}, figures in {metrics_path}")
+    say(f"labelled scans in {data}, figures in {metrics_path}; open {page} in a browser")

@@ -119,6 +119,13 @@ class Drawing {
     return this.uploaded.get(scan.index);
   }
 
+  /** Replace the values of a plane, such as labels that were corrected. */
+  refresh(scan, name) {
+    const buffers = this.buffersOf(scan);
+    if (buffers[name]) this.gl.deleteBuffer(buffers[name]);
+    buffers[name] = this.buffer(scan.planes[name]);
+  }
+
   /** Bind the planes of a scan to the shader's attributes; a missing plane is 0 at every point. */
   bind(scan, labels) {
     const gl = this.gl, buffers = this.buffersOf(scan);
@@ -167,6 +174,8 @@ class Drawing {
     gl.uniform3fv(places.center, scan.center);
     gl.uniform3fv(places.unit, scan.step);
     gl.uniform2fv(places.range, look.range());
+    gl.uniform3fv(places.low, look.box.slice(0, 3));
+    gl.uniform3fv(places.high, look.box.slice(3));
     for (const [name, color] of Object.entries(about.marks)) gl.uniform3fv(places[name], color.map((part) => part / 255));
     gl.uniform1f(places.size, (look.size * this.height) / (2 * FIELD));
     gl.uniform1f(places.smallest, 1.4 * this.ratio * Math.max(1, look.size));

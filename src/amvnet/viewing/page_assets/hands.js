@@ -82,8 +82,9 @@ function listen(keys) {
   ]);
   byId("key-list").replaceChildren(...lines);
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || byId("keys").open) return;
-    const onControl = event.target.closest("button, input, select");
+    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
+    if (event.target.closest("input[type=number], select")) return;
+    const onControl = event.target.closest("button, input, summary");
     if (onControl && (event.key === " " || event.key === "Enter" || event.key.startsWith("Arrow"))) return;
     const pressed = event.key.length === 1 ? event.key.toUpperCase() : event.key;
     const found = keys.find(([names]) => names.includes(ARROWS[pressed] ?? pressed));

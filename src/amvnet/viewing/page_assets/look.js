@@ -2,6 +2,7 @@
 "use strict";
 
 const SIZES = [0.4, 4];
+const NO_BOX = [-9999, -9999, -9999, 9999, 9999, 9999];  // metres: x, y, z of the lowest and the highest corner
 const TITLES = { class: "Class", error: "Error", uncertainty: "Uncertainty", height: "Height", intensity: "Intensity" };
 const predictions = about.sources.map((source) => source.key).filter((key) => key !== "truth");
 const has = (plane) => about.scans.some((scan) => scan.planes.includes(plane));
@@ -31,6 +32,7 @@ const firstLook = {
   size: 1,
   shading: true,
   rings: true,
+  box: NO_BOX,
 };
 
 class Look {
@@ -78,6 +80,7 @@ class Look {
       color: chosen("color"),
       only: chosen("only"),
       size: number("size", ...SIZES),
+      box: boxOf((said.get("box") ?? "").split(",").map(Number)),
       shading: said.get("shading") !== "0",
       rings: said.get("rings") !== "0",
     });
@@ -91,11 +94,19 @@ class Look {
     for (const name of ["color", "labels", "only", "size"]) {
       if (this[name] !== firstLook[name]) said.set(name, this[name]);
     }
+    if (this.box !== NO_BOX) said.set("box", this.box.join(","));
     if (this.hidden.size) said.set("hide", [...this.hidden].sort((a, b) => a - b).join(","));
     for (const name of ["shading", "rings"]) if (!this[name]) said.set(name, "0");
     said.set("camera", camera.map((value) => Number(value.toFixed(3))).join(","));
     return "#" + said.toString().replaceAll("%2C", ",");
   }
+}
+
+/** Return six numbers as a box; none of numbers that are no box. */
+function boxOf(numbers) {
+  const whole = numbers.length === 6 && numbers.every(Number.isFinite);
+  const box = whole ? numbers.map((value) => Math.min(Math.max(value, NO_BOX[0]), NO_BOX[3])) : NO_BOX;
+  return box.every((value, place) => value === NO_BOX[place]) ? NO_BOX : box;
 }
 
 const ramps = new Map();
@@ -116,13 +127,17 @@ function rampOf(name) {
 
 /** Return a function that says whether a point is drawn, by the same rule as the shader. */
 function shownBy(look, scan) {
-  const ids = scan.planes[look.labels], { truth, uncertain } = scan.planes;
+  const ids = scan.planes[look.labels], { truth, uncertain } = scan.planes, boxed = look.box !== NO_BOX;
   return (i) => {
     const id = ids ? ids[i] : 0;
-    if (look.hidden.has(id)) return false;
+    if (look.hidden.has(id) || (boxed && !inBox(placeOf(scan, i), look.box))) return false;
     if (look.only === "wrong") return Boolean(truth && truth[i] && truth[i] !== id);
     return look.only === "all" || Boolean(uncertain && uncertain[i]);
   };
+}
+
+function inBox([x, y, z], [x0, y0, z0, x1, y1, z1]) {
+  return x >= x0 && x <= x1 && y >= y0 && y <= y1 && z >= z0 && z <= z1;
 }
 
 /** Count the points of each class in a scan, and those that are drawn: {all: [...], drawn: [...]}, by id. */

@@ -5,7 +5,7 @@ const look = new Look(), camera = new Camera();
 const PAUSE = 800;  // milliseconds between scans during playback
 const GLIDE = 0.04;  // fraction of the window's height that one key press moves
 const STEP = 0.023;  // fraction of the window's height that one key press turns: 4 degrees
-let drawing, panel, scan = null, chosen = -1, asked = 0, playing = 0, remembering = 0;
+let drawing, panel, tape, editor, scan = null, chosen = -1, asked = 0, playing = 0, remembering = 0;
 
 function redraw() {
   if (!asked) asked = requestAnimationFrame(draw);
@@ -17,6 +17,7 @@ function draw() {
   camera.middle = panel.free();
   drawing.draw(scan, look, camera);
   mark();
+  tape.draw(scan, camera);
 }
 
 /** Put the ring around the point that was clicked. */
@@ -40,9 +41,14 @@ async function change(changes) {
 async function show() {
   const wanted = look.scan, found = await scanAt(wanted);
   if (look.scan !== wanted) return;  // another scan was chosen while this one was read
-  if (found !== scan) chosen = -1;
+  if (found !== scan) {
+    chosen = -1;
+    tape.clear();
+  }
   scan = found;
+  if (look.labels === CORRECTED) editor.begin(scan);
   const drawn = panel.show(look, scan);
+  editor.show(look, scan);
   byId("scan").value = wanted;
   byId("place").textContent = `${wanted + 1} of ${about.scans.length} · ${scan.name}`;
   byId("place").title = scan.name;
@@ -92,6 +98,7 @@ function click(x, y, again) {
   const { clientWidth: width, clientHeight: height } = byId("canvas");
   chosen = scan ? pointAt(x, y, scan, look, camera.matrix(width / height), width, height) : -1;
   if (chosen >= 0) describe(chosen, scan);
+  if (chosen >= 0 && tape.on) tape.add(chosen);
   if (chosen >= 0 && again) camera.set({ ...camera, target: placeOf(scan, chosen) });
   moved();
 }
@@ -130,10 +137,29 @@ const KEYS = [
   })],
   [["L"], "shading on, off", () => change({ shading: !look.shading })],
   [["G"], "rings every 10 m on, off", () => change({ rings: !look.rings })],
+  [["M"], "measure between two points", () => tape.toggle()],
+  [["B"], "a box around the point, no box", () => editor.toggleBox()],
+  [["V"], "save a picture", savePicture],
+  [["I"], "table of the labels' scores", () => about.table && byId("table").showModal()],
   [["P"], "fold the panel", () => panel.fold()],
-  [["escape"], "let go of the point", () => click(-100, -100)],
+  [["escape"], "let go of the point and of the tape", () => {
+    tape.clear();
+    click(-100, -100);
+  }],
   [["?"], "this list", () => byId("keys").showModal()],
 ].filter(([names]) => names.length && (about.scans.length > 1 || !(names.includes("→") || names.includes(" "))));
+
+/** Save what is drawn as a picture; the canvas is read in the frame in which it was drawn. */
+function savePicture() {
+  if (!scan) return;
+  draw();
+  const canvas = byId("canvas"), picture = element("canvas", { width: canvas.width, height: canvas.height });
+  const paper = picture.getContext("2d");
+  paper.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--ground");
+  paper.fillRect(0, 0, picture.width, picture.height);
+  paper.drawImage(canvas, 0, 0);
+  picture.toBlob((blob) => saveFile(blob, `${fileNameOf(scan)}.png`));
+}
 
 function start() {
   if (!("DecompressionStream" in window)) throw new Error("This page needs a browser of 2023 or later.");
@@ -142,12 +168,17 @@ function start() {
   byId("canvas").addEventListener("webglcontextrestored", () => location.reload());
   drawing = new Drawing(byId("canvas"));
   panel = new Panel(change);
+  tape = new Tape(redraw);
+  editor = new Editor(change, () => ({ look, scan, chosen }), (changed, plane) => drawing.refresh(changed, plane));
   new Hands(byId("canvas"), camera, { camera: moved, click });
   listen(KEYS);
   byId("above").onclick = () => stand(ABOVE);
   byId("street").onclick = () => stand(STREET);
   byId("reset").onclick = () => stand(FIRST);
   byId("help").onclick = () => byId("keys").showModal();
+  byId("measure").onclick = () => tape.toggle();
+  byId("picture").onclick = savePicture;
+  byId("show-table").onclick = () => byId("table").showModal();
   byId("play").onclick = play;
   byId("point").querySelector("button").onclick = () => click(-100, -100);
   byId("timeline").hidden = about.scans.length < 2;

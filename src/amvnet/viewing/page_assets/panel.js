@@ -50,6 +50,23 @@ function choices(group, keys, chosen, make, choose) {
   if (focused) buttons[keys.indexOf(chosen)]?.focus();
 }
 
+/** Fill the table of the labels' scores: a row for each class and overall figure, a column for each method. */
+function fillTable({ methods, rows, totals, scans, uncertain }) {
+  const doubts = uncertain === null ? "" : `, ${uncertain.toFixed(1)} % uncertain`;
+  byId("table-title").textContent = `IoU in % · ${scans} scan${scans > 1 ? "s" : ""}${doubts}`;
+  const cells = (kind, first, values) => element("tr", {
+    name: kind,
+    children: [element("th", { children: first }), ...values.map((text) => element("td", { text }))],
+  });
+  const number = (value) => (value === null ? "–" : value.toFixed(1));
+  byId("table").querySelector("table").replaceChildren(
+    cells("head", [], methods.map(capital)),
+    ...rows.map(({ class: id, values }) =>
+      cells("", [swatch(about.colors[id]), element("span", { text: about.classes[id] })], values.map(number))),
+    ...totals.map(({ name, values }) => cells("total", [element("span", { text: name })], values.map(number))),
+  );
+}
+
 class Panel {
   /** `change` is called with changes of the look. */
   constructor(change) {
@@ -61,6 +78,8 @@ class Panel {
     byId("none").onclick = () => change({ hidden: new Set(about.classes.keys()) });
     byId("size").oninput = (event) => change({ size: Number(event.target.value) });
     byId("fold").onclick = () => this.fold();
+    byId("show-table").hidden = !about.table;
+    if (about.table) fillTable(about.table);
     if (this.narrow) this.fold();
   }
 

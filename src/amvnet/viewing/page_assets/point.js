@@ -31,7 +31,14 @@ function describe(i, scan) {
     const id = planes[key][i];
     const wrong = truth > 0 && key !== "truth" && id !== truth;
     const text = element("span", { name: wrong ? "wrong" : "", text: about.classes[id] + (wrong ? " ✗" : "") });
-    lines.push([title, swatch(about.colors[id]), text]);
+    const probability = planes[`${key}-probability`];
+    const certainty = probability ? [element("span", { name: "value", text: ` ${probability[i]} %` })] : [];
+    lines.push([title, swatch(about.colors[id]), text, ...certainty]);
+  }
+  if (planes["second-probability"]?.[i]) {
+    const id = planes.second[i], text = `${about.classes[id]} `;
+    const certainty = element("span", { name: "value", text: `${planes["second-probability"][i]} %` });
+    lines.push(["second", swatch(about.colors[id]), element("span", { text }), certainty]);
   }
   if (planes.disagreement) {
     const doubt = planes.uncertain[i] ? ", uncertain" : "";

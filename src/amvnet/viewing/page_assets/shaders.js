@@ -12,7 +12,7 @@ layout(location = 3) in uint label;
 layout(location = 4) in uint truth;
 layout(location = 5) in uint uncertain;
 uniform mat4 matrix;
-uniform vec3 center, unit;
+uniform vec3 center, unit, low, high;  // low, high: corners of the box
 uniform vec2 range;
 uniform vec3 right, wrong, unscored;
 uniform float size, smallest;
@@ -35,7 +35,8 @@ void main() {
   if (mode == 2) color = ramped(disagreement);
   if (mode == 3) color = ramped(at.z);
   if (mode == 4) color = ramped(intensity);
-  bool shown = own.a > 0.5 && (only == 0 || (only == 1 && missed) || (only == 2 && doubted));
+  bool inside = all(greaterThanEqual(at, low)) && all(lessThanEqual(at, high));
+  bool shown = inside && own.a > 0.5 && (only == 0 || (only == 1 && missed) || (only == 2 && doubted));
   gl_Position = shown ? matrix * vec4(at, 1.0) : vec4(0.0, 0.0, 2.0, 1.0);
   // Laser beams diverge: points far from the sensor are drawn larger, so that surfaces have no gaps.
   float metres = 0.055 + 0.002 * length(at);

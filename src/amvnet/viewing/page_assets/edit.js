@@ -1,0 +1,125 @@
+// The box of points that are drawn, and corrections of their labels, which are saved as a label file.
+"use strict";
+
+const CORRECTED = "corrected";  // the plane of labels that were corrected
+const HALF = 3;  // metres from the point to the sides of its box
+const AXES = ["x", "y", "z"];
+
+/** Return a scan's name as that of a file. */
+function fileNameOf(scan) {
+  return scan.name.split("/").at(-1).replace(/[^\w.-]/g, "_") || "scan";
+}
+
+function saveFile(blob, name) {
+  const link = element("a", { href: URL.createObjectURL(blob), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+}
+
+/** Return the raw ids of a scan's labels, as a .label file has them: uint32, little-endian. */
+function labelFile(ids, raw) {
+  const view = new DataView(new ArrayBuffer(4 * ids.length));
+  ids.forEach((id, i) => view.setUint32(4 * i, raw[id], true));
+  return view.buffer;
+}
+
+class Editor {
+  /**
+   * `change` is called with changes of the look, `now` returns {look, scan, chosen}, and `refresh` is called with a
+   * scan and the name of its plane that has new values.
+   */
+  constructor(change, now, refresh) {
+    Object.assign(this, { change, now, refresh, before: [] });
+    this.inputs = NO_BOX.map((bound, place) => element("input", {
+      type: "number",
+      ariaLabel: `${place < 3 ? "lowest" : "highest"} ${AXES[place % 3]}`,
+      onchange: () => this.change({ box: this.read() }),
+    }));
+    byId("bounds").replaceChildren(...AXES.flatMap((name, axis) => [
+      element("span", { text: name }), this.inputs[axis], element("span", { text: "to" }), this.inputs[axis + 3],
+    ]));
+    byId("class").replaceChildren(...about.classes.map((text, id) => element("option", { text, value: id })));
+    byId("around").onclick = () => this.surround();
+    byId("no-box").onclick = () => this.change({ box: NO_BOX });
+    byId("apply").onclick = () => this.apply(Number(byId("class").value));
+    byId("undo").onclick = () => this.undo();
+    byId("save").onclick = () => this.save();
+  }
+
+  /** Return the box of the inputs; an empty one does not bound. */
+  read() {
+    return boxOf(this.inputs.map(({ value }, place) => (value === "" ? NO_BOX[place] : Number(value))));
+  }
+
+  show(look, scan) {
+    this.inputs.forEach((input, place) => {
+      input.value = look.box[place] === NO_BOX[place] ? "" : Number(look.box[place].toFixed(2));
+    });
+    // Without the labels of every point, a label file would not fit the scan.
+    byId("edit").hidden = !about.sources.length || scan.note !== "";
+    byId("undo").disabled = this.before.at(-1)?.scan !== scan;
+    byId("save").disabled = !scan.planes[CORRECTED];
+  }
+
+  toggleBox() {
+    if (this.now().look.box === NO_BOX) this.surround();
+    else this.change({ box: NO_BOX });
+  }
+
+  /** Put the box around the point that was clicked. */
+  surround() {
+    const { scan, chosen } = this.now();
+    if (chosen < 0) {
+      byId("edited").textContent = "Click a point first.";
+      return;
+    }
+    byId("box").open = true;
+    byId("edited").textContent = "";
+    const place = placeOf(scan, chosen);
+    const sides = [-HALF, HALF].flatMap((half) => place.map((value) => Number((value + half).toFixed(2))));
+    this.change({ box: sides });
+  }
+
+  /** Copy a scan's labels, before they are corrected. */
+  begin(scan) {
+    if (scan.planes[CORRECTED]) return;
+    const from = predictions.filter((key) => scan.planes[key]).at(-1) ?? "truth";
+    scan.planes[CORRECTED] = Uint8Array.from(scan.planes[from]);
+    this.refresh(scan, CORRECTED);
+  }
+
+  /** Give all points that are drawn a class. */
+  apply(id) {
+    const { look, scan } = this.now(), shown = shownBy(look, scan);
+    const points = [...Array(scan.count).keys()].filter(shown);
+    if (!predictions.includes(CORRECTED)) {
+      about.sources.push({ key: CORRECTED, title: "Corrected" });
+      possible.labels.push(CORRECTED);
+    }
+    if (!about.present.includes(id)) about.present = [...about.present, id].sort((a, b) => a - b);
+    this.begin(scan);
+    if (!predictions.includes(CORRECTED)) predictions.push(CORRECTED);
+    const plane = scan.planes[CORRECTED];
+    this.before.push({ scan, points, ids: points.map((i) => plane[i]) });
+    for (const i of points) plane[i] = id;
+    this.tell(`${counted(points.length)} points are ${about.classes[id]} now.`, scan);
+  }
+
+  undo() {
+    const { scan, points, ids } = this.before.pop();
+    points.forEach((i, place) => { scan.planes[CORRECTED][i] = ids[place]; });
+    this.tell(`${counted(points.length)} points have their label again.`, scan);
+  }
+
+  tell(words, scan) {
+    this.refresh(scan, CORRECTED);
+    byId("edited").textContent = words;
+    this.change({ labels: CORRECTED });
+  }
+
+  save() {
+    const { scan } = this.now(), name = `${fileNameOf(scan)}.label`;
+    saveFile(new Blob([labelFile(scan.planes[CORRECTED], about.raw)]), name);
+    byId("edited").textContent = `Saved as ${name}.`;
+  }
+}
