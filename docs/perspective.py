@@ -1,18 +1,19 @@
-"""Draw one simulated scan in perspective, from behind and above the car: the picture of README.md.
+"""Draw one real scan in perspective, from behind and above the car: the picture of README.md.
 
-    python docs/perspective.py [--seed 80] [--sequence 7] [--scan 0] [--out FILE.png]
+    python docs/perspective.py pandaset/scans/001_00.bin pandaset/labels/001_00.npy [--out FILE.png]
 
-Four panels: ground truth, AMVNet's labels, the uncertain points, and the wrong labels. Points are
-drawn as discs whose size follows their distance, the nearest on top, at twice the resolution of the
-picture.
+The scan is from PandaSet by Hesai and Scale AI (CC BY 4.0), as rows of float32: x forward, y left
+and z up in metres, and intensity in [0, 1]; the labels are PandaSet's ids, one a point. Four
+panels:
+official labels, AMVNet's labels, the uncertain points, and the wrong labels. Points are drawn as
+discs whose size follows their distance, the nearest on top, at twice the resolution of the picture.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -26,28 +27,37 @@ GAP = 8  # pixels between panels
 OVERSAMPLE = 2
 LEGEND = 56  # pixels, height of a row
 MOST_COLUMNS = 10  # of the legend
-LEAST = 40  # points of a class in the legend, of both upper panels
+LEAST = 120  # points of a class in the legend, of both upper panels
 
 BACKGROUND = np.array([13, 16, 22], np.float32)
 INK = (226, 230, 238)
 PLAIN = (74, 82, 96)  # points that a panel says nothing about
-CAR = (196, 204, 216)
 
-DISC = 0.0032  # radius of a point in metres, per metre from the sensor: it fills the gaps of a wall
+DISC = 0.004  # radius of a point in metres, per metre from the sensor: it fills the gaps of a wall
 SMALLEST = 0.028  # metres
 FOG = 120.0  # metres at which a colour has lost 63 % of its contrast
 REACH = 75.0  # metres from the sensor
 DARKEST = 105.0  # luminance that class colours are lifted to, for a dark background
 
 
-# The car, seen from its side: x forward and height over the ground in metres, from tail to nose.
-PROFILE = (
-    (-2.25, 0.35), (-2.25, 0.95), (-1.95, 1.02), (-1.35, 1.42),
-    (0.35, 1.42), (1.05, 1.0), (2.1, 0.85), (2.2, 0.35),
-)  # fmt: skip
-BRIGHTNESS = (0.55, 0.85, 0.3, 1.0, 0.3, 0.9, 0.5)  # of each part; windows are dark
-HALF_WIDTH = 0.9
-SENSOR_HEIGHT = 1.73
+# The classes of the weights that PandaSet's ids stand for; points of other ids, such as poles, are
+# not compared.
+OFFICIAL = {
+    5: "vegetation",
+    6: "terrain",  # "Ground"
+    7: "road", 8: "road", 9: "road", 10: "road",  # road, and lines on it
+    11: "sidewalk",
+    13: "car", 14: "car",
+    15: "truck", 16: "truck",
+    18: "motorcycle",
+    17: "other-vehicle", 19: "other-vehicle", 20: "other-vehicle", 23: "other-vehicle",
+    26: "bicycle",
+    30: "person", 31: "person",
+    36: "traffic-sign", 38: "traffic-sign",
+    41: "building",
+}  # fmt: skip
+# Classes of the weights that PandaSet does not tell from another one.
+MERGED = {"parking": "road", "trunk": "vegetation"}
 
 
 @dataclass(frozen=True)
@@ -77,6 +87,9 @@ class Camera:
         column = width / 2 + focal * (offset @ right) / safe
         row = height / 2 - focal * (offset @ up) / safe
         return column, row, depth, focal
+
+
+CAMERA = Camera(eye=(-20.5, -0.5, 9.5), target=(12.0, -0.5, -0.1), field_of_view=53)
 
 
 def render(camera: Camera, xyz: np.ndarray, colors: np.ndarray, radius: np.ndarray) -> Image.Image:
@@ -120,30 +133,6 @@ def render(camera: Camera, xyz: np.ndarray, colors: np.ndarray, radius: np.ndarr
     return picture.resize(PANEL, Image.Resampling.LANCZOS)
 
 
-def car_points() -> tuple[np.ndarray, np.ndarray]:
-    """Return the surface of the sensor's car as (N, 3) points and their brightness (N,)."""
-    rng = np.random.default_rng(0)
-    pieces = []
-    for (x0, z0), (x1, z1), brightness in zip(PROFILE[:-1], PROFILE[1:], BRIGHTNESS, strict=True):
-        share = rng.random(40_000)
-        across = rng.uniform(-HALF_WIDTH, HALF_WIDTH, 40_000)
-        pieces.append((x0 + share * (x1 - x0), across, z0 + share * (z1 - z0), brightness))
-
-    x = rng.uniform(PROFILE[0][0], PROFILE[-1][0], 80_000)
-    z = rng.uniform(PROFILE[0][1], 1.42, 80_000)
-    below_roof = z < np.interp(x, *np.array(PROFILE[1:-1]).T)
-    for side in (-HALF_WIDTH, HALF_WIDTH):
-        pieces.append((x[below_roof], np.full(below_roof.sum(), side), z[below_roof], 0.5))
-
-    angle = rng.uniform(-np.pi, np.pi, 20_000)
-    height = rng.uniform(1.42, 1.80, 20_000)
-    pieces.append((0.14 * np.cos(angle), 0.14 * np.sin(angle), height, 0.22))
-
-    points = np.concatenate([np.stack([x, y, z], axis=1) for x, y, z, _ in pieces])
-    points[:, 2] -= SENSOR_HEIGHT
-    return points, np.concatenate([np.full(len(x), brightness) for x, _, _, brightness in pieces])
-
-
 def class_colors(taxonomy: Any, labels: np.ndarray) -> np.ndarray:
     """Return (N, 3) colours, the dark ones lifted so that they show on a dark background."""
     table = np.array(palette.class_colors(taxonomy), np.float32)
@@ -173,21 +162,22 @@ def draw(
     shown = scan.valid & (distance < REACH) & (distance > 2.6)
     xyz = xyz[shown]
     distance = distance[shown]
-    labels = result.labels[shown]
-    truth = scan.labels[shown]
+    labels = merged(taxonomy)[result.labels]
+    truth = scan.labels
+    compared = scan.valid & (truth > 0)
+    wrong = compared & (labels != truth)
+    error = wrong.sum() / compared.sum()
+    labels = labels[shown]
+    truth = truth[shown]
     uncertain = result.uncertain[shown]
-    wrong = (labels != truth) & (truth > 0)
+    wrong = wrong[shown]
 
-    body, brightness = car_points()
-    metal = np.array(CAR, np.float32) * brightness[:, None]
-    everything = np.concatenate([xyz, body])
     texture = (0.82 + 0.36 * scan.points[shown, 3:4]).astype(np.float32)
     radius = np.maximum(DISC * distance, SMALLEST)
 
     def panel(colors: np.ndarray, marked: np.ndarray | None = None) -> Image.Image:
         sizes = radius if marked is None else np.where(marked, 1.25 * radius, radius)
-        sizes = np.concatenate([sizes, np.full(len(body), 0.025)])
-        return render(camera, everything, np.concatenate([colors, metal]), sizes)
+        return render(camera, xyz, colors, sizes)
 
     def by_class(labels: np.ndarray) -> Image.Image:
         return panel(np.clip(class_colors(taxonomy, labels) * texture, 0, 255))
@@ -197,16 +187,14 @@ def draw(
         return panel(np.where(marked[:, None], np.array(color, np.float32), plain), marked)
 
     share = result.uncertain[scan.valid].mean()
-    labelled = scan.valid & (scan.labels > 0)
-    right = (result.labels == scan.labels)[labelled].mean()
     panels = [
-        ("Ground truth", by_class(truth)),
+        ("Official labels (grey: not compared)", by_class(truth)),
         ("AMVNet", by_class(labels)),
         (
             f"Uncertain: the two networks disagree on {share:.0%} of the points",
             highlight(uncertain, palette.UNCERTAIN),
         ),
-        (f"Wrong labels: {1 - right:.1%} of the points", highlight(wrong, palette.WRONG)),
+        (f"Wrong labels: {error:.0%} of the compared points", highlight(wrong, palette.WRONG)),
     ]
 
     width, height = PANEL
@@ -252,36 +240,38 @@ def reduced(sheet: Image.Image, taxonomy: Any) -> Image.Image:
     return sheet.quantize(palette=palette, dither=Image.Dither.NONE)
 
 
+def merged(taxonomy: Any) -> np.ndarray:
+    """Return the train id to draw for each train id of the weights."""
+    table = np.arange(taxonomy.size + 1)
+    for name, other in MERGED.items():
+        table[taxonomy.names.index(name)] = taxonomy.names.index(other)
+    return table
+
+
+def official(labels: np.ndarray, taxonomy: Any) -> np.ndarray:
+    """Return the train ids of PandaSet's labels, 0 where the weights have no such class."""
+    table = np.zeros(256, int)
+    for raw, name in OFFICIAL.items():
+        table[raw] = taxonomy.names.index(name)
+    return table[labels]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=80)
-    parser.add_argument("--sequence", type=int, default=7)
-    parser.add_argument("--scan", type=int, default=0)
-    parser.add_argument("--data", type=Path)
+    parser.add_argument("scan", type=Path)
+    parser.add_argument("labels", type=Path)
     parser.add_argument(
         "--out", type=Path, default=Path(__file__).parent / "figures/perspective.png"
     )
     arguments = parser.parse_args()
+
     segmenter = amvnet.load("sim-hdl64e")
-    with TemporaryDirectory() as folder:
-        data = arguments.data or amvnet.simulate(
-            folder, sequences=1, first_sequence=arguments.sequence, scans=2, seed=arguments.seed
-        )
-        scan = read(
-            Path(data), f"{arguments.sequence:02d}", f"{arguments.scan:06d}", segmenter.taxonomy
-        )
-    camera = Camera(eye=(-20.5, -0.5, 9.5), target=(12.0, -0.5, -0.1), field_of_view=53)
-    sheet = draw(scan, segmenter(scan), segmenter.taxonomy, camera)
+    result = segmenter(arguments.scan)
+    truth = official(np.load(arguments.labels, allow_pickle=False), segmenter.taxonomy)
+    scan = replace(result.require_origin().scan, labels=truth)  # its origin is that of the sensor
+    sheet = draw(scan, result, segmenter.taxonomy, CAMERA)
     reduced(sheet, segmenter.taxonomy).save(arguments.out, optimize=True)
     print(arguments.out, sheet.size, arguments.out.stat().st_size)
-
-
-def read(folder: Path, sequence: str, name: str, taxonomy: Any) -> amvnet.Scan:
-    """Read a scan and its labels from SemanticKITTI's layout."""
-    place = folder / "sequences" / sequence
-    points = np.fromfile(place / "velodyne" / f"{name}.bin", np.float32).reshape(-1, 4)
-    raw = np.fromfile(place / "labels" / f"{name}.label", np.uint32) & 0xFFFF
-    return amvnet.Scan(points, taxonomy.to_train(raw))
 
 
 if __name__ == "__main__":
