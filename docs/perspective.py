@@ -4,9 +4,9 @@
 
 The scan is from PandaSet by Hesai and Scale AI (CC BY 4.0), as rows of float32: x forward, y left
 and z up in metres, and intensity in [0, 1]; the labels are PandaSet's ids, one a point. Four
-panels:
-official labels, AMVNet's labels, the uncertain points, and the wrong labels. Points are drawn as
-discs whose size follows their distance, the nearest on top, at twice the resolution of the picture.
+panels: official labels, AMVNet's labels, the uncertain points, and the wrong labels. Points are
+drawn as discs whose size follows their distance, the nearest on top, at twice the resolution of
+the picture.
 """
 
 from __future__ import annotations

@@ -2,9 +2,10 @@
 
     python docs/results.py
 
-Each page has the table between the lines `<!-- results -->` and `<!-- end of results -->`: README.md
-and docs/index.md the rows that are marked `readme`, docs/log/index.md all of them. Change a figure
-in docs/results.json only, and run this. A test compares the pages with the file.
+Each page has the table between the lines `<!-- results -->` and `<!-- end of results -->`:
+README.md and docs/index.md the rows that are marked `readme`, docs/log/index.md all of them. Change
+a figure in docs/results.json only, and run this. A test compares the pages with the file, also the
+outputs of commands in them.
 """
 
 from __future__ import annotations

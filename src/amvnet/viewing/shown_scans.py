@@ -120,10 +120,10 @@ def shown_scan(result: Segmentation, origin: Origin) -> ShownScan:
     """
     scan = origin.scan
     valid = torch.from_numpy(scan.valid)
-    scores = {}  # (P, K) by method
-    for name, values in (("rv", result.rv), ("bev", result.bev)):
-        if values is not None:
-            scores[name] = torch.from_numpy(values)[valid]
+    scores: dict[str, Tensor] = {}  # (P, K) by method
+    for name, network in (("rv", result.rv), ("bev", result.bev)):
+        if network is not None:
+            scores[name] = torch.from_numpy(network)[valid]
     has_two = len(scores) == 2
     if has_two:
         scores["ensemble"] = geometric_mean(scores["rv"], scores["bev"])
