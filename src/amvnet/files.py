@@ -223,7 +223,7 @@ class _BoundedLoader(yaml.SafeLoader):
     """PyYAML's safe loader without what can take hours or any amount of memory.
 
     Values have a limited depth, numbers have a limited length, and there are no aliases: ten lines
-    of them stand for billions of values.
+    of them stand for billions of values. A key stands once: of two, one would be lost.
     """
 
     def __init__(self, stream: str) -> None:
@@ -241,6 +241,16 @@ class _BoundedLoader(yaml.SafeLoader):
         self._depth -= 1
 
         return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        mapping = super().construct_mapping(node, deep)  # first: it checks the kinds of the nodes
+        keys = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if key in keys:
+                raise yaml.YAMLError(f"the key {shown(key)} twice")
+            keys.add(key)
+        return mapping
 
     def construct_scalar(self, node: Any) -> Any:
         if node.tag == INTEGER and len(node.value) > LONGEST_INTEGER:

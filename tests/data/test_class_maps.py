@@ -149,5 +149,14 @@ def test_scores_of_coarse_classes_are_those_of_mapped_labels(tmp_path: Path) -> 
 
 def test_two_classes_of_one_name_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "few.yaml"
-    path.write_text("classes: {1: [road], '1': [car]}")
-    fails(lambda: class_map(str(path)), path, "no class twice, found ['1']")
+    path.write_text("classes: {ground: [road], 'ground': [car]}")
+    fails(lambda: class_map(str(path)), path, "the key 'ground' twice")
+
+
+@pytest.mark.parametrize("name", ["no", "on", "1", "1.5", "null", "2026-01-01"])
+def test_a_name_that_yaml_reads_as_another_value_needs_quotes(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "few.yaml"
+    path.write_text(f"classes: {{{name}: [road]}}")
+    fails(lambda: class_map(str(path)), path, "quotes")
+    path.write_text(f"classes: {{'{name}': [road]}}")
+    assert class_map(str(path)).target.classes == (name,)

@@ -12,10 +12,11 @@ import pytest
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.nuscenes import MINI_TRAIN, MINI_VAL, VAL, NuScenes
 from amvnet.data.datasets.open import is_dataset, open_dataset
+from amvnet.data.datasets.select import split_records
 from amvnet.data.taxonomy import SEMANTICKITTI
 
 from fixtures.datasets import COUNTS, MAKERS, Layout, make_nuscenes, make_semantickitti
-from fixtures.worlds import fails
+from fixtures.worlds import fails, make_streets
 
 REAL = os.environ.get("AMVNET_REAL_DATA")
 
@@ -296,3 +297,22 @@ def test_real_scans_open(name: str, sequence: str, rings: int) -> None:
         assert scan.ring is None
 
     assert (scan.labels is None) == (records[0].labels_path is None)
+
+
+@pytest.mark.parametrize(
+    ("sequences", "train", "val"),
+    [
+        (("00", "01", "08", "11"), ("00", "01"), ("08",)),
+        (("00", "01", "02"), ("00", "01"), ("02",)),
+        (("00", "01", "11"), ("00",), ("01",)),
+        (("08", "place"), ("place",), ("08",)),
+    ],
+)
+def test_without_the_official_split_the_last_sequence_validates_and_tests_are_left_out(
+    tmp_path: Path, sequences: tuple[str, ...], train: tuple[str, ...], val: tuple[str, ...]
+) -> None:
+    dataset = open_dataset(str(make_streets(tmp_path, sequences, 1)))
+    assert (dataset.sequences("train"), dataset.sequences("val")) == (train, val)
+    scans = split_records(dataset, None, None)
+    assert tuple(record.sequence for record in scans.train) == train
+    assert tuple(record.sequence for record in scans.val) == val

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 import yaml
 
-from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.open import open_dataset, open_with_classes
 from amvnet.data.datasets.own import OwnScans, open_own
-from amvnet.data.datasets.select import split_records
+from amvnet.data.datasets.select import split_records, training_records
 from amvnet.data.labels.readers import read_scan_labels
-from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.data.taxonomy import SEMANTICKITTI, Taxonomy
 
 from fixtures.scan_writers import some_points, write_las, write_ply
-from fixtures.worlds import fails
+from fixtures.worlds import fails, run_cli
 
 RAW = np.random.default_rng(1).choice([3, 7, 40], 60)
 EXPECTED = np.select([RAW == 3, RAW == 7], [1, 2], 0)  # 40 is ignored
@@ -113,9 +113,11 @@ def test_scans_without_a_label_file_are_left_out_of_the_training(tmp_path: Path)
     assert [record.name for record in scans.train] == ["a/0"]
     assert [record.name for record in scans.val] == ["b/1"]
 
+    # Without labels, b does not validate: a is left alone.
     (tmp_path / "b/1.label").unlink()
+    fails(lambda: split_records(data_of(tmp_path), None, None), "no split", "a alone")
     first = tmp_path / "b/0.label"  # that was looked for
-    fails(lambda: split_records(data_of(tmp_path), None, None), "labelled scans", first, "other 2")
+    fails(lambda: split_records(data_of(tmp_path), None, ["b"]), "labelled scans", first, "other 2")
 
 
 def data_of(folder: Path) -> OwnScans:
@@ -136,6 +138,135 @@ def test_splits_are_folders_patterns_or_lists_and_may_cut_through_a_folder(tmp_p
 
     both = describe(tmp_path, split={"train": "a", "val": "a/0"})
     fails(lambda: open_own(both), "a/0", "train and val")
+
+
+def sites(folder: Path, split: dict[str, Any] | None = None, labelled: str = "abcd") -> OwnScans:
+    """Return a dataset of two scans in each of the sites a, b, c and d."""
+    for site in "abcd":
+        (folder / site).mkdir(exist_ok=True)
+        for index in range(2):
+            np.save(folder / f"{site}/{index}.npy", some_points(seed=index))
+            if site in labelled:
+                RAW.astype(np.uint32).tofile(folder / f"{site}/{index}.label")
+    return open_own(describe(folder, split=split))
+
+
+def sequences_of(data: OwnScans) -> tuple[set[str], set[str]]:
+    """Return the sequences that are trained on, and those that are validated with."""
+    scans = split_records(data, None, None)
+    return {record.sequence for record in scans.train}, {record.sequence for record in scans.val}
+
+
+@pytest.mark.parametrize(
+    ("split", "train", "val"),
+    [
+        ({"train": ["a", "b"], "val": "c"}, "ab", "c"),
+        ({"val": "c", "test": "b"}, "ad", "c"),
+        ({"val": "c"}, "abd", "c"),
+        (None, "abc", "d"),
+    ],
+)
+def test_what_is_trained_on_follows_from_the_split(
+    tmp_path: Path, split: dict[str, Any] | None, train: str, val: str
+) -> None:
+    data = sites(tmp_path, split)
+    assert sequences_of(data) == (set(train), set(val))
+    # Every command validates with the same scans.
+    assert data.sequences("val") == tuple(val)
+    assert [record.sequence for record in data.left_out()] == (["d", "d"] if train == "ab" else [])
+
+
+@pytest.mark.parametrize(
+    ("split", "words"),
+    [
+        ({"train": ["a"], "val": "x"}, ("split: val", "'x'", "a, b, c, d")),
+        ({"train": ["a", "x"], "val": "c"}, ("split: train", "'x'")),
+        ({"train": "train.lst", "val": "val.lst"}, ("split: train", "'train.lst'")),
+        ({"train": "a", "val": []}, ("split: val", "none")),
+        ({"train": "a", "val": "b", "test": "c/2*"}, ("split: test", "'c/2*'")),
+    ],
+)
+def test_an_entry_of_the_split_without_scans_is_refused(
+    tmp_path: Path, split: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    fails(lambda: sites(tmp_path, split), "own.yaml", *words)
+
+
+def test_a_split_without_val_is_not_replaced_by_the_default(tmp_path: Path) -> None:
+    data = sites(tmp_path, {"train": ["a", "b"]})
+    fails(lambda: split_records(data, None, None), "split val", "only train")
+    scans = split_records(data, None, ["c"])
+    assert {record.sequence for record in scans.train} == {"a", "b"}
+    everything = split_records(data, None, None, with_val=True)
+    assert {record.sequence for record in everything.train} == {"a", "b"}
+
+
+def test_test_scans_are_never_trained_on(tmp_path: Path) -> None:
+    data = sites(tmp_path, {"val": "c", "test": "b"})
+    fails(lambda: split_records(data, ["a", "b"], None), "test split", "found b")
+    for with_val in (False, True):
+        scans = split_records(data, None, None, with_val)
+        assert "b" not in {record.sequence for record in scans.train}
+    assert "b" not in {record.sequence for record in training_records(data)}
+
+
+def test_the_default_split_validates_with_the_last_sequence_that_has_labels(
+    tmp_path: Path,
+) -> None:
+    assert sequences_of(sites(tmp_path, labelled="abc")) == ({"a", "b"}, {"c"})
+
+
+def test_named_sequences_are_not_used_for_the_other_purpose(tmp_path: Path) -> None:
+    data = sites(tmp_path)
+    scans = split_records(data, None, ["a"])
+    assert {record.sequence for record in scans.train} == {"b", "c", "d"}
+    fails(lambda: split_records(data, ["d"], None), "two sequences", "name them")
+
+
+def test_evaluate_scores_the_scans_that_train_validates_with(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sites(tmp_path)
+    predictions = tmp_path / "predictions/d"
+    predictions.mkdir(parents=True)
+    for index in range(2):
+        RAW.astype(np.uint32).tofile(predictions / f"{index}.label")
+    command = ("evaluate", tmp_path / "own.yaml", "--predictions", predictions.parent)
+    assert run_cli(*command) == (0, "")
+    assert "2 scans of d" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("ignored", ["rest", ["rest"], [40, "rest"]])
+def test_the_rest_of_the_ids_can_be_ignored(site: Path, ignored: Any) -> None:
+    np.save(site / "a.npy", some_points())
+    raw = np.where(RAW == 40, np.arange(60) + 1000, RAW)
+    raw.astype(np.uint32).tofile(site / "a.label")
+    np.testing.assert_array_equal(only_scan(site.parent, ignored=ignored), EXPECTED)
+
+    # Weights, which carry the classes, do not name 65,536 ids.
+    taxonomy = open_own(site.parent / "own.yaml").taxonomy
+    assert len(Taxonomy.from_dict(taxonomy.to_dict()).raw_to_train) < 6
+
+
+@pytest.mark.parametrize("text", ["{no: 1, b: 2}", "{1: 1, b: 2}", "{a: 1, b: 2, 'a': 3}"])
+def test_names_that_yaml_changes_or_drops_are_refused(site: Path, text: str) -> None:
+    np.save(site / "a.npy", some_points())
+    path = site.parent / "own.yaml"
+    path.write_text(f"classes: {text}\nscans: '*/*.npy'\n")
+    fails(lambda: open_own(path), path, "twice" if "'a'" in text else "quotes")
+
+
+def test_the_classes_that_differ_are_named(tmp_path: Path) -> None:
+    spec = str(sites(tmp_path).spec)
+    for names, words in (
+        (("ground", "tree"), ("without 'plant'", "with 'tree'")),
+        (("plant", "ground"), ("another order",)),
+        (("ground", "plant", "car"), ("with 'car'",)),
+    ):
+        ids = tuple(range(len(names) + 1))
+        colors = ((0, 0, 0),) * len(ids)
+        weights = Taxonomy("own", names, colors, dict(enumerate(ids)), ids, {}, False)
+        fails(lambda other=weights: open_with_classes(spec, other), "own.yaml", *words)
 
 
 def test_label_files_that_match_the_pattern_of_scans_are_no_scans(tmp_path: Path) -> None:

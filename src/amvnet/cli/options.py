@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from amvnet.cli.console import silence
+from amvnet.cli.console import say, silence
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute, MethodName
@@ -66,15 +66,22 @@ class LabelledChoice:
     """Which labelled scans of the dataset to use."""
 
     split: Split | None = None
-    """the official split; default: val, and of rank: all."""
+    """the split; default: val, and of rank: all. Without an official split or one of your own, the
+    last sequence validates."""
     sequences: tuple[str, ...] | None = None
     """sequences or scenes instead, separated by commas."""
 
     def records(self, dataset: Dataset, default: Split = "val") -> Sequence[ScanRecord]:
-        """Return the scans; raise InputError if there are none."""
+        """Return the scans, and say which; raise InputError if there are none."""
         from amvnet.data.datasets.base import choose_records
 
-        return dataset.labelled(choose_records(dataset, self.sequences, self.split or default))
+        chosen = choose_records(dataset, self.sequences, self.split or default)
+        records = dataset.labelled(chosen)
+        text = f"labelled scans: {describe_records(records)}"
+        if len(records) < len(chosen):
+            text += f"; {len(chosen) - len(records)} others have no labels"
+        say(text)
+        return records
 
 
 @dataclass(frozen=True)
@@ -82,15 +89,26 @@ class TrainingChoice:
     """Which scans to train on and to validate with."""
 
     train_sequences: tuple[str, ...] | None = None
-    """sequences or scenes, separated by commas, to train on; default: the official split."""
+    """sequences or scenes, separated by commas, to train on; default: those of the split."""
     val_sequences: tuple[str, ...] | None = None
-    """sequences or scenes, separated by commas, to validate with; default: the official split."""
+    """sequences or scenes, separated by commas, to validate with; default: those of the split, or
+    without a split the last one."""
 
     def scans(self, dataset: Dataset, with_val: bool = False) -> TrainingScans:
-        """Return the scans; if `with_val`, those to validate with are trained on, too."""
+        """Return the scans; if `with_val`, those to validate with are trained on, too.
+
+        Scans that the split of a user's own dataset does not name are said.
+        """
+        from amvnet.data.datasets.own import OwnScans
         from amvnet.data.datasets.select import split_records
 
-        return split_records(dataset, self.train_sequences, self.val_sequences, with_val)
+        scans = split_records(dataset, self.train_sequences, self.val_sequences, with_val)
+        if isinstance(dataset, OwnScans):
+            used = {record.name for record in (*scans.train, *scans.val)}
+            unnamed = [record for record in dataset.left_out() if record.name not in used]
+            if unnamed:
+                say(f"not used, as the split does not name them: {describe_records(unnamed)}")
+        return scans
 
 
 @dataclass(frozen=True)

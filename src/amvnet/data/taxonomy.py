@@ -46,6 +46,7 @@ class Taxonomy:
             defines them.
         counts_absent: whether a class in neither ground truth nor prediction counts as 0 in the
             mIoU (SemanticKITTI) or is left out of it (nuScenes).
+        ignores_rest: whether labels may have other raw ids, which are ignored.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Taxonomy:
     train_to_raw: tuple[int, ...]
     splits: Mapping[str, tuple[str, ...]]
     counts_absent: bool
+    ignores_rest: bool = False
 
     def __post_init__(self) -> None:
         check_text("taxonomy", self.name)
@@ -105,7 +107,8 @@ class Taxonomy:
     @cached_property
     def _raw_id_lookup(self) -> np.ndarray:
         """(65536,) int16 train ids by raw id; UNKNOWN if the taxonomy has no such raw id."""
-        table = np.full(INSTANCE_MASK + 1, UNKNOWN, dtype=np.int16)
+        others = 0 if self.ignores_rest else UNKNOWN
+        table = np.full(INSTANCE_MASK + 1, others, dtype=np.int16)
 
         # If categories have names, the only numeric raw ids are those of prediction files.
         if any(isinstance(raw, str) for raw in self.raw_to_train):
@@ -152,8 +155,13 @@ class Taxonomy:
         return np.asarray(self.train_to_raw, dtype=np.uint32)[ids]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields for JSON, with `raw_to_train` as pairs: keys in JSON are texts."""
-        return {**dataclasses.asdict(self), "raw_to_train": list(self.raw_to_train.items())}
+        """Return the fields for JSON, with `raw_to_train` as pairs: keys in JSON are texts.
+
+        `ignores_rest` says how labels are read, and is left out.
+        """
+        fields = {**dataclasses.asdict(self), "raw_to_train": list(self.raw_to_train.items())}
+        del fields["ignores_rest"]
+        return fields
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Taxonomy:
@@ -179,7 +187,23 @@ class Taxonomy:
             )
 
 
-def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, Any]]:
+def describe_difference(classes: Sequence[str], others: Sequence[str], of_others: str) -> str:
+    """Return in words how some classes differ from others, by their names.
+
+    Args:
+        of_others: what the others belong to, such as "the weights".
+    """
+    missing = [name for name in classes if name not in others]
+    added = [name for name in others if name not in classes]
+    texts = []
+    for names, word in ((missing, "without"), (added, "with")):
+        if names:
+            more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+            texts.append(f"{word} {', '.join(map(repr, names[:SHOWN]))}{more}")
+    return f"{of_others} {' and '.join(texts) or 'with the classes in another order'}"
+
+
+def class_entries(classes: Any, key: str, example: str) -> dict[str, dict[str, Any]]:
     """Return the entries of a user's classes, by name, each as a mapping with a colour.
 
     Args:
@@ -188,7 +212,8 @@ def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, A
         example: an entry, for the message.
 
     Raises:
-        InputError: if there are no classes, or a colour is not a list of three whole numbers.
+        InputError: if there are no classes, a name is not a text, or a colour is not a list of
+            three whole numbers.
     """
     if not isinstance(classes, Mapping) or not classes:
         raise InputError(
@@ -197,6 +222,11 @@ def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, A
 
     entries = {}
     for train_id, (title, entry) in enumerate(classes.items(), start=1):
+        if not isinstance(title, str):  # YAML reads no, off, on and yes without quotes as booleans
+            raise InputError(
+                f"classes: expected texts as names, found the value {shown(title)}, as YAML reads "
+                "numbers, no, off, on, yes and null; write the name in quotes"
+            )
         values = dict(entry) if isinstance(entry, Mapping) else {key: entry}
         color = values.get("color")
         if color is None:
@@ -216,14 +246,14 @@ def class_entries(classes: Any, key: str, example: str) -> dict[Any, dict[str, A
 
 def user_taxonomy(
     name: str,
-    entries: Mapping[Any, Mapping[str, Any]],
+    entries: Mapping[str, Mapping[str, Any]],
     raw_to_train: Mapping[int | str, int],
     train_to_raw: Sequence[int],
 ) -> Taxonomy:
     """Return the taxonomy of a user's classes, given the entries of `class_entries`."""
     return Taxonomy(
         name=f"own-{name}" if name in TAXONOMIES else name,
-        classes=tuple(map(str, entries)),
+        classes=tuple(entries),
         colors=((0, 0, 0), *(_rgb(values["color"]) for values in entries.values())),
         raw_to_train=raw_to_train,
         train_to_raw=tuple(train_to_raw),

@@ -13,6 +13,7 @@ from amvnet.data.labels.ids import check_count, read_ids, train_ids, write_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.files import inside
+from amvnet.progress import counted
 from amvnet.scan import Scan
 
 
@@ -34,6 +35,11 @@ class ScanRecord:
     labels_path: Path | None
     prediction: str
 
+    @property
+    def has_labels(self) -> bool:
+        """Whether the file of the labels exists."""
+        return self.labels_path is not None and self.labels_path.is_file()
+
 
 class Dataset(ABC):
     """One dataset on disk; instances can be pickled, so that worker processes can read.
@@ -50,15 +56,56 @@ class Dataset(ABC):
         self.spec = spec or str(root)
 
     @abstractmethod
-    def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of a split that are on disk.
+    def official(self, split: str) -> tuple[str, ...]:
+        """Return the sequences of an official split that are on disk.
 
         Args:
-            split: an official split ("train", "val" or "test"), or "all".
+            split: "train", "val", "test", another one that the dataset knows, or "all".
 
         Raises:
             InputError: if the split is unknown or none of its sequences is on disk.
         """
+
+    @property
+    def is_split(self) -> bool:
+        """Whether there is an official split: sequences to train on and to validate with."""
+        return bool(self._on_disk("train") and self._on_disk("val"))
+
+    def sequences(self, split: str) -> tuple[str, ...]:
+        """Return the sequences of a split, which are those of every command.
+
+        Without an official split, the last sequence validates and the others train. Sequences of
+        the test split do neither, nor do those without labels if others have labels. If only the
+        official "val" is on disk, it validates.
+
+        Raises:
+            InputError: as `official`, also if there are fewer than two sequences to split.
+        """
+        if split not in ("train", "val") or self.is_split:
+            return self.official(split)
+
+        trainable = self.trainable()
+        val = self._on_disk("val") or trainable[-1:]
+        train = tuple(name for name in trainable if name not in val)
+        if not train or not val:
+            return self.official(split)
+        return train if split == "train" else val
+
+    def trainable(self) -> tuple[str, ...]:
+        """Return the sequences to train on or to validate with, without an official split."""
+        test = self._on_disk("test")
+        names = tuple(name for name in self.official("all") if name not in test)
+        if not names:
+            return ()
+        labelled = {record.sequence for record in self.records(names) if record.has_labels}
+        return tuple(name for name in names if name in labelled) or names
+
+    def _on_disk(self, split: str) -> tuple[str, ...]:
+        """Return the sequences of an official split; empty if there are none."""
+        try:
+            return self.official(split)
+        except InputError:
+            return ()
 
     @abstractmethod
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
@@ -84,12 +131,20 @@ class Dataset(ABC):
         return record
 
     def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
-        """Return the scans to train on or to score: all, unless the dataset may lack labels.
+        """Return the scans to train on or to score: those that have labels.
 
         Raises:
-            InputError: if it may, and none of the scans has labels.
+            InputError: if none of the scans has labels.
         """
-        return list(records)
+        labelled = [record for record in records if record.has_labels]
+        if not labelled:
+            path = records[0].labels_path if records else None
+            found = f"no {path}" if path is not None else "no labels"
+            raise InputError(
+                f"{self.spec}: expected labelled scans, found {found} among "
+                f"{counted(len(records), 'scan')}; name labelled sequences, or add the labels"
+            )
+        return labelled
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan; raise the errors of `read`."""

@@ -11,9 +11,9 @@ from functools import cache
 import numpy as np
 
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.open import check_classes
 from amvnet.data.datasets.select import TrainingScans
 from amvnet.data.datasets.simulated import SCANS
+from amvnet.data.taxonomy import describe_difference
 from amvnet.errors import InputError
 from amvnet.scan import Scan
 
@@ -66,6 +66,10 @@ class Joined(Dataset):
         for other in self.others:
             texts.append(other.dataset.spec + suffix)
         return texts
+
+    def official(self, split: str) -> tuple[str, ...]:
+        """Return the sequences of the first dataset."""
+        return self.dataset.official(split)
 
     def sequences(self, split: str) -> tuple[str, ...]:
         """Return the sequences of the first dataset."""
@@ -126,7 +130,14 @@ def join(
     if not others:
         return scans
     for other in others:
-        check_classes(other.dataset, scans.dataset.taxonomy)
+        classes = scans.dataset.taxonomy.classes
+        others_classes = other.dataset.taxonomy.classes
+        if classes != others_classes:
+            difference = describe_difference(classes, others_classes, other.dataset.spec)
+            raise InputError(
+                f"expected the same classes in every --data, found {difference}; leave out that "
+                "--data"
+            )
 
     joined = Joined(scans, others, share)
     return TrainingScans(joined, [*scans.train, *joined.mixed_records()], scans.val)

@@ -83,7 +83,7 @@ class NuScenes(Dataset):
         """Return whether a folder has this layout."""
         return any(root.glob("v1.0-*/sample_data.json"))
 
-    def sequences(self, split: str) -> tuple[str, ...]:
+    def official(self, split: str) -> tuple[str, ...]:
         """Return the scenes of a split of `SPLITS` that are on disk."""
         scenes = self.scenes(split)
         folder = self.root / "samples" / CHANNEL

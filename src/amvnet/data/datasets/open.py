@@ -9,7 +9,7 @@ from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.own import OwnScans, is_description, open_own
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.datasets.simulated import SENSORS, SimulatedStreets
-from amvnet.data.taxonomy import Taxonomy
+from amvnet.data.taxonomy import Taxonomy, describe_difference
 from amvnet.errors import InputError
 
 Reader = type[SemanticKitti] | type[NuScenes]
@@ -91,8 +91,9 @@ def check_classes(dataset: Dataset, taxonomy: Taxonomy) -> None:
     """Raise InputError if a dataset has other classes than a taxonomy."""
     if taxonomy.classes != dataset.taxonomy.classes:
         raise InputError(
-            f"{dataset.root}: expected the classes of {dataset.taxonomy.name}, found those of "
-            f"{taxonomy.name}; use weights or a head with the dataset's classes"
+            f"{dataset.spec}: expected weights with the classes of the data, found "
+            f"{describe_difference(dataset.taxonomy.classes, taxonomy.classes, taxonomy.name)}; "
+            "use weights with these classes, or map both by --classes"
         )
 
 

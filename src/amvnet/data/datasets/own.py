@@ -17,7 +17,7 @@ from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, USUAL_TYPE, RowLayout
 from amvnet.data.labels.readers import read_scan_labels
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
-from amvnet.errors import InputError, errors_of, shown
+from amvnet.errors import InputError, did_you_mean, errors_of, shown
 from amvnet.files import read_yaml
 from amvnet.scan import Scan
 
@@ -27,6 +27,8 @@ KEYS = (
     *("columns", "dtype"),
 )
 SPLITS = ("train", "val", "test")
+WILDCARDS = set("*?[")  # characters of patterns
+REST = "rest"  # among the ignored ids: all ids that the file does not name
 
 # Turns the points of a file into a scan, given the name of the recording.
 Normalise = Callable[[Cloud, str], Scan]
@@ -96,8 +98,13 @@ class OwnScans(Dataset):
         self.normalise = normalise
         self._counts: dict[str, int] = {}  # points of the scans that have been read, by name
 
-    def sequences(self, split: str) -> tuple[str, ...]:
-        """Return the sequences of "train", "val", "test" or "all" that have scans."""
+    @property
+    def is_split(self) -> bool:
+        """Whether the file has a split; what it does not name is not chosen by default."""
+        return bool(self.description.split)
+
+    def official(self, split: str) -> tuple[str, ...]:
+        """Return the sequences of "train", "val" or "test" by the file's split, or "all"."""
         check_split(self.spec, split, (*SPLITS, "all"))
         names = set()
         for record, split_of_scan in self._listing:
@@ -105,11 +112,20 @@ class OwnScans(Dataset):
                 names.add(record.sequence)
 
         if not names:
+            found = f"only {' and '.join(self.description.split)}"
+            if not self.is_split:
+                labelled = {record.sequence for record, _ in self._listing if record.has_labels}
+                alone = f", and labels of {min(labelled)} alone" if len(labelled) == 1 else ""
+                found = f"no split{alone}"
             raise InputError(
-                f"{self.spec}: expected scans of the split {split}, found none; name them under "
-                "split, give --split all, or name the sequences to use"
+                f"{self.spec}: expected scans of the split {split}, found {found}; name them under "
+                "split, or give --split all or the names of sequences"
             )
         return tuple(sorted(names))
+
+    def left_out(self) -> list[ScanRecord]:
+        """Return the scans that the file's split does not name."""
+        return [record for record, split in self._listing if self.is_split and not split]
 
     def records(self, sequences: Sequence[str]) -> list[ScanRecord]:
         """Return the scans of these sequences, in order."""
@@ -218,11 +234,10 @@ class OwnScans(Dataset):
     @cached_property
     def _listing(self) -> list[tuple[ScanRecord, str]]:
         """The records of all scans, each with its split ("" if it is in none)."""
-        splits: dict[str, str] = {}
+        splits = self._splits()
         splits_of_folder: dict[str, set[str]] = {}
-        for name, scan in self._scans.items():
-            splits[name] = self._split_of(name, scan.path)
-            splits_of_folder.setdefault(self._folder_of(name), set()).add(splits[name])
+        for name, split in splits.items():
+            splits_of_folder.setdefault(self._folder_of(name), set()).add(split)
 
         listing = []
         for name, scan in self._scans.items():
@@ -251,29 +266,62 @@ class OwnScans(Dataset):
             return parts[0]
         return fixed.name or "all"
 
-    def _split_of(self, name: str, path: Path) -> str:
-        """Return the split of a scan; "" if it is in none."""
+    def _splits(self) -> dict[str, str]:
+        """Return the split of each scan, by its name; "" if it is in none.
+
+        If the file names a split but no "train", all scans that it does not name are of it.
+
+        Raises:
+            InputError: if an entry of the split matches no scan, or a scan is in two splits.
+        """
+        entries = []
+        for split, names in self.description.split.items():
+            entries += [(split, entry) for entry in names]
+        usual = "train" if self.is_split and "train" not in self.description.split else ""
+
+        splits = {}
+        matched = set()
+        for name, scan in self._scans.items():
+            found = self._entries_of(name, scan.path, entries)
+            of_scan = sorted({split for split, _ in found}, key=SPLITS.index)
+            if len(of_scan) > 1:
+                raise InputError(
+                    f"{self.spec}: expected a scan in one split, found {name} in "
+                    f"{' and '.join(of_scan)}; correct the split"
+                )
+            splits[name] = of_scan[0] if of_scan else usual
+            matched |= found
+
+        for split, entry in entries:
+            if (split, entry) not in matched:
+                folders = dict.fromkeys(map(self._folder_of, self._scans))
+                advice = f"name a folder ({', '.join(list(folders)[:20])}), a scan or a pattern"
+                raise InputError(
+                    f"{self.spec}: split: {split}: expected entries that match scans, found "
+                    f"{shown(entry)}, which matches none" + did_you_mean(entry, folders, advice)
+                )
+        return splits
+
+    def _entries_of(
+        self, name: str, path: Path, entries: Sequence[tuple[str, str]]
+    ) -> set[tuple[str, str]]:
+        """Return the entries of the split, each with its split, that match a scan."""
         folders = map(Path.as_posix, Path(name).parents)
         file = path.relative_to(self.root).as_posix()
         texts = {name, file, self._folder_of(name), *folders}
-        splits = []
-        for split, names in self.description.split.items():
-            if texts & set(names) or any(fnmatchcase(name, pattern) for pattern in names):
-                splits.append(split)
 
-        if len(splits) > 1:
-            raise InputError(
-                f"{self.spec}: expected a scan in one split, found {name} in "
-                f"{' and '.join(splits)}; correct the split"
-            )
-        return splits[0] if splits else ""
+        found = set()
+        for split, entry in entries:
+            if entry in texts or (set(entry) & WILDCARDS and fnmatchcase(name, entry)):
+                found.add((split, entry))
+        return found
 
 
 def _fixed_part(pattern: str) -> Path:
     """Return the folders at the beginning of a pattern that have no wildcards."""
     fixed = Path()
     for part in Path(pattern).parts[:-1]:
-        if set(part) & set("*?["):
+        if set(part) & WILDCARDS:
             break
         fixed /= part
     return fixed
@@ -339,14 +387,18 @@ def _parse_classes(name: str, tree: Mapping[str, Any]) -> Taxonomy:
         for raw_id in ids:
             _add(raw_to_train, raw_id, train_id)
 
-    ignored = _ids("ignored", tree.get("ignored", []))
+    entries_ignored = tree.get("ignored", [])
+    if not isinstance(entries_ignored, list):
+        entries_ignored = [entries_ignored]
+    ignored = _ids("ignored", [entry for entry in entries_ignored if entry != REST])
     for raw_id in ignored:
         _add(raw_to_train, raw_id, 0)
 
     if not ignored:  # predictions need an id for points without a class
         ignored = [next(raw for raw in range(INSTANCE_MASK) if raw not in raw_to_train)]
         raw_to_train[ignored[0]] = 0
-    return user_taxonomy(name, entries, raw_to_train, (ignored[0], *train_to_raw))
+    taxonomy = user_taxonomy(name, entries, raw_to_train, (ignored[0], *train_to_raw))
+    return dataclasses.replace(taxonomy, ignores_rest=REST in entries_ignored)
 
 
 def _add(raw_to_train: dict[int | str, int], raw_id: int, train_id: int) -> None:
@@ -398,6 +450,8 @@ def _parse_split(entry: Any) -> dict[str, tuple[str, ...]]:
     splits = {}
     for split, values in entry.items():
         names = _texts(f"split: {split}", values)
+        if not names:
+            raise InputError(f"split: {split}: expected names, found none; add some")
         splits[split] = tuple(name.rstrip("/") for name in names)
     return splits
 

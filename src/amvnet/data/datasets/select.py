@@ -36,46 +36,58 @@ def split_records(
 ) -> TrainingScans:
     """Return the scans to train on and to validate with.
 
-    If an official split is needed and the dataset has no sequence of it, the last sequence is used
-    to validate and the others to train.
-
     Args:
-        train, val: sequences; None for the sequences of the official split.
+        train, val: sequences; None for those of `Dataset.sequences`.
         with_val: train on the sequences of `val`, too, and validate with none.
 
     Raises:
-        InputError: if no sequence is left for one of the two, a sequence does not exist, or a scan
-            is in both.
+        InputError: if no sequence is left for one of the two, a sequence does not exist or is one
+            of the test split, or a scan is in both.
     """
-    present = dataset.sequences("all")
-    official_train = _sequences_on_disk(dataset, "train")
-    official_val = _sequences_on_disk(dataset, "val")
-    has_train = train or official_train
-    has_val = val or official_val
-    if not has_train or not has_val:
-        official_train = present[:-1]
-        official_val = present[-1:]
-
     # A sequence that the user named for one purpose is not used for the other by default.
-    if not val:
-        val = _without(official_val, train or ())
-    if not train:
-        train = _without(official_train, val)
+    by_default = _sequences_with_val if with_val else Dataset.sequences
+    names_val = list(val) if val else _without(by_default(dataset, "val"), train or ())
+    if train:
+        names_train = list(train)
+    elif val and not dataset.is_split:
+        names_train = _without(dataset.trainable(), val)
+    else:
+        names_train = _without(by_default(dataset, "train"), names_val)
 
     if with_val:
-        names = [*train, *_without(val, train)]
-        return TrainingScans(dataset, dataset.labelled(dataset.records(names)), [])
-
-    if not train or not val:
+        names_train += _without(names_val, names_train)
+        names_val = []
+    elif not names_train or not names_val:
         raise InputError(
-            f"{dataset.root}: expected two sequences, one to train on and one to validate with, "
-            f"found {', '.join(present)}; name them"
+            f"{dataset.spec}: expected two sequences, one to train on and one to validate with, "
+            f"found {', '.join(dataset.sequences('all'))}; name them"
         )
-    return TrainingScans(
-        dataset,
-        dataset.labelled(dataset.records(train)),
-        dataset.labelled(dataset.records(val)),
-    )
+
+    _refuse_test(dataset, names_train)
+    val_records = dataset.labelled(dataset.records(names_val)) if names_val else []
+    return TrainingScans(dataset, dataset.labelled(dataset.records(names_train)), val_records)
+
+
+def _sequences_with_val(dataset: Dataset, split: str) -> tuple[str, ...]:
+    """Return the sequences of a split for a training on all scans, one of which may be empty."""
+    try:
+        return dataset.sequences(split)
+    except InputError:
+        return () if dataset.is_split or split == "val" else dataset.trainable()
+
+
+def _refuse_test(dataset: Dataset, names: Sequence[str]) -> None:
+    """Raise InputError if sequences to train on are of the test split."""
+    try:
+        test = dataset.official("test")
+    except InputError:  # there is none
+        return
+    of_test = sorted(set(names) & set(test))
+    if of_test:
+        raise InputError(
+            f"{dataset.spec}: expected sequences to train on outside the test split, found "
+            f"{', '.join(of_test)}; name others, or correct the split"
+        )
 
 
 def _without(names: Sequence[str], others: Sequence[str]) -> list[str]:
@@ -83,14 +95,6 @@ def _without(names: Sequence[str], others: Sequence[str]) -> list[str]:
 
 
 def training_records(dataset: Dataset) -> list[ScanRecord]:
-    """Return the scans of the official training split, or all if none of it is on disk."""
-    names = _sequences_on_disk(dataset, "train") or dataset.sequences("all")
-    return dataset.records(names)
-
-
-def _sequences_on_disk(dataset: Dataset, split: str) -> tuple[str, ...]:
-    """Return the sequences of an official split that are on disk; empty if there are none."""
-    try:
-        return dataset.sequences(split)
-    except InputError:
-        return ()
+    """Return the labelled scans of the training split, or of a single sequence without a split."""
+    names = _sequences_with_val(dataset, "train")
+    return dataset.labelled(dataset.records(names))

@@ -39,7 +39,7 @@ class SemanticKitti(Dataset):
         """Return whether a folder has this layout."""
         return any(root.glob("sequences/*/velodyne")) or any(root.glob("*/velodyne"))
 
-    def sequences(self, split: str) -> tuple[str, ...]:
+    def official(self, split: str) -> tuple[str, ...]:
         """Return the sequences of "train", "val", "test" or "all" that are on disk."""
         present = self._sequences_on_disk()
         splits = {**self.taxonomy.splits, "all": present}
@@ -92,9 +92,7 @@ class SemanticKitti(Dataset):
     def _records(self, sequence: str) -> list[ScanRecord]:
         """Return the scans of one sequence, in order."""
         folder = self._folder / sequence
-
-        # If only some scans have labels, reading one without is an error.
-        has_labels = any((folder / "labels").glob("*.label"))
+        labelled = {path.name for path in (folder / "labels").glob("*.label")}
 
         records = []
         for path in sorted((folder / "velodyne").glob("*.bin")):
@@ -107,7 +105,7 @@ class SemanticKitti(Dataset):
                 name=f"{sequence}/{path.stem}",
                 sequence=sequence,
                 points_path=path,
-                labels_path=labels_path if has_labels else None,
+                labels_path=labels_path if labels_path.name in labelled else None,
                 prediction=f"sequences/{sequence}/predictions/{path.stem}.label",
             )
             records.append(record)

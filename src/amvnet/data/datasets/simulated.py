@@ -62,7 +62,7 @@ class SimulatedStreets(Dataset):
         super().__init__(root, SENSORS[sensor], f"simulated-{sensor}:{root}")
         self.sensor = sensor
 
-    def sequences(self, split: str) -> tuple[str, ...]:
+    def official(self, split: str) -> tuple[str, ...]:
         """Return the streets of "train", "val" or "all"."""
         train = range(TRAIN_STREETS[self.sensor])
         val = range(FIRST_VAL_STREET, FIRST_VAL_STREET + VAL_STREETS)
@@ -88,6 +88,10 @@ class SimulatedStreets(Dataset):
         shift = epoch * STREET_STEP
         index = int(record.points_path.name)
         return self._record((number + shift) % FIRST_VAL_STREET, index)
+
+    def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+        """Return all scans: labels are simulated with them."""
+        return list(records)
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan; simulate its street if it is not in the cache."""
