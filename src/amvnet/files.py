@@ -15,6 +15,7 @@ import yaml
 
 from amvnet.errors import InputError, shown
 
+CACHE = "AMVNET_CACHE"  # the environment variable with the folder of what can be made again
 LARGEST_YAML = 50_000  # bytes; PyYAML takes a second for as many
 DEEPEST_YAML = 50  # levels
 LONGEST_INTEGER = 40  # characters
@@ -180,6 +181,14 @@ def make_folder(path: Path) -> None:
         raise InputError(
             f"{path}: expected a folder to write to, found {problem}; give another"
         ) from None
+
+
+def user_cache() -> Path:
+    """Return where to keep what can be made again: $AMVNET_CACHE, or amvnet in the user's cache."""
+    if os.environ.get(CACHE):
+        return Path(os.environ[CACHE])
+    caches = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(caches) / "amvnet"
 
 
 def read_yaml(path: Path, content: str) -> Any:

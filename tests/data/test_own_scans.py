@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -266,7 +267,7 @@ def test_the_classes_that_differ_are_named(tmp_path: Path) -> None:
         ids = tuple(range(len(names) + 1))
         colors = ((0, 0, 0),) * len(ids)
         weights = Taxonomy("own", names, colors, dict(enumerate(ids)), ids, {}, False)
-        fails(lambda other=weights: open_with_classes(spec, other), "own.yaml", *words)
+        fails(partial(open_with_classes, spec, weights), "own.yaml", *words)
 
 
 def test_label_files_that_match_the_pattern_of_scans_are_no_scans(tmp_path: Path) -> None:

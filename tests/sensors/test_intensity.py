@@ -26,7 +26,7 @@ from amvnet.sensors.intensity import (
     trained_intensity,
 )
 from amvnet.sensors.lidars import Sensor
-from amvnet.training.loaders import sensor_record
+from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights
 
 from fixtures.sensors import LASERS, ground_height, place

@@ -14,7 +14,7 @@ from amvnet.inference.reading import normaliser_for
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import HEIGHTS, SENSORS
 from amvnet.sensors.record import KEY, measure_sensor, trained_sensor
-from amvnet.training.loaders import sensor_record
+from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.scan_writers import write_bag1

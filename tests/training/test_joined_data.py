@@ -24,8 +24,8 @@ from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.record import AS_IS
 from amvnet.sensors.record import KEY as SENSOR
 from amvnet.training.augment import mix
-from amvnet.training.loaders import sensor_record
 from amvnet.training.plan import open_parts, sized_by_init, without_mean
+from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import load, save
 
 from fixtures.own_scans import make_own_scans

@@ -21,12 +21,13 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.select import TrainingScans
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
 from amvnet.training import networks
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
-from amvnet.training.loaders import count_classes
+from amvnet.training.checking import check_data
 from amvnet.training.networks import NetworkStage
 from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights, load, save
@@ -149,17 +150,20 @@ def test_the_class_counts_of_a_run_are_those_of_its_training_scans(world: Path, 
         assert count == np.count_nonzero(raw_labels == raw_ids.get(index, -1))
 
 
-def test_counting_classes_reports_ten_times_and_only_once(
+def test_the_check_of_the_scans_reports_ten_times_and_only_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("amvnet.progress.QUIET_SECONDS", 0)
-    dataset = open_dataset(str(make_streets(tmp_path, ("00",), 23)))
-    records = dataset.records(["00"])
+    monkeypatch.setenv("AMVNET_CACHE", str(tmp_path / "cache"))
+    dataset = open_dataset(str(make_streets(tmp_path / "data", ("00", "08"), 23)))
+    scans = TrainingScans(dataset, dataset.records(["00"]), [])
     lines: list[str] = []
-    for _ in range(2):  # the second time, the counts are those of the file
-        count_classes(dataset, records, tmp_path / "counts.npz", say=lines.append)
-    assert len(lines) == 10
-    assert lines[-1] == "classes: counted in 23 of 23 scans"
+    plan = Plan(load_recipe("semantickitti-compact"), scans, tmp_path / "run", say=lines.append)
+    counts = [check_data(plan).tolist() for _ in range(2)]  # the second time from the cache
+    assert counts[0] == counts[1]
+    checked = [line for line in lines if line.startswith("checked")]
+    assert len(checked) == 10
+    assert checked[-1] == "checked 23 of 23 scans"
 
 
 def test_the_weights_describe_their_training(run: Path) -> None:

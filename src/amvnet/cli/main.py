@@ -12,6 +12,7 @@ from amvnet import __version__
 from amvnet.cli.commands.ablate import ablate
 from amvnet.cli.commands.analyze import analyze
 from amvnet.cli.commands.bench import bench
+from amvnet.cli.commands.check import check
 from amvnet.cli.commands.demo import demo
 from amvnet.cli.commands.evaluate import evaluate
 from amvnet.cli.commands.export import export
@@ -30,7 +31,7 @@ from amvnet.errors import InputError, SomeBroken, did_you_mean, memory_for
 from amvnet.runtime.threads import wait_passively
 
 # In the order of the help.
-_FIRST = (demo, simulate, train, predict, evaluate, submit, fuse)
+_FIRST = (demo, simulate, check, train, predict, evaluate, submit, fuse)
 _LAST = (rank, analyze, ablate, export, view, bench, info)
 VERBS = {run_verb.__name__: run_verb for run_verb in _FIRST + _LAST}
 RESUMED = ("train", "predict")  # verbs with --resume

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -95,7 +96,7 @@ class TrainingChoice:
     without a split the last one."""
 
     def scans(self, dataset: Dataset, with_val: bool = False) -> TrainingScans:
-        """Return the scans; if `with_val`, those to validate with are trained on, too.
+        """Return the labelled scans; if `with_val`, those to validate with are trained on as well.
 
         Scans that the split of a user's own dataset does not name are said.
         """
@@ -103,12 +104,25 @@ class TrainingChoice:
         from amvnet.data.datasets.select import split_records
 
         scans = split_records(dataset, self.train_sequences, self.val_sequences, with_val)
+        if scans.unlabelled:
+            say(f"skipped, as they have no labels: {describe_records(scans.unlabelled)}")
         if isinstance(dataset, OwnScans):
             used = {record.name for record in (*scans.train, *scans.val)}
             unnamed = [record for record in dataset.left_out() if record.name not in used]
             if unnamed:
                 say(f"not used, as the split does not name them: {describe_records(unnamed)}")
         return scans
+
+    def splits(self, dataset: Dataset) -> Iterator[tuple[str, Sequence[ScanRecord]]]:
+        """Yield the scans by the name of their split, also those without labels."""
+        from amvnet.data.datasets.select import named_sequences
+
+        train, val = named_sequences(dataset, self.train_sequences, self.val_sequences)
+        self.scans(dataset)  # says what is not used
+        yield "train", dataset.records(train)
+        yield "val", dataset.records(val)
+        with suppress(InputError):  # there may be none
+            yield "test", dataset.labelled(dataset.records(dataset.official("test")))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import torch
 from rich.table import Table
 
 from amvnet.config.recipes import recipe_names
+from amvnet.data.check import Report
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.evaluation.metrics import OVERALL
 from amvnet.inference.timing import MEAN, STAGES
@@ -48,6 +49,45 @@ def evaluation_table(report: Mapping[str, Any], taxonomy: Taxonomy) -> Table:
 
     if report["uncertain_fraction"] is not None:
         table.caption = f"uncertain points: {report['uncertain_fraction']:.1%}"
+    return table
+
+
+def contents_table(report: Report) -> Table:
+    """Return the table of what the labelled scans of a dataset hold: points and scans by class."""
+    table = Table(title=report.spec, show_edge=False)
+    table.add_column("class")
+    splits = {name: split for name, split in report.splits.items() if split.scans}
+    for name in splits:
+        table.add_column(f"{name}: points", justify="right")
+        table.add_column("in %", justify="right")
+        table.add_column("scans", justify="right")
+
+    names = ("ignored", *report.taxonomy.classes)
+    for train_id in (*range(1, len(names)), 0):
+        cells = []
+        for split in splits.values():
+            points = int(split.points[train_id])
+            share = _percent(points / max(int(split.points.sum()), 1))
+            cells += [f"{points:,}", share, str(split.scans_with[train_id])]
+        table.add_row(names[train_id], *cells)
+
+    table.add_section()
+    totals = []
+    for split in splits.values():
+        totals += [f"{int(split.points.sum()):,}", "", str(len(split.scans))]
+    table.add_row("all", *totals)
+    return table
+
+
+def unknown_table(report: Report) -> Table:
+    """Return the table of the ids that are neither of a class nor ignored."""
+    table = Table(title="ids of no class", show_edge=False)
+    table.add_column("id", justify="right")
+    table.add_column("points", justify="right")
+    table.add_column("scans", justify="right")
+    table.add_column("for example", overflow="fold")
+    for raw_id, entry in report.unknown.items():
+        table.add_row(str(raw_id), f"{entry.points:,}", str(entry.scans), str(entry.example))
     return table
 
 

@@ -105,7 +105,7 @@ class Taxonomy:
         return ("unlabelled", *self.classes)
 
     @cached_property
-    def _raw_id_lookup(self) -> np.ndarray:
+    def train_ids_by_raw(self) -> np.ndarray:
         """(65536,) int16 train ids by raw id; UNKNOWN if the taxonomy has no such raw id."""
         others = 0 if self.ignores_rest else UNKNOWN
         table = np.full(INSTANCE_MASK + 1, others, dtype=np.int16)
@@ -126,7 +126,7 @@ class Taxonomy:
             InputError: if a raw id is not in the table.
         """
         raw_ids = np.asarray(raw).astype(np.uint32) & np.uint32(INSTANCE_MASK)
-        train_ids = self._raw_id_lookup[raw_ids]
+        train_ids = self.train_ids_by_raw[raw_ids]
 
         unknown = np.unique(raw_ids[train_ids == UNKNOWN]).tolist()
         if unknown:
@@ -136,10 +136,12 @@ class Taxonomy:
 
             if raw_ids.max() <= self.size:
                 listed += " (train ids, it seems)"
+            advice = "write its raw ids, or describe your own in a YAML file (docs/own_data.md)"
+            if self.name not in TAXONOMIES:
+                advice = "add them to a class or to ignored, or write ignored: rest"
             raise InputError(
                 f"expected the raw ids of {self.name} "
-                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; write its raw "
-                "ids, or describe your own in a YAML file (docs/own_data.md)"
+                f"({', '.join(map(str, self.train_to_raw[1:]))}), found {listed}; {advice}"
             )
         return train_ids.astype(np.uint8)
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from amvnet.progress import Say
 from amvnet.sensors.intensity import TrainedIntensity
-from amvnet.training.loaders import sensor_record
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import PART_OF, SETTINGS, stage_record, stage_settings, write_yaml
+from amvnet.training.sensor_record import sensor_record
 from amvnet.weights.file import Weights, part_state, save
 
 

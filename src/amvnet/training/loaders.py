@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -15,30 +12,13 @@ from torch.utils import data
 
 from amvnet.config.schema import AugmentConfig
 from amvnet.data.datasets.base import Dataset, ScanRecord
-from amvnet.data.datasets.joined import Joined
-from amvnet.data.datasets.own import OwnScans
 from amvnet.data.laser_order import with_lasers
-from amvnet.data.spacing import evenly_spaced
 from amvnet.errors import InputError
-from amvnet.files import atomic_write
 from amvnet.models.views.points import PointBatch
-from amvnet.progress import Say, Tenths, say_nothing
 from amvnet.runtime.distributed import ALONE, Processes
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import KEY as INTENSITY
-from amvnet.sensors.intensity import (
-    MATCHED,
-    NO_INTENSITY,
-    TrainedIntensity,
-    are_quantiles,
-    match_scan,
-    quantiles_of,
-)
-from amvnet.sensors.record import AS_IS, measure_sensor, normalised_record
-from amvnet.sensors.record import KEY as SENSOR
+from amvnet.sensors.intensity import TrainedIntensity, match_scan
 from amvnet.training.augment import augment, mix, mix_lasers, paste
-
-SAMPLED_SCANS = 60  # to measure: enough for the mean height of simulated sensors
 
 Key = tuple[int, int]  # epoch, index in the list of scans
 
@@ -210,89 +190,3 @@ def make_loader(
         persistent_workers=workers > 0,
         pin_memory=torch.cuda.is_available(),  # so that batches go to a GPU while it computes
     )
-
-
-def count_classes(
-    dataset: Dataset,
-    records: Sequence[ScanRecord],
-    path: Path,
-    processes: Processes = ALONE,
-    say: Say = say_nothing,
-) -> np.ndarray:
-    """Return how many points of each class some scans have, (K,) int64.
-
-    The counts are read from the .npz file `path` if it is of these scans, else written to it.
-    """
-    source = {
-        "scans": [record.name for record in records],
-        "classes": list(dataset.taxonomy.classes),
-    }
-
-    # The first process reads for all: others might already see the file that it writes below.
-    earlier = processes.gather(_read_counts(path, source))[0]
-    if earlier is not None:
-        return earlier
-
-    counts = np.zeros(dataset.taxonomy.size + 1, dtype=np.int64)
-    share = processes.share(records)
-    tenths = Tenths()
-    for number, record in enumerate(share, start=1):
-        labels = dataset.read(record).labels
-        if labels is not None:
-            counts += np.bincount(labels, minlength=len(counts))
-        if tenths.ends(number, len(share)):
-            done = number * len(records) // len(share)
-            say(f"classes: counted in {done} of {len(records)} scans")
-
-    totals = np.sum(processes.gather(counts), axis=0)[1:]
-
-    if processes.first:
-        with atomic_write(path) as part:
-            np.savez(part, counts=totals, scans=source["scans"], classes=source["classes"])
-    return totals
-
-
-def sensor_record(
-    dataset: Dataset, records: Sequence[ScanRecord], intensity: TrainedIntensity | None = None
-) -> dict[str, Any]:
-    """Return what weights record of the sensor, measured on some of their training scans.
-
-    These are the measures of `sensors.record`, and the mean quantiles of the intensities at
-    `sensors.intensity.PROBABILITIES`, empty if no scan has usable ones. Broken scans are left out:
-    the training names them.
-
-    Args:
-        intensity: what the intensities of the scans are brought to.
-    """
-    scans = []
-    for sampled in evenly_spaced(records, SAMPLED_SCANS):
-        with suppress(InputError):
-            scans.append(dataset.read(sampled, labels=False))
-
-    quantiles_of_scans = []
-    for scan in scans:
-        quantiles = quantiles_of(scan.points[scan.valid, 3])
-        if quantiles is not None:
-            quantiles_of_scans.append(quantiles)
-    mean = np.mean(quantiles_of_scans, axis=0).round(4).tolist() if quantiles_of_scans else []
-    is_known = mean == NO_INTENSITY or are_quantiles(mean)
-    record: dict[str, Any] = {INTENSITY: mean if is_known else []}
-
-    # Normalised scans are as the weights will get them: record what they are normalised to.
-    first = dataset.dataset if isinstance(dataset, Joined) else dataset
-    normalised = normalised_record(first) if isinstance(first, OwnScans) else {}
-    record |= normalised or {SENSOR: {**measure_sensor(scans), AS_IS: True}}
-    if intensity is not None and intensity.is_matched:
-        record |= {INTENSITY: list(intensity.quantiles), MATCHED: True}
-    return record
-
-
-def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:
-    """Return the counts in a file, or None if it is missing, broken or of other scans."""
-    with (
-        suppress(OSError, ValueError, KeyError, BadZipFile),
-        np.load(path, allow_pickle=False) as file,
-    ):
-        if all(file[name].tolist() == values for name, values in source.items()):
-            return file["counts"]
-    return None

@@ -17,7 +17,8 @@ from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
 from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
-from amvnet.training.loaders import ScanSet, count_classes, make_loader
+from amvnet.training.checking import class_counts
+from amvnet.training.loaders import ScanSet, make_loader
 from amvnet.training.losses import (
     RegionLoss,
     Scored,
@@ -197,7 +198,9 @@ def train_network(plan: Plan, name: str, weights: Weights) -> None:
     model = plan.build(weights)
     intensity = _intensity(plan, weights)
     loaders = make_loaders(plan, config, intensity)
-    stage = make_stage(plan, name, model, _class_weights(plan) if config.class_weights else None)
+    # The weights of the classes in the loss (section 4.2 of the paper).
+    of_classes = class_weights(class_counts(plan)) if config.class_weights else None
+    stage = make_stage(plan, name, model, of_classes)
     try:
         fit(stage, plan, loaders, weights, intensity)
     except torch.OutOfMemoryError:
@@ -240,13 +243,6 @@ def make_loaders(
         return train, None
     val_set = ScanSet(scans.dataset, scans.val, **how)
     return train, make_loader(val_set, 1, shuffle=False, **shared)
-
-
-def _class_weights(plan: Plan) -> np.ndarray:
-    """Return the (K,) weights of the classes in the loss (section 4.2 of the paper)."""
-    path = plan.out / "class_counts.npz"
-    scans = plan.scans
-    return class_weights(count_classes(scans.dataset, scans.train, path, plan.processes, plan.say))
 
 
 def _intensity(plan: Plan, weights: Weights) -> TrainedIntensity | None:

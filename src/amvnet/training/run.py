@@ -10,6 +10,7 @@ import lightning as L
 
 from amvnet.config.schema import StageName
 from amvnet.errors import InputError
+from amvnet.training.checking import check_data, keep_counts
 from amvnet.training.head import train_head
 from amvnet.training.networks import train_network
 from amvnet.training.plan import Plan
@@ -33,7 +34,8 @@ def train(
 
     Raises:
         InputError: if the head is to be trained without trained networks, or the folder holds a
-            run that is not to be resumed or was begun with other settings.
+            run that is not to be resumed or was begun with other settings, or the check of the
+            data (`check_data`) finds an error.
     """
     names = plan.recipe.stages if stage == "all" else (stage,)
     if plan.scores is not None and names != ("head",):
@@ -43,9 +45,11 @@ def train(
     weights = _first_weights(plan, init, names)
     for name in names:
         check_begun(plan.out / name, stage_settings(plan, name, weights), plan.resume)
+    counts = check_data(plan)
     plan.processes.wait()
     if plan.processes.first:
         write_record(plan, stage, init)
+    keep_counts(plan, counts)
 
     # Save after each stage, so that one that fails does not lose the others.
     path = plan.out / "weights.safetensors"

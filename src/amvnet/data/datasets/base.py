@@ -50,6 +50,8 @@ class Dataset(ABC):
         spec: the text by which `open_dataset` opens the same dataset; by default the folder.
     """
 
+    readers = 8  # threads that may read scans at the same time
+
     def __init__(self, root: Path | str, taxonomy: Taxonomy, spec: str | None = None) -> None:
         self.root = Path(root)
         self.taxonomy = taxonomy
@@ -136,7 +138,7 @@ class Dataset(ABC):
         Raises:
             InputError: if none of the scans has labels.
         """
-        labelled = [record for record in records if record.has_labels]
+        labelled = self.having_labels(records)
         if not labelled:
             path = records[0].labels_path if records else None
             found = f"no {path}" if path is not None else "no labels"
@@ -145,6 +147,33 @@ class Dataset(ABC):
                 f"{counted(len(records), 'scan')}; name labelled sequences, or add the labels"
             )
         return labelled
+
+    def having_labels(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+        """Return those of some scans that have labels, which may be none."""
+        return [record for record in records if record.has_labels]
+
+    def read_unchanged(self, record: ScanRecord) -> Scan:
+        """Read the points of one scan as in its file; raise the errors of `read`."""
+        return self.read(record, labels=False)
+
+    @abstractmethod
+    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+        """Read the (N,) raw ids of a scan that has labels, with whatever values.
+
+        Args:
+            count: N, the number of points.
+
+        Raises:
+            InputError: if the file is missing, broken or has another number of labels.
+        """
+
+    def train_ids_by_raw(self) -> np.ndarray:
+        """Return the int16 train ids by raw id (`raw_labels`), UNKNOWN for ids to refuse."""
+        return self.taxonomy.train_ids_by_raw
+
+    def reading_key(self) -> str:
+        """Return a text that changes if the same files would be read in another way."""
+        return f"{self.spec} in {self.root.absolute()}"
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan; raise the errors of `read`."""

@@ -102,6 +102,12 @@ class Joined(Dataset):
             return self.dataset.read(record, labels)
         return self.others[record.member - 1].dataset.read(record.original, labels)
 
+    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+        """Read the raw ids of a scan of any of them; the others may have ids of their own."""
+        if not isinstance(record, MixedRecord):
+            return self.dataset.raw_labels(record, count)
+        return self.others[record.member - 1].dataset.raw_labels(record.original, count)
+
     def _record(self, member: int, place: int, epoch: int) -> MixedRecord:
         """Return the record of the scan whose turn it is at a place in an epoch."""
         records = self.others[member - 1].train
@@ -140,7 +146,8 @@ def join(
             )
 
     joined = Joined(scans, others, share)
-    return TrainingScans(joined, [*scans.train, *joined.mixed_records()], scans.val)
+    train = [*scans.train, *joined.mixed_records()]
+    return TrainingScans(joined, train, scans.val, scans.unlabelled)
 
 
 @cache

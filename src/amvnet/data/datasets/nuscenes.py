@@ -155,9 +155,19 @@ class NuScenes(Dataset):
 
         ids = None
         if labels and record.labels_path is not None:
-            indices = read_ids(record.labels_path, np.uint8, len(points))
+            indices = self.raw_labels(record, len(points))
             ids = self._categories_to_train(indices, record.labels_path)
         return Scan(points, labels=ids, ring=ring, name=record.name)
+
+    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+        """Read the (N,) indices in category.json of the points of one scan."""
+        assert record.labels_path is not None
+        return read_ids(record.labels_path, np.uint8, count)
+
+    def train_ids_by_raw(self) -> np.ndarray:
+        """Return the (256,) train ids by index in category.json."""
+        assert self._category_train_ids is not None  # no record has labels without this table
+        return self._category_train_ids
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""

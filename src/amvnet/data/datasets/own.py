@@ -11,11 +11,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.formats.find import NamedScan, list_scans, scan_stem
 from amvnet.data.formats.rows import UNKNOWN, USUAL_TYPE, RowLayout
-from amvnet.data.labels.readers import read_scan_labels
+from amvnet.data.labels.ids import train_ids
+from amvnet.data.labels.readers import read_raw_labels
 from amvnet.data.taxonomy import INSTANCE_MASK, Taxonomy, class_entries, user_taxonomy
 from amvnet.errors import InputError, did_you_mean, errors_of, shown
 from amvnet.files import read_yaml
@@ -167,12 +170,29 @@ class OwnScans(Dataset):
         self._counts[record.name] = len(scan)
 
         ids = None
-        place = self.description.labels
         path = record.labels_path
-        if labels and place is not None and path is not None:
-            layout = self.description.layout
-            ids = read_scan_labels(path, len(scan), self.taxonomy, place.field, layout)
+        if labels and path is not None:
+            ids = train_ids(path, self.raw_labels(record, len(scan)), self.taxonomy)
         return dataclasses.replace(scan, labels=ids, name=record.name)
+
+    def read_unchanged(self, record: ScanRecord) -> Scan:
+        """Read the points of one scan as they are in its file."""
+        scan = self._scans[record.name].read().to_scan()
+        self._counts[record.name] = len(scan)
+        return dataclasses.replace(scan, name=record.name)
+
+    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+        """Read the (N,) raw ids of one scan."""
+        place = self.description.labels
+        assert place is not None
+        assert record.labels_path is not None
+        layout = self.description.layout
+        return read_raw_labels(record.labels_path, count, place.field, layout)
+
+    def reading_key(self) -> str:
+        """Return what the file says of how scans and labels are read."""
+        described = self.description
+        return repr((self.root, described.scans, described.labels, described.layout))
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan; the file is not read a second time."""

@@ -13,6 +13,9 @@ from amvnet.errors import InputError
 class TrainingScans:
     """The scans of a dataset to train on, and those to validate with, which may be none.
 
+    Attributes:
+        unlabelled: scans that were chosen and have no labels, which are skipped.
+
     Raises:
         InputError: if a scan is in both `train` and `val`.
     """
@@ -20,6 +23,7 @@ class TrainingScans:
     dataset: Dataset
     train: Sequence[ScanRecord]
     val: Sequence[ScanRecord]
+    unlabelled: Sequence[ScanRecord] = ()
 
     def __post_init__(self) -> None:
         names = {record.name for record in self.train}
@@ -44,6 +48,21 @@ def split_records(
         InputError: if no sequence is left for one of the two, a sequence does not exist or is one
             of the test split, or a scan is in both.
     """
+    names_train, names_val = named_sequences(dataset, train, val, with_val)
+    chosen = dataset.records(names_train)
+    chosen_val = dataset.records(names_val) if names_val else []
+    train_records = dataset.labelled(chosen)
+    val_records = dataset.labelled(chosen_val) if names_val else []
+
+    used = {record.name for record in (*train_records, *val_records)}
+    unlabelled = [record for record in (*chosen, *chosen_val) if record.name not in used]
+    return TrainingScans(dataset, train_records, val_records, unlabelled)
+
+
+def named_sequences(
+    dataset: Dataset, train: Sequence[str] | None, val: Sequence[str] | None, with_val: bool = False
+) -> tuple[list[str], list[str]]:
+    """Return the sequences of `split_records`, to train on and to validate with."""
     # A sequence that the user named for one purpose is not used for the other by default.
     by_default = _sequences_with_val if with_val else Dataset.sequences
     names_val = list(val) if val else _without(by_default(dataset, "val"), train or ())
@@ -62,10 +81,8 @@ def split_records(
             f"{dataset.spec}: expected two sequences, one to train on and one to validate with, "
             f"found {', '.join(dataset.sequences('all'))}; name them"
         )
-
     _refuse_test(dataset, names_train)
-    val_records = dataset.labelled(dataset.records(names_val)) if names_val else []
-    return TrainingScans(dataset, dataset.labelled(dataset.records(names_train)), val_records)
+    return names_train, names_val
 
 
 def _sequences_with_val(dataset: Dataset, split: str) -> tuple[str, ...]:

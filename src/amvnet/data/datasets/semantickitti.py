@@ -10,7 +10,7 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import check_usable
 from amvnet.data.formats.raw import KITTI_COLUMNS, count_rows, read_table
-from amvnet.data.labels.ids import read_ids, train_ids
+from amvnet.data.labels.ids import check_bits, read_ids, train_ids
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.scan import Scan
@@ -67,10 +67,15 @@ class SemanticKitti(Dataset):
         points = check_usable(read_table(path, np.float32, KITTI_COLUMNS), path)
         ids = None
         if labels and record.labels_path is not None:
-            raw = read_ids(record.labels_path, np.uint32, len(points))
+            raw = self.raw_labels(record, len(points))
             ids = train_ids(record.labels_path, raw, self.taxonomy)
 
         return Scan(points, labels=ids, name=record.name)
+
+    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+        """Read the (N,) raw ids of one scan."""
+        assert record.labels_path is not None
+        return check_bits(record.labels_path, read_ids(record.labels_path, np.uint32, count))
 
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""

@@ -58,6 +58,8 @@ class SimulatedStreets(Dataset):
         sensor: the name of a sensor in `SENSORS`, whose benchmark has the classes.
     """
 
+    readers = 1  # two would simulate the same street
+
     def __init__(self, root: Path | str, sensor: str = "hdl64e") -> None:
         super().__init__(root, SENSORS[sensor], f"simulated-{sensor}:{root}")
         self.sensor = sensor
@@ -89,9 +91,19 @@ class SimulatedStreets(Dataset):
         index = int(record.points_path.name)
         return self._record((number + shift) % FIRST_VAL_STREET, index)
 
-    def labelled(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
+    def having_labels(self, records: Sequence[ScanRecord]) -> list[ScanRecord]:
         """Return all scans: labels are simulated with them."""
         return list(records)
+
+    def raw_labels(self, record: ScanRecord, count: int) -> np.ndarray:
+        """Return the (N,) train ids of the points: the cache has no others."""
+        labels = self.read(record).labels
+        assert labels is not None
+        return labels
+
+    def train_ids_by_raw(self) -> np.ndarray:
+        """Return the train ids by train id."""
+        return np.arange(self.taxonomy.size + 1, dtype=np.int16)
 
     def read(self, record: ScanRecord, labels: bool = True) -> Scan:
         """Read one scan; simulate its street if it is not in the cache."""

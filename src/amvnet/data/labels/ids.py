@@ -88,6 +88,12 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
         InputError: if an id is not one of the raw ids of the taxonomy, or if all of them look like
             float32 or big-endian ids.
     """
+    with errors_of(name):
+        return taxonomy.to_train(check_bits(name, raw))
+
+
+def check_bits(name: Path | str, raw: np.ndarray) -> np.ndarray:
+    """Return (N,) raw ids; raise InputError if all of them look like float32 or big-endian ids."""
     classes = raw.astype(np.uint32) & np.uint32(INSTANCE_MASK)
 
     # The float 40.0 and a big-endian 40 have all of their bits in the upper half.
@@ -96,6 +102,4 @@ def train_ids(name: Path | str, raw: np.ndarray, taxonomy: Taxonomy) -> np.ndarr
             f"{name}: expected little-endian {raw.dtype} ids, found the class 0 with other bits, "
             f"as float32 and big-endian ids read; write the ids as little-endian {raw.dtype}"
         )
-
-    with errors_of(name):
-        return taxonomy.to_train(raw)
+    return raw

@@ -13,7 +13,7 @@ from amvnet.data.formats.numpy_files import member_names, read_array
 from amvnet.data.formats.raw import count_rows
 from amvnet.data.formats.registry import COLUMN_READERS, read_columns
 from amvnet.data.formats.rows import UNKNOWN, RowLayout
-from amvnet.data.labels.ids import train_ids
+from amvnet.data.labels.ids import check_bits, train_ids
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 
@@ -33,7 +33,18 @@ def read_scan_labels(
     field: str | None = None,
     layout: RowLayout = UNKNOWN,
 ) -> np.ndarray:
-    """Read (N,) uint8 train ids from a file of labels, or from a field of the scan's file.
+    """Read the (N,) uint8 train ids of a scan, as `read_raw_labels` reads its raw ids.
+
+    Raises:
+        InputError: as `read_raw_labels`, or if an id is unknown.
+    """
+    return train_ids(path, read_raw_labels(path, count, field, layout), taxonomy)
+
+
+def read_raw_labels(
+    path: Path, count: int, field: str | None = None, layout: RowLayout = UNKNOWN
+) -> np.ndarray:
+    """Read (N,) raw ids from a file of labels, or from a field of the scan's file, as int64.
 
     Without a field, the ending decides the format: `.npy`, `.npz`, text with a number per line, or
     the usual column of `.pcd`, `.ply`, `.las`, `.laz`; any other file holds integers of 8, 16, 32
@@ -47,14 +58,14 @@ def read_scan_labels(
 
     Raises:
         InputError: if the file is missing or broken, lacks the field, or has another number of
-            labels or an unknown id.
+            labels.
     """
     if not path.is_file():
         raise InputError(f"{path}: expected the labels of a scan, found no file; check the path")
 
     with reading(path, "labels", ADVICE):
         raw = _read_usual(path, count) if field is None else _read_field(path, field, layout)
-    return train_ids(path, _check(raw, path, count), taxonomy)
+    return check_bits(path, _check(raw, path, count))
 
 
 def _read_field(path: Path, field: str, layout: RowLayout) -> np.ndarray:

@@ -1,0 +1,46 @@
+"""The verb `check`."""
+
+from __future__ import annotations
+
+from amvnet.cli.console import progress, say, show
+from amvnet.cli.options import TrainingChoice
+from amvnet.errors import InputError, SomeBroken
+from amvnet.progress import counted
+
+
+def check(data: str, /, choice: TrainingChoice) -> None:
+    """Check the labels of all scans to train on, to validate with and to test on.
+
+    Args:
+        data: the dataset.
+        choice: which scans to check; also those of the test split that have labels.
+    """
+    from amvnet.cli.tables import contents_table, unknown_table
+    from amvnet.data.check import check_scans
+    from amvnet.data.datasets.open import open_dataset
+
+    dataset = open_dataset(data)
+    splits = dict(choice.splits(dataset))
+    with progress("checking") as step:
+        report = check_scans(dataset, splits, step)
+
+    show(contents_table(report))
+    if report.unknown:
+        show(unknown_table(report))
+    for line in report.warnings():
+        say(line)
+
+    broken = report.broken
+    errors = list(report.errors())
+    if errors:
+        for message in broken.values():
+            say(f"broken: {message}")
+        raise InputError(errors[0])
+    if broken:
+        raise SomeBroken(
+            f"expected scans that can be read, found {len(broken)} broken ones; correct them or "
+            "leave them out",
+            list(broken.values()),
+        )
+    scans = sum(len(split.scans) for split in report.splits.values())
+    say(f"{counted(scans, 'scan')} can be trained on or scored")

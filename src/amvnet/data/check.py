@@ -1,0 +1,340 @@
+"""Check labelled scans before they are trained on: every label of every scan, in one report."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.taxonomy import INSTANCE_MASK, TAXONOMIES, UNKNOWN, Taxonomy
+from amvnet.errors import InputError
+from amvnet.files import atomic_write, user_cache
+from amvnet.progress import Progress, counted, no_progress
+from amvnet.runtime.distributed import ALONE, Processes
+
+NAMED = 5  # unknown ids and scans in a message
+LARGEST_MEMORY = 200_000_000  # bytes of a file of remembered contents; 20,000 scans need 5 million
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a labelled scan holds.
+
+    Attributes:
+        valid: valid points (`Scan.valid`).
+        ids: points by raw id.
+    """
+
+    valid: int
+    ids: Mapping[int, int]
+
+
+@dataclass
+class UnknownId:
+    """A raw id that is neither in a class nor ignored."""
+
+    points: int = 0
+    scans: int = 0
+    example: str = ""
+
+
+@dataclass
+class SplitReport:
+    """What the scans of a split hold.
+
+    Attributes:
+        scans: the names of the labelled scans that could be read.
+        unlabelled: the names of the scans without a label file, which are skipped.
+        broken: messages by the name of the scan.
+        points: (K + 1,) points by train id.
+        scans_with: (K + 1,) scans with a point of each train id.
+        unknown: by raw id.
+    """
+
+    points: np.ndarray
+    scans_with: np.ndarray
+    scans: list[str] = field(default_factory=list)
+    unlabelled: list[str] = field(default_factory=list)
+    broken: dict[str, str] = field(default_factory=dict)
+    unknown: dict[int, UnknownId] = field(default_factory=dict)
+
+    def add(self, record: ScanRecord, contents: Contents, lookup: np.ndarray) -> None:
+        """Count a scan.
+
+        Args:
+            lookup: train ids by raw id; UNKNOWN for raw ids that are not expected.
+        """
+        self.scans.append(record.name)
+        counts = np.zeros_like(self.points)
+        for raw_id, count in contents.ids.items():
+            train_id = lookup[raw_id] if raw_id < len(lookup) else UNKNOWN
+            if train_id != UNKNOWN:
+                counts[train_id] += count
+                continue
+            example = os.path.normpath(record.labels_path or record.points_path)
+            entry = self.unknown.setdefault(raw_id, UnknownId(example=example))
+            entry.points += count
+            entry.scans += 1
+        self.points += counts
+        self.scans_with += counts > 0
+
+
+@dataclass(frozen=True)
+class Report:
+    """What the labelled scans of a dataset hold, by split.
+
+    Attributes:
+        spec: the text by which the dataset is opened.
+        contents: by the name of the scan; broken scans are not in it.
+        lookup: int16 train ids by raw id (`Dataset.train_ids_by_raw`).
+    """
+
+    spec: str
+    taxonomy: Taxonomy
+    splits: Mapping[str, SplitReport]
+    contents: Mapping[str, Contents]
+    lookup: np.ndarray
+
+    def count_points(self, records: Sequence[ScanRecord]) -> np.ndarray:
+        """Return the (K + 1,) int64 points of some of the scans by train id."""
+        counts = np.zeros(self.taxonomy.size + 1, dtype=np.int64)
+        for record in records:
+            for raw_id, count in self.contents[record.name].ids.items():
+                counts[self.lookup[raw_id]] += count
+        return counts
+
+    @property
+    def broken(self) -> dict[str, str]:
+        """Messages about scans that cannot be read, by the name of the scan."""
+        return {name: text for split in self.splits.values() for name, text in split.broken.items()}
+
+    @property
+    def unknown(self) -> dict[int, UnknownId]:
+        """Raw ids that are neither in a class nor ignored, in all splits."""
+        total: dict[int, UnknownId] = {}
+        for split in self.splits.values():
+            for raw_id, entry in split.unknown.items():
+                sum_of_id = total.setdefault(raw_id, UnknownId(example=entry.example))
+                sum_of_id.points += entry.points
+                sum_of_id.scans += entry.scans
+        return dict(sorted(total.items()))
+
+    def errors(self) -> Iterator[str]:
+        """Yield what must be corrected before a training, but for broken scans."""
+        if self.taxonomy.size < 2:
+            yield (
+                f"{self.spec}: expected two or more classes to train, found only "
+                f"{self.taxonomy.classes[0]}; add a class, such as one for all other points"
+            )
+        unknown = self.unknown
+        if unknown:
+            texts = [describe_unknown(*item) for item in list(unknown.items())[:NAMED]]
+            more = f" and {len(unknown) - NAMED} more" if len(unknown) > NAMED else ""
+            yield (
+                f"{self.spec}: expected ids of classes or of ignored points, found "
+                f"{', '.join(texts)}{more}; {_advice(self.taxonomy)}"
+            )
+            return
+
+        for name, purpose in (("train", "train on"), ("val", "validate with")):
+            split = self.splits.get(name)
+            if split is None or not split.scans:
+                continue
+            present = [self.taxonomy.classes[index] for index in np.flatnonzero(split.points[1:])]
+            if not present:
+                yield (
+                    f"{self.spec}: expected points with a class to {purpose}, found "
+                    f"{counted(int(split.points[0]), 'point')} that are all ignored; correct the "
+                    "ids of the classes, or name other scans"
+                )
+            elif name == "train" and len(present) == 1:
+                yield (
+                    f"{self.spec}: expected points of two or more classes to train on, found only "
+                    f"{present[0]}; label other classes, or name other scans"
+                )
+
+    def warnings(self) -> Iterator[str]:
+        """Yield what may be a mistake."""
+        for name, split in self.splits.items():
+            if split.unlabelled:
+                total = len(split.unlabelled) + len(split.scans) + len(split.broken)
+                yield (
+                    f"{name}: skipped, as they have no labels: {len(split.unlabelled)} of "
+                    f"{counted(total, 'scan')}, such as {split.unlabelled[0]}"
+                )
+            absent = [
+                self.taxonomy.classes[index] for index in np.flatnonzero(split.points[1:] == 0)
+            ]
+            if split.scans and absent and len(absent) < self.taxonomy.size:
+                yield f"{name}: no point of {', '.join(absent)}"
+
+
+def check_scans(
+    dataset: Dataset,
+    splits: Mapping[str, Sequence[ScanRecord]],
+    progress: Progress = no_progress,
+    processes: Processes = ALONE,
+) -> Report:
+    """Read all labelled scans of some splits, and report what they hold.
+
+    Scans are read by several threads. What was found is remembered in the user's cache as long as
+    the files do not change; the classes may.
+
+    Args:
+        splits: the scans by the name of the split; those without labels are only counted.
+        progress: takes the number of this process's scans that are done, and their total.
+        processes: those that share the scans; each returns the report of all.
+    """
+    labelled = {}
+    for records in splits.values():
+        for record in dataset.having_labels(records):
+            labelled[record.name] = record
+    found = _find_contents(dataset, labelled, progress, processes)
+
+    lookup = dataset.train_ids_by_raw()
+    reports = {}
+    for split, records in splits.items():
+        size = dataset.taxonomy.size + 1
+        report = SplitReport(np.zeros(size, np.int64), np.zeros(size, np.int64))
+        for record in records:
+            contents = found.get(record.name)
+            if contents is None:
+                report.unlabelled.append(record.name)
+            elif isinstance(contents, Contents):
+                report.add(record, contents, lookup)
+            else:
+                report.broken[record.name] = contents
+        reports[split] = report
+
+    whole = {name: item for name, item in found.items() if isinstance(item, Contents)}
+    return Report(dataset.spec, dataset.taxonomy, reports, whole, lookup)
+
+
+def _find_contents(
+    dataset: Dataset,
+    records: Mapping[str, ScanRecord],
+    progress: Progress,
+    processes: Processes,
+) -> dict[str, Contents | str]:
+    """Return what scans hold, or a message about a broken scan, by the name of the scan.
+
+    Args:
+        records: labelled scans by name.
+    """
+    memory = Memory(dataset)
+    # The first process remembers for all: others might see what it writes below.
+    known = processes.gather(memory.recall(list(records.values())))[0]
+    found: dict[str, Contents | str] = {**known}
+    unread = [record for name, record in records.items() if name not in known]
+    for part in processes.gather(_read_all(dataset, processes.share(unread), progress)):
+        found |= part
+
+    if unread and processes.first:
+        whole = {name: item for name, item in found.items() if isinstance(item, Contents)}
+        memory.keep(records, whole)
+    return found
+
+
+def describe_unknown(raw_id: int, entry: UnknownId) -> str:
+    """Return an unknown id in words: how often it occurs, and in which file."""
+    points = f"{entry.points:,} point{'' if entry.points == 1 else 's'}"
+    return f"{raw_id} ({points} in {counted(entry.scans, 'scan')}, such as {entry.example})"
+
+
+def _advice(taxonomy: Taxonomy) -> str:
+    if taxonomy.name in TAXONOMIES:
+        return f"write ids of {taxonomy.name}, or describe your own in a YAML file"
+    return "add them to a class or to ignored in that file (ignored: rest takes all others)"
+
+
+def _read_all(
+    dataset: Dataset, records: Sequence[ScanRecord], progress: Progress
+) -> dict[str, Contents | str]:
+    """Return what scans hold, or a message about a broken scan, by the name of the scan."""
+
+    def read(record: ScanRecord) -> Contents | str:
+        try:
+            return _contents_of(dataset, record)
+        except InputError as error:
+            return str(error)
+        except OSError as error:  # of a network disk
+            return f"{error.filename or record.points_path}: {error.strerror or error}"
+
+    found = {}
+    with ThreadPoolExecutor(min(dataset.readers, os.cpu_count() or 1)) as pool:
+        for done, (record, result) in enumerate(
+            zip(records, pool.map(read, records), strict=True), start=1
+        ):
+            found[record.name] = result
+            progress(done, len(records))
+    return found
+
+
+def _contents_of(dataset: Dataset, record: ScanRecord) -> Contents:
+    """Read a scan and its labels; raise InputError if it cannot be trained on."""
+    scan = dataset.read_unchanged(record)
+    raw = dataset.raw_labels(record, len(scan))
+    counts = np.bincount(raw.astype(np.int64) & INSTANCE_MASK)
+    ids = {int(raw_id): int(counts[raw_id]) for raw_id in np.flatnonzero(counts)}
+
+    valid = int(scan.valid.sum())
+    if valid < 2:  # batch norm needs two points to compute a variance
+        raise InputError(
+            f"{scan.name}: expected at least two valid points to train with, found {valid}; "
+            "leave the scan out"
+        )
+    return Contents(valid, ids)
+
+
+class Memory:
+    """The contents of a dataset's scans in the user's cache, as long as their files do not change.
+
+    What cannot be read or written there is forgotten: it only costs time.
+    """
+
+    def __init__(self, dataset: Dataset) -> None:
+        identity = repr((type(dataset).__name__, dataset.reading_key()))
+        name = hashlib.sha256(identity.encode()).hexdigest()[:16]
+        self.path = user_cache() / "checked" / f"{name}.json"
+        self._entries: dict[str, Any] = {}
+
+    def recall(self, records: Sequence[ScanRecord]) -> dict[str, Contents]:
+        """Return the remembered contents of scans by name."""
+        entries: Any = None
+        with suppress(OSError, ValueError, RecursionError):
+            if self.path.stat().st_size <= LARGEST_MEMORY:
+                entries = json.loads(self.path.read_text(encoding="utf-8"))
+        self._entries = entries if isinstance(entries, dict) else {}
+
+        known = {}
+        for record in records:
+            with suppress(KeyError, TypeError, ValueError, AttributeError):
+                state, valid, ids = self._entries[record.name]
+                if state == _state_of(record):
+                    counts = {int(raw_id): int(count) for raw_id, count in ids.items()}
+                    known[record.name] = Contents(int(valid), counts)
+        return known
+
+    def keep(self, records: Mapping[str, ScanRecord], contents: Mapping[str, Contents]) -> None:
+        """Remember the contents of scans, and of those that were recalled."""
+        for name, found in contents.items():
+            self._entries[name] = (_state_of(records[name]), found.valid, found.ids)
+        with suppress(OSError, InputError), atomic_write(self.path) as part:
+            part.write_text(json.dumps(self._entries), encoding="utf-8")
+
+
+def _state_of(record: ScanRecord) -> list[list[Any]]:
+    """Return what changes with the files of a scan: their paths, sizes and times."""
+    state: list[list[Any]] = []
+    for path in (record.points_path, record.labels_path):
+        stat = path.stat() if path is not None and path.is_file() else None
+        state.append([str(path), stat and stat.st_size, stat and stat.st_mtime_ns])
+    return state

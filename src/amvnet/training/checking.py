@@ -1,0 +1,125 @@
+"""The check of a training's scans before its first epoch, and the class counts that it gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from amvnet.data.check import Report, check_scans
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.joined import Joined, MixedRecord
+from amvnet.data.datasets.simulated import SimulatedStreets
+from amvnet.errors import InputError
+from amvnet.files import atomic_write
+from amvnet.progress import Tenths, counted
+from amvnet.training.plan import Plan
+
+COUNTS = "class_counts.npz"  # in the folder of the run
+NAMED = 3  # broken scans in a message
+
+
+def check_data(plan: Plan) -> np.ndarray:
+    """Check all labels of the scans of a training, and say what may be a mistake.
+
+    Returns:
+        (K,) int64: how many points of each class the training scans of an epoch have.
+
+    Raises:
+        InputError: if a label has an unknown id, a scan cannot be read, or there is nothing to
+            learn or to validate with.
+    """
+    tenths = Tenths()
+
+    def progress(done: int, total: int) -> None:
+        if tenths.ends(done, total):
+            size = plan.processes.size
+            plan.say(f"checked {min(done * size, total * size)} of {total * size} scans")
+
+    totals = np.zeros(plan.scans.dataset.taxonomy.size + 1, dtype=np.int64)
+    for dataset, splits, counted_records in _datasets_of(plan):
+        report = check_scans(dataset, splits, progress, plan.processes)
+        _refuse(report)
+        for line in report.warnings():
+            plan.say(line)
+        totals += report.count_points(counted_records)
+    return totals[1:]
+
+
+def class_counts(plan: Plan) -> np.ndarray:
+    """Return the (K,) counts of `check_data`, which are kept in the folder of the run."""
+    # The first process reads for all: others might already see the file that it writes below.
+    kept = plan.processes.gather(_read_counts(plan.out / COUNTS, _source_of(plan)))[0]
+    if kept is not None:
+        return kept
+    counts = check_data(plan)
+    keep_counts(plan, counts)
+    return counts
+
+
+def keep_counts(plan: Plan, counts: np.ndarray) -> None:
+    """Write the (K,) counts of `check_data` into the folder of the run."""
+    if plan.processes.first:
+        with atomic_write(plan.out / COUNTS) as part:
+            np.savez(part, counts=counts, **_source_of(plan))  # type: ignore[arg-type]
+
+
+def _datasets_of(
+    plan: Plan,
+) -> Iterator[tuple[Dataset, Mapping[str, Sequence[ScanRecord]], Sequence[ScanRecord]]]:
+    """Yield each dataset of a training, its scans by split, and those of the first epoch."""
+    scans = plan.scans
+    joined = scans.dataset
+    if not isinstance(joined, Joined):
+        yield joined, {"train": scans.train, "val": scans.val}, scans.train
+        return
+
+    mixed = [record for record in scans.train if isinstance(record, MixedRecord)]
+    own = [record for record in scans.train if not isinstance(record, MixedRecord)]
+    yield joined.dataset, {"train": own, "val": scans.val}, own
+    for member, other in enumerate(joined.others, start=1):
+        in_epoch = [record.original for record in mixed if record.member == member]
+        # Streets of later epochs are simulated when it is their turn.
+        is_simulated = isinstance(other.dataset, SimulatedStreets)
+        yield other.dataset, {"train": in_epoch if is_simulated else other.train}, in_epoch
+
+
+def _refuse(report: Report) -> None:
+    """Raise InputError if a report has an error."""
+    for error in report.errors():
+        raise InputError(error)
+
+    broken = report.broken
+    if broken:
+        total = sum(len(split.scans) + len(split.broken) for split in report.splits.values())
+        others = list(broken)[1:NAMED]
+        more = len(broken) - 1 - len(others)
+        rest = f", also {', '.join(others)}" if others else ""
+        rest += f" and {more} more" if more > 0 else ""
+        raise InputError(
+            f"{report.spec}: expected scans that can be read, found {len(broken)} of "
+            f"{counted(total, 'scan')} that cannot: {next(iter(broken.values()))}{rest}; correct "
+            "them or leave them out (amvnet check lists all)"
+        )
+
+
+def _source_of(plan: Plan) -> dict[str, list[str]]:
+    """Return what the counts are of."""
+    return {
+        "scans": [record.name for record in plan.scans.train],
+        "classes": list(plan.scans.dataset.taxonomy.classes),
+    }
+
+
+def _read_counts(path: Path, source: dict[str, list[str]]) -> np.ndarray | None:
+    """Return the counts in a file, or None if it is missing, broken or of other scans."""
+    with (
+        suppress(OSError, ValueError, KeyError, BadZipFile),
+        np.load(path, allow_pickle=False) as file,
+    ):
+        if all(file[name].tolist() == values for name, values in source.items()):
+            return file["counts"]
+    return None

@@ -1,0 +1,62 @@
+"""What weights record of the sensor of their training scans."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from amvnet.data.datasets.base import Dataset, ScanRecord
+from amvnet.data.datasets.joined import Joined
+from amvnet.data.datasets.own import OwnScans
+from amvnet.data.spacing import evenly_spaced
+from amvnet.errors import InputError
+from amvnet.sensors.intensity import KEY as INTENSITY
+from amvnet.sensors.intensity import (
+    MATCHED,
+    NO_INTENSITY,
+    TrainedIntensity,
+    are_quantiles,
+    quantiles_of,
+)
+from amvnet.sensors.record import AS_IS, measure_sensor, normalised_record
+from amvnet.sensors.record import KEY as SENSOR
+
+SAMPLED_SCANS = 60  # to measure: enough for the mean height of simulated sensors
+
+
+def sensor_record(
+    dataset: Dataset, records: Sequence[ScanRecord], intensity: TrainedIntensity | None = None
+) -> dict[str, Any]:
+    """Return what weights record of the sensor, measured on some of their training scans.
+
+    These are the measures of `sensors.record`, and the mean quantiles of the intensities at
+    `sensors.intensity.PROBABILITIES`, empty if no scan has usable ones. Broken scans are left out:
+    the training names them.
+
+    Args:
+        intensity: what the intensities of the scans are brought to.
+    """
+    scans = []
+    for sampled in evenly_spaced(records, SAMPLED_SCANS):
+        with suppress(InputError):
+            scans.append(dataset.read(sampled, labels=False))
+
+    quantiles_of_scans = []
+    for scan in scans:
+        quantiles = quantiles_of(scan.points[scan.valid, 3])
+        if quantiles is not None:
+            quantiles_of_scans.append(quantiles)
+    mean = np.mean(quantiles_of_scans, axis=0).round(4).tolist() if quantiles_of_scans else []
+    is_known = mean == NO_INTENSITY or are_quantiles(mean)
+    record: dict[str, Any] = {INTENSITY: mean if is_known else []}
+
+    # Normalised scans are as the weights will get them: record what they are normalised to.
+    first = dataset.dataset if isinstance(dataset, Joined) else dataset
+    normalised = normalised_record(first) if isinstance(first, OwnScans) else {}
+    record |= normalised or {SENSOR: {**measure_sensor(scans), AS_IS: True}}
+    if intensity is not None and intensity.is_matched:
+        record |= {INTENSITY: list(intensity.quantiles), MATCHED: True}
+    return record

@@ -1,0 +1,207 @@
+"""The check of labelled scans: what it counts, what it refuses, and what it remembers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from amvnet.data.check import Contents, Memory, check_scans
+from amvnet.data.datasets.open import open_dataset
+from amvnet.data.datasets.own import OwnScans, open_own
+from amvnet.data.taxonomy import UNKNOWN
+
+from fixtures.datasets import MAKERS
+from fixtures.scan_writers import some_points
+from fixtures.worlds import make_streets, run_cli, write_recipe
+
+SITES = ("a", "b", "c")  # c validates
+RAW = np.random.default_rng(1).choice([3, 7, 40], 60)
+BASE: dict[str, Any] = {
+    "classes": {"ground": 3, "plant": [7, 8], "car": 11},
+    "ignored": [40],
+    "scans": "*/*.npy",
+    "labels": ".label",
+}
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "cache"
+    monkeypatch.setenv("AMVNET_CACHE", str(folder))
+    return folder
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """Two scans at each site; return the file that describes them."""
+    for number, site in enumerate(SITES):
+        (tmp_path / site).mkdir()
+        for index in range(2):
+            np.save(tmp_path / f"{site}/{index}.npy", some_points(seed=2 * number + index))
+            write_labels(tmp_path / f"{site}/{index}.label", RAW)
+    return describe(tmp_path)
+
+
+def describe(folder: Path, **changes: Any) -> Path:
+    path = folder / "own.yaml"
+    path.write_text(yaml.safe_dump({**BASE, **changes}, sort_keys=False))
+    return path
+
+
+def write_labels(path: Path, raw: np.ndarray) -> None:
+    raw.astype(np.uint32).tofile(path)
+
+
+def train(data: Path) -> str:
+    """Start a training that must be refused before it makes its folder; return its line."""
+    recipe = write_recipe(data.parent / "recipe.yaml")
+    code, error = run_cli("train", recipe, "--data", data, "--out", data.parent / "run")
+    assert code == 2
+    assert error.count("\n") == 1
+    assert not (data.parent / "run").exists()
+    return error
+
+
+def test_points_and_scans_are_counted_by_class(data: Path) -> None:
+    dataset = open_own(data)
+    splits = {split: dataset.records(dataset.sequences(split)) for split in ("train", "val")}
+    report = check_scans(dataset, splits)
+    once = [np.count_nonzero(raw == RAW) for raw in (40, 3, 7, 11)]
+    for split, scans in (("train", 4), ("val", 2)):
+        assert report.splits[split].points.tolist() == [scans * count for count in once]
+        assert report.splits[split].scans_with.tolist() == [scans, scans, scans, 0]
+    assert list(report.errors()) == []
+    assert list(report.warnings()) == ["train: no point of car", "val: no point of car"]
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_the_counts_of_a_benchmark_are_those_of_its_scans(name: str, tmp_path: Path) -> None:
+    dataset = open_dataset(MAKERS[name](tmp_path / "set").spec)
+    records = dataset.having_labels(dataset.records(dataset.sequences("all")))
+    report = check_scans(dataset, {"train": records})
+    labels = [dataset.read(record).labels for record in records]
+    expected = np.bincount(
+        np.concatenate([*labels, []]).astype(int), minlength=dataset.taxonomy.size + 1
+    )
+    np.testing.assert_array_equal(report.splits["train"].points, expected)
+    np.testing.assert_array_equal(report.count_points(records), expected)
+
+
+def test_every_unknown_id_is_found_before_a_training(data: Path) -> None:
+    raw = RAW.copy()
+    raw[:5], raw[5:8] = 55, 1000
+    write_labels(data.parent / "c/1.label", raw)  # of a scan to validate with
+    write_labels(data.parent / "a/0.label", np.where(np.arange(60) == 0, 55, RAW))
+    for error in (train(data), run_cli("check", data)[1]):
+        assert "55 (6 points in 2 scans, such as" in error
+        assert f"1000 (3 points in 1 scan, such as {data.parent / 'c/1.label'})" in error
+        assert "ignored: rest" in error
+
+
+def test_labels_without_a_class_or_of_one_class_are_not_trained_on(data: Path) -> None:
+    for site in ("a", "b"):
+        for index in range(2):
+            write_labels(data.parent / f"{site}/{index}.label", np.full(60, 40))
+    assert "all ignored" in train(data)
+
+    for site in ("a", "b"):
+        for index in range(2):
+            write_labels(data.parent / f"{site}/{index}.label", np.where(RAW == 7, 3, RAW))
+    assert "only ground" in train(data)
+
+    describe(data.parent, classes={"ground": [3, 7]})
+    assert "two or more classes" in train(data)
+
+
+def test_nothing_to_validate_with_is_refused(data: Path) -> None:
+    for index in range(2):
+        write_labels(data.parent / f"c/{index}.label", np.full(60, 40))
+    assert "validate" in train(data)
+
+
+def test_missing_label_files_are_skipped_and_counted(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (data.parent / "b/1.label").unlink()
+    assert run_cli("check", data)[0] == 0
+    text = capsys.readouterr().out
+    assert "train: skipped, as they have no labels: 1 of 4 scans, such as b/1" in text
+    assert "5 scans can be" in text
+
+    # In every layout.
+    streets = make_streets(data.parent / "streets")
+    (streets / "sequences/01/labels/000001.label").unlink()
+    assert run_cli("check", streets)[0] == 0
+    assert "1 of 4 scans, such as 01/000001" in capsys.readouterr().out
+
+
+def test_broken_scans_are_named_and_the_others_are_checked(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (data.parent / "a/1.npy").write_bytes(b"no array")
+    np.save(data.parent / "c/0.npy", np.full((60, 4), np.nan))
+    code, error = run_cli("check", data)
+    assert code == 3
+    assert "a/1.npy" in error
+    assert "found 2 broken" in error
+    assert "4 scans" not in error
+    assert str(3 * np.count_nonzero(RAW == 3)) in capsys.readouterr().out
+    line = train(data)
+    assert "found 2 of 6 scans that cannot" in line
+    assert "a/1.npy" in line
+
+
+def refuse_to_read(patch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("the scan was read again")
+
+    patch.setattr(OwnScans, "read_unchanged", fail)
+
+
+def test_what_was_found_is_remembered_as_long_as_files_stay(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def counts() -> list[int]:
+        dataset = open_own(data)
+        report = check_scans(dataset, {"train": dataset.records(dataset.sequences("all"))})
+        assert not report.broken
+        return report.splits["train"].points.tolist()
+
+    before = counts()
+    with monkeypatch.context() as patch:
+        refuse_to_read(patch)
+        assert counts() == before
+        # Other classes need no second look at the files.
+        describe(data.parent, classes={"ground": [3, 7], "car": 11})
+        assert counts() == [before[0], before[1] + before[2], 0]
+
+    describe(data.parent)
+    write_labels(data.parent / "a/0.label", np.full(60, 11))
+    assert counts()[3] == 60
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"a/0": [1]}', '{"a/0": [[], "x", {"3": "y"}]}'])
+def test_a_broken_memory_is_forgotten(data: Path, text: str) -> None:
+    dataset = open_own(data)
+    records = dataset.records(dataset.sequences("all"))
+    memory = Memory(dataset)
+    memory.path.parent.mkdir(parents=True)
+    memory.path.write_text(text)
+    assert memory.recall(records) == {}
+    assert len(check_scans(dataset, {"train": records}).contents) == 6
+    assert len(Memory(dataset).recall(records)) == 6
+
+
+def test_a_cache_that_cannot_be_written_costs_only_time(
+    data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AMVNET_CACHE", str(data))  # a file
+    dataset = open_own(data)
+    report = check_scans(dataset, {"train": dataset.records(["a"])})
+    assert all(isinstance(found, Contents) for found in report.contents.values())
+    assert len(report.contents) == 2
+    assert (report.lookup[[3, 55]] == [1, UNKNOWN]).all()
