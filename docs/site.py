@@ -10,10 +10,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import amvnet
+from amvnet.cli.commands.demo import SEED
 from amvnet.cli.main import DONE, main
 
 ROOT = Path(__file__).parents[1]
-SEED = 80  # of the street; the built-in weights were not trained on it
 LIVE = "live/index.html"  # docs/index.md shows it
 
 
@@ -29,7 +29,7 @@ def on_post_build(config: Any, **_: Any) -> None:
     """Write the page of a simulated scan into the site; MkDocs calls this last."""
     page = Path(config.site_dir) / LIVE
     with TemporaryDirectory() as folder:
-        data = amvnet.simulate(folder, sequences=1, scans=2, seed=SEED)
+        data = amvnet.simulate(Path(folder) / "street", sequences=1, scans=2, seed=SEED)
         view = ["view", str(data), "--weights", "sim-hdl64e", "--html", str(page)]
         with redirect_stdout(io.StringIO()):
             code = main(view)
