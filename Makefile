@@ -6,7 +6,7 @@ SPREAD := OMP_NUM_THREADS=1
 
 .PHONY: demo test test-slow bench docs lint format clean
 
-demo: .venv/installed  ## simulate streets, segment, score and draw them
+demo: .venv/installed  ## simulate streets, segment and score them, and show all in demo/index.html
 	$(BIN)/amvnet demo --out demo
 
 test: .venv/installed lint  ## style, types and the tests; COVERAGE=1 measures which lines they run
@@ -22,13 +22,13 @@ docs: .venv/docs  ## the site of docs/, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: .venv/installed
-	$(BIN)/ruff check src ros2 docker tests benchmarks docs
-	$(BIN)/ruff format --check src ros2 docker tests benchmarks
+	$(BIN)/ruff check src ros2 docker tests benchmarks docs .ci
+	$(BIN)/ruff format --check src ros2 docker tests benchmarks docs/*.py
 	$(BIN)/mypy
 
 format: .venv/installed
-	$(BIN)/ruff check --fix src ros2 docker tests benchmarks docs
-	$(BIN)/ruff format src ros2 docker tests benchmarks
+	$(BIN)/ruff check --fix src ros2 docker tests benchmarks docs .ci
+	$(BIN)/ruff format src ros2 docker tests benchmarks docs/*.py
 
 # torch first and by itself: pinned, so that no other build is drawn in.
 .venv/installed: pyproject.toml constraints.txt

@@ -1,10 +1,14 @@
+from pathlib import Path
+from xml.etree import ElementTree
+
 from setuptools import setup
 
 NAME = "amvnet_ros"
+VERSION = ElementTree.parse(Path(__file__).with_name("package.xml")).findtext("version")
 
 setup(
     name=NAME,
-    version="0.2.0",
+    version=VERSION,
     packages=[NAME],
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

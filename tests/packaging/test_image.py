@@ -253,7 +253,7 @@ def test_the_page_runs_commands_that_there_are() -> None:
     assert len(commands) >= 3
     for _, verb, composed_verb in commands:
         assert verb + composed_verb in VERBS
-    for path in re.findall(r"(?:docker|conda|ros2)/[\w./]+\w", page):
+    for path in re.findall(r"(?:docker|ros2)/[\w./]+\w", page):
         assert (ROOT / path).exists(), path
 
 

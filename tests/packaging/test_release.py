@@ -1,0 +1,76 @@
+"""One version, in one place; a tag releases its part of the changelog."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+NOTES = ROOT / ".ci/release_notes.py"
+
+
+def run_notes(root: Path, tag: str) -> subprocess.CompletedProcess[str]:
+    """Run the program on a copy of what it reads, below `root`."""
+    (root / ".ci").mkdir(exist_ok=True)
+    (root / ".ci/release_notes.py").write_text(NOTES.read_text())
+    command = [sys.executable, str(root / ".ci/release_notes.py"), tag]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def make_project(root: Path, changelog: str) -> None:
+    (root / "pyproject.toml").write_text('[project]\nversion = "1.2.3"\n')
+    (root / "CHANGELOG.md").write_text(changelog)
+
+
+def test_the_notes_are_the_part_on_the_version(tmp_path: Path) -> None:
+    newest = "## [Unreleased]\n\n- not yet\n\n## [1.2.3] - 2026-01-02\n\n### Added\n\n- this\n\n"
+    make_project(tmp_path, f"# Changelog\n\n{newest}## [1.2.2] - 2025-01-02\n\n- that\n")
+    result = run_notes(tmp_path, "v1.2.3")
+    assert (result.returncode, result.stdout) == (0, "### Added\n\n- this\n")
+
+
+def test_a_tag_of_another_version_is_not_released(tmp_path: Path) -> None:
+    make_project(tmp_path, "## [1.2.4] - 2026-01-02\n\n- this\n")
+    result = run_notes(tmp_path, "v1.2.4")
+    assert result.returncode == 2
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_version_without_a_dated_part_is_not_released(tmp_path: Path) -> None:
+    for changelog in ("## [Unreleased]\n\n- this\n", "## [1.2.3] - 2026-01-02\n\n## [1.2.2]\n"):
+        make_project(tmp_path, changelog)
+        result = run_notes(tmp_path, "v1.2.3")
+        assert result.returncode == 2
+        assert result.stderr.count("\n") == 1
+
+
+def test_the_changelog_has_a_part_on_the_version_after_an_unreleased_one() -> None:
+    headings = re.findall(r"(?m)^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text())
+    assert headings[:2] == ["Unreleased", PROJECT["version"]]
+
+
+def test_no_other_file_states_a_version() -> None:
+    """ROS wants it in package.xml, which tests/ros2 compares; setup.py reads it from there."""
+    assert "version" not in yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert PROJECT["version"] not in (ROOT / "ros2/amvnet_ros/setup.py").read_text()
+
+
+def test_only_a_tag_publishes_and_no_job_has_more_rights_than_it_needs() -> None:
+    workflow = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())
+    assert workflow[True] == {"push": {"tags": ["v*"]}}  # YAML reads `on` as true
+    assert workflow["permissions"] == {"contents": "read"}
+    assert "permissions" not in workflow["jobs"]["build"]
+    assert workflow["jobs"]["publish"]["needs"] == "build"
+
+
+def test_the_address_of_the_repository_is_the_same_everywhere() -> None:
+    address = PROJECT["urls"]["Repository"]
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["repository-code"] == address
+    for url in PROJECT["urls"].values():
+        assert url.startswith((address, "https://arxiv.org/"))
