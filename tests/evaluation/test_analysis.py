@@ -269,6 +269,21 @@ def test_more_neighbours_are_swept_with_heads_of_their_own(world: Path) -> None:
     assert "networks" in refusal(command.replace("weights.safetensors", "other.safetensors"))
 
 
+def test_taus_are_swept_with_heads_of_their_own(world: Path) -> None:
+    out = world / "taus"
+    options = f"--out {out} --taus 1,0.5 --recipe {world}/recipe.yaml"
+    succeed(f"analyze {world}/data --weights {world}/weights.safetensors {options}")
+    assert column(out / "taus.csv", "tau") == ["0.5", "1.0"]
+    assert column(out / "taus.csv", "uncertain %")[1].startswith("100")
+
+    half = load(out / "taus/0.5/weights.safetensors")
+    every = load(out / "taus/1/weights.safetensors")
+    assert half.model.assertion.threshold == 0.5
+    assert every.model.assertion.threshold == 1
+    name = "point_head.mlp.0.weight"
+    assert not torch.equal(half.tensors[name], every.tensors[name])
+
+
 def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     save(without(fresh_weights(), "point_head"), world / "headless.safetensors")
 
@@ -276,6 +291,8 @@ def test_wrong_input_of_analyze_is_one_line(world: Path) -> None:
     cases = [
         ("headless", "", "point_head"),
         ("weights", "--neighbours 3", "--recipe"),
+        ("weights", "--taus 0.5", "--recipe"),
+        ("weights", f"--taus 1.5 {recipe}", "taus"),
         ("weights", f"--neighbours 3,x {recipe}", "found 'x'"),
         ("weights", f"--neighbours ² {recipe}", "²"),
         ("weights", "--neighbours 3 --recipe nonsense", "nonsense"),

@@ -28,6 +28,7 @@ from amvnet.training import networks
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.checking import check_data
+from amvnet.training.head_points import PointGatherer
 from amvnet.training.networks import NetworkStage
 from amvnet.training.plan import Plan
 from amvnet.weights.file import PARTS, Weights, load, save
@@ -444,6 +445,28 @@ def test_the_head_stage_leaves_the_networks_bitwise_unchanged(
     before = load(run)
     after = train(world, tmp_path / "head", "--stage", "head", "--init", run, "--training.seed", 5)
     assert differing(before, after) == {"point_head"}
+
+
+def test_a_head_may_learn_from_points_of_another_tau(
+    world: Path, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares: dict[str, list[float]] = {"train": [], "val": []}
+    gather = PointGatherer.gather
+
+    def watched(self: PointGatherer, records: Any, folder: Path, *more: Any, **named: Any) -> Any:
+        points = gather(self, records, folder, *more, **named)
+        shares[folder.name].append(points.uncertain_share)
+        return points
+
+    monkeypatch.setattr(PointGatherer, "gather", watched)
+    options = ("--stage", "head", "--init", run, "--training.head.epochs", 1)
+    train(world, tmp_path / "own", *options)
+    weights = train(world, tmp_path / "few", *options, "--training.head.tau", 0.8)
+
+    # It validates at the model's tau, which stays.
+    assert 0 < shares["train"][1] < shares["train"][0]
+    assert shares["val"][0] == shares["val"][1]
+    assert weights.model.assertion == load(run).model.assertion
 
 
 def test_a_stage_takes_the_other_parts_from_init(world: Path, run: Path, tmp_path: Path) -> None:

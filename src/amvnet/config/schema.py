@@ -344,6 +344,9 @@ class HeadTraining(Checked):
     """Share of the steps before the learning rate's peak (open)."""
     views: Annotated[int, Range(0)] = 0
     """Augmented copies of each training scan to score for the head; 0: the scan itself."""
+    tau: Share = 0.0
+    """Largest cosine similarity of the points that the head learns from; 0: that of the model's
+    uncertain points (open)."""
     disturb: Share = 0.0
     """Probability of disturbing the scores of a network in a view of a scan (open)."""
     points: Count = 300_000

@@ -1,12 +1,12 @@
-"""Studies that train: heads by number of neighbours, and the range-view network's ablation."""
+"""Studies that train: heads by tau and by neighbours, and the range-view network's ablation."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from amvnet.config.schema import Recipe
+from amvnet.config.schema import ModelConfig, Recipe
 from amvnet.evaluation.analysis import SweptRow, swept_row
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
@@ -18,35 +18,49 @@ from amvnet.training.run import train
 from amvnet.weights.file import Weights
 
 
-def sweep_neighbours(
-    plan: Plan, counts: Sequence[int], weights: Weights, device: str = "cpu"
+def sweep_heads(
+    plan: Plan,
+    models: Mapping[int, ModelConfig] | Mapping[float, ModelConfig],
+    weights: Weights,
+    device: str = "cpu",
 ) -> Iterator[SweptRow]:
-    """Train a head for each number of neighbours, and yield its figures (Fig. 8 of the paper).
+    """Train a head for each value of a parameter, and yield its figures (Fig. 8 of the paper).
 
     Args:
-        plan: how the heads are trained; each is kept in a folder of the plan's, and not trained
-            again if it is finished.
-        weights: whose networks the heads are trained for.
+        plan: how the heads are trained. Each head is kept in a folder inside the plan's folder, and
+            not trained again if it is finished.
+        models: by value, the configuration with this value.
+        weights: the weights with the networks that the heads are trained for.
 
     Raises:
         InputError: if a folder holds a head for other networks, other scans or another recipe.
     """
     dataset = plan.scans.dataset
-    for count in counts:
-        networks = _with_neighbours(weights, count)
-        recipe = dataclasses.replace(plan.recipe, model=networks.model)
-        head_plan = dataclasses.replace(plan, recipe=recipe, out=plan.out / str(count))
+    for value, model in models.items():
+        networks = _networks(weights, model)
+        recipe = dataclasses.replace(plan.recipe, model=model)
+        head_plan = dataclasses.replace(plan, recipe=recipe, out=plan.out / f"{value:g}")
 
         segmenter = Segmenter(train(head_plan, "head", networks), device)
         evaluation = evaluate(dataset, plan.scans.val, label_by_weights(dataset, segmenter))
         uncertain = evaluation.uncertain / max(evaluation.asked, 1)
-        yield swept_row(count, uncertain, evaluation.matrices["amvnet"][0], dataset.taxonomy)
+        yield swept_row(value, uncertain, evaluation.matrices["amvnet"][0], dataset.taxonomy)
 
 
-def _with_neighbours(weights: Weights, count: int) -> Weights:
-    """Return the networks of some weights, for a head with another number of neighbours."""
-    head = dataclasses.replace(weights.model.point_head, neighbours=count)
-    model = dataclasses.replace(weights.model, point_head=head)
+def with_neighbours(model: ModelConfig, count: int) -> ModelConfig:
+    """Return the configuration with another number of neighbours of a point."""
+    head = dataclasses.replace(model.point_head, neighbours=count)
+    return dataclasses.replace(model, point_head=head)
+
+
+def with_tau(model: ModelConfig, tau: float) -> ModelConfig:
+    """Return the configuration with another tau. With a tau of 1, every point is uncertain."""
+    assertion = dataclasses.replace(model.assertion, threshold=tau)
+    return dataclasses.replace(model, assertion=assertion)
+
+
+def _networks(weights: Weights, model: ModelConfig) -> Weights:
+    """Return the two networks of some weights, for a head of another configuration."""
     networks = Weights(model, weights.taxonomy, weights.sensor)
     for part in BOTH_NETWORKS:
         networks = networks.replace_part(part, weights)

@@ -112,7 +112,9 @@ def train_head(plan: Plan, weights: Weights) -> None:
 
     # Gather the uncertain points of all scans, with their scores and neighbours.
     gatherer = PointGatherer(plan, weights, intensity)
-    train = gatherer.gather(plan.scans.train, folder / "train", config.views, plan.say)
+    train = gatherer.gather(
+        plan.scans.train, folder / "train", config.views, tau=config.tau, say=plan.say
+    )
     val = gatherer.gather(plan.scans.val, folder / "val") if plan.scans.val else None
 
     model = plan.build(weights)

@@ -153,7 +153,12 @@ class PointGatherer:
     intensity: TrainedIntensity | None = None
 
     def gather(
-        self, records: Sequence[ScanRecord], folder: Path, views: int = 0, say: Say = say_nothing
+        self,
+        records: Sequence[ScanRecord],
+        folder: Path,
+        views: int = 0,
+        tau: float = 0.0,
+        say: Say = say_nothing,
     ) -> HeadPoints:
         """Gather the labelled uncertain points of some scans.
 
@@ -164,6 +169,7 @@ class PointGatherer:
             folder: receives the points; its earlier content is removed.
             views: how often each scan is scored, each time augmented differently; 0 to score it
                 once, without augmentation. Other models' scores are of the scans as they are.
+            tau: the threshold of the assertion; 0 takes the model's.
 
         Raises:
             InputError: if the scans have too few labelled points.
@@ -184,7 +190,7 @@ class PointGatherer:
         keys = list(product(range(max(views, 1)), range(len(scans))))
         least = max(2, self.plan.processes.size)  # batch norm needs two, and each process one
 
-        assertion = Disagreement(self.weights.model.assertion.threshold)
+        assertion = Disagreement(tau or self.weights.model.assertion.threshold)
         points = self._gather(scans, keys, folder, assertion, say)
         if len(points) < least:
             say("head: the networks agree everywhere; it learns from points drawn from all")

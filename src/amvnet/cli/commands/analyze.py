@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, say
 from amvnet.cli.options import LabelledChoice
-from amvnet.config.bounds import Range
+from amvnet.config.bounds import Range, Share
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute
 from amvnet.progress import counted
@@ -23,6 +24,7 @@ def analyze(
     choice: LabelledChoice,
     compute: Compute,
     neighbours: tuple[Neighbours, ...] | None = None,
+    taus: tuple[Share, ...] | None = None,
     recipe: str | None = None,
     train_sequences: tuple[str, ...] | None = None,
 ) -> None:
@@ -36,6 +38,8 @@ def analyze(
         compute: where and how the networks are computed.
         neighbours: also train a head for each of these numbers of neighbours, separated by commas
             (Fig. 8b); needs a recipe.
+        taus: also train a head for each of these thresholds, separated by commas (Fig. 8a); with 1
+            it learns from points drawn from all; needs a recipe.
         recipe: how these heads are trained: a built-in recipe's name or a YAML file.
         train_sequences: sequences or scenes, separated by commas, that these heads learn from;
             default: the official split.
@@ -47,13 +51,13 @@ def analyze(
     from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
-    from amvnet.training.ablation import sweep_neighbours
+    from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
     from amvnet.training.plan import Plan
     from amvnet.weights.file import load
 
-    if (neighbours is None) != (recipe is None):
+    if (neighbours is None and taus is None) != (recipe is None):
         raise InputError(
-            "expected --neighbours together with --recipe, found only one of them; "
+            "expected --neighbours or --taus together with --recipe, found only one of them; "
             "give both or neither"
         )
     loaded = load(weights)
@@ -62,14 +66,11 @@ def analyze(
     records = choice.records(dataset)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.
-    counts: list[int] = []
     plan = None
-    if neighbours is not None and recipe is not None:
-        counts = sorted(set(neighbours))
+    if recipe is not None:
         names = train_sequences or dataset.sequences("train")
         scans = TrainingScans(dataset, dataset.labelled(dataset.records(names)), records)
-        folder = out / "neighbours"
-        plan = Plan(load_recipe(recipe), scans, folder, resume=True, say=say)
+        plan = Plan(load_recipe(recipe), scans, out, resume=True, say=say)
 
     make_folder(out)
     with progress("scoring") as step:
@@ -77,7 +78,16 @@ def analyze(
     written = charts.write_all(analysis, data, out)
 
     if plan is not None:
-        sweep = list(sweep_neighbours(plan, counts, loaded, segmenter.device))
-        used = loaded.model.point_head.neighbours
-        written += charts.write_sweep(sweep, "neighbours", used, data, out / "neighbours")
+        model = loaded.model
+        by_count = {count: with_neighbours(model, count) for count in sorted(set(neighbours or ()))}
+        by_tau = {tau: with_tau(model, tau) for tau in sorted(set(taus or ()))}
+        studies = (
+            ("neighbours", "neighbours", model.point_head.neighbours, by_count),
+            ("tau", "taus", model.assertion.threshold, by_tau),
+        )
+        for parameter, name, used, models in studies:
+            if models:
+                study = replace(plan, out=out / name)
+                rows = list(sweep_heads(study, models, loaded, segmenter.device))
+                written += charts.write_sweep(rows, parameter, used, data, out / name)
     say(f"{counted(len(written), 'file')} in {out}")
