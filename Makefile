@@ -18,7 +18,7 @@ test-slow: .venv/installed .venv/fleet  ## the tests that take minutes, and thos
 bench: .venv/installed  ## the time of a scan, and what each optimisation gives: half an hour; SCAN="--scan FILE" for a scan of yours
 	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8
 
-docs: .venv/docs  ## the site of docs/, in site/
+docs: .venv/docs docs/try/node_modules  ## the site of docs/, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 lint: .venv/installed
@@ -46,5 +46,9 @@ format: .venv/installed
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
 	touch $@
 
+# What the page docs/try runs and is tested with. Without npm, the build says that it leaves the page out.
+docs/try/node_modules: docs/try/package-lock.json
+	if command -v npm > /dev/null; then npm ci --prefix docs/try --ignore-scripts --no-audit --no-fund --silent; fi
+
 clean:
-	rm -rf .venv demo site
+	rm -rf .venv demo site build docs/try/node_modules

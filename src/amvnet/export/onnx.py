@@ -20,6 +20,7 @@ from amvnet.errors import InputError, import_optional
 from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, strip
 from amvnet.files import atomic_write, make_folder, publish
+from amvnet.inference.reading import expectation_of
 from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import AMVNet
 from amvnet.models.methods import widest_method
@@ -30,6 +31,9 @@ from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
+from amvnet.sensors.lasers import MEASURES
+from amvnet.sensors.lidars import SENSORS
+from amvnet.sensors.normalise import Expectation
 from amvnet.weights.file import Weights, load
 
 EXTRA = ("onnx", "onnxscript", "onnxruntime")
@@ -178,6 +182,7 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
         "sensor": segmenter.weights.sensor,
         "points": {"columns": ["x", "y", "z", "intensity"], "farthest": FARTHEST},
         "intensity": _describe_intensity(segmenter.intensity),
+        "normalise": describe_expectation(expectation_of(segmenter.weights)),
         "range_view": to_dict(model.range_view),
         "range_channels": ["x", "y", "z", "intensity", "range", "mask"],
         "polar_view": to_dict(model.polar_view),
@@ -210,6 +215,23 @@ def _describe_intensity(trained: TrainedIntensity | None) -> dict[str, list[floa
     if trained is None or not trained.is_matched:
         return None
     return {"probabilities": list(PROBABILITIES), "quantiles": list(trained.quantiles)}
+
+
+def describe_expectation(expected: Expectation) -> dict[str, Any]:
+    """Return what some weights expect of scans, for programs that normalise scans themselves."""
+    sensor = expected.sensor
+    sheet = SENSORS.get(sensor.name)
+    intensity = expected.intensity
+    return {
+        "sensor": {
+            "name": sensor.name,
+            "is_known": sheet is not None,
+            "is_like_sheet": sheet is not None and sheet.beams == sensor.beams,
+            **{key: getattr(sensor, key) for key in MEASURES},
+        },
+        "as_is": expected.as_is,
+        "intensity": None if intensity is None else to_dict(intensity),
+    }
 
 
 def _graphs(segmenter: Segmenter) -> dict[str, Graph]:

@@ -86,13 +86,17 @@ def normaliser_for(
         sensor: what is known of the sensor; the rest is measured.
         say: takes a line about what was assumed of the sensor.
     """
-    expected = Expectation(
+    return Normaliser(expectation_of(weights), sensor, say)
+
+
+def expectation_of(weights: Weights) -> Expectation:
+    """Return the scans that some weights expect."""
+    return Expectation(
         weights.model.range_view,
         trained_sensor(weights.training, weights.sensor),
         intensity=trained_intensity(weights.training, weights.sensor),
         as_is=is_trained_as_is(weights.training),
     )
-    return Normaliser(expected, sensor, say)
 
 
 def open_for_weights(spec: str, weights: Weights) -> Dataset:

@@ -183,24 +183,37 @@ def pack(shown: ShownScan) -> Packed:
 
 def assemble(packed: list[Packed], taxonomy: Taxonomy, title: str, evaluation: Evaluation) -> str:
     """Return the text of the page, in which the names of files cannot act as HTML or script."""
+    scans = []
+    for index, scan in enumerate(packed):
+        scans.append(f'<script type="text/plain" id="scan-{index}">{scan.planes}</script>')
+    about = _about(packed, taxonomy, title) | {"table": _table(evaluation)}
+    return fill_page(title, about, "\n".join(scans))
+
+
+def fill_page(
+    title: str, about: Mapping[str, Any], scans: str = "", replaced: Mapping[str, str] | None = None
+) -> str:
+    """Return the text of a page with the viewer's markup, style and scripts.
+
+    Args:
+        about: what the scripts need to know, as JSON.
+        scans: the elements of the scans.
+        replaced: the texts of scripts that take the place of some of `SCRIPTS`, by their names.
+    """
+    scripts = {name: _source(name) for name in SCRIPTS} | dict(replaced or {})
     style = _source("page.css")
-    script = "\n".join(map(_source, SCRIPTS))
+    script = "\n".join(scripts.values())
     policy = (
         f"default-src 'none'; style-src '{_hash(style)}'; script-src '{_hash(script)}'; "
         "img-src data:; base-uri 'none'; form-action 'none'"
     )
-
-    scans = []
-    for index, scan in enumerate(packed):
-        scans.append(f'<script type="text/plain" id="scan-{index}">{scan.planes}</script>')
-
     parts = {
         "POLICY": policy,
         "TITLE": html.escape(title),
         "STYLE": style,
         "SCRIPT": script,
-        "ABOUT": _json(_about(packed, taxonomy, title) | {"table": _table(evaluation)}),
-        "SCANS": "\n".join(scans),
+        "ABOUT": _json(about),
+        "SCANS": scans,
     }
     return _fill(_source("page.html"), parts)
 
@@ -227,7 +240,6 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
         "classes": ["unlabelled", *taxonomy.classes],
         "colors": [UNLABELLED, *class_colors(taxonomy)[1:]],
         "raw": taxonomy.train_to_raw,
-        "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
         "present": sorted(present),
         "sources": sources,
         "scans": [scan.about for scan in packed],
@@ -236,12 +248,20 @@ def _about(packed: list[Packed], taxonomy: Taxonomy, title: str) -> dict[str, An
             "height": (min(lows), max(highs)),
             "intensity": (0, brightest),
         },
+        "ground": float(np.median(grounds)),
+        **drawing(),
+    }
+
+
+def drawing() -> dict[str, Any]:
+    """Return what the page's scripts need to know about the colours of any scan, for its JSON."""
+    return {
+        "marks": {"right": RIGHT, "wrong": WRONG, "unscored": UNSCORED},
         "ramps": {
             "uncertainty": UNCERTAINTY_RAMP,
             "height": _ramp(*RAMPS["height"]),
             "intensity": _ramp(*RAMPS["intensity"]),
         },
-        "ground": float(np.median(grounds)),
     }
 
 

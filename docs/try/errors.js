@@ -1,0 +1,12 @@
+/** Input that cannot be used: one line says what was expected, what was found and what to do, as `amvnet predict` does. */
+export class InputError extends Error {}
+
+/** Return text from a file for an error message: in quotes, on one line and short. */
+export function shown(text, longest = 100) {
+  return `'${[...text].slice(0, longest).map((letter) => (/[ -~]/.test(letter) ? letter : "?")).join("")}'`;
+}
+
+/** Return a number with commas between thousands. */
+export function counted(count) {
+  return count.toLocaleString("en");
+}

@@ -1,0 +1,34 @@
+// The point head (section 3.3 of the paper): decides uncertain points by what both networks say around them.
+
+const PART = 2048;  // uncertain points at a time, which bounds the memory
+
+/**
+ * Return the head's probabilities (u K) of uncertain points (u), given the points (4 p), both networks' probabilities
+ * f and g (p K), and the neighbours (u n) of the uncertain points.
+ */
+export async function settle(networks, { points, f, g, uncertain, neighbours }) {
+  const { k, description } = networks, scale = Math.fround(description.point_head.position_scale);
+  const width = 2 * k + 4, n = neighbours.length / uncertain.length, scores = new Float32Array(uncertain.length * k);
+
+  const fill = (target, start, i) => {
+    target.set(f.subarray(i * k, (i + 1) * k), start);
+    target.set(g.subarray(i * k, (i + 1) * k), start + k);
+    target.set(points.subarray(4 * i, 4 * i + 4), start + 2 * k);
+  };
+  for (let first = 0; first < uncertain.length; first += PART) {
+    const part = uncertain.subarray(first, first + PART);
+    const point = new Float32Array(part.length * width), rows = new Float32Array(part.length * n * width);
+    part.forEach((i, row) => {
+      for (let rank = 0; rank < n; rank++) {
+        const start = (row * n + rank) * width;
+        fill(rows, start, neighbours[(first + row) * n + rank]);
+        // x, y, z and intensity of neighbours are relative to the point.
+        for (let axis = 0; axis < 4; axis++) rows[start + 2 * k + axis] -= points[4 * i + axis];
+      }
+      fill(point, row * width, i);
+      for (let axis = 0; axis < 3; axis++) point[row * width + 2 * k + axis] *= scale;
+    });
+    scores.set(await networks.scorePoints(point, rows, part.length), first * k);
+  }
+  return scores;
+}

@@ -1,0 +1,108 @@
+// Finds nearest neighbours with a k-d tree. (npm's well-kept libraries find the nearest in two dimensions, or only one.)
+
+const LEAF = 12;  // points that are compared one by one
+
+export class KdTree {
+  /** Sort points (4 n) into a tree. */
+  constructor(points) {
+    this.points = points;
+    this.ids = Uint32Array.from({ length: points.length / 4 }, (_, i) => i);
+    this.axes = new Uint8Array(this.ids.length);  // of the point in the middle of each branch: how it is divided
+    this.divide(0, this.ids.length);
+  }
+
+  /** Divide the ids from start to end in halves, along the axis of their largest extent. */
+  divide(start, end) {
+    if (end - start <= LEAF) return;
+    const middle = (start + end) >> 1, axis = this.widestAxis(start, end);
+    this.select(middle, start, end - 1, axis);
+    this.axes[middle] = axis;
+    this.divide(start, middle);
+    this.divide(middle + 1, end);
+  }
+
+  at(place, axis) {
+    return this.points[4 * this.ids[place] + axis];
+  }
+
+  widestAxis(start, end) {
+    const extents = [0, 1, 2].map((axis) => {
+      let low = Infinity, high = -Infinity;
+      for (let place = start; place < end; place++) {
+        const value = this.at(place, axis);
+        if (value < low) low = value;
+        if (value > high) high = value;
+      }
+      return high - low;
+    });
+    return extents.indexOf(Math.max(...extents));
+  }
+
+  /** Move ids so that none before `middle` is larger along the axis, and none after it smaller (quickselect). */
+  select(middle, left, right, axis) {
+    while (left < right) {
+      const pivot = this.at((left + right) >> 1, axis);
+      let low = left, high = right;
+      while (low <= high) {
+        while (this.at(low, axis) < pivot) low++;
+        while (this.at(high, axis) > pivot) high--;
+        if (low > high) break;
+        [this.ids[low], this.ids[high]] = [this.ids[high], this.ids[low]];
+        low++;
+        high--;
+      }
+      if (middle <= high) right = high;
+      else if (middle >= low) left = low;
+      else return;
+    }
+  }
+
+  /** Return the ids of the m points nearest to a point, the nearest first; the point is one of them. */
+  nearest(own, m) {
+    const query = this.points.subarray(4 * own, 4 * own + 3), ids = new Uint32Array(m);
+    const squares = new Float64Array(m).fill(Infinity);
+
+    const compare = (place) => {
+      const id = this.ids[place], [x, y, z] = query, start = 4 * id;
+      const square = (this.points[start] - x) ** 2 + (this.points[start + 1] - y) ** 2 + (this.points[start + 2] - z) ** 2;
+      if (!(square < squares[m - 1])) return;
+      let rank = m - 1;
+      for (; rank > 0 && squares[rank - 1] > square; rank--) {
+        squares[rank] = squares[rank - 1];
+        ids[rank] = ids[rank - 1];
+      }
+      squares[rank] = square;
+      ids[rank] = id;
+    };
+    const visit = (start, end) => {
+      if (end - start <= LEAF) {
+        for (let place = start; place < end; place++) compare(place);
+        return;
+      }
+      const middle = (start + end) >> 1, axis = this.axes[middle], off = query[axis] - this.at(middle, axis);
+      const halves = [[start, middle], [middle + 1, end]];
+      if (off > 0) halves.reverse();
+      visit(...halves[0]);
+      compare(middle);
+      if (off * off < squares[m - 1]) visit(...halves[1]);
+    };
+    visit(0, this.ids.length);
+    return ids;
+  }
+}
+
+/**
+ * Return the n nearest others (u n) of each point `own` (u) of points (4 p), the nearest first. If there are fewer
+ * than n others, the farthest is repeated. A lone point is its own neighbour.
+ */
+export function nearestOthers(points, own, n) {
+  const tree = new KdTree(points), m = Math.min(n + 1, points.length / 4);
+  const neighbours = new Uint32Array(own.length * n);
+  own.forEach((point, row) => {
+    const found = Array.from(tree.nearest(point, m));
+    // If many points coincide, a point may be missing from its own neighbours. Then the last one is dropped instead.
+    if (m > 1) found.splice(found.includes(point) ? found.indexOf(point) : m - 1, 1);
+    for (let rank = 0; rank < n; rank++) neighbours[row * n + rank] = found[Math.min(rank, found.length - 1)];
+  });
+  return neighbours;
+}

@@ -1,0 +1,124 @@
+// Runs the networks: the graphs of `amvnet export`, in ONNX Runtime Web.
+
+import { InputError } from "../errors.js";
+import { atPixels } from "./range_view.js";
+import { addToMaxima, atPillars, FEATURES, toMap } from "./polar_view.js";
+
+const FORMAT = 2, DESCRIPTION = "amvnet.json";
+const POLAR = ["polar_points", "polar_pillars", "polar_map", "polar_scores"];
+// The graphs that each method needs
+const GRAPHS = {
+  rv: ["range_net"],
+  bev: POLAR,
+  ensemble: ["range_net", ...POLAR],
+  amvnet: ["range_net", ...POLAR, "point_head"],
+};
+const PART = 16_384;  // points or pillars that a graph takes at a time, which bounds the memory
+
+/** Read the description in a folder of `amvnet export`. */
+export async function readDescription(folder) {
+  const response = await fetch(`${folder}/${DESCRIPTION}`);
+  if (!response.ok) {
+    throw new InputError(`${folder}: expected ${DESCRIPTION} of amvnet export, found none; export again`);
+  }
+  const description = await response.json();
+  if (description.format !== FORMAT || !(description.method in GRAPHS) || !description.normalise) {
+    throw new InputError(
+      `${folder}/${DESCRIPTION}: expected format ${FORMAT}, a known method and the key normalise, found others; ` +
+      "export again",
+    );
+  }
+  return description;
+}
+
+export class Networks {
+  /** Load the graphs of a folder into `ort`; `progress` is called with the share that is loaded. */
+  static async load(ort, folder, description, device, progress) {
+    const networks = new Networks();
+    Object.assign(networks, { ort, description, sessions: {}, k: description.classes.length - 1 });
+    const names = GRAPHS[description.method];
+    for (const [place, name] of names.entries()) {
+      progress(place / names.length);
+      const file = `${folder}/${description.graphs[name]?.file}`, response = await fetch(file);
+      if (!response.ok) throw new InputError(`${file}: expected a graph of amvnet export, found none; export again`);
+      const options = { executionProviders: device === "webgpu" ? ["webgpu", "wasm"] : ["wasm"] };
+      networks.sessions[name] = await ort.InferenceSession.create(new Uint8Array(await response.arrayBuffer()), options);
+    }
+    return networks;
+  }
+
+  async release() {
+    for (const session of Object.values(this.sessions)) await session.release();
+  }
+
+  /** Return the probabilities (n K) of points by the range view. */
+  async scoreRangeView({ image, pixel }) {
+    const { height, width } = this.description.range_view;
+    const scores = await this.run("range_net", [[image, [1, image.length / (height * width), height, width]]]);
+    return softmax(atPixels(scores, pixel, this.k), this.k);
+  }
+
+  /** Return the probabilities (n K) of points by the bird's-eye view. */
+  async scorePolarView({ features, pillar, voxel, isSeen }) {
+    const { radial, angular, vertical } = this.description.polar_view, size = radial * angular;
+    const maxima = new Map();
+    for (const part of partsOf(Uint32Array.from(pillar.keys()).filter((i) => isSeen[i]))) {
+      const rows = new Float32Array(FEATURES * part.length);
+      part.forEach((i, row) => rows.set(features.subarray(FEATURES * i, FEATURES * (i + 1)), FEATURES * row));
+      const pointFeatures = await this.run("polar_points", [[rows, [part.length, FEATURES]]]);
+      addToMaxima(maxima, Int32Array.from(part, (i) => pillar[i]), pointFeatures);
+    }
+
+    const seen = [...maxima.keys()], channels = maxima.get(seen[0]).length, pooled = new Float32Array(seen.length * channels);
+    seen.forEach((place, row) => pooled.set(maxima.get(place), row * channels));
+    const pillars = toMap(await this.run("polar_pillars", [[pooled, [seen.length, channels]]]), seen, size);
+    const decoded = await this.run("polar_map", [[pillars, [1, pillars.length / size, radial, angular]]]);
+
+    // Also pillars with none but points that are too near to be seen have scores.
+    const occupied = Int32Array.from(new Set(pillar)), slots = new Int32Array(size);
+    occupied.forEach((place, slot) => (slots[place] = slot));
+    const logits = new Float32Array(pillar.length * this.k), scores = [];
+    for (const part of partsOf(occupied)) {
+      const values = atPillars(decoded, part, size);
+      scores.push(await this.run("polar_scores", [[values, [part.length, values.length / part.length]]]));
+    }
+    for (let i = 0; i < pillar.length; i++) {
+      const slot = slots[pillar[i]], start = ((slot % PART) * vertical + voxel[i]) * this.k;
+      logits.set(scores[Math.floor(slot / PART)].subarray(start, start + this.k), i * this.k);
+    }
+    return softmax(logits, this.k);
+  }
+
+  /** Return the probabilities (u K) of uncertain points by the point head, given their features and neighbours'. */
+  async scorePoints(point, rows, count) {
+    const width = point.length / count, n = rows.length / point.length;
+    return softmax(await this.run("point_head", [[point, [count, width]], [rows, [count, n, width]]]), this.k);
+  }
+
+  /** Run a graph on inputs [[values, shape], ...]; return the values of its output. */
+  async run(name, inputs) {
+    const feeds = {};
+    inputs.forEach(([values, shape], place) => {
+      feeds[this.description.graphs[name].inputs[place].name] = new this.ort.Tensor("float32", values, shape);
+    });
+    const output = Object.values(await this.sessions[name].run(feeds))[0], values = output.data.slice();
+    output.dispose();
+    return values;
+  }
+}
+
+/** Return consecutive parts of a typed array. */
+function partsOf(values) {
+  return Array.from({ length: Math.ceil(values.length / PART) }, (_, part) => values.subarray(part * PART, (part + 1) * PART));
+}
+
+/** Turn logits (n K) into probabilities, in place. */
+function softmax(scores, k) {
+  for (let start = 0; start < scores.length; start += k) {
+    const row = scores.subarray(start, start + k), largest = row.reduce((a, b) => Math.max(a, b));
+    let sum = 0;
+    for (let c = 0; c < k; c++) sum += row[c] = Math.exp(row[c] - largest);
+    for (let c = 0; c < k; c++) row[c] /= sum;
+  }
+  return scores;
+}

@@ -1,0 +1,73 @@
+// The points of a scan file, before anything is assumed of the sensor.
+//
+// A column is {values, isInteger}: a typed array with a number per point, and whether the file stores integers.
+// A cloud is {name, count, xyz, intensity, ring}: xyz (3 count) holds x, y, z of each point, float32 if the file's
+// coordinates are, else float64; intensity is a column and ring (count) the index of each point's laser, or null.
+
+import { counted, InputError, shown } from "../errors.js";
+
+// A page has less memory than a program; `amvnet predict` reads ten million points.
+export const MOST_POINTS = 1_000_000;
+const MOST_RINGS = 256;  // a column with larger values does not hold ring indices
+
+// The possible names of each column; the first that a file has is read.
+const NAMES = {
+  x: ["x"],
+  y: ["y"],
+  z: ["z"],
+  intensity: ["intensity", "intensities", "i", "reflectivity", "reflectance", "remission", "scalar_intensity"],
+  ring: ["ring", "rings", "channel", "laser_id", "laser", "scalar_ring"],
+};
+
+/** Check the number of points that a header claims; a file of `size` bytes must have at least `least`. */
+export function checkPointCount(count, name, size = 0, least = 0) {
+  if (!(count >= 0 && count <= MOST_POINTS)) {
+    const most = counted(MOST_POINTS);
+    throw new InputError(`${name}: expected a scan of at most ${most} points, found ${count}; split it into scans`);
+  }
+  if (least > size) {
+    throw new InputError(
+      `${name}: expected at least ${least} bytes for ${count} points, found ${size}; ` +
+      "the file is truncated, copy it again",
+    );
+  }
+}
+
+/** Return {x: index, ...}: which of the named columns of a file hold what is read. */
+export function requireColumns(names, name) {
+  const lower = names.map((each) => each.toLowerCase()), found = {};
+  for (const [key, aliases] of Object.entries(NAMES)) {
+    const alias = aliases.find((each) => lower.includes(each));
+    if (alias) found[key] = lower.indexOf(alias);
+  }
+  if (!("x" in found && "y" in found && "z" in found)) {
+    const listing = names.slice(0, 20).join(", ") || "none";
+    throw new InputError(`${name}: expected columns x, y, z, found ${shown(listing, 200)}; rename the columns`);
+  }
+  return found;
+}
+
+/** Return the cloud of the columns {x, y, z, intensity, ring}, of which the last two may be missing. */
+export function makeCloud(columns, name) {
+  const axes = [columns.x, columns.y, columns.z], count = axes[0].values.length;
+  const isFloat32 = axes.every(({ values }) => values instanceof Float32Array);
+  const xyz = new (isFloat32 ? Float32Array : Float64Array)(3 * count);
+  axes.forEach(({ values }, axis) => {
+    for (let i = 0; i < count; i++) xyz[3 * i + axis] = values[i];
+  });
+  const ring = columns.ring ? ringIndices(columns.ring.values) : null;
+  return { name, count, xyz, intensity: columns.intensity ?? null, ring };
+}
+
+/** Return values as ring indices, 0 for NaN; null if they are all equal, negative, too large or not whole. */
+export function ringIndices(values) {
+  const ring = Uint8Array.from(values, (value) => (Number.isFinite(value) ? value : 0));
+  let low = Infinity, high = -Infinity;
+  for (let i = 0; i < values.length; i++) {
+    const value = Number.isFinite(values[i]) ? values[i] : 0;
+    if (value !== ring[i]) return null;  // a byte holds whole numbers below MOST_RINGS only
+    low = Math.min(low, value);
+    high = Math.max(high, value);
+  }
+  return low < high && high < MOST_RINGS ? ring : null;
+}

@@ -1,0 +1,137 @@
+// Finds the frame of a scan file: its unit, which axis points up, how it is tilted, and how high the sensor is.
+
+import { InputError } from "../errors.js";
+import { findGround } from "./ground.js";
+import { quantilesOf } from "./statistics.js";
+
+// Matrices that turn a file's x, y, z into forward, left, up.
+const AXES = {
+  "x-forward": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  // x forward, y left, z up: ROS, KITTI
+  "z-forward": [[0, 0, 1], [-1, 0, 0], [0, -1, 0]],  // x right, y down, z forward: cameras
+  "z-down": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],  // x forward, y right, z down: aircraft
+  "y-up": [[0, 0, -1], [-1, 0, 0], [0, 1, 0]],  // x right, y up, z backward: computer graphics
+};
+const UP_AXES = ["z-down", "z-forward", "y-up"];  // to try if no ground is found below
+const UNITS = { m: 1, mm: 0.001 };  // metres
+
+// The median distance of the points tells the unit: in metres it is 2 to 40 with all sensors.
+const FARTHEST_MEDIAN = 200;  // up to here, the unit is metres
+const LEAST_MILLIMETRES = 4000;  // from here on, millimetres; in between, centimetres or millimetres
+// The origin is near the sensor if near points (5 %) are nearer than this share of far ones (95 %).
+const AROUND = 0.5;
+
+const SAME_TILT = 3.5;  // degrees: roads slope by up to 3.1 as seen from the cars of the datasets
+const SAME_HEIGHT = 0.15;  // metres: training moves the sensor up and down by as much
+const LOWEST = 0.3;  // metres: if the origin is lower, it lies on the ground and not at the sensor
+const HIGHEST = 4.5;  // metres: no vehicle carries its sensor higher; the coordinates may be in feet
+
+const degrees = (radians) => (radians * 180) / Math.PI;
+
+/**
+ * Return the frame of points (3 n) without lost ones: {unit, axes, pitch, roll, height, tilt}. Pitch and roll in
+ * degrees turn the scan level; the height is that of the origin over the ground in metres, null without a ground.
+ */
+export function findFrame(xyz, name) {
+  const frame = { unit: unitOf(xyz, name), axes: "x-forward", pitch: 0, roll: 0, height: null, tilt: 0 };
+  let level = toLevel(xyz, frame), ground = findGround(level);
+  if (!ground) {
+    frame.axes = axesOf(level);
+    level = turned(level, AXES[frame.axes]);
+    ground = findGround(level);
+  }
+  if (!ground) return frame;
+
+  frame.tilt = degrees(Math.acos(Math.min(ground.up[2], 1)));
+  frame.height = ground.height;
+  if (ground.isSure && frame.tilt > SAME_TILT) {
+    // The ground is found a second time in the level scan, whose cells have other lowest points.
+    const turn = rotation(...levelling(ground.up)), again = findGround(turned(level, turn));
+    const up = again ? [0, 1, 2].map((axis) => dot([0, 1, 2].map((row) => turn[row][axis]), again.up)) : ground.up;
+    [frame.pitch, frame.roll] = levelling(up);
+    frame.height = (again ?? ground).height;
+  }
+  if (frame.height > HIGHEST) {
+    throw new InputError(
+      `${name}: expected a sensor at most ${HIGHEST} m over the ground, found ${frame.height.toFixed(1)}; ` +
+      "label it with amvnet predict and --unit ft if these are feet, else --height",
+    );
+  }
+  return frame;
+}
+
+/** Return points (3 n) in metres and in the package's axes; lost ones become NaN if anything changes. */
+export function toLevel(xyz, { unit, axes, pitch, roll }) {
+  if (unit === "m" && axes === "x-forward" && !pitch && !roll) return xyz;
+  const columns = [0, 1, 2].map((column) => AXES[axes].map((row) => row[column]));
+  const turn = rotation(pitch, roll).map((row) => columns.map((column) => dot(row, column)));
+  const metres = Float64Array.from(xyz, (value) => value * UNITS[unit]);
+  for (let i = 0; i < metres.length; i += 3) if (!metres[i] && !metres[i + 1] && !metres[i + 2]) metres[i] = NaN;
+  return turned(metres, turn);
+}
+
+/** Return whether the origin of the coordinates lies on the ground, or below. */
+export function isOnGround(frame) {
+  return frame.height !== null && frame.height < LOWEST;
+}
+
+/**
+ * Return how far to move a scan up, metres: [to bring the sensor to the origin, to bring the ground `usualHeight`
+ * below the origin].
+ */
+export function risesOf(frame, usualHeight) {
+  const { height } = frame;
+  if (height === null || usualHeight === null) return [0, 0];
+  if (isOnGround(frame)) return [height - usualHeight, height - usualHeight];
+  return [0, Math.abs(height - usualHeight) < SAME_HEIGHT ? 0 : height - usualHeight];
+}
+
+function dot(a, b) {
+  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+/** Return the points (3 n) turned by a (3, 3) matrix, float64. */
+function turned(xyz, turn) {
+  const result = new Float64Array(xyz.length);
+  for (let i = 0; i < xyz.length; i += 3) {
+    for (let axis = 0; axis < 3; axis++) {
+      const [a, b, c] = turn[axis];
+      result[i + axis] = a * xyz[i] + b * xyz[i + 1] + c * xyz[i + 2];
+    }
+  }
+  return result;
+}
+
+/** Return the rotation by roll about x, then pitch about y, in degrees. */
+function rotation(pitch, roll) {
+  const [cp, sp, cr, sr] = [pitch, roll].flatMap((angle) => {
+    const radians = (angle * Math.PI) / 180;
+    return [Math.cos(radians), Math.sin(radians)];
+  });
+  return [[cp, sp * sr, sp * cr], [0, cr, -sr], [-sp, cp * sr, cp * cr]];
+}
+
+/** Return pitch and roll in degrees of the rotation that turns a vector to +z. */
+function levelling([x, y, z]) {
+  return [-degrees(Math.atan2(x, Math.hypot(y, z))), degrees(Math.atan2(y, z))];
+}
+
+/** Tell metres from millimetres by the distances of the points. */
+function unitOf(xyz, name) {
+  if (!xyz.length) return "m";
+  const distances = Float64Array.from({ length: xyz.length / 3 }, (_, i) => Math.hypot(...xyz.subarray(3 * i, 3 * i + 3)));
+  const [near, median, far] = quantilesOf(distances.sort(), [0.05, 0.5, 0.95]);
+
+  // Points far from the origin are map coordinates, which `levelScan` refuses.
+  if (!(median > FARTHEST_MEDIAN) || near > AROUND * far) return "m";
+  if (median > LEAST_MILLIMETRES) return "mm";
+  throw new InputError(
+    `${name}: expected metres from the sensor, found half of the points farther than ${median.toFixed(0)}; ` +
+    "label it with amvnet predict and --unit cm or mm (or m, if they are metres)",
+  );
+}
+
+/** Return the axes by which the points have a ground, if only one of UP_AXES does: a wall can look like one. */
+function axesOf(xyz) {
+  const sure = UP_AXES.filter((axes) => findGround(turned(xyz, AXES[axes]))?.isSure);
+  return sure.length === 1 ? sure[0] : "x-forward";
+}

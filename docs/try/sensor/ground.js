@@ -1,0 +1,134 @@
+// Finds the ground in a scan: the plane that most of the lowest points around the sensor lie in.
+
+import { drawing } from "./statistics.js";
+
+export const NEAREST = 1.0;  // metres: nearer returns are from the vehicle itself
+const CELL = 1.0;  // metres: side of the cells whose lowest points are used
+const RADIUS = 20.0;  // metres: farther points are not used
+const HALF_WEIGHT = 8.0;  // metres: a cell at this distance counts half as much as one at the sensor
+const TRIES = 400;  // planes through three low points each
+const LEAST_AREA = 1.0;  // square metres: twice the area of the triangle between the three points
+const TOLERANCE = 0.1;  // metres between the plane and the points of the ground
+const STEEPEST = 25.0;  // degrees: steeper planes are walls and embankments
+const LEAST_CELLS = 30;
+const LEAST_AGREEMENT = 0.25;  // weighted share of the cells that must lie in the plane
+
+// Which side of the plane is up: the ground has things on it, and little below it
+const OFF_PLANE = 0.3;  // metres from the plane within which points belong to it, at the sensor
+const CURVED = 0.02;  // metres more for each metre of distance from the sensor
+const MOST_BELOW = 0.1;  // share of the points that may be below the plane, unless more are above it
+const LOWEST = -0.5, HIGHEST = 10.0;  // metres of the origin over the plane; a lower plane must be sure
+
+// When a plane is sure enough to turn a scan by it
+const SURE_AGREEMENT = 0.3;  // weighted share of the cells
+const SURE_CELLS = 40;  // square metres, weighted by their distance
+const SURE_SHARE = 0.2;  // of the points within RADIUS that must lie in the plane
+
+/**
+ * Return {up, height, isSure} of the ground of points (3 n: x, y, z in metres), whose z axis points more or less up:
+ * its unit normal, metres of the origin over it, and whether it is certain; null if there is none.
+ */
+export function findGround(xyz) {
+  const points = [];
+  for (let i = 0; i < xyz.length; i += 3) {
+    const [x, y, z] = [xyz[i], xyz[i + 1], xyz[i + 2]], distance = Math.hypot(x, y);
+    if (distance > NEAREST) points.push({ x, y, z, distance });
+  }
+  const around = points.filter(({ distance }) => distance < RADIUS), low = lowestPoints(around);
+  if (low.length < LEAST_CELLS) return null;
+
+  let plane = bestPlane(low), ground = [];
+  if (!plane) return null;
+  for (let round = 0; round < 3; round++) {
+    ground = low.filter((point) => Math.abs(offPlane(point, plane)) < TOLERANCE);
+    if (ground.length < LEAST_CELLS / 2) return null;
+    plane = fitted(ground);
+  }
+
+  const agreement = weightOf(ground) / weightOf(low);
+  const inPlane = around.filter((point) => Math.abs(offPlane(point, plane)) < TOLERANCE).length / around.length;
+  const [above, below] = sides(points, plane);
+  const isFirm = agreement > SURE_AGREEMENT && weightOf(ground) > SURE_CELLS;
+  const isSure = isFirm && inPlane > SURE_SHARE && above >= below;
+
+  // A plane above the origin may be a ceiling, or the lower ends of far walls.
+  const [a, b, c] = plane, height = -c;
+  const isCommon = height < HIGHEST && below <= Math.max(above, MOST_BELOW);
+  const isBelow = height > LOWEST ? isCommon : isSure && below < above / 2;
+  if (agreement <= LEAST_AGREEMENT || !isBelow) return null;
+  const length = Math.hypot(a, b, 1);
+  return { up: [-a / length, -b / length, 1 / length], height, isSure };
+}
+
+function offPlane({ x, y, z }, [a, b, c]) {
+  return z - (a * x + b * y + c);
+}
+
+function weightOf(points) {
+  return points.reduce((sum, { weight }) => sum + weight, 0);
+}
+
+/** Return the shares of the points that are clearly above and below a plane. */
+function sides(points, plane) {
+  let above = 0, below = 0;
+  for (const point of points) {
+    const off = offPlane(point, plane), least = OFF_PLANE + CURVED * point.distance;
+    if (off > least) above++;
+    if (off < -least) below++;
+  }
+  return [above / points.length, below / points.length];
+}
+
+/** Return the lowest point of each cell around the sensor, with its weight: near ones count more. */
+function lowestPoints(points) {
+  const lowest = new Map(), cells = (2 * RADIUS) / CELL + 1;
+  for (const point of points) {
+    const cell = Math.floor((point.x + RADIUS) / CELL) * cells + Math.floor((point.y + RADIUS) / CELL);
+    if (!(point.z >= lowest.get(cell)?.z)) lowest.set(cell, point);
+  }
+  const ascending = [...lowest].sort(([a], [b]) => a - b);
+  return ascending.map(([, point]) => ({ ...point, weight: 1 / (1 + point.distance / HALF_WEIGHT) }));
+}
+
+/** Return [a, b, c] of the plane z = a x + b y + c that most low points agree with; null if all are too steep. */
+function bestPlane(low) {
+  const draw = drawing(), ends = [];
+  low.reduce((sum, { weight }) => (ends.push(sum + weight), sum + weight), 0);
+  const drawn = () => {
+    const place = draw() * ends.at(-1);
+    return low[ends.findIndex((end) => end > place)] ?? low.at(-1);
+  };
+
+  let best = null, most = -Infinity;
+  for (let attempt = 0; attempt < TRIES; attempt++) {
+    const plane = planeThrough(drawn(), drawn(), drawn());
+    if (!plane || !(Math.hypot(plane[0], plane[1]) < Math.tan((STEEPEST * Math.PI) / 180))) continue;
+    let agreeing = 0;
+    for (const point of low) {
+      const off = offPlane(point, plane);
+      if (Math.abs(off) < TOLERANCE) agreeing += point.weight;
+      else if (off < -3 * TOLERANCE) agreeing--;
+    }
+    if (agreeing > most) [best, most] = [plane, agreeing];
+  }
+  return best;
+}
+
+/** Return the plane through three points; null if they are nearly on a line. */
+function planeThrough(p, q, r) {
+  const [qx, qy, qz, rx, ry, rz] = [q.x - p.x, q.y - p.y, q.z - p.z, r.x - p.x, r.y - p.y, r.z - p.z];
+  const area = qx * ry - qy * rx;
+  if (!(Math.abs(area) > LEAST_AREA)) return null;
+  const a = (qz * ry - qy * rz) / area, b = (qx * rz - qz * rx) / area;
+  return [a, b, p.z - a * p.x - b * p.y];
+}
+
+/** Return the plane through points by least squares. */
+function fitted(points) {
+  const [x, y, z] = ["x", "y", "z"].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
+  const sum = (valueOf) => points.reduce((total, point) => total + valueOf(point.x - x, point.y - y, point.z - z), 0);
+  const xx = sum((dx) => dx * dx), xy = sum((dx, dy) => dx * dy), yy = sum((dx, dy) => dy * dy);
+  const xz = sum((dx, _, dz) => dx * dz), yz = sum((_, dy, dz) => dy * dz), area = xx * yy - xy * xy;
+  const a = (xz * yy - yz * xy) / area, b = (yz * xx - xz * xy) / area;
+  return [a, b, z - a * x - b * y];
+}

@@ -1,0 +1,98 @@
+// Brings intensities to the range and the distribution that the weights know. All decisions rest on quantiles, so
+// that a few outliers change nothing.
+
+import { drawing, interpolate, quantilesOf } from "./statistics.js";
+
+// The quantiles at these probabilities describe a distribution of intensities.
+const PROBABILITIES = [0.001, 0.01, 0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99, 0.999];
+const MEDIAN = PROBABILITIES.indexOf(0.5), BRIGHT = PROBABILITIES.indexOf(0.9);
+const DARKEST = 0.004;  // one step of 8 bits: below it, factors mean nothing
+const ALIKE = 2;  // factor by which the median or the bright quantile of two distributions that are alike may differ
+const CONSTANT = 0.01;  // share of the median: if 98 % of the intensities differ by less, they say nothing
+
+/** Return the quantiles of intensities; null if there are none. */
+function distributionOf(values) {
+  const finite = Float64Array.from(values).filter(Number.isFinite).sort();
+  return finite.length ? quantilesOf(finite, PROBABILITIES) : null;
+}
+
+/** Return whether nearly all intensities are the same, so that they say nothing. */
+function isConstant(quantiles) {
+  const [low, high] = [0.01, 0.99].map((probability) => quantiles[PROBABILITIES.indexOf(probability)]);
+  return high - low <= CONSTANT * Math.abs(quantiles[MEDIAN]);
+}
+
+/** Return a function that maps intensities with these quantiles to those of the training. */
+function matching(quantiles, trained) {
+  // Equal quantiles, as of many zeros, become the mean of the training's quantiles in their place.
+  const levels = [...new Set(quantiles)];
+  const becomes = levels.map((level) => {
+    const same = trained.filter((_, place) => quantiles[place] === level);
+    return Math.min(Math.max(same.reduce((sum, value) => sum + value, 0) / same.length, 0), 1);
+  });
+  return (value) => interpolate(value, levels, becomes);
+}
+
+/**
+ * Return {text, apply}: what is done with the intensities of a cloud, and a function that returns those in [0, 1].
+ * `trained` says what the weights know: {quantiles, is_optional, is_matched}, or null.
+ */
+export function intensityMap(cloud, trained) {
+  const { intensity, count } = cloud, quantiles = intensity && distributionOf(intensity.values);
+  const fill = () => filler(count, trained);
+  if (!quantiles) return { text: `no intensity (${fillerText(trained)})`, apply: fill };
+  if (isConstant(quantiles)) {
+    const level = Number(quantiles[MEDIAN].toPrecision(6));
+    return { text: `intensity ${level} everywhere, so none (${fillerText(trained)})`, apply: fill };
+  }
+
+  const scale = usualScale(quantiles.at(-1), intensity.isInteger), { values } = intensity;
+  const rounded = values instanceof Float32Array ? Math.fround : (value) => value;
+  const divided = (value) => Math.min(Math.max(rounded(value / scale), 0), 1);
+  const linear = { text: `intensity 0 to ${Number(scale.toPrecision(6))}`, apply: () => Float32Array.from(values, divided) };
+  if (trained?.is_matched) return { ...linear, text: `${linear.text}, spread as in the training` };  // by matchScan
+  if (!trained || areAlike(quantiles.map((value) => value / scale), trained.quantiles)) return linear;
+
+  const matched = matching(quantiles, trained.quantiles);
+  const [half, now] = [quantiles[MEDIAN] / scale, trained.quantiles[MEDIAN]].map((value) => Number(value.toPrecision(2)));
+  return {
+    text: `${linear.text}, spread as in the training: half of it was below ${half}, now ${now}`,
+    apply: () => Float32Array.from(values, (value) => (Number.isFinite(value) ? matched(value) : NaN)),
+  };
+}
+
+/** Bring the intensities of points (4 n), in place, to the distribution of the training, if this asks for it. */
+export function matchIntensity(points, trained) {
+  if (!trained?.is_matched) return;
+  const quantiles = distributionOf(points.filter((_, place) => place % 4 === 3));
+  if (!quantiles || isConstant(quantiles)) return;
+  const matched = matching(quantiles, trained.quantiles);
+  for (let i = 3; i < points.length; i += 4) points[i] = matched(points[i]);
+}
+
+/** Return the end of the narrowest usual range of intensities that holds the largest one. */
+function usualScale(largest, isInteger) {
+  const ranges = isInteger ? [255, 65535] : [1, 255, 65535];  // integers are not fractions
+  return ranges.find((limit) => largest <= limit) ?? largest;
+}
+
+function areAlike(a, b) {
+  const least = DARKEST;
+  return [MEDIAN, BRIGHT].every((place) => {
+    const [low, high] = [Math.max(a[place], least), Math.max(b[place], least)].sort((x, y) => x - y);
+    return high <= ALIKE * low;
+  });
+}
+
+/** Return intensities for a scan that has none: zeros for networks that learnt to do without, else seeded draws. */
+function filler(count, trained) {
+  if (!trained || trained.is_optional) return new Float32Array(count);
+  const draw = drawing();
+  return Float32Array.from({ length: count }, () => interpolate(draw(), PROBABILITIES, trained.quantiles));
+}
+
+function fillerText(trained) {
+  if (!trained) return "0 instead";
+  if (trained.is_optional) return "0 instead, as in a part of the training";
+  return "drawn at random as in the training; the labels will be much worse";
+}

@@ -1,0 +1,122 @@
+// Normalises a scan of any sensor to what the weights expect: axes, height, intensities, rows.
+
+import { InputError } from "../errors.js";
+import { findFrame, isOnGround, risesOf, toLevel } from "./frame.js";
+import { NEAREST } from "./ground.js";
+import { intensityMap, matchIntensity } from "./intensity.js";
+import { elevationOf, hasEndsOf, rowsOf } from "./rows.js";
+import { quantilesOf } from "./statistics.js";
+
+const FARTHEST = 10_000;  // metres: no LiDAR sees that far
+const LEAST_POINTS = 100;  // fewer say nothing about the sensor
+const SAME_BEAMS = 1.4;  // factor: numbers of lasers are alike if they differ by less
+
+/**
+ * Return {points, rows, places, text}: the valid points as the weights expect them (4 n: x, y, z in metres, intensity
+ * in [0, 1]), their rows in the range image or null, their places in the cloud, and what was assumed, in a line.
+ *
+ * `expected` is what the weights know: {view, sensor, intensity, isAsIs}.
+ */
+export function normalise(cloud, expected) {
+  const { name, xyz, count } = cloud, { sensor } = expected;
+  const isUsable = (i) => [0, 1, 2].every((axis) => Number.isFinite(xyz[i + axis])) && (xyz[i] || xyz[i + 1] || xyz[i + 2]);
+  const usable = xyz.filter((_, place) => isUsable(place - (place % 3)));
+  const frame = findFrame(usable, name);
+  const [toSensor, toTrained] = risesOf(frame, sensor.height);
+
+  const level = toLevel(xyz, frame), map = intensityMap(cloud, expected.intensity), intensity = map.apply();
+  const lasers = lasersOf(validPoints(level, null, name), toSensor, cloud.ring);
+  const { points, places } = validPoints(level, intensity, name);
+  const rows = rowsOf(raised(points, toSensor), places, cloud, lasers, expected);
+
+  const moved = raised(points, toTrained);
+  matchIntensity(moved, expected.intensity);
+  const assumed = [map.text, ...frameTexts(frame), heightText(frame, sensor.height), lasersText(lasers)];
+  return { count, points: moved, rows, places, text: `assumed ${assumed.join(", ")}${sensorText(lasers, sensor)}` };
+}
+
+/** Return {points, places}: the points (4 n, float32) that are finite and not at the origin, and where they were. */
+function validPoints(xyz, intensity, name) {
+  const count = xyz.length / 3, points = new Float32Array(4 * count), places = new Uint32Array(count);
+  let filled = 0, isFar = false;
+  for (let i = 0; i < count; i++) {
+    const [x, y, z] = [0, 1, 2].map((axis) => Math.fround(xyz[3 * i + axis])), bright = intensity ? intensity[i] : 0;
+    if (!(x || y || z)) continue;
+    const isNear = Math.abs(x) < FARTHEST && Math.abs(y) < FARTHEST && Math.abs(z) < FARTHEST;
+    isFar ||= !isNear && Number.isFinite(x + y + z);
+    if (!isNear || !Number.isFinite(bright)) continue;
+    points.set([x, y, z, bright], 4 * filled);
+    places[filled++] = i;
+  }
+  if (!filled) throw new InputError(`${name}: ${whyUnusable(count, isFar)}`);
+  return { points: points.subarray(0, 4 * filled), places: places.subarray(0, filled) };
+}
+
+function whyUnusable(count, isFar) {
+  if (!count) return "expected a scan with points, found 0 points; leave the file out";
+  if (isFar) {
+    return (
+      `expected metres from the sensor, found points farther than ${FARTHEST / 1000} km, as in map coordinates; ` +
+      "label it with amvnet predict, and subtract the sensor's position x,y,z with --offset -x,-y,-z"
+    );
+  }
+  return (
+    "expected finite coordinates and intensities, found NaN, infinity or 0, 0, 0 in every point; leave the file out"
+  );
+}
+
+/** Return points (4 n) moved up by some metres, in float32. */
+function raised(points, rise) {
+  const result = points.slice();
+  for (let i = 2; i < result.length; i += 4) result[i] += Math.fround(rise);
+  return result;
+}
+
+/** Measure the lasers of a sensor: {beams, fov_up, fov_down}; null stands for what is unknown. */
+function lasersOf({ points, places }, rise, ring) {
+  const seen = raised(points, rise), elevations = [];
+  for (let i = 0; i < seen.length; i += 4) {
+    const [x, y, z] = seen.subarray(i, i + 3);
+    if (Math.hypot(x, y) > NEAREST) elevations.push(elevationOf(x, y, z));
+  }
+  if (elevations.length < LEAST_POINTS) return { beams: null, fov_up: null, fov_down: null };
+  const [bottom, top] = quantilesOf(Float64Array.from(elevations).sort(), [0.005, 0.995]);
+  const beams = ring ? new Set(Array.from(places, (place) => ring[place])).size : null;
+  return { beams, fov_up: top, fov_down: bottom };
+}
+
+const signed = (value, digits) => `${value < 0 ? "" : "+"}${value.toFixed(digits)}`;
+
+function frameTexts({ unit, axes, pitch, roll, tilt }) {
+  const texts = [];
+  if (unit !== "m") texts.push(`--unit ${unit}`);
+  if (axes !== "x-forward") texts.push(`--axes ${axes}`);
+  if (pitch || roll) {
+    const turn = `0,${pitch.toFixed(1)},${roll.toFixed(1)}`;
+    texts.push(`a tilt of ${tilt.toFixed(0)} degrees (levelled, --rotate ${turn})`);
+  }
+  return texts;
+}
+
+function heightText(frame, usualHeight) {
+  const { height } = frame;
+  if (height === null) return "no ground to measure the height by (give --height; --axes if z is not up)";
+  const text = isOnGround(frame) ? `the ground ${signed(-height, 2)} m from the origin` : `sensor ${height.toFixed(2)} m over the ground`;
+  const [, rise] = risesOf(frame, usualHeight);
+  return rise ? `${text} (moved by ${signed(rise, 2)} m to ${usualHeight.toFixed(2)} m)` : text;
+}
+
+function lasersText({ beams, fov_up: top, fov_down: bottom }) {
+  const count = beams === null ? "lasers" : `${beams} lasers`;
+  if (top === null) return beams === null ? "field of view not found" : count;
+  return `${count} from ${signed(top, 0)} to ${signed(bottom, 0)} degrees`;
+}
+
+/** Return the end of the line if the weights have not seen such a sensor. */
+function sensorText(lasers, sensor) {
+  const ratio = lasers.beams && sensor.beams ? lasers.beams / sensor.beams : 1;
+  const isLike = ratio > 1 / SAME_BEAMS && ratio < SAME_BEAMS && hasEndsOf(lasers, sensor);
+  if (sensor.fov_up === null || sensor.fov_down === null || isLike) return "";
+  const name = sensor.is_like_sheet ? sensor.name : "a sensor";
+  return `; the weights were trained for ${name} (${lasersText(sensor)}) and have seen no such sensor`;
+}

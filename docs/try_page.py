@@ -1,0 +1,135 @@
+"""Build the page that labels scans in the browser, `try/` of the site, when MkDocs builds it.
+
+    python docs/try_page.py FOLDER
+
+builds it alone. The files in docs/try are its source. This module adds the networks of the built-in
+weights, a sample scan, the viewer, and ONNX Runtime Web, which `npm ci --prefix docs/try` fetches.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from amvnet.data.palette import DRAWN
+from amvnet.export.onnx import export
+from amvnet.viewing.page import drawing, fill_page
+from amvnet.viewing.shown_scans import UNLABELLED
+from lidarstreets import simulate
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "docs" / "try"
+PARTS = ("*.html", "*.css", "*.js", "*/*.js")  # of SOURCE; node_modules lies deeper
+RUNTIME = SOURCE / "node_modules" / "onnxruntime-web" / "dist"
+RUNTIME_FILES = (  # for the CPU, and for GPUs
+    "ort.wasm.min.mjs",
+    "ort-wasm-simd-threaded.mjs",
+    "ort-wasm-simd-threaded.wasm",
+    "ort.jspi.min.mjs",
+    "ort-wasm-simd-threaded.jspi.mjs",
+    "ort-wasm-simd-threaded.jspi.wasm",
+)
+WITHOUT_RUNTIME = (
+    f"{RUNTIME}: expected ONNX Runtime Web, found none: the page try/ is left out; install Node.js "
+    "with npm, and run make docs again"
+)
+
+MODELS = (
+    {"folder": "sim-hdl64e", "title": "HDL-64E, 19 classes", "sample": "street.bin"},
+    {"folder": "sim-hdl32e", "title": "HDL-32E, 16 classes"},
+)
+SAMPLE_SEED = 80
+SAMPLE_STREET = 7  # not of the training
+
+CACHE = ROOT / "build" / "try"  # of what takes a minute to make
+MADE_BY = ("config", "export", "models", "sensors", "weights")  # the packages that decide graphs
+
+
+def on_post_build(config: Any, **_: Any) -> None:
+    """Add the page to the site; MkDocs calls this at the end."""
+    out = Path(config["site_dir"]) / "try"
+    shutil.rmtree(out, ignore_errors=True)  # what MkDocs has copied
+    if RUNTIME.is_dir():
+        build(out)
+    else:
+        print(WITHOUT_RUNTIME)
+
+
+def build(out: Path) -> None:
+    """Write the page and all that it needs into a folder."""
+    for pattern in PARTS:
+        for path in SOURCE.glob(pattern):
+            copy(path, out / path.relative_to(SOURCE))
+    for name in RUNTIME_FILES:
+        copy(RUNTIME / name, out / "ort" / name)
+
+    (out / "viewer.html").write_text(viewer(), encoding="utf-8")
+    (out / "models.json").write_text(json.dumps(MODELS, indent=1) + "\n", encoding="utf-8")
+    for model in MODELS:
+        for path in graphs(model["folder"]).iterdir():
+            copy(path, out / model["folder"] / path.name)
+    copy(sample(), out / MODELS[0]["sample"])
+
+
+def copy(path: Path, to: Path) -> None:
+    to.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(path, to)
+
+
+def viewer() -> str:
+    """Return the page of the viewer, which takes the scan from the page around it."""
+    colors = {"unlabelled": UNLABELLED, "drawn": DRAWN}
+    script = (SOURCE / "viewer_data.js").read_text(encoding="utf-8")
+    return fill_page("Scan", drawing() | colors, replaced={"scans.js": script})
+
+
+def graphs(name: str) -> Path:
+    """Return a folder with the exported graphs of built-in weights."""
+    package = ROOT / "src" / "amvnet"
+    sources = [package / "pretrained" / f"{name}.safetensors"]
+    for part in MADE_BY:
+        sources += sorted((package / part).rglob("*.py"))
+    return cached(name, sources, lambda folder: export(name, folder))
+
+
+def sample() -> Path:
+    """Return a simulated scan in KITTI's format."""
+
+    def make(folder: Path) -> None:
+        with tempfile.TemporaryDirectory() as city:
+            simulate(city, scans=1, seed=SAMPLE_SEED, first_sequence=SAMPLE_STREET)
+            copy(next(Path(city).rglob("*.bin")), folder / "street.bin")
+
+    sources = sorted((ROOT / "src" / "lidarstreets").rglob("*"))
+    return cached("sample", [path for path in sources if path.is_file()], make) / "street.bin"
+
+
+def cached(name: str, sources: list[Path], make: Any) -> Path:
+    """Return a folder that `make` has filled, unless one of its sources has changed since."""
+    digest = hashlib.sha256()
+    for path in sources:
+        if "__pycache__" not in path.parts:
+            digest.update(path.read_bytes())
+
+    folder = CACHE / f"{name}-{digest.hexdigest()[:16]}"
+    if not folder.is_dir():
+        CACHE.mkdir(parents=True, exist_ok=True)
+        for old in CACHE.glob(f"{name}-*"):
+            shutil.rmtree(old, ignore_errors=True)
+        with tempfile.TemporaryDirectory(dir=CACHE) as temporary:
+            unfinished = Path(temporary) / name
+            unfinished.mkdir()
+            make(unfinished)
+            unfinished.rename(folder)
+    return folder
+
+
+if __name__ == "__main__":
+    if not RUNTIME.is_dir():
+        sys.exit(WITHOUT_RUNTIME)
+    build(Path(sys.argv[1]))

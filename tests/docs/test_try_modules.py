@@ -1,0 +1,408 @@
+"""The modules of the page docs/try do what the package does, number by number: run in Node.js."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amvnet.config.nested import to_dict
+from amvnet.config.schema import PolarViewConfig
+from amvnet.data.formats.detect import ending_of
+from amvnet.data.formats.registry import read_file
+from amvnet.data.formats.rows import UNKNOWN
+from amvnet.errors import InputError
+from amvnet.export.onnx import describe_expectation
+from amvnet.inference.reading import expectation_of
+from amvnet.models.neighbours import nearest_others
+from amvnet.onnx_runner import polar_features, range_image
+from amvnet.scan import Scan
+from amvnet.sensors.normalise import Expectation, Normaliser
+from amvnet.weights.file import load
+
+from fixtures.scan_writers import WRITERS, pcd_bytes, some_points
+from fixtures.sensors import LASERS, place
+
+NODE = shutil.which("node")
+PAGE = Path(__file__).parents[2] / "docs" / "try"
+DRIVER = Path(__file__).parents[1] / "fixtures" / "try_modules.mjs"
+FORMATS = ("kitti.bin", "ascii.pcd", "binary.pcd", "compressed.pcd", "ascii.ply", "little.ply")
+POLAR = PolarViewConfig(radial=40, angular=36, vertical=8)
+NEIGHBOURS = 15
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="Node.js is not installed")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scan file, and the weights that it is normalised for."""
+
+    file: Path
+    weights: str = "sim-hdl64e"
+
+    @property
+    def expected(self) -> Expectation:
+        return expectation_of(load(self.weights))
+
+
+def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
+    """Return what the page's modules make of scans: {text, points, rows, ...} or {error}."""
+    jobs = []
+    for index, case in enumerate(cases):
+        expected = describe_expectation(case.expected)
+        job = {
+            "file": str(case.file),
+            "out": str(folder / str(index)),
+            "polarView": to_dict(POLAR),
+            "own": list(range(0, 30_000, 97)),
+            "n": NEIGHBOURS,
+            "expected": {
+                "view": to_dict(case.expected.view),
+                "sensor": expected["sensor"],
+                "intensity": expected["intensity"],
+                "isAsIs": expected["as_is"],
+            },
+        }
+        jobs.append(job)
+    listing = folder / "jobs.json"
+    listing.write_text(json.dumps(jobs))
+    command = [str(NODE), str(DRIVER), str(PAGE), str(listing)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+
+    results: list[dict[str, Any]] = json.loads(done.stdout)
+    for index, result in enumerate(results):
+        if "text" not in result:
+            continue
+        for path in folder.glob(f"{index}.*"):
+            kind = np.float32 if path.suffix in (".points", ".image", ".features") else np.int32
+            result[path.suffix[1:]] = np.fromfile(path, kind)
+    return results
+
+
+def normalised(case: Case) -> tuple[Scan, str]:
+    """Return the scan as the package normalises it, and what it says."""
+    lines: list[str] = []
+    normaliser = Normaliser(case.expected, say=lines.append)
+    cloud = read_file(case.file, ending_of(case.file), UNKNOWN)
+    normaliser.expect("scans", lambda: cloud)
+    scan = normaliser(cloud, "scans")
+    (line,) = lines
+    return scan, line.removeprefix(f"{case.file}: ")
+
+
+def write_bin(path: Path, points: np.ndarray) -> Path:
+    path.write_bytes(np.ascontiguousarray(points, np.float32).tobytes())
+    return path
+
+
+def with_ring(points: np.ndarray, laser: np.ndarray, scale: float = 255) -> np.ndarray:
+    return np.column_stack([points * [1, 1, 1, scale], laser])
+
+
+def by_laser(points: np.ndarray, laser: np.ndarray) -> np.ndarray:
+    """Return points in the order of KITTI's files."""
+    turn = np.mod(np.arctan2(points[:, 1], points[:, 0]), 2 * np.pi)
+    return points[np.lexsort([turn, -laser])]
+
+
+HDL64E = np.linspace(-23.9, 3, 64)
+
+
+def kitti_like(folder: Path) -> Case:
+    points, laser = place(HDL64E, 1.73)
+    return Case(write_bin(folder / "kitti_like.bin", by_laser(points, laser)))
+
+
+def in_another_order(folder: Path) -> Case:
+    points, _ = place(HDL64E, 1.73)
+    return Case(write_bin(folder / "order.bin", points))
+
+
+def nuscenes_like(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    path = write_bin(folder / "nuscenes_like.pcd.bin", with_ring(points, laser))
+    return Case(path, "sim-hdl32e")
+
+
+def higher_with_lost_returns(folder: Path) -> Case:
+    points, _ = place(HDL64E, 2.4)
+    points[::50, :3] = 0
+    points[7::50, :3] = np.nan
+    points[9::50, 3] = np.nan
+    return Case(write_bin(folder / "higher.bin", points))
+
+
+def of_another_sensor(folder: Path) -> Case:
+    points, laser = place(LASERS["os1-64"], 1.9)
+    return Case(write_bin(folder / "ouster.bin", with_ring(points, laser)), "sim-hdl64e")
+
+
+def for_other_lasers(folder: Path) -> Case:
+    points, laser = place(LASERS["vlp16"], 1.9, steps=1000)
+    return Case(write_bin(folder / "vlp16.bin", with_ring(points, laser)), "sim-hdl32e")
+
+
+def without_rings(folder: Path) -> Case:
+    points, _ = place(LASERS["hdl32e"], 1.84, steps=700)
+    return Case(write_bin(folder / "lone32.bin", points), "sim-hdl32e")
+
+
+def tilted(folder: Path) -> Case:
+    points, _ = place(HDL64E, 1.73)
+    angle = np.radians(14)
+    turn = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    points[:, :3] = points[:, :3] @ np.array(turn)
+    return Case(write_bin(folder / "tilted.bin", points))
+
+
+def with_y_up_in_millimetres(folder: Path) -> Case:
+    points, _ = place(HDL64E, 1.73)
+    x, y, z, intensity = points.T
+    table = np.column_stack([-1000 * y, 1000 * z, -1000 * x, intensity]).astype(np.float64)
+    fields = [(name, "F 8", 1) for name in ("x", "y", "z", "intensity")]
+    path = folder / "cameras.pcd"
+    path.write_bytes(pcd_bytes(table, fields))
+    return Case(path)
+
+
+def on_the_ground(folder: Path) -> Case:
+    points, _ = place(HDL64E, 1.73)
+    points[:, 2] += 1.73
+    return Case(write_bin(folder / "ground.bin", points))
+
+
+def without_a_ground(folder: Path) -> Case:
+    return Case(write_bin(folder / "few.bin", some_points(4000)))
+
+
+def without_intensity(folder: Path) -> Case:
+    points, _ = place(HDL64E, 1.73)
+    points[:, 3] = 0.5
+    return Case(write_bin(folder / "constant.bin", points))
+
+
+def bright(folder: Path) -> Case:
+    points, _ = place(HDL64E, 1.73)
+    points[:, 3] = np.round(points[:, 3] ** 4 * 60_000)
+    return Case(write_bin(folder / "bright.bin", points))
+
+
+SCANS: tuple[Callable[[Path], Case], ...] = (
+    kitti_like,
+    in_another_order,
+    nuscenes_like,
+    higher_with_lost_returns,
+    of_another_sensor,
+    for_other_lasers,
+    without_rings,
+    tilted,
+    with_y_up_in_millimetres,
+    on_the_ground,
+    without_a_ground,
+    without_intensity,
+    bright,
+)
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Case, dict[str, Any]]]:
+    """Each scan, and what the page makes of it, by its name."""
+    folder = tmp_path_factory.mktemp("scans")
+    cases = [make(folder) for make in SCANS]
+    names = [make.__name__ for make in SCANS]
+    return dict(zip(names, zip(cases, run_page(cases, folder), strict=True), strict=True))
+
+
+@pytest.mark.parametrize("name", [make.__name__ for make in SCANS])
+def test_a_scan_is_normalised_as_by_the_package(
+    name: str, scans: dict[str, tuple[Case, dict[str, Any]]]
+) -> None:
+    case, page = scans[name]
+    scan, line = normalised(case)
+    valid = scan.valid
+    assert page["text"] == line
+
+    points = page["points"].reshape(-1, 4)
+    assert np.array_equal(page["places"], np.flatnonzero(valid))
+    assert np.allclose(points[:, :3], scan.points[valid, :3], atol=1e-4)
+    assert (rows_of(case, scan) == page["rows"]).mean() > 0.9995
+
+
+def rows_of(case: Case, scan: Scan) -> np.ndarray:
+    """Return the rows of the valid points as the package decides them, 0 the top."""
+    assert scan.ring is not None
+    return np.asarray(case.expected.view.height - 1 - scan.ring[scan.valid])
+
+
+@pytest.mark.parametrize("name", ["kitti_like", "nuscenes_like", "higher_with_lost_returns"])
+def test_the_views_equal_those_of_the_onnx_runner(
+    name: str, scans: dict[str, tuple[Case, dict[str, Any]]]
+) -> None:
+    case, page = scans[name]
+    points = page["points"].reshape(-1, 4)
+    view = case.expected.view
+    ring = view.height - 1 - page["rows"]
+    image, pixel = range_image(dataclasses.replace(view, rows="ring"), points, ring)
+    features, pillar, voxel = polar_features(POLAR, points)
+
+    assert np.array_equal(page["pixel"], pixel)
+    assert np.array_equal(page["image"], image.ravel())
+    assert np.array_equal(page["pillar"], pillar)
+    assert np.array_equal(page["voxel"], voxel)
+    assert np.allclose(page["features"], features.ravel(), atol=1e-6)
+
+
+def test_neighbours_are_as_near_as_those_of_the_package(
+    scans: dict[str, tuple[Case, dict[str, Any]]],
+) -> None:
+    _, page = scans["higher_with_lost_returns"]
+    xyz = page["points"].reshape(-1, 4)[:, :3]
+    own = np.arange(0, min(30_000, len(xyz)), 97)
+    expected = nearest_others(xyz, own, NEIGHBOURS)
+    actual = page["neighbours"].reshape(-1, NEIGHBOURS)
+
+    def distances(near: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(xyz[near].astype(np.float64) - xyz[own][:, None], axis=2)
+
+    assert np.allclose(distances(actual), distances(expected))
+    assert (actual != own[:, None]).all()
+
+
+@pytest.mark.parametrize("count", [1, 2, 9])
+def test_few_points_are_repeated_as_neighbours(count: int, tmp_path: Path) -> None:
+    points = some_points(200)
+    points[count:] = np.nan
+    case = Case(write_bin(tmp_path / "few.bin", points))
+    (page,) = run_page([case], tmp_path)
+    expected = nearest_others(points[:count, :3], np.array([0]), NEIGHBOURS)
+    assert np.array_equal(page["neighbours"], expected[0])
+
+
+def test_formats_give_the_points_of_the_package(tmp_path: Path) -> None:
+    points = some_points(5000)
+    names = [name for name in WRITERS if name.endswith((".bin", ".pcd", ".ply"))]
+    assert set(FORMATS) < set(names)
+    for name in names:
+        WRITERS[name](tmp_path / name, points)
+
+    cases = [Case(tmp_path / name) for name in names]
+    for case, page in zip(cases, run_page(cases, tmp_path), strict=True):
+        scan, line = normalised(case)
+        assert page["text"] == line
+        assert np.allclose(page["points"].reshape(-1, 4)[:, :3], scan.points[:, :3], atol=1e-6)
+
+
+def test_integers_of_any_size_are_read(tmp_path: Path) -> None:
+    points, laser = place(LASERS["hdl32e"], 1.84)
+    kinds = {"x": "f8", "y": "f4", "z": "f8", "Intensity": "u2", "ring": "i8", "time": "u8"}
+    table = np.zeros(len(points), list(kinds.items()))
+    table["x"], table["y"], table["z"] = points[:, :3].T
+    table["Intensity"] = points[:, 3] * 40_000
+    table["ring"] = laser
+    fields = [(name, f"{kind[0].upper()} {kind[1]}", 1) for name, kind in kinds.items()]
+    path = tmp_path / "mixed.pcd"
+    path.write_bytes(pcd_bytes(table, fields))
+
+    case = Case(path, "sim-hdl32e")
+    (page,) = run_page([case], tmp_path)
+    scan, line = normalised(case)
+    assert page["text"] == line
+    assert "32 lasers" in line
+    assert np.array_equal(page["rows"], rows_of(case, scan))
+
+
+def broken_files(folder: Path) -> list[Path]:
+    """Write files that no command can read, in all ways that the readers know."""
+    points = some_points(3000)
+    for name in FORMATS:
+        WRITERS[name](folder / name, points)
+    pcd = (folder / "binary.pcd").read_bytes()
+    text = (folder / "ascii.pcd").read_bytes()
+    packed = (folder / "compressed.pcd").read_bytes()
+    ply = (folder / "little.ply").read_bytes()
+    kitti = points.tobytes()
+    nan = np.full_like(points, np.nan)
+    far = points + np.array([5e5, 5e5, 0, 0], np.float32)
+    floor = points[:, :3] * [1, 1, 0.001] - [0, 0, 9]
+
+    files = {
+        "odd.bin": kitti[:-3],
+        "letters.bin": b"not a scan at all, but a long text" * 300,
+        "none.bin": b"",
+        "nan.bin": nan.tobytes(),
+        "map.bin": far.tobytes(),
+        "centimetres.bin": (points * [100, 100, 100, 1]).astype(np.float32).tobytes(),
+        "feet.bin": np.column_stack([floor, points[:, 3]]).astype(np.float32).tobytes(),
+        "cut.pcd": pcd[:-1000],
+        "cut_text.pcd": text[: len(text) // 2],
+        "lines.pcd": b"\n".join(text.split(b"\n")[:-5]) + b"\n" * 60_000,
+        "words.pcd": text.replace(b"DATA ascii\n", b"DATA ascii\nfour words of text\n"),
+        "cut_packed.pcd": packed[:-100],
+        "swapped.pcd": packed[:400] + packed[500:600] + packed[400:500] + packed[600:],
+        "claims.pcd": pcd.replace(b"POINTS 3000", b"POINTS 9999999999"),
+        "names.pcd": pcd.replace(b"FIELDS x y z", b"FIELDS a b c"),
+        "encoding.pcd": pcd.replace(b"DATA binary", b"DATA zipped"),
+        "types.pcd": pcd.replace(b"TYPE F F", b"TYPE F Q"),
+        "header.pcd": pcd[:40],
+        "header.ply": ply[:40],
+        "cut.ply": ply[:-1000],
+        "format.ply": ply.replace(b"binary_little_endian", b"binary_middle_endian"),
+        "lists.ply": ply.replace(
+            b"property float x", b"property list uchar int i\nproperty float x"
+        ),
+        "names.ply": ply.replace(b"property float x", b"property float q"),
+        "vertex.ply": ply.replace(b"element vertex", b"element points"),
+    }
+    paths = []
+    for name, data in files.items():
+        paths.append(folder / name)
+        paths[-1].write_bytes(data)
+    return paths
+
+
+# Words that differ: what a library says, and the page's own limit.
+OWN_WORDS = ("found a broken one", "expected a scan of at most")
+
+
+def test_a_broken_file_gives_the_line_of_the_command(tmp_path: Path) -> None:
+    paths = broken_files(tmp_path)
+    results = run_page([Case(path) for path in paths], tmp_path)
+    for path, page in zip(paths, results, strict=True):
+        assert "error" in page, path.name
+        with pytest.raises(InputError) as caught:
+            normalised(Case(path))
+
+        ours = page["error"]
+        theirs = str(caught.value).replace(str(path), path.name)
+        if any(words in theirs for words in OWN_WORDS):
+            assert any(words in ours for words in OWN_WORDS)
+        else:
+            assert problem_of(ours) == problem_of(theirs)
+        # The page has no options: it names those of the command, if they help.
+        assert "--" not in ours or "amvnet predict" in ours
+        assert "\n" not in ours
+
+
+def problem_of(line: str) -> str:
+    """Return what was expected and found, without the advice."""
+    return line.split("; ")[0]
+
+
+def test_unknown_formats_name_those_that_the_page_reads(tmp_path: Path) -> None:
+    names = [name for name in WRITERS if name.endswith((".npy", ".npz", ".las", ".bag", ".mcap"))]
+    for name in names:
+        WRITERS[name](tmp_path / name, some_points())
+    results = run_page([Case(tmp_path / name) for name in names], tmp_path)
+    for name, page in zip(names, results, strict=True):
+        assert page["error"].startswith(
+            f"{name}: expected a scan file (.pcd.bin, .bin, .pcd, .ply)"
+        )

@@ -1,0 +1,293 @@
+"""The page docs/try labels scans in Chromium as `onnx_runner.py` does."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from amvnet.data.formats.detect import ending_of
+from amvnet.data.formats.registry import read_file
+from amvnet.data.formats.rows import UNKNOWN
+from amvnet.inference.reading import expectation_of
+from amvnet.onnx_runner import OnnxSegmenter
+from amvnet.sensors.normalise import Normaliser
+from amvnet.weights.file import load
+
+from fixtures.browser_pages import CHROMIUM, FLAGS
+from fixtures.scan_writers import write_pcd
+from fixtures.sensors import LASERS, place
+
+ROOT = Path(__file__).parents[2]
+DRIVER = ROOT / "tests" / "fixtures" / "try_page.mjs"
+PLAYWRIGHT = ROOT / "docs" / "try" / "node_modules" / "playwright-core"
+NODE = shutil.which("node")
+MEGABYTE = 1_000_000
+AGREEMENT = 0.999  # least share of the points with the labels of `onnx_runner.py`
+# With these, a browser may run threads.
+ISOLATION = {
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Embedder-Policy": "require-corp",
+}
+
+MISSING = [
+    what
+    for what, is_missing in (
+        ("Chromium", CHROMIUM is None),
+        ("Node.js", NODE is None),
+        ("docs/try/node_modules (make docs)", not PLAYWRIGHT.is_dir()),
+    )
+    if is_missing
+]
+# CI has all of it.
+pytestmark = pytest.mark.skipif(
+    bool(MISSING) and "CI" not in os.environ, reason=f"missing: {', '.join(MISSING)}"
+)
+
+
+@dataclass
+class Site:
+    """A folder that is served, and the bytes of each request."""
+
+    folder: Path
+    url: str = ""
+    sent: list[tuple[str, int]] = field(default_factory=list)
+
+
+@contextmanager
+def served(folder: Path, headers: dict[str, str]) -> Iterator[Site]:
+    """Serve a folder on this machine, with additional headers."""
+    site = Site(folder)
+
+    class Handler(SimpleHTTPRequestHandler):
+        extensions_map = {**SimpleHTTPRequestHandler.extensions_map, ".mjs": "text/javascript"}  # noqa: RUF012
+
+        def end_headers(self) -> None:
+            for name, value in headers.items():
+                self.send_header(name, value)
+            super().end_headers()
+
+        def copyfile(self, source: Any, outputfile: Any) -> None:
+            data = source.read()
+            site.sent.append((self.path, len(data)))
+            outputfile.write(data)
+
+        def log_message(self, *_: Any) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+    site.url = f"http://127.0.0.1:{server.server_port}/try/"
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield site
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the page, and return the folder around it."""
+    spec = importlib.util.spec_from_file_location("try_page", ROOT / "docs" / "try_page.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    site = tmp_path_factory.mktemp("site")
+    module.build(site / "try")
+    return site
+
+
+def drive(site: Site, cases: list[dict[str, Any]], downloads: Path) -> dict[str, Any]:
+    """Open the page in Chromium and label scans; return the report of the driver."""
+    job = {
+        "playwright": str(PLAYWRIGHT),
+        "chromium": CHROMIUM,
+        "flags": [flag for flag in FLAGS if "=" not in flag or "gl" in flag],
+        "url": f"{site.url}index.html",
+        "cases": cases,
+    }
+    command = [str(NODE), str(DRIVER), str(downloads), json.dumps(job)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=550)
+    assert done.returncode == 0, done.stderr
+    return dict(json.loads(done.stdout))
+
+
+def scan_files(folder: Path) -> dict[str, Path]:
+    """Write a scan as of KITTI, one as of nuScenes, one of PCL, and a broken file."""
+    points, _ = place(np.linspace(-23.9, 3, 64), 2.2, steps=500)
+    points[::40, :3] = 0  # lost returns
+    kitti = folder / "kitti.bin"
+    kitti.write_bytes(points.astype(np.float32).tobytes())
+
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=1000)
+    nuscenes = folder / "nuscenes.pcd.bin"
+    table = np.column_stack([points * [1, 1, 1, 255], laser])
+    nuscenes.write_bytes(table.astype(np.float32).tobytes())
+
+    points, _ = place(LASERS["os1-64"], 1.9, steps=500)
+    pcd = write_pcd(folder / "cloud.pcd", points, "binary_compressed")
+    broken = folder / "broken.pcd"
+    broken.write_bytes(pcd.read_bytes()[:-500])
+    return {"kitti": kitti, "nuscenes": nuscenes, "pcd": pcd, "broken": broken}
+
+
+@dataclass(frozen=True)
+class Session:
+    """What one browser did with all scans.
+
+    Attributes:
+        report: of the driver.
+        results: of the driver, by the name of the case.
+        files: the scans, by the name of the case.
+        site: the folder that was served.
+    """
+
+    report: dict[str, Any]
+    results: dict[str, dict[str, Any]]
+    files: dict[str, Path]
+    site: Site
+
+
+@pytest.fixture(scope="module")
+def session(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
+    """Label all scans in a browser that may use threads."""
+    scans = tmp_path_factory.mktemp("scans")
+    files = {"sample": folder / "try" / "street.bin", **scan_files(scans)}
+    cases = [
+        {"model": 0, "kinds": ["label", "npy"]},
+        {"file": str(files["kitti"]), "model": 0},
+        {"file": str(files["nuscenes"]), "model": 1},
+        {"file": str(files["pcd"]), "model": 0},
+        {"file": str(files["broken"]), "model": 0},
+    ]
+    with served(folder, ISOLATION) as site:
+        report = drive(site, cases, scans)
+    results = dict(zip(files, report["results"], strict=True))
+    return Session(report, results, files, site)
+
+
+def reference(path: Path, weights: str, graphs: Path) -> np.ndarray:
+    """Return the raw ids by `onnx_runner.py` of a scan that is normalised as in `predict`."""
+    loaded = load(weights)
+    normaliser = Normaliser(expectation_of(loaded))
+    cloud = read_file(path, ending_of(path), UNKNOWN)
+    normaliser.expect("scans", lambda: cloud)
+    scan = normaliser(cloud, "scans")
+
+    segmenter = OnnxSegmenter(graphs)
+    if scan.ring is not None:
+        segmenter.range_view = dataclasses.replace(segmenter.range_view, rows="ring")
+    return loaded.taxonomy.to_raw(segmenter(scan.points, scan.ring).labels)
+
+
+WEIGHTS = {
+    "sample": "sim-hdl64e",
+    "kitti": "sim-hdl64e",
+    "nuscenes": "sim-hdl32e",
+    "pcd": "sim-hdl64e",
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
+def test_a_scan_gets_the_labels_of_the_onnx_runner(
+    name: str, session: Session, folder: Path
+) -> None:
+    result = session.results[name]
+    assert result["state"] == "labelled", result["problem"]
+    ids = np.fromfile(result["label"], np.uint32)
+    expected = reference(session.files[name], WEIGHTS[name], folder / "try" / WEIGHTS[name])
+    assert len(ids) == len(expected)
+    assert (ids == expected).mean() >= AGREEMENT
+    assert len(np.unique(expected)) > 3
+
+
+def test_both_downloads_have_the_same_ids(session: Session) -> None:
+    result = session.results["sample"]
+    ids = np.load(result["npy"])
+    assert ids.dtype == np.uint32
+    assert np.array_equal(ids, np.fromfile(result["label"], np.uint32))
+
+
+def test_the_viewer_draws_every_point_with_its_label(session: Session) -> None:
+    result = session.results["sample"]
+    assert result["sources"] == ["RV", "BEV", "Ensemble", "AMVNet"]
+    ids = np.fromfile(result["label"], np.uint32)
+    counts = np.unique(ids[ids > 0], return_counts=True)[1]
+    assert sorted(filter(None, result["drawn"])) == sorted(counts.tolist())
+
+
+def test_a_broken_file_gives_its_line(session: Session) -> None:
+    result = session.results["broken"]
+    assert result["state"] == "failed"
+    assert result["problem"].startswith("broken.pcd: expected at least ")
+    assert result["problem"].endswith("the file is truncated, copy it again")
+
+
+def test_steps_have_times_and_the_line_says_what_was_assumed(session: Session) -> None:
+    result = session.results["kitti"]
+    titles = [title for title, _ in result["steps"]]
+    assert all(time.endswith(" s") for _, time in result["steps"])
+    assert titles[:2] == ["read", "normalise"]
+    assert {"range-view network", "bird's-eye-view network", "point head", "merge"} <= set(titles)
+    assert "moved by" in result["assumed"]
+
+
+def test_nothing_leaves_the_folder_of_the_page(session: Session) -> None:
+    requests = session.report["requests"]
+    assert len(requests) > 30
+    for url in requests:
+        assert url.removeprefix("blob:").startswith(session.site.url) or url.startswith(
+            f"blob:{session.site.url.removesuffix('try/')}"
+        )
+
+
+def test_the_console_has_no_errors_and_no_warnings(session: Session) -> None:
+    assert session.report["console"] == []
+
+
+def test_the_page_is_small(session: Session) -> None:
+    sizes = [size for _, size in session.site.sent]
+    first = sum(sizes[: session.report["first"]["requests"]])
+    assert first < 3 * MEGABYTE
+    assert sum(dict(session.site.sent).values()) < 40 * MEGABYTE  # with both weights
+    assert session.report["memory"] < 1000 * MEGABYTE
+
+
+def test_without_isolation_one_thread_labels_a_scan(
+    folder: Path, session: Session, tmp_path: Path
+) -> None:
+    with served(folder, {}) as site:
+        report = drive(site, [{"file": str(session.files["nuscenes"]), "model": 1}], tmp_path)
+    (result,) = report["results"]
+    assert report["isolated"] is False
+    assert "one thread" in result["line"]
+    ids = np.fromfile(result["label"], np.uint32)
+    by_threads = np.fromfile(session.results["nuscenes"]["label"], np.uint32)
+    assert (ids == by_threads).mean() >= AGREEMENT
+
+
+def test_the_page_has_less_than_1500_lines_of_code() -> None:
+    lines: list[str] = []
+    for path in (ROOT / "docs" / "try").rglob("*.js"):
+        if "node_modules" not in path.parts:
+            lines += path.read_text().splitlines()
+    code = [line for line in lines if line.strip() and not re.match(r"\s*(//|/?\*)", line)]
+    assert len(code) < 1500
