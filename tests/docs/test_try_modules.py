@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from amvnet.errors import InputError
 from amvnet.export.onnx import describe_expectation
 from amvnet.inference.reading import expectation_of
 from amvnet.models.neighbours import nearest_others
-from amvnet.onnx_runner import polar_features, range_image
+from amvnet.onnx_runner import image_rows, polar_features, range_image
 from amvnet.scan import Scan
 from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.weights.file import load
@@ -43,14 +43,17 @@ pytestmark = pytest.mark.skipif(NODE is None, reason="Node.js is not installed")
 
 @dataclass(frozen=True)
 class Case:
-    """A scan file, and the weights that it is normalised for."""
+    """A scan file, the weights that it is normalised for, and what their rows are, if changed."""
 
     file: Path
     weights: str = "sim-hdl64e"
+    rows: Literal["elevation", "laser", "ring"] | None = None
 
     @property
     def expected(self) -> Expectation:
-        return expectation_of(load(self.weights))
+        expected = expectation_of(load(self.weights))
+        rows = self.rows or expected.view.rows
+        return dataclasses.replace(expected, view=dataclasses.replace(expected.view, rows=rows))
 
 
 def run_page(cases: list[Case], folder: Path) -> list[dict[str, Any]]:
@@ -119,18 +122,31 @@ HDL64E = np.linspace(-23.9, 3, 64)
 
 def kitti_like(folder: Path) -> Case:
     points, laser = place(HDL64E, 1.73)
-    return Case(write_bin(folder / "kitti_like.bin", by_laser(points, laser)))
+    points = by_laser(points, laser)
+    points[1000:1010, :3] = 0  # lost returns
+    return Case(write_bin(folder / "kitti_like.bin", points), rows="laser")
 
 
 def in_another_order(folder: Path) -> Case:
     points, _ = place(HDL64E, 1.73)
-    return Case(write_bin(folder / "order.bin", points))
+    return Case(write_bin(folder / "order.bin", points), rows="laser")
+
+
+def by_elevation(folder: Path) -> Case:
+    points, laser = place(HDL64E, 1.73)
+    return Case(write_bin(folder / "elevation.bin", by_laser(points, laser)), rows="elevation")
 
 
 def nuscenes_like(folder: Path) -> Case:
     points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
     path = write_bin(folder / "nuscenes_like.pcd.bin", with_ring(points, laser))
-    return Case(path, "sim-hdl32e")
+    return Case(path, "sim-hdl32e", rows="ring")
+
+
+def with_lasers_in_a_column(folder: Path) -> Case:
+    points, laser = place(LASERS["hdl32e"], 1.84, steps=700)
+    path = write_bin(folder / "lasers.pcd.bin", with_ring(points, laser))
+    return Case(path, "sim-hdl32e", rows="laser")
 
 
 def higher_with_lost_returns(folder: Path) -> Case:
@@ -143,17 +159,18 @@ def higher_with_lost_returns(folder: Path) -> Case:
 
 def of_another_sensor(folder: Path) -> Case:
     points, laser = place(LASERS["os1-64"], 1.9)
-    return Case(write_bin(folder / "ouster.bin", with_ring(points, laser)), "sim-hdl64e")
+    return Case(write_bin(folder / "ouster.bin", with_ring(points, laser)), rows="laser")
 
 
-def for_other_lasers(folder: Path) -> Case:
+def of_fewer_lasers(folder: Path) -> Case:
     points, laser = place(LASERS["vlp16"], 1.9, steps=1000)
-    return Case(write_bin(folder / "vlp16.bin", with_ring(points, laser)), "sim-hdl32e")
+    path = write_bin(folder / "vlp16.bin", with_ring(points, laser))
+    return Case(path, "sim-hdl32e", rows="ring")
 
 
 def without_rings(folder: Path) -> Case:
     points, _ = place(LASERS["hdl32e"], 1.84, steps=700)
-    return Case(write_bin(folder / "lone32.bin", points), "sim-hdl32e")
+    return Case(write_bin(folder / "lone32.bin", points), "sim-hdl32e", rows="ring")
 
 
 def tilted(folder: Path) -> Case:
@@ -199,10 +216,12 @@ def bright(folder: Path) -> Case:
 SCANS: tuple[Callable[[Path], Case], ...] = (
     kitti_like,
     in_another_order,
+    by_elevation,
     nuscenes_like,
+    with_lasers_in_a_column,
     higher_with_lost_returns,
     of_another_sensor,
-    for_other_lasers,
+    of_fewer_lasers,
     without_rings,
     tilted,
     with_y_up_in_millimetres,
@@ -239,8 +258,7 @@ def test_a_scan_is_normalised_as_by_the_package(
 
 def rows_of(case: Case, scan: Scan) -> np.ndarray:
     """Return the rows of the valid points as the package decides them, 0 the top."""
-    assert scan.ring is not None
-    return np.asarray(case.expected.view.height - 1 - scan.ring[scan.valid])
+    return image_rows(case.expected.view, scan.select(scan.valid))
 
 
 @pytest.mark.parametrize("name", ["kitti_like", "nuscenes_like", "higher_with_lost_returns"])
@@ -249,9 +267,7 @@ def test_the_views_equal_those_of_the_onnx_runner(
 ) -> None:
     case, page = scans[name]
     points = page["points"].reshape(-1, 4)
-    view = case.expected.view
-    ring = view.height - 1 - page["rows"]
-    image, pixel = range_image(dataclasses.replace(view, rows="ring"), points, ring)
+    image, pixel = range_image(case.expected.view, Scan(points, row=page["rows"]))
     features, pillar, voxel = polar_features(POLAR, points)
 
     assert np.array_equal(page["pixel"], pixel)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import json
 import os
@@ -192,10 +191,7 @@ def reference(path: Path, weights: str, graphs: Path) -> np.ndarray:
     normaliser.expect("scans", lambda: cloud)
     scan = normaliser(cloud, "scans")
 
-    segmenter = OnnxSegmenter(graphs)
-    if scan.ring is not None:
-        segmenter.range_view = dataclasses.replace(segmenter.range_view, rows="ring")
-    return loaded.taxonomy.to_raw(segmenter(scan.points, scan.ring).labels)
+    return loaded.taxonomy.to_raw(OnnxSegmenter(graphs)(scan).labels)
 
 
 WEIGHTS = {
