@@ -5,7 +5,7 @@
 #
 # INIT are weights to begin with, such as sim-hdl64e; options of `amvnet train` may follow. An epoch is
 # 6,000 scans of 1,000 streets, which are other streets in each epoch. A network takes 0.5 to 1 s a scan on a CPU core, and 4 minutes
-# an epoch on an H100. docs/log/training.md says how the training of the shipped weights differed.
+# an epoch on an H100. docs/log.md says how the training of the shipped weights differed.
 set -euo pipefail
 sensor=$1 out=$2
 shift 2

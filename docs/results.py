@@ -3,7 +3,7 @@
     python docs/results.py
 
 Each page has the table between the lines `<!-- results -->` and `<!-- end of results -->`:
-README.md and docs/index.md the rows that are marked `readme`, docs/log/index.md all of them. Change
+README.md and docs/index.md the rows that are marked `readme`, docs/log.md all of them. Change
 a figure in docs/results.json only, and run this. A test compares the pages with the file, also the
 outputs of commands in them.
 """
@@ -18,7 +18,7 @@ from typing import Any
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs/results.json"
 SHORT = ("README.md", "docs/index.md")  # pages with the rows for the first screen
-LONG = ("docs/log/index.md",)
+LONG = ("docs/log.md",)
 METHODS = ("rv", "bev", "ensemble", "amvnet")
 REGION = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.S)
 

@@ -11,6 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
+LOG = DOCS / "log.md"
 
 
 def load_program() -> ModuleType:
@@ -47,10 +48,20 @@ def test_what_evaluate_prints_in_the_pages_is_in_the_file() -> None:
 
 def test_only_the_log_tells_history() -> None:
     """Users of a page need no commit, and no weights that they cannot load."""
-    for page in [ROOT / "README.md", *DOCS.glob("*.md")]:
+    for page in [ROOT / "README.md", *set(DOCS.glob("*.md")) - {LOG}]:
         text = page.read_text(encoding="utf-8")
         commits = re.findall(r"\b(?=[0-9a-f]*[0-9])(?=[0-9a-f]*[a-f])[0-9a-f]{7}\b", text)
         assert commits == [], page
         assert not re.search(r"earlier weights|an earlier `sim|the present (weights|`sim)", text), (
             page
         )
+
+
+def test_every_entry_of_the_log_has_a_date_a_table_and_a_verdict() -> None:
+    _, _, *entries = re.split(r"(?m)^## ", LOG.read_text(encoding="utf-8"))  # without the results
+    assert entries
+    for entry in entries:
+        title = entry.splitlines()[0]
+        assert re.search(r"\n\n\*\d{4}-\d\d-\d\d( to (\d\d-)?\d\d)?\.\* ", entry), title
+        assert "\n|---" in entry, title
+        assert "\n**Verdict:** " in entry, title

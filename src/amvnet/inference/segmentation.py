@@ -21,7 +21,7 @@ NAMED = 3  # classes in the short description of a result
 # A share of uncertain points is unusual if its odds are more than this multiple of the usual odds.
 # Unlike a difference of shares, the odds suit every tau: for weights of simulated streets, real
 # scans of the right sensor have up to 5 times the usual odds at a tau of 0.5 and of 0.82, and scans
-# in another frame or unit more (docs/log/fusion.md).
+# in another frame or unit more (docs/log.md).
 UNUSUAL_ODDS = 5.0
 
 

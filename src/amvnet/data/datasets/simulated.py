@@ -34,7 +34,7 @@ FIRST_VAL_STREET = 900_000  # training uses the streets below
 LAST_STREET = 999_999
 
 # The numbers of the streets rise by this from epoch to epoch: new streets help a training, more
-# scans of the same streets do not (docs/log/training.md).
+# scans of the same streets do not (docs/log.md).
 STREET_STEP = 1000
 
 SEED = 64  # `amvnet simulate`, whose seed is 0 by default, makes other streets
