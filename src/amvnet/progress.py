@@ -27,9 +27,9 @@ class Tenths:
         return True
 
 
-def counted(count: int, noun: str) -> str:
-    """Return a number of things in words: "1 scan", "2 scans"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+def counted(count: int, noun: str, plural: str = "") -> str:
+    """Return a number of things in words: "1 scan", "2 scans"; `plural` if it is not regular."""
+    return f"{count} {noun}" if count == 1 else f"{count} {plural or f'{noun}s'}"
 
 
 def no_progress(done: int, total: int) -> None:

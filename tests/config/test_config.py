@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
+from collections.abc import Iterator
+from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
 
 import pytest
 import yaml
 
+from amvnet.config.bounds import Range
 from amvnet.config.nested import from_dict, merge_trees, to_dict
 from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.config.schema import ModelConfig, PointHeadConfig, Recipe
 from amvnet.errors import InputError
+
+from fixtures.worlds import run_cli
 
 
 def write_recipe(folder: Path, text: str) -> str:
@@ -296,3 +302,54 @@ def test_what_was_removed_is_refused_by_its_name(field: str, value: Any) -> None
     part, name = field.split()
     with pytest.raises(InputError, match=f"{part}: {name}: expected .* found .* was removed"):
         from_dict(ModelConfig, {part: {name: value}})
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [
+        ("training.rv.lr", "1e308"),
+        ("training.head.lr", "1e308"),
+        ("training.rv.epochs", 10**30),
+        ("training.bev.batch", 10**30),
+        ("training.rv.clip", "1e308"),
+        ("training.bev.weight_decay", "1e308"),
+        ("training.rv.region", "1e308"),
+        ("training.rv.accumulate", 10**30),
+        ("training.head.views", 10**30),
+        ("training.head.points", 10**30),
+        ("training.head.drawn", 10**30),
+        ("training.workers", 10**12),
+        ("training.augment.jitter", "1e308"),
+        ("training.augment.yaw", "1e308"),
+        ("training.augment.height", "1e308"),
+        ("model.point_head.position_scale", "1e308"),
+    ],
+)
+def test_absurd_values_are_refused_before_a_folder_is_made(
+    tmp_path: Path, option: str, value: object
+) -> None:
+    out = tmp_path / "run"
+    code, error = run_cli(
+        *("train", "semantickitti-compact", "--data", tmp_path, "--out", out),
+        *(f"--{option}", value),
+    )
+    assert code == 2
+    assert error.count("\n") == 1
+    assert option in error
+    assert not out.exists()
+
+
+def test_every_number_of_a_recipe_has_two_bounds() -> None:
+    def numbers(cls: type) -> Iterator[tuple[str, Any]]:
+        for name, kind in get_type_hints(cls, include_extras=True).items():
+            if isinstance(kind, type) and is_dataclass(kind):
+                yield from numbers(kind)
+            elif name != "obsolete":
+                item_kind = get_args(kind)[0] if get_origin(kind) is tuple else kind
+                yield f"{cls.__name__}.{name}", item_kind
+
+    for name, kind in numbers(Recipe):
+        number = get_args(kind)[0] if get_origin(kind) is Annotated else kind
+        if number in (int, float):
+            (allowed,) = [part for part in get_args(kind) if isinstance(part, Range)]
+            assert math.isfinite(allowed.high), name

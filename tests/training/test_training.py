@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shutil
 import signal
@@ -22,9 +23,10 @@ from amvnet.config.recipes import load_recipe, recipe_names
 from amvnet.data.datasets import simulated
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.select import TrainingScans
+from amvnet.scan import Scan
 from amvnet.sensors.intensity import KEY as INTENSITIES
 from amvnet.sensors.intensity import MATCHED, PROBABILITIES, QUANTILES
-from amvnet.training import networks
+from amvnet.training import loaders, networks
 from amvnet.training import run as training_run
 from amvnet.training.callbacks import KeepWeights
 from amvnet.training.checking import check_data
@@ -165,6 +167,28 @@ def test_the_check_of_the_scans_reports_ten_times_and_only_once(
     checked = [line for line in lines if line.startswith("checked")]
     assert len(checked) == 10
     assert checked[-1] == "checked 23 of 23 scans"
+
+
+def test_an_epoch_without_a_labelled_point_is_an_error_and_writes_no_weights(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drawn = itertools.count()
+
+    def ignore(scan: Scan, first: int) -> Scan:
+        is_empty = next(drawn) >= first
+        return replace(scan, labels=np.zeros_like(scan.labels)) if is_empty else scan
+
+    options = ("--stage", "rv", "--training.rv.epochs", 1, "--training.rv.batch", 1)
+    monkeypatch.setattr(loaders, "augment", lambda scan, *_: ignore(scan, 0))
+    error = fail(*train_arguments(world, tmp_path / "none"), *options)
+    assert "none in 4 batches" in error
+    kept = (".safetensors", ".ckpt")
+    assert not {name for name in files(tmp_path / "none") if name.endswith(kept)}
+
+    drawn = itertools.count()
+    monkeypatch.setattr(loaders, "augment", lambda scan, *_: ignore(scan, 3))
+    train(world, tmp_path / "some", *options)
+    assert "1 of 4 batches had no labelled point" in capsys.readouterr().out
 
 
 def test_the_weights_describe_their_training(run: Path) -> None:

@@ -39,9 +39,7 @@ class Range:
 
 LONGEST_TEXT = 200
 MOST_ITEMS = 12  # of a list of values, such as the channels of a network's layers
-Count = Annotated[int, Range(1)]
-NotNegative = Annotated[float, Range(0)]
-Positive = Annotated[float, Range(0, open=True)]
+Count = Annotated[int, Range(1, 1_000_000)]  # far above any use
 Share = Annotated[float, Range(0, 1)]
 
 # By field, the values that earlier versions wrote and that ask for what is done now anyway. None

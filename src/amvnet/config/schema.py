@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
-from amvnet.config.bounds import Checked, Count, NotNegative, Obsolete, Positive, Range, Share
+from amvnet.config.bounds import Checked, Obsolete, Range, Share
 
 StageName = Literal["rv", "bev", "head"]
 
@@ -22,6 +22,12 @@ MOST_CELLS = 2**22  # of a view; the paper's range image has 2**18
 LASERS_SEEN = 0.75  # least share of a sensor's lasers that have returns in every scan
 Degrees = Annotated[float, Range(-90, 90)]  # above the horizon
 Metres = Annotated[float, Range(-1000, 1000)]
+# Also far above any use: a mistyped number is refused before a run begins.
+Epochs = Annotated[int, Range(1, 100_000)]
+Scans = Annotated[int, Range(1, 100_000)]  # of a batch, or its parts
+Points = Annotated[int, Range(1, 100_000_000)]
+LearningRate = Annotated[float, Range(0, 100, open=True)]
+Factor = Annotated[float, Range(0, 1000)]
 
 
 def _check_cells(view: Checked, *sides: int) -> None:
@@ -205,7 +211,7 @@ class PointHeadConfig(Checked):
     """Channels of the shared MLP over the neighbours."""
     fc: Channels = 128
     """Channels of the fully connected layer before the scores."""
-    position_scale: float = 0.05
+    position_scale: Factor = 0.05
     """Factor on x, y, z (metres) as features: brings them to the magnitude of the scores."""
     share: Share = 1.0
     """Weight of the head in its geometric mean with the ensemble, in predictions (1: the paper)."""
@@ -244,11 +250,11 @@ class AugmentConfig(Checked):
     """Scaling by 1 +- this, one factor per scan."""
     flip: Share = 0.5
     """Probability of mirroring x, and of mirroring y."""
-    jitter: NotNegative = 0.01
+    jitter: Annotated[float, Range(0, 10)] = 0.01
     """Standard deviation of the noise on each coordinate, metres."""
-    yaw: NotNegative = 180.0
+    yaw: Annotated[float, Range(0, 360)] = 180.0
     """Rotation about the vertical by up to +- this, degrees."""
-    height: NotNegative = 0.0
+    height: Annotated[float, Range(0, 100)] = 0.0
     """Vertical shift by up to +- this, metres: sensors are mounted at various heights (open)."""
     tilt: Annotated[float, Range(0, 45)] = 0.0
     """Roll and pitch of the sensor by up to +- this each, degrees (open)."""
@@ -284,31 +290,31 @@ class AugmentConfig(Checked):
 class NetworkTraining(Checked):
     """Training of one of the two networks: AdamW, one-cycle (section 4.2 of the paper)."""
 
-    epochs: Count
+    epochs: Epochs
     """Passes over the training scans."""
-    batch: Count
+    batch: Scans
     """Scans of one optimizer step."""
-    lr: Positive
+    lr: LearningRate
     """Peak of the one-cycle learning rate (open)."""
-    weight_decay: NotNegative = 0.01
+    weight_decay: Factor = 0.01
     """AdamW's weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the learning rate's peak (open)."""
     hold: Annotated[float, Range(0, 0.9)] = 0.0
     """Share of the steps at the learning rate's peak, before it falls (open)."""
-    region: NotNegative = 1.0
+    region: Factor = 1.0
     """Weight of the region loss (Dice or Lovász-softmax) relative to cross-entropy (open)."""
     region_loss: Literal["default", "dice", "lovasz"] = "default"
     """The region loss; by default the paper's: Dice for rv, Lovász-softmax for bev."""
     class_weights: bool = True
     """Weight the classes by the square root of their inverse frequency; off for the ablation."""
-    clip: Positive = 5.0
+    clip: Annotated[float, Range(0, 1e6, open=True)] = 5.0
     """Largest norm of the gradient; larger ones are scaled down (open)."""
     ema: Annotated[float, Range(0, 0.99999)] = 0.0
     """Decay of the exponential moving average of the weights that is used in the end; 0: none."""
     initial: Share = 0.0
     """Share of the initial weights in those that are used in the end, for `--init` (open)."""
-    accumulate: Count = 1
+    accumulate: Scans = 1
     """Parts that each process splits its batch into, if it does not fit into memory."""
 
     def __post_init__(self) -> None:
@@ -330,28 +336,28 @@ class NetworkTraining(Checked):
 class HeadTraining(Checked):
     """Training of the point head: SGD, one-cycle, frozen networks (section 4.2 of the paper)."""
 
-    epochs: Count = 20
+    epochs: Epochs = 20
     """Passes over the uncertain points of the training scans."""
-    batch: Count = 256
+    batch: Points = 256
     """Uncertain points of one optimizer step, drawn at random."""
-    lr: Positive = 0.1
+    lr: LearningRate = 0.1
     """Peak of the one-cycle learning rate (open)."""
     momentum: Annotated[float, Range(0.1, 0.999)] = 0.95
     """SGD's largest momentum; at the learning rate's peak it is lower by 0.1 (open)."""
-    weight_decay: NotNegative = 1e-4
+    weight_decay: Factor = 1e-4
     """SGD's weight decay (open)."""
     warmup: Annotated[float, Range(0, 1, open=True)] = 0.2
     """Share of the steps before the learning rate's peak (open)."""
-    views: Annotated[int, Range(0)] = 0
+    views: Annotated[int, Range(0, 10_000)] = 0
     """Augmented copies of each training scan to score for the head; 0: the scan itself."""
     tau: Share = 0.0
     """Largest cosine similarity of the points that the head learns from; 0: that of the model's
     uncertain points (open)."""
     disturb: Share = 0.0
     """Probability of disturbing the scores of a network in a view of a scan (open)."""
-    points: Count = 300_000
+    points: Points = 300_000
     """Limit on the uncertain points of all scans, shared equally; 1.3 kB each on disk (K = 19)."""
-    drawn: Annotated[int, Range(0)] = 0
+    drawn: Annotated[int, Range(0, 100_000_000)] = 0
     """Points of an epoch, other ones in each, drawn at random from those on disk; 0: all (open)."""
     balance: Share = 0.0
     """How far draws even out the classes: 0 draws points alike, 1 classes equally often (open)."""
@@ -377,7 +383,7 @@ class TrainingConfig(Checked):
     """Share of an epoch for the second and later --data in all; 0: all of their scans."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Seed of the initial weights, the order of the scans and the augmentation."""
-    workers: Annotated[int, Range(0)] = 0
+    workers: Annotated[int, Range(0, 1024)] = 0
     """Worker processes that read and augment scans; 0: none."""
     precision: Literal["auto", "32-true", "bf16-mixed", "16-mixed", "64-true"] = "32-true"
     """Lightning's precision of the forward and backward passes; auto: bf16-mixed on a device with

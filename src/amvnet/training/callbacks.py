@@ -123,6 +123,7 @@ class KeepWeights(Callback):
         self.highest = state_dict["highest"]
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: Any) -> None:
+        pl_module.check_epoch()
         metrics = {}
         for name, value in _metrics(trainer).items():
             if name.startswith("val/"):

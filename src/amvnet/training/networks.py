@@ -16,6 +16,7 @@ from amvnet.models.amvnet import AMVNet
 from amvnet.models.views.points import PointBatch, occurring
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeView
+from amvnet.progress import counted
 from amvnet.sensors.intensity import TrainedIntensity, simulated_intensity, trained_intensity
 from amvnet.training.checking import class_counts
 from amvnet.training.loaders import ScanSet, make_loader
@@ -64,6 +65,9 @@ class NetworkStage(Stage):
         self.class_weights: Tensor | None
         tensor = None if weights is None else torch.from_numpy(weights)
         self.register_buffer("class_weights", tensor, persistent=False)
+        # Batches of the epoch, and those of them with a label to learn from.
+        self.batches = 0
+        self.labelled: Tensor | int = 0
 
     def logits(self, batch: PointBatch, labels: Tensor) -> tuple[Scored, Tensor]:
         """Return what the loss is over, and the (P, K) logits of all points.
@@ -82,10 +86,28 @@ class NetworkStage(Stage):
         points, labels = batch
         scored, _ = self.logits(points, labels)
         loss = self.loss(scored)
+        self.batches += 1
+        self.labelled += (scored.labels > 0).any().int()  # stays on the device
 
         self.check_finite(loss, f"at the scans {', '.join(points.names)}")
         self.log("train/loss", loss, prog_bar=True, batch_size=points.count)
         return loss * self.step_factor(points.count, index)
+
+    def check_epoch(self) -> None:
+        batches = sum(self.processes.gather(self.batches))
+        empty = batches - sum(self.processes.gather(int(self.labelled)))
+        self.batches = 0
+        self.labelled = 0
+        if empty == batches:
+            raise InputError(
+                f"{self.name}: expected labelled points in the batches of an epoch, found none in "
+                f"{counted(batches, 'batch', 'batches')}; weaken the augmentation "
+                "(--training.augment.*), or label more points"
+            )
+        if empty:
+            self.say(
+                f"{self.name}: {empty} of {batches} batches had no labelled point to learn from"
+            )
 
     def validation_step(self, batch: Batch, index: int) -> None:
         points, labels = batch
@@ -220,6 +242,7 @@ def make_stage(
         "taxonomy": plan.scans.dataset.taxonomy,
         "weights": weights,
         "processes": plan.processes,
+        "say": plan.say,
     }
     if name == "rv":
         return RangeStage(model.range_view, model.range_net, **shared)

@@ -30,6 +30,7 @@ from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
 from amvnet.models.sync_batch_norm import synchronise_batch_norms
 from amvnet.models.views.points import PointBatch
+from amvnet.progress import Say, say_nothing
 from amvnet.runtime.distributed import ALONE, Processes, device_of, environment
 from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.intensity import TrainedIntensity
@@ -62,11 +63,13 @@ class Stage(L.LightningModule):
         config: NetworkTraining | HeadTraining,
         taxonomy: Taxonomy,
         processes: Processes = ALONE,
+        say: Say = say_nothing,
     ) -> None:
         super().__init__()
         self.config = config
         self.taxonomy = taxonomy
         self.processes = processes
+        self.say = say
         self.matrix = self.empty_matrix()
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
@@ -80,6 +83,9 @@ class Stage(L.LightningModule):
             raise InputError(
                 f"expected a finite loss, found {loss:g} {where}; lower {option}, or leave them out"
             )
+
+    def check_epoch(self) -> None:
+        """Raise InputError if an epoch had nothing to learn from, before its weights are kept."""
 
     def whole_matrix(self) -> np.ndarray:
         """Return the (K + 1, K + 1) confusion matrix of the validation, summed over processes."""

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated
 
 from amvnet.cli.console import progress, say
+from amvnet.config.bounds import Count, Range
 from amvnet.progress import counted
+
+Seed = Annotated[int, Range(0, 2**64)]
 
 
 def simulate(
     out: Path,
     /,
     sensor: str = "hdl64e",
-    sequences: int = 1,
-    scans: int = 10,
-    seed: int = 0,
-    processes: int | None = None,
+    sequences: Count = 1,
+    scans: Count = 10,
+    seed: Seed = 0,
+    processes: Annotated[int, Range(1, 1024)] | None = None,
 ) -> None:
     """Write labelled scans of simulated streets; scans of an earlier call stay.
 
