@@ -19,8 +19,8 @@ from amvnet.config.schema import AssertionConfig, PointHeadConfig, PolarViewConf
 from amvnet.data.laser_order import with_lasers
 from amvnet.errors import InputError, reason_of
 from amvnet.models.neighbours import nearest_others
-from amvnet.scan import Scan
-from amvnet.sensors.intensity import TrainedIntensity, check_quantiles, match_scan
+from amvnet.scan import AnyArray, Scan, as_array, check_scan
+from amvnet.sensors.intensity import TrainedIntensity, check_intensity, check_quantiles, match_scan
 
 DESCRIPTION = "amvnet.json"  # in the folder of the graphs
 LONGEST_NAME = 200  # characters of the name of a graph's file
@@ -44,10 +44,10 @@ class OnnxSegmentation:
     """The results for the N points of a scan, in their order.
 
     Attributes:
-        labels: (N,) uint8 train ids, 1..K; 0 if a point is not finite.
+        labels: (N,) uint8 train ids, 1..K; 0 for points that are not valid (`Scan.valid`).
         uncertain: (N,) bool: True if the two networks disagree; all False for a single network.
-        scores: (N, K) float32 probabilities; column c belongs to train id c + 1. Zeros if a point
-            is not finite. The rows of an ensemble do not add up to 1.
+        scores: (N, K) float32 probabilities; column c belongs to train id c + 1. Zeros for points
+            that are not valid. The rows of an ensemble do not add up to 1.
     """
 
     labels: np.ndarray
@@ -76,6 +76,7 @@ class OnnxSegmenter:
         self.description = description
         self.method: str = description["method"]
         self.intensity = _read_intensity(folder, description)
+        self.are_fractions = _takes_fractions(description)
         self.range_view = from_dict(RangeViewConfig, description.get("range_view", {}), source)
         self.polar_view = from_dict(PolarViewConfig, description.get("polar_view", {}), source)
         self.assertion = from_dict(AssertionConfig, description.get("assertion", {}), source)
@@ -86,9 +87,7 @@ class OnnxSegmenter:
             self._graphs[name] = _open_session(folder, description["graphs"][name], providers)
         self._check_sizes(folder, len(description["classes"]) - 1)
 
-    def __call__(
-        self, points: np.ndarray | Scan, ring: np.ndarray | None = None
-    ) -> OnnxSegmentation:
+    def __call__(self, points: AnyArray | Scan, ring: np.ndarray | None = None) -> OnnxSegmentation:
         """Segment one scan.
 
         Args:
@@ -97,23 +96,25 @@ class OnnxSegmenter:
                 range view are rings.
 
         Raises:
-            InputError: if no point is finite, the shapes do not fit, or rings are missing or out of
-                range.
+            InputError: if no point is valid, more than a few intensities are out of range, the
+                shapes do not fit, or rings are missing or out of range.
         """
         if isinstance(points, Scan):
             scan = points
         else:
             ring = None if ring is None else np.asarray(ring)
-            scan = Scan(np.asarray(points, dtype=np.float32), ring=ring)
+            with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: not valid
+                table = as_array(points, "points of shape (N, 4)").astype(np.float32)
+            scan = Scan(table, ring=ring)
+        check_scan(scan)
+
         if scan.row is None:
             scan = with_lasers(scan, self.range_view.lasers)
+        if self.are_fractions:
+            scan = check_intensity(scan)
         scan = match_scan(scan, self.intensity)
-        valid = scan.valid
-        if not valid.any():
-            raise InputError(
-                "expected points to segment, found none that is finite; leave the scan out"
-            )
 
+        valid = scan.valid
         scores, uncertain = self._scores(scan.select(valid))
         labels = scores.argmax(axis=1).astype(np.uint8) + 1
         return OnnxSegmentation(
@@ -219,6 +220,12 @@ def _read_intensity(folder: Path, description: Mapping[str, Any]) -> TrainedInte
 
     quantiles = values.get("quantiles") if isinstance(values, Mapping) else None
     return TrainedIntensity(check_quantiles(quantiles, str(folder)), is_matched=True)
+
+
+def _takes_fractions(description: Mapping[str, Any]) -> bool:
+    """Return whether the graphs take intensities in [0, 1]; false if trained with others."""
+    points = description.get("points")
+    return not isinstance(points, Mapping) or points.get("intensity", "missing") is not None
 
 
 def range_image(view: RangeViewConfig, scan: Scan) -> tuple[np.ndarray, np.ndarray]:

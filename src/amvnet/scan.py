@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 
-from amvnet.errors import InputError
+from amvnet.errors import InputError, shown
 
 FARTHEST = 10_000.0  # metres: no LiDAR sees that far, and squares of much larger numbers overflow
 
@@ -17,8 +19,8 @@ class Scan:
 
     Attributes:
         points: (N, 4) float32: x, y, z in metres and intensity in [0, 1]. A row is a lost return if
-            a value is not finite, or a coordinate is larger than any LiDAR sees: it keeps its place
-            and gets id 0.
+            a value is not finite, a coordinate is larger than any LiDAR sees, or the point is at
+            the origin, where sensors put it: it keeps its place and gets id 0.
         labels: (N,) uint8 train ids (0 = ignored, 1..K), or None if there are no labels.
         ring: (N,) int64 index of the laser (0 = lowest, -1 = unknown), or None if the format has
             none.
@@ -84,14 +86,23 @@ class Scan:
 
     @property
     def valid(self) -> np.ndarray:
-        """(N,) bool: points with four finite values, nearer than `FARTHEST` along each axis."""
+        """(N,) bool: points with four finite values, nearer than `FARTHEST`, not at 0, 0, 0."""
         # Comparisons with NaN are false.
         if np.abs(self.points).max(initial=0) < FARTHEST:
-            return np.ones(len(self.points), dtype=bool)
+            valid = np.ones(len(self.points), dtype=bool)
+        else:
+            # Column by column: a reduction over rows of four takes ten times as long.
+            x, y, z, intensity = np.abs(self.points.T)
+            valid = (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST) & (intensity < np.inf)
 
-        # Column by column: a reduction over rows of four takes ten times as long.
-        x, y, z, intensity = np.abs(self.points.T)
-        return (x < FARTHEST) & (y < FARTHEST) & (z < FARTHEST) & (intensity < np.inf)
+        valid[at_origin(self.points)] = False
+        return valid
+
+
+def at_origin(xyz: np.ndarray) -> np.ndarray:
+    """Return the (M,) indices of the points at 0, 0, 0, given (N, 3 or more) coordinates."""
+    on_axis = np.flatnonzero(xyz[:, 0] == 0)  # few: their other coordinates are looked at alone
+    return on_axis[(xyz[on_axis, 1] == 0) & (xyz[on_axis, 2] == 0)]
 
 
 def check_scan(scan: Scan) -> Scan:
@@ -103,3 +114,52 @@ def check_scan(scan: Scan) -> Scan:
             "leave the scan out"
         )
     return scan
+
+
+class TensorLike(Protocol):
+    """What is used of a tensor of torch."""
+
+    def detach(self) -> Any: ...
+
+
+class TableLike(Protocol):
+    """What is used of a table of pandas."""
+
+    def to_records(self, *, index: bool) -> Any: ...
+
+
+AnyArray = np.ndarray | Sequence[Any] | TensorLike | TableLike  # what `as_array` takes
+
+
+def as_array(values: AnyArray, expected: str) -> np.ndarray:
+    """Return numbers that a library or the user holds as a NumPy array.
+
+    Args:
+        values: an array, also one with named fields or a mask, a tensor on any device, a table of
+            pandas, or nested lists of numbers. Masked values become NaN.
+        expected: what they are, for messages, such as "points of shape (N, 4)".
+
+    Raises:
+        InputError: if these are no numbers, or the lists have several lengths.
+    """
+    numbers: Any = values
+    if hasattr(values, "detach"):
+        numbers = values.detach().cpu()
+        if numbers.element_size() < 4:
+            numbers = numbers.float()  # NumPy has no bfloat16
+    elif hasattr(values, "to_records"):
+        numbers = values.to_records(index=False)
+    elif isinstance(values, np.ma.MaskedArray) and values.dtype.names is None:
+        numbers = np.ma.filled(values.astype(np.float64), np.nan)
+
+    try:
+        array = np.asarray(numbers)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"expected {expected}, found a {type(values).__name__} ({error}); give one array"
+        ) from None
+
+    if array.dtype.names is None and array.dtype.kind not in "fiu":
+        found = f"values of {array.dtype}" if array.ndim else shown(values)
+        raise InputError(f"expected {expected}, found {found}; give an array of numbers")
+    return array

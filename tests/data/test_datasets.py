@@ -155,6 +155,21 @@ def test_unusable_labels_are_named(layout: Layout) -> None:
     fails(lambda: open_dataset(layout.spec).read(record), path)
 
 
+def test_lost_returns_of_nuscenes_get_the_most_frequent_class_in_files(tmp_path: Path) -> None:
+    dataset = open_dataset(make_nuscenes(tmp_path).spec)
+    record = dataset.records(dataset.sequences("all"))[0]
+    count = dataset.count_points(record)
+    ids = np.full(count, 5, dtype=np.uint8)
+    ids[:2] = [0, 3]
+    path = dataset.write_prediction(record, tmp_path, ids)
+    assert np.fromfile(path, np.uint8).tolist() == [5, 3, *[5] * (count - 2)]
+    assert ids[0] == 0
+
+    # Other classes have an id for them.
+    dataset.write_prediction(record, tmp_path, ids, SEMANTICKITTI)
+    assert np.fromfile(path, np.uint8)[0] == 0
+
+
 def test_one_lost_return_keeps_its_place(layout: Layout) -> None:
     values = np.fromfile(layout.first_points, np.float32)
     values[0] = np.nan

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import shutil
 import subprocess
 import sys
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 
 from amvnet import fuse
+from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import load, save
 
@@ -145,6 +148,57 @@ def test_logits_are_the_same_as_their_softmax(world: Path, tmp_path: Path, sides
     assert run_fuse(world, out, *options, a=tmp_path / "a", b=tmp_path / "b") == ""
     expected = read_labels(world / "ensemble/sequences/08")
     assert (read_labels(out) == expected).mean() >= 0.999
+
+
+def test_rows_of_zeros_are_no_opinion(world: Path, tmp_path: Path) -> None:
+    uniform = {}
+    for side, key in KEYS.items():
+        for scan in (SCAN, NEXT_SCAN):
+            scores = read_probabilities(world, key, scan).astype(np.float32)
+            if side == "b":
+                scores[::4] = 0
+                uniform[scan] = np.where(scores.any(axis=1, keepdims=True), scores, 1 / 19)
+            write_scores(tmp_path / side, scores, scan)
+            write_scores(tmp_path / f"uniform {side}", uniform.get(scan, scores), scan)
+
+    options = ("--sequences", "08")
+    stdout = io.StringIO()
+    with contextlib.redirect_stdout(stdout):
+        run_fuse(world, tmp_path / "zeros", *options, a=tmp_path / "a", b=tmp_path / "b")
+    assert f"{tmp_path / 'b'} (b): no opinion of 25.0% of the points" in stdout.getvalue()
+    assert f"{tmp_path / 'a'} (a): no opinion" not in stdout.getvalue()
+    folders = {"a": tmp_path / "uniform a", "b": tmp_path / "uniform b"}
+    run_fuse(world, tmp_path / "uniform", *options, **folders)
+    labels = read_labels(tmp_path / "zeros")
+    assert np.array_equal(labels, read_labels(tmp_path / "uniform"))
+
+    # Without a head, the model that has an opinion decides.
+    alone = SEMANTICKITTI.to_raw(read_probabilities(world, "rv").argmax(axis=1)[::4] + 1)
+    assert np.array_equal(labels[: len(read_probabilities(world, "rv"))][::4], alone)
+
+
+def test_arrays_with_rows_of_zeros_are_fused_alike() -> None:
+    points = street(1, 50)[0]
+    rng = np.random.default_rng(0)
+    f, g = rng.dirichlet(np.ones(19), (2, 50)).astype(np.float32)
+    g[:10] = 0
+    labels = fuse(points, f, g)
+    assert np.array_equal(labels[:10], f[:10].argmax(axis=1) + 1)
+    with pytest.raises(ValueError, match="zeros in every row"):
+        fuse(points, f, np.zeros_like(g))
+
+
+def test_probabilities_are_no_logits(world: Path, tmp_path: Path) -> None:
+    for side, key in KEYS.items():
+        for scan in (SCAN, NEXT_SCAN):
+            scores = read_probabilities(world, key, scan)
+            scores[::3] = 0
+            write_scores(tmp_path / side, scores, scan)
+    folders = {"a": tmp_path / "a", "b": tmp_path / "b"}
+    out = tmp_path / "out"
+    error = run_fuse(world, out, "--sequences", "08", "--logits", "both", **folders)
+    assert "rows add up to 1; leave out --logits" in error
+    assert not files(out)
 
 
 def test_arrays_that_are_no_probabilities_are_refused() -> None:

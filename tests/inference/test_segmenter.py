@@ -6,7 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -184,6 +184,110 @@ def test_a_scan_without_points_is_refused(points: np.ndarray, method: MethodName
 def test_points_of_other_shapes_are_refused(segmenter: Segmenter, shape: tuple[int, ...]) -> None:
     with pytest.raises(InputError):
         segmenter(np.ones(shape, np.float32))
+
+
+def test_probabilities_are_the_scores_with_rows_that_sum_to_1(segmenter: Segmenter) -> None:
+    points, is_lost = with_lost_returns(POINTS)
+    result = segmenter(points)
+    sums = result.probabilities.sum(axis=1)
+    assert np.allclose(sums[~is_lost], 1, atol=1e-5)
+    assert not sums[is_lost].any()
+    assert result.probabilities.dtype == np.float32
+    assert np.array_equal(result.probabilities.argmax(axis=1), result.scores.argmax(axis=1))
+
+    of_label = result.probabilities[np.arange(len(points)), result.labels.astype(int) - 1]
+    assert np.array_equal(result.confidence[~is_lost], of_label[~is_lost])
+    assert not result.confidence[is_lost].any()
+    # The scores stay as the paper has them.
+    assert (result.scores.sum(axis=1)[~is_lost & ~result.uncertain] < 0.999).any()
+
+
+def test_a_point_without_any_score_is_of_every_class_alike() -> None:
+    scores = np.zeros((2, K), np.float32)
+    result = Segmentation(np.array([1, 0], np.uint8), np.zeros(2, bool), scores)
+    assert np.array_equal(result.probabilities[0], np.full(K, 1 / K, np.float32))
+    assert not result.probabilities[1].any()
+
+
+# ---- what holds the points
+
+
+class Table:
+    """The part of a table of pandas that is used."""
+
+    def to_records(self, index: bool) -> np.ndarray:
+        assert not index
+        names = ("intensity", "x", "y", "z", "time")
+        records = np.zeros(len(POINTS), [(name, "f4") for name in names])
+        for column, name in enumerate("xyz"):
+            records[name] = POINTS[:, column]
+        records["intensity"] = POINTS[:, 3]
+        return records
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        POINTS.tolist(),
+        tuple(map(tuple, POINTS)),
+        torch.from_numpy(POINTS),
+        torch.from_numpy(POINTS).double().requires_grad_(),
+        Table(),
+        Table().to_records(index=False).reshape(2, -1),
+    ],
+    ids=["list", "tuple", "tensor", "tensor with gradient", "table", "organised records"],
+)
+def test_whatever_holds_the_points_gives_the_same_labels(
+    segmenter: Segmenter, result: Segmentation, points: Any
+) -> None:
+    assert np.array_equal(segmenter(points).labels, result.labels)
+    assert np.array_equal(segmenter.many([points])[0].labels, result.labels)
+
+
+def test_half_precision_is_read(segmenter: Segmenter) -> None:
+    halves = torch.from_numpy(POINTS).bfloat16()
+    expected = segmenter(halves.float().numpy()).labels
+    assert np.array_equal(segmenter(halves).labels, expected)
+
+
+def test_masked_points_are_lost(segmenter: Segmenter) -> None:
+    masked = np.ma.masked_array(POINTS, mask=False)
+    masked[7, 1] = np.ma.masked
+    labels = segmenter(masked).labels
+    assert labels[7] == 0
+    assert np.delete(labels, 7).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "found"),
+    [
+        (None, "None"),
+        ([POINTS[:5], POINTS[:6]], "list"),
+        ({"x": 1}, "x"),
+        ((row for row in POINTS), "generator"),
+        ([], "(0,)"),
+        (POINTS.astype(str), "<U32"),
+        (POINTS > 0, "bool"),
+        (POINTS * 1j, "complex64"),
+        (np.stack([POINTS, POINTS]), "give several scans to Segmenter.many"),
+        (np.zeros(9, [("x", "f4"), ("y", "f4"), ("intensity", "f4")]), "z"),
+        (np.zeros(9, [("x", "U4"), ("y", "f4"), ("z", "f4")]), "x"),
+        (np.zeros(9, [("x", "f4", 2), ("y", "f4"), ("z", "f4")]), "x"),
+    ],
+)
+def test_what_is_no_scan_is_one_line(segmenter: Segmenter, points: Any, found: str) -> None:
+    for call in (segmenter, lambda points: segmenter.many([points])):
+        with pytest.raises(InputError, match=r"\Ascan: expected .*") as caught:
+            call(points)
+        assert found in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_scores_may_be_tensors(result: Segmentation) -> None:
+    f, g = both_networks(result)
+    expected = fuse(POINTS, f, g)
+    points, f_tensor, g_tensor = map(torch.from_numpy, (POINTS, f, g))
+    assert np.array_equal(fuse(points, f_tensor, g_tensor), expected)
 
 
 # ---- methods

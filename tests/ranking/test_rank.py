@@ -19,6 +19,7 @@ from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking.clusters import CELL, cluster
 from amvnet.ranking.label_errors import NEAR, Doubts, find_clusters, find_doubts, rank
+from amvnet.scan import AnyArray
 from amvnet.weights.file import save
 
 from fixtures.worlds import files, fresh_weights, make_streets, run_cli, without
@@ -88,7 +89,7 @@ class FixedScores(Segmenter):
         self.bev = bev.astype(np.float32)
 
     def __call__(
-        self, points: np.ndarray | Scan | Path | str, columns: str | None = None
+        self, points: AnyArray | Scan | Path | str, columns: str | None = None
     ) -> Segmentation:
         labels = self.rv.argmax(axis=1) + 1
         uncertain = np.zeros(len(labels), bool)

@@ -180,7 +180,11 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
         "made_by": f"amvnet {version('amvnet')}, torch {torch.__version__}",
         "method": segmenter.method,
         "sensor": segmenter.weights.sensor,
-        "points": {"columns": ["x", "y", "z", "intensity"], "farthest": FARTHEST},
+        "points": {
+            "columns": ["x", "y", "z", "intensity"],
+            "farthest": FARTHEST,
+            "intensity": _intensity_range(segmenter.intensity),
+        },
         "intensity": _describe_intensity(segmenter.intensity),
         "normalise": describe_expectation(expectation_of(segmenter.weights)),
         "range_view": to_dict(model.range_view),
@@ -208,6 +212,11 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
 
     described = {"taxonomy": taxonomy.name, "classes": classes, "opset": OPSET, "graphs": graphs}
     return description | described
+
+
+def _intensity_range(trained: TrainedIntensity | None) -> list[float] | None:
+    """Return the range of the intensities; None if the networks were trained with others."""
+    return [0.0, 1.0] if trained is None or trained.are_fractions else None
 
 
 def _describe_intensity(trained: TrainedIntensity | None) -> dict[str, list[float]] | None:

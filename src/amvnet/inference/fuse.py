@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,15 +17,15 @@ from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.pipeline import OutputOptions, Pipeline, check_faults
 from amvnet.inference.reading import checked_scan, normaliser_for
-from amvnet.inference.scores import SURE, ScorePair, check_probabilities
+from amvnet.inference.scores import SURE, ScorePair, as_probabilities, have_opinion
 from amvnet.inference.segmentation import Segmentation, fetch, unpack
 from amvnet.models.amvnet import LateFusion, Scores
 from amvnet.models.assertion import Disagreement
 from amvnet.models.point_head import PointHead
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Progress, no_progress
-from amvnet.scan import Scan
-from amvnet.sensors.intensity import match_scan, trained_intensity
+from amvnet.scan import AnyArray, Scan, as_array
+from amvnet.sensors.intensity import prepare, trained_intensity
 from amvnet.sensors.lidars import Sensor
 from amvnet.sensors.normalise import Expectation, Normaliser
 from amvnet.weights.file import Weights, load
@@ -52,20 +54,21 @@ class Fusion:
         point_head = None if head is None else copy.deepcopy(head).cpu().eval()
         self.model = LateFusion(assertion, point_head)
 
-    def __call__(self, points: np.ndarray | Scan, f: np.ndarray, g: np.ndarray) -> Segmentation:
+    def __call__(self, points: AnyArray | Scan, f: AnyArray, g: AnyArray) -> Segmentation:
         """Fuse (N, K) class probabilities of one scan's N points.
+
+        Rows of zeros say that a model has no opinion, and count as 1/K.
 
         Raises:
             InputError: if the shapes do not fit, or the scores are not probabilities.
         """
-        scan = checked_scan(points, trained=self._intensity)
-        scan = match_scan(scan, self._intensity)
-        self._check_shapes(scan, f, g)
+        scan = prepare(checked_scan(points, trained=self._intensity), self._intensity)
+        f_all = as_array(f, "scores f").astype(np.float32, copy=False)
+        g_all = as_array(g, "scores g").astype(np.float32, copy=False)
+        self._check_shapes(scan, f_all, g_all)
 
-        f_valid = np.asarray(f, dtype=np.float32)[scan.valid]
-        g_valid = np.asarray(g, dtype=np.float32)[scan.valid]
-        check_probabilities(f_valid, "f", "apply softmax")
-        check_probabilities(g_valid, "g", "apply softmax")
+        f_valid = as_probabilities(f_all[scan.valid], "f", "apply softmax")
+        g_valid = as_probabilities(g_all[scan.valid], "g", "apply softmax")
 
         with torch.inference_mode():
             scores = self.model.fuse(
@@ -96,13 +99,14 @@ class Fusion:
 
 
 def fuse(
-    points: np.ndarray, f: np.ndarray, g: np.ndarray, head: Head = None, tau: float | None = None
+    points: AnyArray, f: AnyArray, g: AnyArray, head: Head = None, tau: float | None = None
 ) -> np.ndarray:
     """Label points by the late fusion of two models' scores (sections 3.2 and 3.3 of the paper).
 
     Args:
         points: (N, 4) x, y, z in metres and intensity in [0, 1].
-        f: (N, K) class probabilities of one model.
+        f: (N, K) class probabilities of one model; a row of zeros says that it has no opinion of
+            this point, and counts as 1/K.
         g: (N, K) class probabilities of the other model.
         head: a trained point head, or weights that hold one; None gives the ensemble.
         tau: points whose scores have a cosine similarity of at most this are uncertain; by default
@@ -117,6 +121,20 @@ def fuse(
     return Fusion(head, tau)(points, f, g).labels
 
 
+class Fused(NamedTuple):
+    """What `fuse_files` has done.
+
+    Attributes:
+        files: the number of label files.
+        uncertain: the share of the points on which the two models disagree, in [0, 1].
+        silent: the share of the points of which a model has no opinion, in [0, 1], by its side.
+    """
+
+    files: int
+    uncertain: float
+    silent: dict[str, float]
+
+
 def fuse_files(
     inputs: Sequence[str],
     pair: ScorePair,
@@ -127,16 +145,13 @@ def fuse_files(
     tau: float | None = None,
     taxonomy: Taxonomy | None = None,
     progress: Progress = no_progress,
-) -> tuple[int, float]:
+) -> Fused:
     """Fuse two models' scores of scans, and write the labels as `predict` does.
 
     Args:
         head: weights with a point head; None gives the ensemble.
         tau: threshold of the cosine similarity; None means the head's, or else the paper's.
         taxonomy: the classes if there is no head; None means those of the inputs.
-
-    Returns:
-        The number of label files, and the share of the points that are uncertain.
 
     Raises:
         InputError: before anything is written, if scores of a scan are missing or a file of the
@@ -155,12 +170,15 @@ def fuse_files(
         pair.b.find(scan.scores_path)
 
     fusion = Fusion(head, tau)
+    silent: Counter[str] = Counter()  # points of which a model has no opinion, by its side
 
     def segment(inputs: Sequence[InputScan], loaded: Sequence[Scan]) -> list[Segmentation]:
         results = []
         for scan_input, scan in zip(inputs, loaded, strict=True):
             f, g = pair.read(scan_input.scores_path, scan, taxonomy.size)
             results.append(fusion(scan, f, g))
+            for side, values in (("a", f), ("b", g)):
+                silent[side] += int(np.count_nonzero(~have_opinion(values[scan.valid])))
         return results
 
     pipeline = Pipeline(scans, segment, output, taxonomy)
@@ -172,4 +190,9 @@ def fuse_files(
     for entry in entries:
         points += entry.points
         uncertain += entry.uncertain
-    return len(scans), uncertain / max(points, 1)
+    total = max(points, 1)
+    return Fused(
+        len(scans),
+        uncertain=uncertain / total,
+        silent={side: count / total for side, count in silent.items()},
+    )

@@ -9,10 +9,11 @@ import numpy as np
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_with_classes
 from amvnet.data.datasets.own import OwnScans
+from amvnet.data.formats.cloud import require_columns
 from amvnet.data.formats.rows import name_columns, named_cloud, parse_layout
 from amvnet.errors import InputError, errors_of
 from amvnet.progress import Say, say_nothing
-from amvnet.scan import Scan, check_scan
+from amvnet.scan import AnyArray, Scan, as_array, check_scan
 from amvnet.sensors.intensity import TrainedIntensity, describe_filler, trained_intensity
 from amvnet.sensors.lidars import Sensor, make_sensor
 from amvnet.sensors.normalise import Expectation, Normaliser
@@ -20,10 +21,11 @@ from amvnet.sensors.record import is_trained_as_is, trained_sensor
 from amvnet.weights.file import Weights
 
 MOST_COLUMNS = 64  # of an array of points; one with more is transposed
+EXPECTED = "points of shape (N, 3 or more) with columns x, y, z, intensity"
 
 
 def checked_scan(
-    points: np.ndarray | Scan,
+    points: AnyArray | Scan,
     columns: str | None = None,
     trained: TrainedIntensity | None = None,
 ) -> Scan:
@@ -32,49 +34,68 @@ def checked_scan(
     Raises:
         InputError: as `array_scan`, or if no point is valid.
     """
-    if isinstance(points, np.ndarray):
-        points = array_scan(points, columns, trained)
-    return check_scan(points)
+    scan = points if isinstance(points, Scan) else array_scan(points, columns, trained)
+    return check_scan(scan)
 
 
 def array_scan(
-    points: np.ndarray, columns: str | None = None, trained: TrainedIntensity | None = None
+    points: AnyArray, columns: str | None = None, trained: TrainedIntensity | None = None
 ) -> Scan:
     """Return the scan of an array with the columns that a scan file may have.
 
     Args:
-        points: (N, 3 or more): x, y, z in metres, intensity in [0, 1], ring.
+        points: (N, 3 or more): x, y, z in metres, intensity in [0, 1], ring; or an array with
+            fields of these names, in any order and shape, such as `read_points` of ROS returns.
+            Anything that `as_array` takes may stand for an array.
         columns: their names in order, separated by commas; others than x, y, z, intensity and ring
-            are left out. None means these in this order, the ring if the values suggest it.
+            are left out. None means the names of the fields, or else these in this order, the ring
+            if the values suggest it.
         trained: fills in the intensities if there are none, which a warning says.
 
     Raises:
         InputError: if the shape is another one, or names of columns are missing.
     """
-    array = np.asarray(points)
-    is_transposed = array.ndim == 2 and len(array) < MOST_COLUMNS < array.shape[1]
-    if array.ndim != 2 or array.shape[1] < 3 or is_transposed:
-        advice = "transpose it" if is_transposed else "reshape it"
-        raise InputError(
-            "scan: expected points of shape (N, 3 or more) with columns x, y, z, intensity, "
-            f"found {array.shape}; {advice}"
-        )
+    names = parse_layout(columns, None).columns
+    with errors_of("scan"):
+        array = as_array(points, EXPECTED)
+    if array.dtype.names is not None:
+        fields = array.ravel()
+        values = [fields[name] for name in array.dtype.names]
+        names = names or array.dtype.names
+        require_columns(names, "scan")
+    else:
+        _check_shape(array)
+        values = list(array.T)
+        names = names or name_columns(array)
 
-    names = parse_layout(columns, None).columns or name_columns(array)
-    cloud = named_cloud(list(array.T), names, "scan")
+    cloud = named_cloud(values, names, "scan")
+    count = len(cloud.xyz)
     intensity = cloud.intensity
-    if intensity is None:
-        intensity = np.zeros(len(array)) if trained is None else trained.filler(len(array))
+    # If no intensity is a number, there are none, as in files.
+    if cloud.measured_intensity() is None and (intensity is None or cloud.is_placed.any()):
+        intensity = np.zeros(count) if trained is None else trained.filler(count)
         warnings.warn(
             f"the scan has no intensity: {describe_filler(trained)}; give a fourth column",
             stacklevel=4,
         )
 
-    table = np.empty((len(array), 4), np.float32)
+    table = np.empty((count, 4), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: not valid
         table[:, :3] = cloud.xyz
         table[:, 3] = intensity
     return Scan(table, ring=cloud.ring)
+
+
+def _check_shape(array: np.ndarray) -> None:
+    """Raise InputError unless an array without named fields has a row for each point."""
+    is_transposed = array.ndim == 2 and len(array) < MOST_COLUMNS < array.shape[1]
+    if array.ndim == 2 and array.shape[1] >= 3 and not is_transposed:
+        return
+
+    advice = "transpose it" if is_transposed else "reshape it"
+    if array.ndim == 3:
+        advice += ", or give several scans to Segmenter.many"
+    raise InputError(f"scan: expected {EXPECTED}, found {array.shape}; {advice}")
 
 
 def normaliser_for(

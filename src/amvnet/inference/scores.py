@@ -78,7 +78,8 @@ class ScoreFolder:
     def read(self, prediction: Path, scan: Scan, classes: int) -> np.ndarray:
         """Return the (N, K) float32 class probabilities of a scan, in the file of `find`.
 
-        Rows of points that are not valid are not checked.
+        Rows of points that are not valid are not checked. Other rows are as `as_probabilities`
+        returns them.
 
         Raises:
             InputError: if there is no such file, or it does not hold scores of this scan's points.
@@ -102,12 +103,13 @@ class ScoreFolder:
             )
 
         scores = scores.astype(np.float32)
-        valid = scores[scan.valid]
+        valid = scan.valid
         if self.logits:
-            check_finite(valid, str(path))
+            check_logits(scores[valid], str(path))
             return softmax(scores, axis=1)
 
-        check_probabilities(valid, str(path), f"apply softmax, or say --logits {self.side}")
+        advice = f"apply softmax, or say --logits {self.side}"
+        scores[valid] = as_probabilities(scores[valid], str(path), advice)
         return scores
 
     def _load(self, path: Path) -> np.ndarray:
@@ -145,24 +147,66 @@ class ScorePair:
         return {scores.side: _digest(scores, records) for scores in (self.a, self.b)}
 
 
-def check_probabilities(values: np.ndarray, name: str, advice: str) -> None:
-    """Check that (P, K) scores are class probabilities; `advice` says what to do if they are not.
+def as_probabilities(values: np.ndarray, name: str, advice: str) -> np.ndarray:
+    """Return (P, K) scores as class probabilities.
+
+    A row of zeros, which other tools write for points outside their view, says that the model has
+    no opinion. It becomes 1/K in every class.
+
+    Args:
+        name: the beginning of error messages.
+        advice: what to do if the scores are no probabilities.
 
     Raises:
-        InputError: if a value is negative or not finite, or a row does not add up to 1.
+        InputError: if a value is negative or not finite, a row does not add up to 1, or all rows
+            are zeros.
     """
     check_finite(values, name)
 
-    sums = values.sum(axis=1)
-    is_wrong = (np.abs(sums - 1) > ROUNDING) | (values < 0).any(axis=1)
+    is_silent = np.count_nonzero(values, axis=1) == 0
+    if is_silent.any():
+        if is_silent.all():
+            raise InputError(
+                f"{name}: expected class probabilities, found zeros in every row; "
+                "give the scores of this scan"
+            )
+        values = np.where(is_silent[:, None], np.float32(1 / values.shape[1]), values)
+
+    is_wrong = ~are_probabilities(values)
     if not is_wrong.any():
-        return
+        return values
 
     row = int(is_wrong.argmax())
     raise InputError(
         f"{name}: expected class probabilities, found a row from {values[row].min():.3g} to "
-        f"{values[row].max():.3g} with the sum {sums[row]:.3g}; {advice}"
+        f"{values[row].max():.3g} with the sum {values[row].sum():.3g}; {advice}"
     )
+
+
+def are_probabilities(values: np.ndarray) -> np.ndarray:
+    """Return (P,) bool: the rows of (P, K) finite scores that are probabilities, up to rounding."""
+    is_one: np.ndarray = np.abs(values.sum(axis=1) - 1) <= ROUNDING
+    return is_one & (values >= 0).all(axis=1)
+
+
+def have_opinion(values: np.ndarray) -> np.ndarray:
+    """Return (P,) bool: the rows of (P, K) probabilities that prefer a class."""
+    return (values != values[:, :1]).any(axis=1)
+
+
+def check_logits(values: np.ndarray, name: str) -> None:
+    """Check (P, K) scores before softmax.
+
+    Raises:
+        InputError: if one is not finite, or most rows are probabilities already, whose softmax is
+            nearly the same for all classes.
+    """
+    check_finite(values, name)
+    if np.count_nonzero(are_probabilities(values)) > len(values) / 2:
+        raise InputError(
+            f"{name}: expected scores before softmax, found probabilities: the rows add up to 1; "
+            "leave out --logits for this model"
+        )
 
 
 def check_finite(values: np.ndarray, name: str) -> None:

@@ -93,7 +93,8 @@ class Segmentation:
         uncertain: (N,) bool, the points on which the two networks disagree; all False for a single
             network.
         scores: (N, K) float32; the label of a point is c + 1 for its largest column c. Rows of the
-            geometric mean (the ensemble, and AMVNet's certain points) do not sum to 1.
+            geometric mean (the ensemble, and AMVNet's certain points) do not sum to 1, as in the
+            paper; those of `probabilities` do.
         rv, bev: (N, K) float32 class probabilities by each network, or None if it did not run.
         origin: the scan and what labelled it; None for the late fusion alone.
     """
@@ -132,6 +133,22 @@ class Segmentation:
     def has_two_networks(self) -> bool:
         """Whether both networks ran, so that it is known which points are uncertain."""
         return self.rv is not None and self.bev is not None
+
+    @property
+    def probabilities(self) -> NDArray[np.float32]:
+        """(N, K) class probabilities: the scores, with rows that sum to 1 if a point is valid."""
+        sums = self.scores.sum(axis=1, keepdims=True)
+        is_scoreless = sums[:, 0] == 0
+        sums[is_scoreless] = 1
+        shares: NDArray[np.float32] = self.scores / sums
+        # Two networks that are wholly sure of different classes leave no score at all.
+        shares[is_scoreless & (self.labels > 0)] = 1 / max(shares.shape[1], 1)
+        return shares
+
+    @property
+    def confidence(self) -> NDArray[np.float32]:
+        """(N,) probability of each point's label, in [0, 1]; 0 for points that are not valid."""
+        return self.probabilities.max(axis=1, initial=0)
 
     @property
     def class_names(self) -> tuple[str, ...]:

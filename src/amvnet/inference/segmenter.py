@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,8 +28,8 @@ from amvnet.models.views.points import PointBatch
 from amvnet.models.voting import vote
 from amvnet.runtime.memory import available_memory, return_freed_memory
 from amvnet.runtime.threads import survive_forks
-from amvnet.scan import Scan
-from amvnet.sensors.intensity import check_intensity, match_scan, trained_intensity
+from amvnet.scan import AnyArray, Scan
+from amvnet.sensors.intensity import prepare, trained_intensity
 from amvnet.weights.file import Weights, load
 
 SCAN_BYTES = 2**30  # that a scan may take; one of 120,000 points takes half, at the paper's size
@@ -88,9 +87,7 @@ class Segmenter:
         if self.device == "cpu":
             self.at_once = max(min(torch.get_num_threads(), available_memory() // SCAN_BYTES), 1)
 
-        # Weights that were trained with other intensities take them, too.
         self.intensity = trained_intensity(self.weights.training, self.weights.sensor)
-        self._are_fractions = self.intensity is None or self.intensity.quantiles[-1] <= 1
 
         survive_forks()
 
@@ -127,16 +124,17 @@ class Segmenter:
         return f"<Segmenter {self.method} on {self.device}, {self.precision}: {self.weights!r}>"
 
     def __call__(
-        self, points: np.ndarray | Scan | Path | str, columns: str | None = None
+        self, points: AnyArray | Scan | Path | str, columns: str | None = None
     ) -> Segmentation:
         """Segment one scan.
 
         Args:
-            points: (N, 4) x, y, z in metres and intensity in [0, 1]; or an array with other columns
-                (`array_scan`); or a `Scan`; or the path of a scan file, which is normalised to the
-                weights as `amvnet predict` does.
+            points: (N, 4) x, y, z in metres and intensity in [0, 1], as an array, a tensor or a
+                list; or an array with other columns or with named fields (`array_scan`); or a
+                `Scan`; or the path of a scan file, which is normalised to the weights as `amvnet
+                predict` does.
             columns: of an array, what its columns hold, such as "x,y,z,intensity,ring"; None means
-                what their number and values suggest.
+                the names of its fields, or what their number and values suggest.
 
         Raises:
             InputError: if there is no valid point, more than a few intensities are out of range,
@@ -153,8 +151,11 @@ class Segmenter:
             )
         return self._segment_input(scans[0], assumed)
 
-    def many(self, scans: Sequence[np.ndarray | Scan]) -> list[Segmentation]:
+    def many(self, scans: Sequence[AnyArray | Scan]) -> list[Segmentation]:
         """Segment several scans in one pass of the networks, which suits a GPU.
+
+        Args:
+            scans: each as the points of one scan, but no path.
 
         Raises:
             InputError: if one cannot be segmented; segment them one by one to see which.
@@ -242,14 +243,12 @@ class Segmenter:
         Raises:
             InputError: if more than a few intensities are out of range.
         """
-        matched = []
+        prepared = []
         for scan in scans:
-            if self._are_fractions:
-                scan = check_intensity(scan)
             if scan.row is None:
                 scan = with_lasers(scan, self.weights.model.range_view.lasers)
-            matched.append(match_scan(scan, self.intensity))
-        return PointBatch.of(matched, self.device)
+            prepared.append(prepare(scan, self.intensity))
+        return PointBatch.of(prepared, self.device)
 
 
 def _is_gpu(device: str) -> bool:

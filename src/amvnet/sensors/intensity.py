@@ -13,7 +13,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from amvnet.data.formats.cloud import WILD_SHARE
+from amvnet.data.formats.cloud import WILD_SHARE, as_fractions
 from amvnet.errors import InputError, shown
 from amvnet.scan import Scan
 
@@ -56,6 +56,11 @@ class TrainedIntensity:
     quantiles: Sequence[float]
     is_optional: bool = False
     is_matched: bool = False
+
+    @property
+    def are_fractions(self) -> bool:
+        """Whether they lie in [0, 1]; networks that were trained with others take these."""
+        return self.quantiles[-1] <= 1
 
     def filler(self, count: int) -> np.ndarray:
         """Return (count,) float32 intensities for a scan that has none.
@@ -106,6 +111,17 @@ def trained_intensity(training: Mapping[str, Any], sensor: str) -> TrainedIntens
         is_optional=min(shares, default=0) >= BLIND_SHARE,
         is_matched=bool(matched) and all(matched),
     )
+
+
+def prepare(scan: Scan, trained: TrainedIntensity | None) -> Scan:
+    """Return a scan with the intensities that the networks take; every entry calls this.
+
+    Raises:
+        InputError: as `check_intensity`.
+    """
+    if trained is None or trained.are_fractions:
+        scan = check_intensity(scan)
+    return match_scan(scan, trained)
 
 
 def simulated_intensity(sensor: str) -> TrainedIntensity:
@@ -226,7 +242,7 @@ class IntensityMap:
         """Return the (count,) intensities in [0, 1] of a scan; NaN stays NaN."""
         with np.errstate(over="ignore", invalid="ignore"):
             if intensity is not None and self.scale is not None:
-                return np.clip(intensity / self.scale, 0, 1)
+                return as_fractions(intensity, self.scale)
             if intensity is not None and self.matched is not None:
                 mapped = np.interp(intensity, *self.matched)
                 return np.where(np.isfinite(intensity), mapped, np.nan)
@@ -300,9 +316,13 @@ def check_intensity(scan: Scan) -> Scan:
     if is_outside.sum() > max(WILD_SHARE * valid.sum(), 1):
         low = intensity[valid].min()
         high = intensity[valid].max()
+        found = f"{low:g} to {high:g}"
+        advice = "divide them by the largest possible one, as amvnet predict does for scan files"
+        if high <= 1:
+            found = f"{low:g} in {is_outside.sum():,} of {valid.sum():,} points"
+            advice = "write 0 where the intensity is unknown"
         raise InputError(
-            f"{scan.name or 'scan'}: expected intensities in [0, 1], found {low:g} to {high:g}; "
-            "divide them by the largest possible one, as amvnet predict does for scan files"
+            f"{scan.name or 'scan'}: expected intensities in [0, 1], found {found}; {advice}"
         )
 
     points = scan.points.copy()

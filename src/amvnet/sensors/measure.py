@@ -105,9 +105,8 @@ class Recording:
 
     def _measure(self, cloud: Cloud) -> Estimate:
         """Measure the sensor of one scan."""
-        usable = np.isfinite(cloud.xyz).all(axis=1) & (cloud.xyz != 0).any(axis=1)
         with errors_of(cloud.name):
-            frame = find_frame(cloud.xyz[usable], self._sensor)
+            frame = find_frame(cloud.xyz[cloud.is_placed], self._sensor)
         return self._measure_in(frame, cloud)
 
     def _measure_in(self, frame: Frame, cloud: Cloud) -> Estimate:
@@ -118,7 +117,7 @@ class Recording:
         seen = raise_points(scan, to_sensor)
         valid = scan.valid
         lasers = measure_lasers(seen.points[valid], None if scan.ring is None else scan.ring[valid])
-        return Estimate(frame, lasers, quantiles_of(cloud.intensity))
+        return Estimate(frame, lasers, quantiles_of(cloud.measured_intensity()))
 
     def _recognises(self, cloud: Cloud, usual: Estimate) -> bool:
         """Return whether a scan is of the usual sensor, if it is in the usual frame.

@@ -53,7 +53,7 @@ def fuse(
     classes = None if taxonomy is None else TAXONOMIES[taxonomy]
 
     with progress("fusing") as step:
-        written, uncertain = fuse_files(
+        fused = fuse_files(
             inputs,
             pair,
             OutputOptions(out, overwrite=overwrite),
@@ -63,5 +63,9 @@ def fuse(
             taxonomy=classes,
             progress=step,
         )
-    files = counted(written, "label file")
-    say(f"{files} in {out}; the two models disagree on {uncertain:.1%} of the points")
+    for side, share in fused.silent.items():
+        if share:
+            folder = models.scores_a if side == "a" else models.scores_b
+            say(f"{folder} ({side}): no opinion of {share:.1%} of the points")
+    files = counted(fused.files, "label file")
+    say(f"{files} in {out}; the two models disagree on {fused.uncertain:.1%} of the points")

@@ -14,7 +14,7 @@ from amvnet.data.datasets.base import Dataset, ScanRecord, check_split
 from amvnet.data.formats.cloud import check_usable, ring_indices
 from amvnet.data.formats.raw import FULL_INTENSITY, NUSCENES_COLUMNS, count_rows, read_table
 from amvnet.data.labels.ids import read_ids
-from amvnet.data.taxonomy import NUSCENES, UNKNOWN
+from amvnet.data.taxonomy import NUSCENES, UNKNOWN, Taxonomy
 from amvnet.errors import InputError, shown
 from amvnet.files import checked_token
 from amvnet.scan import Scan
@@ -172,6 +172,23 @@ class NuScenes(Dataset):
     def count_points(self, record: ScanRecord) -> int:
         """Return the number of points of a scan, from the size of its file."""
         return count_rows(record.points_path, np.float32, NUSCENES_COLUMNS)
+
+    def write_prediction(
+        self,
+        record: ScanRecord,
+        folder: Path,
+        ids: np.ndarray,
+        taxonomy: Taxonomy | None = None,
+    ) -> Path:
+        """Write train ids, none of which is 0: the benchmark's server refuses points without one.
+
+        Lost returns get the most frequent class of the scan.
+        """
+        is_lost = ids == 0
+        if taxonomy is None and is_lost.any() and not is_lost.all():
+            classes, counts = np.unique(ids[~is_lost], return_counts=True)
+            ids = np.where(is_lost, classes[counts.argmax()], ids)
+        return super().write_prediction(record, folder, ids, taxonomy)
 
     def _find_version(self, version: str | None) -> str:
         """Return the version to read: the one asked for, or the only one in the folder."""

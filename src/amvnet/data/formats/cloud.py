@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from amvnet.errors import InputError, one_line_errors
-from amvnet.scan import FARTHEST, Scan
+from amvnet.scan import FARTHEST, Scan, at_origin
 
 MAX_POINTS = 10_000_000  # of a scan: 40 times as many as the largest sensors record
 MAX_BYTES = 32 * MAX_POINTS  # of the points of a packed file
@@ -60,26 +60,44 @@ class Cloud:
     name: str = ""
     note: str = ""
 
+    @property
+    def is_placed(self) -> np.ndarray:
+        """(N,) bool: points with finite coordinates, not at 0, 0, 0."""
+        # Column by column: a reduction over rows of three takes ten times as long.
+        x, y, z = np.isfinite(self.xyz.T)
+        placed: np.ndarray = x & y & z
+        placed[at_origin(self.xyz)] = False
+        return placed
+
+    def measured_intensity(self) -> np.ndarray | None:
+        """Return the (M,) finite intensities of points with a place; None if there are none.
+
+        Whatever a file has as the intensity of a lost return says nothing about the others.
+        """
+        if self.intensity is None:
+            return None
+
+        measured: np.ndarray = self.intensity[self.is_placed & np.isfinite(self.intensity)]
+        return measured if len(measured) else None
+
     def intensity_scale(self) -> float | None:
         """Return the divisor that brings the intensities to [0, 1]; None if there are none.
 
         It is the end of the usual range that the largest intensity lies in: 1 (floats only), 255 or
         65535. Beyond these, it is that intensity itself. Outliers (`WILD_SHARE`) are left out.
         """
-        if self.intensity is None:
+        measured = self.measured_intensity()
+        if self.intensity is None or measured is None:
             return None
 
-        finite = self.intensity[np.isfinite(self.intensity)]
-        if not len(finite):
-            return None
-
-        largest = float(np.quantile(finite, 1 - WILD_SHARE, method="higher"))
+        largest = float(np.quantile(measured, 1 - WILD_SHARE, method="higher"))
         return usual_scale(largest, is_integer=self.intensity.dtype.kind in "iu")
 
     def to_scan(self, scale: float | None = None) -> Scan:
         """Return the scan, with float32 coordinates and intensities clipped to [0, 1].
 
-        Sensors write 0, 0, 0 for a lost return. Such points become NaN, and so get train id 0.
+        Sensors write 0, 0, 0 for a lost return. Such points become NaN, so that they stay lost
+        wherever the scan is moved.
 
         Args:
             scale: the divisor of the intensities; by default `intensity_scale()`.
@@ -94,13 +112,18 @@ class Cloud:
         with np.errstate(over="ignore", invalid="ignore"):
             points[:, :3] = self.xyz
             if self.intensity is not None and scale is not None:
-                points[:, 3] = np.clip(self.intensity / scale, 0, 1)
-
-        x, y, z = self.xyz.T
-        at_origin = (x == 0) & (y == 0) & (z == 0)
-        points[at_origin, :3] = np.nan
+                points[:, 3] = as_fractions(self.intensity, scale)
+        points[at_origin(self.xyz), :3] = np.nan
 
         return Scan(check_usable(points, self.name), ring=self.ring, name=self.name)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def as_fractions(intensity: np.ndarray, scale: float) -> np.ndarray:
+    """Return (N,) intensities in [0, 1], given their largest value; NaN if one is not finite."""
+    fractions: np.ndarray = np.clip(intensity / scale, 0, 1)
+    is_finite = np.isfinite(intensity)
+    return fractions if is_finite.all() else np.where(is_finite, fractions, np.nan)
 
 
 def usual_scale(largest: float, is_integer: bool) -> float:

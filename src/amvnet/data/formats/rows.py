@@ -106,7 +106,7 @@ def named_cloud(
         note: what was assumed about the file.
 
     Raises:
-        InputError: if there are fewer columns than names.
+        InputError: if there are fewer columns than names, or one does not hold numbers.
     """
     if len(columns) < len(names):
         raise InputError(
@@ -114,7 +114,18 @@ def named_cloud(
             "correct --columns"
         )
 
-    arrays = {key: columns[index] for key, index in find_columns(names).items()}
+    arrays = {}
+    for key, index in find_columns(names).items():
+        arrays[key] = values = columns[index]
+        if values.ndim != 1 or values.dtype.kind not in "fiu":
+            found = (
+                f"{values.dtype} of shape {values.shape[1:]}" if values.ndim > 1 else values.dtype
+            )
+            raise InputError(
+                f"{name}: expected a number for each point in the column {names[index]!a}, found "
+                f"{found}; convert the column"
+            )
+
     cloud = make_cloud(arrays, name)
     return Cloud(cloud.xyz, cloud.intensity, cloud.ring, name, note=note)
 

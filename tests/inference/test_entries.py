@@ -1,0 +1,298 @@
+"""The same scan gets the same labels by every entry, however odd it is."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from rosbags.typesys import Stores, get_typestore
+
+from amvnet.data.datasets.open import open_dataset, open_with_classes
+from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.evaluation.scoring import label_by_weights
+from amvnet.export.onnx import export
+from amvnet.inference.listing import list_inputs
+from amvnet.inference.reading import normalised_for, normaliser_for
+from amvnet.inference.segmenter import Segmenter
+from amvnet.onnx_runner import OnnxSegmenter
+from amvnet.scan import Scan
+from amvnet.viewing.shown_scans import show_scans
+from amvnet.weights.file import save
+from amvnet_ros.segmentation import CloudSegmenter, Settings
+
+from fixtures.scan_writers import cloud_message
+from fixtures.worlds import fails, fresh_weights, street, succeed, without, write_scan
+
+WEIGHTS = fresh_weights()
+OWN = """\
+classes: {classes}
+scans: "*.npy"
+labels: "{{name}}.label"
+"""
+FIELDS = np.dtype([("x", "f4"), ("y", "f4"), ("z", "f4"), ("intensity", "f4")])
+
+
+def plain() -> np.ndarray:
+    """Return a scan whose intensities reach from 0 to 1, as files' are divided by the largest."""
+    points, _ = street(5, 1500)
+    points[:, 3] = np.clip(points[:, 3], 0, 1)
+    points[0, 3] = 1
+    return points
+
+
+def with_rows(*rows: list[float]) -> np.ndarray:
+    """Return the scan with other rows first, last and in between."""
+    table = np.array(rows, np.float32)
+    places = np.linspace(0, len(plain()), len(rows)).astype(int)
+    return np.insert(plain(), places, table, axis=0)
+
+
+def with_intensity(value: float, index: int = 700) -> np.ndarray:
+    points = plain()
+    points[index, 3] = value
+    return points
+
+
+DARK = [0.0, 0.0, 0.0, -1.0]
+BRIGHT = [0.0, 0.0, 0.0, 65535.0]
+LOST: dict[str, list[float]] = {
+    "at the origin": [0, 0, 0, 0.5],
+    "at the origin, with a sign": [-0.0, 0, -0.0, 0],
+    "not a number": [np.nan, np.nan, np.nan, 0],
+    "infinite": [np.inf, -np.inf, np.inf, 0],
+    "infinite in one coordinate": [3, np.inf, 1, 0.5],
+    "of an infinite intensity": [3, 2, 1, np.inf],
+    "of no intensity": [3, 2, 1, np.nan],
+    "far away": [1e20, 1, 1, 0.5],
+}
+SCANS: dict[str, Callable[[], np.ndarray]] = {
+    "plain": plain,
+    "all kinds of lost returns": lambda: with_rows(*LOST.values()),
+    "a third of lost returns": lambda: with_rows(*[LOST["at the origin"]] * 750),
+    "lost returns of intensity -1": lambda: with_rows(*[DARK] * 40),
+    "lost returns of a huge intensity": lambda: with_rows(*[BRIGHT] * 300),
+    "an intensity a little too large": lambda: with_intensity(1.0001),
+    "an intensity a little too small": lambda: with_intensity(-0.0001),
+    "on an axis": lambda: with_rows([0, 0, -1.7, 0.5], [0, 5, 0, 0.5], [5, 0, 0, 0.5]),
+    "without intensities": lambda: plain()[:, :3],
+    "in double precision": lambda: plain().astype(np.float64),
+}
+
+
+@dataclass(frozen=True)
+class World:
+    """A folder of its own for the files of a scan, and what labels them."""
+
+    folder: Path
+    weights: Path
+    graphs: Path
+
+    @cached_property
+    def segmenter(self) -> Segmenter:
+        return Segmenter(self.weights)
+
+    def write(self, points: np.ndarray) -> Path:
+        path = self.folder / "scan.npy"
+        np.save(path, points)
+        return path
+
+    def write_kitti(self, points: np.ndarray) -> Path:
+        root = self.folder / "kitti"
+        path = write_scan(root, "08", "000000", points, np.zeros(len(points)))
+        return path.parents[3]
+
+    def write_own(self, points: np.ndarray) -> Path:
+        path = self.folder / "own" / "own.yaml"
+        path.parent.mkdir(exist_ok=True)
+        np.save(path.with_name("scan.npy"), points)
+        np.zeros(len(points), np.uint32).tofile(path.with_name("scan.label"))
+        classes = {name: index for index, name in enumerate(SEMANTICKITTI.classes, start=1)}
+        path.write_text(OWN.format(classes=classes))
+        return path
+
+    def read(self, path: Path) -> np.ndarray:
+        return SEMANTICKITTI.to_train(np.fromfile(path, np.uint32))
+
+
+# By what the user gives: points in memory, the path of a scan, or a dataset.
+
+
+def by_tensor(world: World, points: np.ndarray) -> np.ndarray:
+    return world.segmenter(torch.from_numpy(points)).labels
+
+
+def by_list(world: World, points: np.ndarray) -> np.ndarray:
+    return world.segmenter(points.tolist()).labels
+
+
+def by_fields(world: World, points: np.ndarray) -> np.ndarray:
+    """Label the array that ROS' read_points returns."""
+    table = np.zeros(len(points), FIELDS)
+    for name, values in zip(FIELDS.names or (), points.T, strict=False):
+        table[name] = values
+    return world.segmenter(table if points.shape[1] == 4 else table[["x", "y", "z"]]).labels
+
+
+def by_scan(world: World, points: np.ndarray) -> np.ndarray:
+    table = np.zeros((len(points), 4), np.float32)
+    table[:, : points.shape[1]] = points
+    return world.segmenter(Scan(table)).labels
+
+
+def by_many(world: World, points: np.ndarray) -> np.ndarray:
+    return world.segmenter.many([plain(), points])[1].labels
+
+
+def by_path(world: World, points: np.ndarray) -> np.ndarray:
+    return world.segmenter(world.write(points)).labels
+
+
+def by_each(world: World, points: np.ndarray) -> np.ndarray:
+    (result,) = world.segmenter.each(world.write(points))
+    return result.labels
+
+
+def by_predict(world: World, points: np.ndarray) -> np.ndarray:
+    out = world.folder / "out"
+    succeed(f"predict {world.write(points)} --weights {world.weights} --out {out} --overwrite")
+    return world.read(out / "scan.label")
+
+
+def by_view(world: World, points: np.ndarray) -> np.ndarray:
+    normaliser = normaliser_for(world.segmenter.weights)
+    scans, taxonomy = list_inputs([str(world.write(points))], normaliser=normaliser)
+    (shown,) = show_scans(scans, taxonomy, world.segmenter)
+    return shown.labels["amvnet"]
+
+
+def by_evaluate(world: World, points: np.ndarray) -> np.ndarray:
+    data = world.write_own(points)
+    return _evaluated(world, normalised_for(world.segmenter.weights, open_dataset(str(data))))
+
+
+def by_node(world: World, points: np.ndarray) -> np.ndarray:
+    """Label a message as the ROS node does."""
+    table = np.zeros((len(points), 4), np.float32)
+    table[:, : points.shape[1]] = points
+    message = cloud_message(get_typestore(Stores.ROS2_HUMBLE), table)
+    label = CloudSegmenter(Settings(weights=str(world.weights)), "/lidar", lambda line: None)
+    return SEMANTICKITTI.to_train(label(message).points.raw)
+
+
+def by_predict_of_a_dataset(world: World, points: np.ndarray) -> np.ndarray:
+    data = world.write_kitti(points)
+    out = world.folder / "dataset"
+    succeed(f"predict {data} --weights {world.weights} --out {out} --overwrite")
+    return world.read(out / "sequences" / "08" / "predictions" / "000000.label")
+
+
+def by_evaluate_of_a_dataset(world: World, points: np.ndarray) -> np.ndarray:
+    data = str(world.write_kitti(points))
+    return _evaluated(world, open_with_classes(data, SEMANTICKITTI))
+
+
+def _evaluated(world: World, dataset: Any) -> np.ndarray:
+    labeller = label_by_weights(dataset, world.segmenter)
+    (record,) = dataset.records(dataset.sequences("all"))
+    labels, _ = labeller.label(record, dataset.read(record))
+    return labels["amvnet"]
+
+
+IN_MEMORY = (by_tensor, by_list, by_fields, by_scan, by_many)
+OF_FILES = (by_path, by_each, by_predict, by_view, by_evaluate, by_node)
+OF_DATASETS = (by_predict_of_a_dataset, by_evaluate_of_a_dataset)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> World:
+    for library in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(library)
+
+    folder = tmp_path_factory.mktemp("entries")
+    save(WEIGHTS, folder / "tiny.safetensors")
+    # One network is enough: all graphs get the same points.
+    export(without(WEIGHTS, "polar_net", "point_head"), folder / "graphs")
+    return World(folder, folder / "tiny.safetensors", folder / "graphs")
+
+
+@contextmanager
+def no_warnings() -> Iterator[None]:
+    """Ignore that an array has no intensities."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        yield
+
+
+@pytest.mark.parametrize("name", SCANS)
+def test_every_entry_gives_a_scan_the_same_labels(saved: World, name: str) -> None:
+    points = SCANS[name]()
+    with no_warnings():
+        expected = saved.segmenter(points).labels
+        by_rv = Segmenter(WEIGHTS, method="rv")(points).labels
+    lost = expected == 0
+    table = points.astype(np.float32)
+    is_lost = ~np.isfinite(table).all(axis=1) | (table[:, :3] == 0).all(axis=1)
+    is_lost |= (np.abs(table[:, :3]) > 1e4).any(axis=1)
+    np.testing.assert_array_equal(lost, is_lost)
+
+    entries = [*IN_MEMORY, *OF_FILES]
+    if points.shape[1] == 4:
+        entries += OF_DATASETS
+    for entry in entries:
+        with no_warnings():
+            labels = entry(saved, points)
+        np.testing.assert_array_equal(labels == 0, lost, entry.__name__)
+        # Batches and other orders of sums may round otherwise.
+        assert (labels == expected).mean() > 0.995, entry.__name__
+
+    if points.shape[1] == 4:
+        actual = OnnxSegmenter(saved.graphs)(points).labels
+        np.testing.assert_array_equal(actual == 0, lost)
+        assert (actual == by_rv).mean() > 0.995
+
+
+def test_entries_that_do_not_normalise_refuse_intensities_of_8_bits(saved: World) -> None:
+    points = plain() * np.array([1, 1, 1, 255], np.float32)
+    words = ("intensities in [0, 1]", "to 255", "divide")
+    for call in (saved.segmenter, OnnxSegmenter(saved.graphs)):
+        fails(partial(call, points), *words)
+    for entry in (*IN_MEMORY, by_evaluate_of_a_dataset):
+        fails(partial(entry, saved, points), *words)
+
+    expected = saved.segmenter(plain()).labels
+    for entry in OF_FILES:
+        assert (entry(saved, points) == expected).mean() > 0.995, entry.__name__
+
+
+def test_negative_intensities_are_named_with_their_number(saved: World) -> None:
+    points = plain()
+    points[1:301, 3] = -1
+    for call in (saved.segmenter, OnnxSegmenter(saved.graphs)):
+        fails(partial(call, points), "-1 in 300 of 1,500 points", "write 0")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_intensities_that_are_all_lost_are_none(saved: World, value: float) -> None:
+    points = plain()
+    points[:, 3] = value
+    with no_warnings():
+        expected = saved.segmenter(points[:, :3]).labels
+        for entry in (by_list, by_tensor, by_fields, *OF_FILES):
+            assert np.array_equal(entry(saved, points), expected), entry.__name__
+
+
+@pytest.mark.parametrize("name", [name for name in LOST if "intensity" not in name])
+def test_a_scan_of_lost_returns_alone_is_refused_by_every_entry(saved: World, name: str) -> None:
+    points = np.array([LOST[name]] * 100, np.float32)
+    for call in (saved.segmenter, OnnxSegmenter(saved.graphs)):
+        fails(partial(call, points), "expected points to segment")
+    for entry in (by_scan, by_path, by_evaluate, by_node, by_evaluate_of_a_dataset):
+        fails(partial(entry, saved, points), "expected")
