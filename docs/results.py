@@ -1,10 +1,9 @@
-"""Write the table of results of docs/results.json into the pages that show it.
+"""Write the tables of docs/results.json into the pages that show them.
 
     python docs/results.py
 
-Each page has the table between the lines `<!-- results -->` and `<!-- end of results -->`:
-README.md and docs/index.md the rows that are marked `readme`, docs/log.md all of them. Change
-a figure in docs/results.json only, and run this. A test compares the pages with the file, also the
+Each page has its table between the lines `<!-- results -->` and `<!-- end of results -->`. Change a
+figure in docs/results.json only, and run this. A test compares the pages with the file, also the
 outputs of commands in them.
 """
 
@@ -17,26 +16,55 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 FIGURES = ROOT / "docs/results.json"
-SHORT = ("README.md", "docs/index.md")  # pages with the rows for the first screen
-LONG = ("docs/log.md",)
 METHODS = ("rv", "bev", "ensemble", "amvnet")
 REGION = re.compile(r"(<!-- results -->\n).*?(<!-- end of results -->)", re.S)
 
 
-def rows() -> list[dict[str, Any]]:
-    """Return the rows of the file."""
-    read = json.loads(FIGURES.read_text(encoding="utf-8"))["rows"]
-    assert isinstance(read, list)
-    return read
+def read() -> dict[str, list[dict[str, Any]]]:
+    """Return the rows of the file: of the built-in weights, and of fine-tuning."""
+    figures = json.loads(FIGURES.read_text(encoding="utf-8"))
+    assert isinstance(figures, dict)
+    return figures
 
 
-def table(chosen: list[dict[str, Any]]) -> str:
+def first_screen() -> str:
+    """Return the table of the rows that are marked `readme`."""
+    return table([row for row in read()["rows"] if row.get("readme")])
+
+
+def everything() -> str:
+    """Return the table of all rows."""
+    return table(read()["rows"])
+
+
+def finetuning() -> str:
+    """Return the table of fine-tuning."""
+    lines = [
+        "| Labelled scans | Tested on | Zero-shot | Fine-tuned, with simulated streets |",
+        "|---|---|---|---|",
+    ]
+    for row in read()["finetuning"]:
+        figures = f"{row['before']:.1f} | **{row['after']:.1f}**"
+        lines.append(f"| {row['labelled']} | {row['tested']} | {figures} |")
+    return "\n".join(lines)
+
+
+# The table of each page.
+PAGES = {
+    "README.md": first_screen,
+    "docs/index.md": first_screen,
+    "docs/log.md": everything,
+    "docs/finetuning.md": finetuning,
+}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
     """Return rows as a table in Markdown, the best method of each in bold."""
     lines = [
         "| Scans | Weights | RV | BEV | Ensemble | AMVNet | Uncertain |",
         "|---|---|---|---|---|---|---|",
     ]
-    for row in chosen:
+    for row in rows:
         best = max(row[method] for method in METHODS)
         cells = [row["scans"], f"`{row['weights']}`"]
         for method in METHODS:
@@ -49,14 +77,15 @@ def table(chosen: list[dict[str, Any]]) -> str:
 
 def filled(page: str, text: str) -> str:
     """Return the text of a page with the present table."""
-    chosen = rows() if page in LONG else [row for row in rows() if row.get("readme")]
-    filled_text, count = REGION.subn(lambda match: f"{match[1]}{table(chosen)}\n{match[2]}", text)
-    assert count == 1, f"{page}: expected one pair of markers, found {count}"
+    new = PAGES[page]()
+    filled_text, count = REGION.subn(lambda match: f"{match[1]}{new}\n{match[2]}", text)
+    if count != 1:
+        raise ValueError(f"{page}: expected one pair of markers, found {count}")
     return filled_text
 
 
 def main() -> None:
-    for page in (*SHORT, *LONG):
+    for page in PAGES:
         path = ROOT / page
         path.write_text(filled(page, path.read_text(encoding="utf-8")), encoding="utf-8")
 

@@ -156,3 +156,9 @@ def test_the_names_that_the_contributing_page_mentions_exist() -> None:
     for name, path in mentions:
         file = ROOT / path if (ROOT / path).exists() else SOURCE / "amvnet" / path
         assert re.search(rf"^(?:class |def )?{name}\b", file.read_text(), re.M), (name, path)
+
+
+def test_no_page_has_the_marks_of_a_conflict() -> None:
+    pages = [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+    for page in pages:
+        assert not re.search(r"(?m)^(<<<<<<<|>>>>>>>) ", page.read_text(encoding="utf-8")), page

@@ -27,7 +27,7 @@ def load_program() -> ModuleType:
 RESULTS = load_program()
 
 
-@pytest.mark.parametrize("page", [*RESULTS.SHORT, *RESULTS.LONG])
+@pytest.mark.parametrize("page", list(RESULTS.PAGES))
 def test_a_page_has_the_table_of_the_file(page: str) -> None:
     text = (ROOT / page).read_text(encoding="utf-8")
     assert RESULTS.filled(page, text) == text, "run python docs/results.py"
@@ -35,12 +35,13 @@ def test_a_page_has_the_table_of_the_file(page: str) -> None:
 
 def test_what_evaluate_prints_in_the_pages_is_in_the_file() -> None:
     known = set()
-    for row in RESULTS.rows():
+    for row in RESULTS.read()["rows"]:
         known.add(tuple(f"{row[method]:.1f}" for method in RESULTS.METHODS))
 
     printed = set()
     for page in DOCS.glob("*.md"):
-        for line in re.findall(r"(?m)^ *mIoU +│(.*)$", page.read_text(encoding="utf-8")):
+        text = page.read_text(encoding="utf-8")
+        for line in re.findall(r"(?m)^ *mIoU +│(.*)$", text):
             printed.add(tuple(re.findall(r"[\d.]+", line)))
     assert printed
     assert printed <= known

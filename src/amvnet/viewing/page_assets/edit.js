@@ -55,8 +55,8 @@ class Editor {
     this.inputs.forEach((input, place) => {
       input.value = look.box[place] === NO_BOX[place] ? "" : Number(look.box[place].toFixed(2));
     });
-    // Without the labels of every point, a label file would not fit the scan.
-    byId("edit").hidden = !about.sources.length || scan.note !== "";
+    // Without the labels of every point, and the ids of files, a label file would not fit the scan.
+    byId("edit").hidden = !about.sources.length || !about.raw || Boolean(scan.note);
     byId("undo").disabled = this.before.at(-1)?.scan !== scan;
     byId("save").disabled = !scan.planes[CORRECTED];
   }
