@@ -4,7 +4,7 @@ BIN := .venv/bin
 # A process for each processor, and one thread in each. The tests of a file share what they make, so one process runs them.
 SPREAD := OMP_NUM_THREADS=1
 
-.PHONY: demo test test-slow bench docs lint format clean
+.PHONY: demo test test-slow bench gpu docs lint format clean
 
 demo: .venv/installed  ## simulate streets, segment and score them, and show all in demo/index.html
 	$(BIN)/amvnet demo --out demo
@@ -17,6 +17,10 @@ test-slow: .venv/installed .venv/fleet  ## the tests that take minutes, and thos
 
 bench: .venv/installed  ## the time of a scan, and what each optimisation gives: half an hour; SCAN="--scan FILE" for a scan of yours
 	$(BIN)/python benchmarks/performance.py $(SCAN) --engines torch,onnx,int8
+
+gpu: .venv/installed  ## on a machine with a GPU: its tests and its tables, to paste into an issue; SCAN="--scan FILE" for a scan of yours
+	$(BIN)/python -m pytest -m gpu -rs
+	$(BIN)/python benchmarks/gpu.py $(SCAN)
 
 docs: .venv/docs docs/try/node_modules  ## the site of docs/, in site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

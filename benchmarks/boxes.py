@@ -18,9 +18,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.scoring import labels_by_method
-from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import PAPER_METHODS
 
 BOXED = 10  # classes that have boxes are the first ones
@@ -36,7 +36,7 @@ def main() -> None:
     options = parser.parse_args()
 
     dataset = open_dataset(options.data)
-    segmenter = Segmenter(options.weights)
+    segmenter = amvnet.load(options.weights)
     size = dataset.taxonomy.size + 1
     matrices = {method: np.zeros((size, size), np.int64) for method in PAPER_METHODS}
     uncertain_points = 0

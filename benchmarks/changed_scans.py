@@ -21,11 +21,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import amvnet
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.formats.cloud import Cloud
 from amvnet.errors import InputError
 from amvnet.inference.reading import normaliser_for
-from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import AXES, HEIGHTS, make_sensor, rotation_from_degrees
 
@@ -122,7 +122,7 @@ class Labeller:
     """Labels normalised scans; the same scan only once, as many changes are undone exactly."""
 
     def __init__(self, weights: str) -> None:
-        self.segmenter = Segmenter(weights)
+        self.segmenter = amvnet.load(weights)
         self._labels: dict[str, np.ndarray] = {}
 
     def __call__(self, scan: Scan) -> np.ndarray:

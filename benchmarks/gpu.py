@@ -31,6 +31,7 @@ import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
+from amvnet import load
 from amvnet import read as read_scan
 from amvnet.cli.main import main as amvnet
 from amvnet.config.recipes import load_recipe
@@ -165,7 +166,7 @@ def make_segmenter(
 
     Untrained networks would disagree on another share than trained ones.
     """
-    segmenter = Segmenter(
+    segmenter = load(
         weights,
         options.device,
         precision=precision,  # type: ignore[arg-type]

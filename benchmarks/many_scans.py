@@ -22,10 +22,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
+from amvnet import load
 from amvnet import read as read_scan
-from amvnet.export.engines import use_engine
 from amvnet.inference.scan_stream import stream_scans
-from amvnet.inference.segmenter import Segmenter
 
 WARM_UP = 4  # scans that do not count
 WEIGHTS = "sim-hdl64e"
@@ -91,8 +90,7 @@ def networks_rate(folder: Path, engine: str, at_once: int) -> float:
 @torch.inference_mode()
 def time_networks(paths: list[Path], engine: str, at_once: int) -> float:
     """Return how many scans per second the two networks score, once these are projected."""
-    segmenter = Segmenter(WEIGHTS)
-    use_engine(segmenter, engine)
+    segmenter = load(WEIGHTS, engine=engine)  # type: ignore[arg-type]
     model = segmenter.model
     views = [model.project(segmenter.batch([read_scan(path)])) for path in paths]
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+import amvnet
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
 from amvnet.evaluation.metrics import Evaluation
@@ -83,6 +84,6 @@ def compare(name: str, folder: Path, segmenter: Segmenter) -> None:
 if __name__ == "__main__":
     SENSORS.update(OTHERS)
     root = Path(sys.argv[1] if len(sys.argv) > 1 else "other_sensors")
-    segmenter = Segmenter(sys.argv[2] if len(sys.argv) > 2 else "sim-hdl64e")
+    segmenter = amvnet.load(sys.argv[2] if len(sys.argv) > 2 else "sim-hdl64e")
     for name in OTHERS:
         compare(name, root / name, segmenter)

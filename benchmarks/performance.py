@@ -24,14 +24,14 @@ from salsanext import CHANNELS, SalsaNext
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-import amvnet.inference.segmenter
+import amvnet
+import amvnet.engines.base
 import amvnet.models.layers
 import amvnet.models.polar_net
 import amvnet.models.range_net
 from amvnet import read as read_scan
 from amvnet.data.labels.ids import write_ids
-from amvnet.export.engines import OnnxGraph, cache_folder, use_engine
-from amvnet.inference.segmenter import Segmenter
+from amvnet.engines.onnx import OnnxGraph
 from amvnet.inference.timing import FUSION, MEAN, STAGES, run_once
 from amvnet.models.layers import upsample
 from amvnet.models.methods import ONNX_ENGINES
@@ -46,7 +46,7 @@ WARM_UP = 2
 
 
 def without_folding() -> None:
-    amvnet.inference.segmenter.freeze = lambda module: None
+    amvnet.engines.base.freeze = lambda module: None
 
 
 def without_convolved_rows() -> None:
@@ -125,8 +125,7 @@ def measure(options: argparse.Namespace) -> dict[str, float]:
         The median seconds of each stage and of SalsaNext's forward pass, timed in turn.
     """
     remove_optimisations(options.variant)
-    segmenter = Segmenter("sim-hdl64e")
-    use_engine(segmenter, options.engines)
+    segmenter = amvnet.load("sim-hdl64e", engine=options.engines)
     salsanext, image = build_salsanext(options.engines)
 
     times: list[dict[str, float]] = []
@@ -160,12 +159,12 @@ def build_salsanext(engine: str) -> tuple[nn.Module, torch.Tensor]:
     net = SalsaNext().eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     image = torch.randn(1, CHANNELS, HEIGHT, WIDTH).contiguous(memory_format=torch.channels_last)
     if engine in ONNX_ENGINES:  # in float32 also next to int8
-        path = cache_folder() / "salsanext.onnx"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torch.onnx.export(
-            net, (image.contiguous(),), path, dynamo=True, external_data=False, verbose=False
-        )
-        net = OnnxGraph(path)
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "salsanext.onnx"
+            torch.onnx.export(
+                net, (image.contiguous(),), path, dynamo=True, external_data=False, verbose=False
+            )
+            net = OnnxGraph(path.read_bytes())
     return net, image
 
 

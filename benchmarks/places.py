@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import amvnet
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.evaluation.metrics import Evaluation
@@ -74,7 +75,7 @@ def main() -> None:
     options = parser.parse_args()
 
     dataset = open_dataset(options.data)
-    segmenter = Segmenter(options.weights)
+    segmenter = amvnet.load(options.weights)
     methods = options.methods.split(",")
     chosen = dataset.records(dataset.sequences("all"))[:: options.every]
     table = Table("place", *methods, "uncertain, %")

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
-from amvnet.inference import segmenter
-from amvnet.models import precision
+from amvnet.engines import onnx as onnx_engine
+from amvnet.engines import precision
+from amvnet.engines import torch as torch_engine
 from amvnet.scan import Scan
 
 from fixtures.submissions import MAKERS, Case
@@ -34,7 +35,7 @@ def on_cpu() -> Iterator[None]:
         return choose("cpu" if name == "auto" else name, engine)
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (precision, segmenter):
+        for module in (precision, torch_engine, onnx_engine):
             patch.setattr(module, "choose_device", choose_cpu)
         yield
 

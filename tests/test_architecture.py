@@ -92,12 +92,6 @@ def test_imports_go_down_only() -> None:
     assert not upward
 
 
-def test_the_house_stays_small() -> None:
-    heights = levels()
-    assert len(heights) - len({"lidarstreets"}) <= 20
-    assert max(heights.values()) < 9
-
-
 def test_no_imports_make_a_circle() -> None:
     try:
         TopologicalSorter(imports()).prepare()
@@ -109,15 +103,6 @@ def test_the_simulator_knows_nothing_of_the_method() -> None:
     for module, targets in imports().items():
         if package(module) == "lidarstreets":
             assert {package(target) for target in targets} <= {"lidarstreets"}
-
-
-def test_no_two_files_have_the_same_name() -> None:
-    special = ("__init__", "__main__")
-    for top in ("amvnet", "lidarstreets"):
-        paths = [path for path in (SOURCE / top).rglob("*.py") if path.stem not in special]
-        # A verb has the name of what it calls.
-        names = [path.stem for path in paths if path.parent.name != "commands"]
-        assert {name for name in names if names.count(name) > 1} == set()
 
 
 # ---- pages

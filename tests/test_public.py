@@ -30,7 +30,7 @@ POINTS = np.clip(street(3, 500)[0], -60, 60)
 
 @pytest.fixture(scope="module")
 def segmenter() -> Segmenter:
-    return Segmenter(WEIGHTS)
+    return amvnet.load(WEIGHTS)
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +198,7 @@ def test_show_writes_a_page_and_opens_it(
 
 
 def test_show_needs_no_path_and_no_browser(segmenter: Segmenter) -> None:
-    path = amvnet.show(Segmenter(WEIGHTS, method="bev")(POINTS), open_browser=False)
+    path = amvnet.show(amvnet.load(WEIGHTS, method="bev")(POINTS), open_browser=False)
     _, planes = read_page(path).scan(0)
     assert "bev" in planes
     assert "uncertain" not in planes
@@ -261,7 +261,7 @@ def segment(path: Path) -> float:
         labels = amvnet.fuse(scan.points, result.rv, result.bev, head="sim-hdl64e")
         print(labels.shape)
     weights: amvnet.Weights = amvnet.weights.load("sim-hdl64e")
-    print(amvnet.Segmenter(weights).taxonomy.classes)
+    print(amvnet.load(weights).taxonomy.classes)
     amvnet.simulate(Path("streets"), sensor="hdl32e", seed=3)
     try:
         return float(result.uncertain.mean())

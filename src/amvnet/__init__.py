@@ -12,17 +12,22 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
+from amvnet.progress import Say, say_nothing
+
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from amvnet import onnx_runner as onnx_runner
     from amvnet import weights as weights
     from amvnet.data.datasets.simulated import simulate as simulate
+    from amvnet.engines.base import Engine
     from amvnet.errors import InputError as InputError
     from amvnet.inference.fuse import fuse as fuse
     from amvnet.inference.listing import read as read
     from amvnet.inference.listing import read_all as read_all
     from amvnet.inference.segmentation import Segmentation as Segmentation
     from amvnet.inference.segmenter import Segmenter as Segmenter
-    from amvnet.models.methods import MethodName, Precision
+    from amvnet.models.methods import EngineName, MethodName, Precision
     from amvnet.scan import Scan as Scan
     from amvnet.viewing.page import show as show
     from amvnet.weights.file import Weights as Weights
@@ -48,34 +53,68 @@ _SUBMODULES = ("onnx_runner", "weights")
 
 
 def load(
-    weights: str,
+    weights: Weights | Path | str,
     device: str = "auto",
     method: MethodName = "amvnet",
     precision: Precision = "auto",
-    engine: str = "torch",
+    engine: EngineName = "torch",
     tau: float | None = None,
+    *,
+    graphs: bool = True,
+    say: Say = say_nothing,
 ) -> Segmenter:
     """Return a segmenter with trained weights.
 
+    The engine `onnx` exports the networks once, in half a minute, and keeps them in $AMVNET_CACHE.
+    It takes scans one by one, and runs the networks on a GPU if the installed ONNX Runtime can.
+    `int8` does the same on the CPU with convolutions in 8-bit integers, which it calibrates once,
+    in a few minutes, on simulated scans of the weights' sensor.
+
     Args:
-        weights: the path of a weights file, the name of built-in weights (`sim-hdl64e`,
-            `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
-        device, method, precision, tau: as for `Segmenter`; "auto" chooses a device that the engine
-            runs on.
+        weights: trained weights, the path of a weights file, the name of built-in weights
+            (`sim-hdl64e`, `sim-hdl32e`), or weights on the hub (`hf-hub:OWNER/NAME`).
+        device: where to compute: "cpu", "cuda", "cuda:1", ..., or "auto": "cuda" if there is a GPU
+            and the engine is "torch", else "cpu".
+        method: "amvnet", or for comparison "rv" or "bev" (one network), "rv-knn" (the range view
+            with a vote of neighbours), "ensemble" (geometric mean), "arithmetic" or "maximum".
+        precision: the precision of the two networks: "float32", "bfloat16", on a GPU "float16", or
+            "auto": bfloat16 on a GPU that has it, else float32. Everything else is computed in
+            float32, the projections in float64.
         engine: what runs the networks: "torch", "onnx" or "int8".
+        tau: points whose class probabilities by the two networks have a cosine similarity of at
+            most this are uncertain, in [0, 1]; None takes the threshold of the weights.
+        graphs: on a GPU, capture the networks as CUDA graphs.
+        say: called with a line about the device, and with one before work that takes long.
 
     Raises:
-        InputError: if there are no such weights, they lack a part that the method needs, or the
-            engine lacks a library.
+        InputError: if there are no such weights, they lack a part that the method needs, there is
+            no such method, device, precision or engine, tau is out of range, the engine lacks a
+            library, or the sensor of the weights cannot be simulated for int8.
     """
-    segmenter_class = import_module("amvnet.inference.segmenter").Segmenter
-    choose_device = import_module("amvnet.models.precision").choose_device
-    device = choose_device(device, engine)
-    segmenter: Segmenter = segmenter_class(
-        weights, device=device, method=method, precision=precision, tau=tau
-    )
-    if engine != "torch":
-        import_module("amvnet.export.engines").use_engine(segmenter, engine)
+    from amvnet.inference.segmenter import Segmenter
+    from amvnet.weights.file import Weights
+    from amvnet.weights.file import load as load_weights
+
+    loaded = weights if isinstance(weights, Weights) else load_weights(weights)
+    made: Engine
+    if engine == "torch":
+        from amvnet.engines.torch import TorchEngine
+
+        made = TorchEngine(loaded, method, tau, device=device, precision=precision, graphs=graphs)
+    else:
+        from amvnet.engines.onnx import OnnxEngine, check_choice
+        from amvnet.export.cache import cached_networks
+        from amvnet.export.int8 import SIMULATED
+        from amvnet.models.methods import check_method
+
+        check_choice(engine, device, precision)
+        check_method(method, loaded.parts)  # an export takes long
+        is_int8 = engine == "int8"
+        networks = cached_networks(loaded, SIMULATED if is_int8 else None, say)
+        made = OnnxEngine(loaded, networks, method, tau, int8=is_int8)
+
+    segmenter = Segmenter(loaded, made)
+    say(f"computing on {made.hardware} in {made.precision}")
     return segmenter
 
 

@@ -5,6 +5,7 @@ This module is meant to be read, and to be ported to other languages.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -70,7 +71,7 @@ class OnnxSegmenter:
         self, folder: Path | str, providers: Sequence[str] = ("CPUExecutionProvider",)
     ) -> None:
         folder = Path(folder)
-        description = _read_description(folder)
+        description = read_description(folder)
         source = str(folder)
 
         self.description = description
@@ -84,7 +85,7 @@ class OnnxSegmenter:
 
         self._graphs: dict[str, Any] = {}
         for name in GRAPHS[self.method]:
-            self._graphs[name] = _open_session(folder, description["graphs"][name], providers)
+            self._graphs[name] = _open_graph(folder, description["graphs"][name], providers)
         self._check_sizes(folder, len(description["classes"]) - 1)
 
     def __call__(self, points: AnyArray | Scan, ring: np.ndarray | None = None) -> OnnxSegmentation:
@@ -357,7 +358,12 @@ def _fill_in(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return filled
 
 
-def _read_description(folder: Path) -> dict[str, Any]:
+def read_description(folder: Path) -> dict[str, Any]:
+    """Return the description of the graphs in a folder.
+
+    Raises:
+        InputError: if there is none, or it lacks a graph or the classes.
+    """
     path = folder / DESCRIPTION
     description = None
     try:
@@ -400,8 +406,33 @@ def _is_complete(graph: Any) -> bool:
     return all(isinstance(entry, dict) and isinstance(entry.get("name"), str) for entry in inputs)
 
 
-def _open_session(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -> Any:
-    """Open a graph in ONNX Runtime; raise InputError if it is not the described one."""
+def read_graph(folder: Path, graph: Mapping[str, Any]) -> bytes:
+    """Return the content of a graph's file; raise InputError if it is not the described one."""
+    path = folder / graph["file"]
+    if not path.is_file():
+        raise InputError(f"{path}: expected a graph of amvnet export, found no file; export again")
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(
+            f"{path}: expected a graph of amvnet export, found {error.strerror}; export again"
+        ) from None
+
+    if hashlib.sha256(content).hexdigest() != graph.get("sha256"):
+        raise InputError(
+            f"{path}: expected the graph that {DESCRIPTION} describes, found another one (its "
+            "sha256 differs); export again"
+        )
+    return content
+
+
+def open_session(path: Path, content: bytes, providers: Sequence[str]) -> Any:
+    """Open a graph in ONNX Runtime; raise InputError if it cannot be opened.
+
+    Args:
+        path: the path of the graph's file, for messages.
+        content: the content of the file.
+    """
     try:
         import onnxruntime
     except ImportError:
@@ -409,16 +440,18 @@ def _open_session(folder: Path, graph: Mapping[str, Any], providers: Sequence[st
             "expected onnxruntime to run the graphs, found none; pip install onnxruntime"
         ) from None
 
-    path = folder / graph["file"]
-    if not path.is_file():
-        raise InputError(f"{path}: expected a graph of amvnet export, found no file; export again")
     try:
-        session = onnxruntime.InferenceSession(str(path), providers=list(providers))
+        return onnxruntime.InferenceSession(content, providers=list(providers))
     except Exception as error:  # one of a dozen classes without a common base of their own
         raise InputError(
             f"{path}: expected a graph of amvnet export, found: {reason_of(error)}; export again"
         ) from None
 
+
+def _open_graph(folder: Path, graph: Mapping[str, Any], providers: Sequence[str]) -> Any:
+    """Open a graph in ONNX Runtime; raise InputError if it is not the described one."""
+    path = folder / graph["file"]
+    session = open_session(path, read_graph(folder, graph), providers)
     inputs = [(value.name, value.shape) for value in session.get_inputs()]
     expected = [(entry.get("name"), entry.get("shape")) for entry in graph["inputs"]]
     if inputs != expected:

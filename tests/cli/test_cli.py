@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import amvnet
 from amvnet.cli.main import VERBS, main
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.inference.segmenter import Segmenter
 from amvnet.training import run as training_run
 from amvnet.training.plan import Plan
 from amvnet.weights.file import save
@@ -250,7 +250,7 @@ def test_lone_scans_are_segmented_by_name_as_the_segmenter_does(
     assert files(tmp_path) == {"lone.label"}
 
     points = np.fromfile(world / "lone.bin", np.float32).reshape(-1, 4)
-    labels = Segmenter(str(world / "w.safetensors"))(points).labels
+    labels = amvnet.load(str(world / "w.safetensors"))(points).labels
     raw = np.fromfile(tmp_path / "lone.label", np.uint32)
     assert np.array_equal(raw, SEMANTICKITTI.to_raw(labels))
 
@@ -270,7 +270,7 @@ def test_scores_are_both_networks_probabilities_in_half_precision(
     }
 
     points = np.fromfile(world / "data/sequences/08/velodyne/000000.bin", np.float32)
-    result = Segmenter(str(world / "w.safetensors"))(points.reshape(-1, 4))
+    result = amvnet.load(str(world / "w.safetensors"))(points.reshape(-1, 4))
     with np.load(tmp_path / folder / "000000.npz", allow_pickle=False) as arrays:
         assert set(arrays.files) == {"rv", "bev"}
         for name, probabilities in (("rv", result.rv), ("bev", result.bev)):

@@ -13,6 +13,7 @@ import pytest
 import torch
 from matplotlib.image import imread
 
+import amvnet
 from amvnet.config.schema import AssertionConfig, Recipe
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
@@ -21,7 +22,6 @@ from amvnet.evaluation import analysis
 from amvnet.evaluation.analysis import BINS, SWEPT, Analysis, analyze
 from amvnet.evaluation.metrics import confusion, metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
-from amvnet.inference.segmenter import Segmenter
 from amvnet.inference.timing import run_once
 from amvnet.models.methods import arithmetic_mean, maximum
 from amvnet.progress import Say, say_nothing
@@ -78,12 +78,12 @@ def with_tau(weights: Weights, tau: float) -> Weights:
 
 def analyze_08(dataset: Dataset, weights: Weights) -> Analysis:
     """Analyze the validation sequence."""
-    return analyze(dataset, dataset.records(["08"]), Segmenter(weights))
+    return analyze(dataset, dataset.records(["08"]), amvnet.load(weights))
 
 
 def figures_of(dataset: Dataset, weights: Weights) -> tuple[float, dict[str, Any]]:
     """Return the share of uncertain points and AMVNet's figures, scan by scan by the segmenter."""
-    segmenter = Segmenter(weights)
+    segmenter = amvnet.load(weights)
     matrix = np.zeros((K + 1, K + 1), np.int64)
     uncertain = []
     for record in dataset.records(["08"]):
@@ -131,7 +131,7 @@ def test_points_that_no_network_sees_count_as_evaluate_counts_them(
     dataset = open_dataset(f"semantickitti:{tmp_path}")
     records = dataset.records(["08"])
 
-    segmenter = Segmenter(weights)
+    segmenter = amvnet.load(weights)
     analyzed = analyze(dataset, records, segmenter)
     evaluation = analyzed.evaluation
     expected = evaluate(dataset, records, label_by_weights(dataset, segmenter))
@@ -168,11 +168,11 @@ def with_matched_intensities(weights: Weights) -> Weights:
 def test_a_scan_is_timed_as_it_is_segmented(dataset: Dataset, weights: Weights) -> None:
     scan = dataset.read(dataset.records(["08"])[0])
     written: list[np.ndarray] = []
-    matched = Segmenter(with_matched_intensities(weights))
+    matched = amvnet.load(with_matched_intensities(weights))
     run_once(matched, lambda: scan, written.append)
 
     np.testing.assert_array_equal(written[0], matched(scan).labels)
-    assert (written[0] != Segmenter(weights)(scan).labels).any()
+    assert (written[0] != amvnet.load(weights)(scan).labels).any()
 
 
 @pytest.mark.parametrize("are_matched", [False, True])
@@ -187,7 +187,7 @@ def test_every_method_is_scored_as_by_the_segmenter(
         expected[method] = np.zeros((K + 1, K + 1), np.int64)
     for record in dataset.records(["08"]):
         scan = dataset.read(record)
-        result = Segmenter(weights)(scan)
+        result = amvnet.load(weights)(scan)
         assert scan.labels is not None
         assert result.rv is not None
         assert result.bev is not None
@@ -324,7 +324,7 @@ def test_ablate_scores_on_the_gpu_of_its_process(monkeypatch: pytest.MonkeyPatch
     evaluation = SimpleNamespace(matrices={"rv": np.ones((1, 20, 20))})
     monkeypatch.setattr(ablation, "choose_device", lambda name: "cuda")
     monkeypatch.setattr(ablation, "train", lambda plan, stage: plan.out)
-    monkeypatch.setattr(ablation, "Segmenter", lambda path, device, *_: devices.append(device))
+    monkeypatch.setattr(ablation, "load", lambda path, device, *_: devices.append(device))
     monkeypatch.setattr(ablation, "label_by_weights", lambda *_: None)
     monkeypatch.setattr(ablation, "evaluate", lambda *_, **options: evaluation)
 

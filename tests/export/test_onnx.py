@@ -22,10 +22,10 @@ import pytest
 import torch
 from torch import Tensor
 
+import amvnet
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.export import onnx as onnx_export
 from amvnet.export.onnx import describe_export
-from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import BOTH_NETWORKS, MethodName
 from amvnet.models.neighbours import nearest_others
 from amvnet.onnx_runner import OnnxSegmenter, pool
@@ -101,7 +101,7 @@ def make_scan(seed: int, count: int = POINTS) -> Scan:
 @pytest.mark.parametrize("count", [6, 700, POINTS])
 def test_the_runner_says_what_torch_says(exported: Exports, rows: str, count: int) -> None:
     scan = make_scan(count, count)
-    expected = Segmenter(exported[rows].weights)(scan)
+    expected = amvnet.load(exported[rows].weights)(scan)
     assert expected.uncertain.any()
     if count == POINTS:
         assert not expected.uncertain[scan.valid].all()
@@ -121,7 +121,7 @@ def test_the_runner_says_what_torch_says(exported: Exports, rows: str, count: in
 def test_the_networks_alone_say_what_torch_says(exported: Exports, rows: str) -> None:
     scan = make_scan(7)
     valid = scan.valid
-    expected = Segmenter(exported[rows].weights)(scan)
+    expected = amvnet.load(exported[rows].weights)(scan)
     assert scan.ring is not None
     assert expected.rv is not None
     assert expected.bev is not None
@@ -139,7 +139,7 @@ def test_other_methods_say_what_torch_says(
 ) -> None:
     change(folder, "method", to=method)
     scan = make_scan(3)
-    expected = Segmenter(exported["elevation"].weights, method=method)(scan)
+    expected = amvnet.load(exported["elevation"].weights, method=method)(scan)
     actual = OnnxSegmenter(folder)(scan.points)
     assert (expected.labels == actual.labels).mean() >= 0.9999
     assert (expected.uncertain == actual.uncertain).mean() >= 0.9999
@@ -149,7 +149,7 @@ def test_matched_intensities_are_in_the_description(exported: Exports, folder: P
     quantiles = QUANTILES["hdl64e"]
     records = {part: {MATCHED: True, KEY: list(quantiles)} for part in BOTH_NETWORKS}
     weights = replace(exported["elevation"].weights, training=records)
-    description = describe_export(Segmenter(weights), read_description(folder)["graphs"])
+    description = describe_export(weights, "amvnet", read_description(folder)["graphs"])
     assert description["intensity"] == {
         "probabilities": list(PROBABILITIES),
         "quantiles": list(quantiles),
@@ -157,12 +157,12 @@ def test_matched_intensities_are_in_the_description(exported: Exports, folder: P
 
     change(folder, "intensity", to=description["intensity"])
     scan = make_scan(3)
-    expected = Segmenter(weights)(scan)
+    expected = amvnet.load(weights)(scan)
     actual = OnnxSegmenter(folder)(scan.points)
     same = expected.uncertain == actual.uncertain
     assert same.mean() >= 0.9999
     assert np.abs(expected.scores - actual.scores)[same].max() <= 1e-4
-    unmatched = Segmenter(exported["elevation"].weights)(scan)
+    unmatched = amvnet.load(exported["elevation"].weights)(scan)
     assert np.abs(expected.scores - unmatched.scores).max() > 0.001
 
 
@@ -275,7 +275,7 @@ result = OnnxSegmenter({str(exported["elevation"].folder)!r})(np.load({str(point
 np.save({str(labels)!r}, result.labels)
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
-    expected = Segmenter(exported["elevation"].weights)(scan).labels
+    expected = amvnet.load(exported["elevation"].weights)(scan).labels
     assert (np.load(labels) == expected).mean() >= 0.9999
 
 

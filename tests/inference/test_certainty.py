@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from amvnet import Segmenter
+import amvnet
 from amvnet.inference.segmentation import Verdict, uncertain_share
 from amvnet.weights.file import UNCERTAIN, USUAL_UNCERTAIN, Weights, load, save
 
@@ -66,9 +66,9 @@ def test_the_verdict_is_a_line_with_both_shares() -> None:
 def test_labels_of_another_tau_are_not_judged_by_the_share_usual_for_the_weights() -> None:
     weights = with_usual(0.001)
     tau = weights.model.assertion.threshold
-    assert Segmenter(weights, tau=tau)(POINTS).verdict == Segmenter(weights)(POINTS).verdict
+    assert amvnet.load(weights, tau=tau)(POINTS).verdict == amvnet.load(weights)(POINTS).verdict
 
-    verdict = Segmenter(weights, tau=1.0)(POINTS).verdict
+    verdict = amvnet.load(weights, tau=1.0)(POINTS).verdict
     assert verdict is not None
     assert verdict.share == 1
     assert not verdict.is_doubtful
@@ -77,7 +77,7 @@ def test_labels_of_another_tau_are_not_judged_by_the_share_usual_for_the_weights
 
 def test_a_result_has_the_share_of_its_valid_points() -> None:
     points = np.concatenate([POINTS, np.full((100, 4), np.nan, np.float32)])
-    result = Segmenter(with_usual(0.1))(points)
+    result = amvnet.load(with_usual(0.1))(points)
     assert result.verdict is not None
     assert result.verdict.share == result.uncertain[: len(POINTS)].mean()
     assert result.verdict.usual == 0.1
@@ -85,7 +85,7 @@ def test_a_result_has_the_share_of_its_valid_points() -> None:
 
 @pytest.mark.parametrize("method", ["rv", "bev"])
 def test_one_network_has_no_verdict(method: Any) -> None:
-    assert Segmenter(fresh_weights(), method=method)(POINTS).verdict is None
+    assert amvnet.load(fresh_weights(), method=method)(POINTS).verdict is None
 
 
 def test_the_share_is_that_of_the_valid_points() -> None:
@@ -117,7 +117,7 @@ def test_predict_says_the_share_of_the_run(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], at_once: str
 ) -> None:
     weights = with_usual(1.0)
-    segmenter = Segmenter(weights)
+    segmenter = amvnet.load(weights)
     uncertain = [segmenter(street(scan)[0]).uncertain for scan in range(2)]
     verdict = Verdict(float(np.concatenate(uncertain).mean()), 1.0)
 

@@ -15,6 +15,7 @@ import pytest
 import torch
 from rosbags.typesys import Stores, get_typestore
 
+import amvnet
 from amvnet.data.datasets.open import open_dataset, open_with_classes
 from amvnet.data.taxonomy import SEMANTICKITTI
 from amvnet.evaluation.scoring import label_by_weights
@@ -97,7 +98,7 @@ class World:
 
     @cached_property
     def segmenter(self) -> Segmenter:
-        return Segmenter(self.weights)
+        return amvnet.load(self.weights)
 
     def write(self, points: np.ndarray) -> Path:
         path = self.folder / "scan.npy"
@@ -236,7 +237,7 @@ def test_every_entry_gives_a_scan_the_same_labels(saved: World, name: str) -> No
     points = SCANS[name]()
     with no_warnings():
         expected = saved.segmenter(points).labels
-        by_rv = Segmenter(WEIGHTS, method="rv")(points).labels
+        by_rv = amvnet.load(WEIGHTS, method="rv")(points).labels
     lost = expected == 0
     table = points.astype(np.float32)
     is_lost = ~np.isfinite(table).all(axis=1) | (table[:, :3] == 0).all(axis=1)

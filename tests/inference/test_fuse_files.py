@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import amvnet
 from amvnet import fuse
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import load, save
 
 from fixtures.worlds import (
@@ -117,7 +117,7 @@ def test_single_scans_are_fused_and_lost_points_have_no_class(world: Path, tmp_p
     points[7] = np.nan
     points.tofile(tmp_path / "a.bin")
     weights = fresh_weights()
-    result = Segmenter(weights)(points)
+    result = amvnet.load(weights)(points)
 
     for name, probabilities in (("rv", result.rv), ("bev", result.bev)):
         assert probabilities is not None

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import amvnet
 from amvnet.data.formats import find
 from amvnet.data.formats.cloud import Cloud
 from amvnet.inference.journal import Entry
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.predict import ADVICE, report
 from amvnet.inference.reading import array_scan, normaliser_for
-from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
 from amvnet.sensors.measure import MEASURED
@@ -150,7 +150,7 @@ def test_recordings_of_a_run_are_judged_on_the_command_line(
         (tmp_path / name).mkdir()
         table.tofile(tmp_path / name / f"{name}.bin")
         scan = normaliser_for(weights)(Cloud(table[:, :3], table[:, 3], name=name), name)
-        result = Segmenter(weights)(scan)
+        result = amvnet.load(weights)(scan)
         shares[name] = f"{result.uncertain.mean():.1%}"
 
     path = save(weights, tmp_path / "w.safetensors")
@@ -218,7 +218,7 @@ def test_each_file_is_read_once_and_its_format_detected_once(
 def test_every_command_labels_a_normalised_scan_by_its_rows(tmp_path: Path) -> None:
     """Of every fourth laser, rows by elevation or by ring give other labels."""
     weights = weights_for()
-    segmenter = Segmenter(weights)
+    segmenter = amvnet.load(weights)
     points, laser = place(LASERS["os1-64"], 1.0)
     points = points[laser % 4 == 0]
     np.save(tmp_path / "a.npy", points)
@@ -263,8 +263,8 @@ def test_an_array_is_taken_with_any_columns(array: np.ndarray, columns: str | No
     has_ring = array.shape[1] == 5
     np.testing.assert_array_equal(scan.ring, RING if has_ring else None)
 
-    expected = Segmenter(weights_for())(POINTS).labels
-    labels = Segmenter(weights_for())(array, columns=columns).labels
+    expected = amvnet.load(weights_for())(POINTS).labels
+    labels = amvnet.load(weights_for())(array, columns=columns).labels
     np.testing.assert_array_equal(labels, expected)
 
 
@@ -275,7 +275,7 @@ def test_an_array_without_intensity_gets_those_that_the_weights_need_and_a_warni
     np.testing.assert_array_equal(scan.points[:, 3], TRAINED.filler(len(POINTS)))
 
     with pytest.warns(UserWarning, match="no intensity"):
-        labels = Segmenter(weights_for())(POINTS[:, :3]).labels
+        labels = amvnet.load(weights_for())(POINTS[:, :3]).labels
     assert labels.all()
 
 

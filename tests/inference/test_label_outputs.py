@@ -12,11 +12,11 @@ import numpy as np
 import plyfile
 import pytest
 
+import amvnet
 from amvnet.cli.options import FormatName
 from amvnet.data.formats.find import read_cloud
 from amvnet.data.labels.writers import KINDS, write_scan_labels
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
-from amvnet.inference.segmenter import Segmenter
 from amvnet.weights.file import save
 
 from fixtures.scan_writers import some_points, write_bag1, write_pcd
@@ -273,7 +273,7 @@ def test_uncertain_points_are_those_of_the_segmenter(world: Path, tmp_path: Path
     }
 
     points = np.fromfile(world / "data/sequences/08/velodyne/000000.bin", np.float32).reshape(-1, 4)
-    expected = Segmenter(str(world / "w.safetensors"))(points).uncertain
+    expected = amvnet.load(str(world / "w.safetensors"))(points).uncertain
     uncertain = np.load(tmp_path / folder / "000000.uncertain.npy", allow_pickle=False)
     assert uncertain.dtype == bool
     np.testing.assert_array_equal(uncertain, expected)

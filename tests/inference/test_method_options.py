@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amvnet import Segmenter
+import amvnet
 from amvnet.config.schema import AssertionConfig
 from amvnet.weights.file import save
 
@@ -63,7 +63,7 @@ def test_predict_writes_the_labels_of_the_segmenter(world: Path, method: str) ->
     options = f"--weights {world}/w.safetensors --method {method}"
     succeed(f"predict semantickitti:{world} {options} --out {out}")
 
-    segmenter = Segmenter(WEIGHTS, method=method)  # type: ignore[arg-type]
+    segmenter = amvnet.load(WEIGHTS, method=method)  # type: ignore[arg-type]
     for name in ("000000", "000001"):
         points = np.fromfile(world / f"sequences/08/velodyne/{name}.bin", np.float32)
         expected = segmenter(points.reshape(-1, 4)).raw_ids

@@ -15,14 +15,16 @@ import numpy as np
 import pytest
 import torch
 
+import amvnet
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.engines.torch import TorchEngine
 from amvnet.errors import InputError
 from amvnet.files import atomic_write
 from amvnet.inference.journal import JOURNAL, UNFINISHED, Entry, Journal, read_journals
 from amvnet.inference.listing import InputScan
 from amvnet.inference.pipeline import AHEAD, OutputOptions, Pipeline
 from amvnet.inference.predict import segment_by
-from amvnet.inference.segmenter import Segmentation, Segmenter
+from amvnet.inference.segmenter import Segmentation
 from amvnet.scan import Scan
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
@@ -69,7 +71,7 @@ def check_same(a: Path, b: Path) -> None:
 
 def settings_of(world: Path) -> dict[str, object]:
     """Return what the journal of a run on the lone scans holds of its options."""
-    weights = Segmenter(str(world / WEIGHTS)).weights
+    weights = amvnet.load(str(world / WEIGHTS)).weights
     return {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
@@ -160,9 +162,9 @@ def test_a_verb_without_memory_ends_with_one_line(
     def fail(*arguments: object, **options: object) -> None:
         raise error
 
-    monkeypatch.setattr(Segmenter, "__init__", fail)
+    monkeypatch.setattr(TorchEngine, "__init__", fail)
     assert "memory" in refusal(predict(world, tmp_path))
-    monkeypatch.setattr(Segmenter, "__init__", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr(TorchEngine, "__init__", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         run_cli(*predict(world, tmp_path).split())
 
@@ -442,7 +444,7 @@ def test_few_scans_are_in_memory_however_many_there_are(
     scans = counted_scans(30, counter, seconds_to_write=0.02)  # slower than the reading
     pipeline = Pipeline(
         scans,
-        segment_by(Segmenter(str(world / WEIGHTS))),
+        segment_by(amvnet.load(str(world / WEIGHTS))),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
         at_once=at_once,

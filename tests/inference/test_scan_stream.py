@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+import amvnet
 from amvnet.data.datasets.base import Dataset
 from amvnet.data.datasets.open import open_dataset
 from amvnet.errors import InputError
@@ -107,8 +108,8 @@ def test_a_scan_for_each_core_is_computed_if_the_memory_suffices(
 ) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     available = int(gibibytes * GIBIBYTE)
-    monkeypatch.setattr("amvnet.inference.segmenter.available_memory", lambda: available)
-    assert Segmenter(fresh_weights()).at_once == expected
+    monkeypatch.setattr("amvnet.engines.base.available_memory", lambda: available)
+    assert amvnet.load(fresh_weights()).at_once == expected
 
 
 def test_the_available_memory_is_that_of_the_machine_or_of_the_control_group(
@@ -160,7 +161,7 @@ def test_any_number_of_scans_at_a_time_gives_the_same_result(
 ) -> None:
     results = []
     for at_once in (1, 3):
-        segmenter = Segmenter(data / "w.safetensors")
+        segmenter = amvnet.load(data / "w.safetensors")
         segmenter.at_once = at_once
         results.append(command(open_dataset(str(data)), segmenter))
     np.testing.assert_equal(*results)

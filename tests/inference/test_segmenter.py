@@ -29,7 +29,7 @@ METHOD_NAMES: tuple[MethodName, ...] = get_args(MethodName)
 
 @pytest.fixture(scope="module")
 def segmenter() -> Segmenter:
-    return Segmenter(WEIGHTS)
+    return amvnet.load(WEIGHTS)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def result(segmenter: Segmenter) -> Segmentation:
 
 
 def labels_by(method: MethodName, points: np.ndarray = POINTS) -> np.ndarray:
-    return Segmenter(WEIGHTS, method=method)(points).labels
+    return amvnet.load(WEIGHTS, method=method)(points).labels
 
 
 def both_networks(result: Segmentation) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +108,7 @@ def with_lost_returns(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("method", METHOD_NAMES)
 def test_lost_points_stay_in_place_and_change_nothing(method: MethodName) -> None:
-    segmenter = Segmenter(WEIGHTS, method=method)
+    segmenter = amvnet.load(WEIGHTS, method=method)
     points, is_lost = with_lost_returns(POINTS)
     expected = segmenter(POINTS)
     actual = segmenter(points)
@@ -127,7 +127,7 @@ def test_lost_points_stay_in_place_and_change_nothing(method: MethodName) -> Non
 def test_only_the_networks_that_were_asked_have_scores(
     method: MethodName, networks: set[str]
 ) -> None:
-    result = Segmenter(WEIGHTS, method=method)(POINTS)
+    result = amvnet.load(WEIGHTS, method=method)(POINTS)
     assert (result.rv is not None) == ("rv" in networks)
     assert (result.bev is not None) == ("bev" in networks)
 
@@ -177,7 +177,7 @@ def test_a_lone_point_is_segmented(segmenter: Segmenter) -> None:
 @pytest.mark.parametrize("method", METHOD_NAMES)
 def test_a_scan_without_points_is_refused(points: np.ndarray, method: MethodName) -> None:
     with pytest.raises(InputError):
-        Segmenter(WEIGHTS, method=method)(points.astype(np.float32))
+        amvnet.load(WEIGHTS, method=method)(points.astype(np.float32))
 
 
 @pytest.mark.parametrize("shape", [(5,), (5, 2), (4, 100), (1, 5, 4)])
@@ -297,7 +297,7 @@ def test_each_method_has_its_own_scores(result: Segmentation) -> None:
     rv, bev = both_networks(result)
     expected: dict[MethodName, np.ndarray] = {"rv": rv, "bev": bev, "ensemble": np.sqrt(rv * bev)}
     for method, scores in expected.items():
-        actual = Segmenter(WEIGHTS, method=method)(POINTS)
+        actual = amvnet.load(WEIGHTS, method=method)(POINTS)
         assert np.allclose(actual.scores, scores, atol=1e-6)
         assert actual.uncertain.any() == (method == "ensemble")
 
@@ -330,7 +330,7 @@ def test_a_method_includes_those_that_need_no_more_than_its_networks() -> None:
         "bev": ["bev"],
     }
     for method, names in expected.items():
-        segmenter = Segmenter(WEIGHTS, method=method)  # type: ignore[arg-type]
+        segmenter = amvnet.load(WEIGHTS, method=method)  # type: ignore[arg-type]
         labels, _ = labels_by_method(segmenter, Scan(POINTS), METHOD_NAMES)
         assert list(labels) == names
         for name in names:
@@ -347,7 +347,7 @@ def test_prediction_runs_the_model_as_it_is(segmenter: Segmenter, result: Segmen
 @pytest.mark.parametrize(("method", "other"), [("rv", "polar_net"), ("bev", "range_net")])
 def test_by_method_of_one_network_is_that_network(method: MethodName, other: str) -> None:
     one_network = without(WEIGHTS, "point_head", other)
-    labels, uncertain = labels_by_method(Segmenter(one_network, method=method), Scan(POINTS))
+    labels, uncertain = labels_by_method(amvnet.load(one_network, method=method), Scan(POINTS))
     assert list(labels) == [method]
     assert uncertain is None
     assert np.array_equal(labels[method], labels_by(method))
@@ -356,8 +356,8 @@ def test_by_method_of_one_network_is_that_network(method: MethodName, other: str
 def test_weights_without_head_are_an_ensemble_and_no_more() -> None:
     headless = without(WEIGHTS, "point_head")
     with pytest.raises(InputError, match="point_head"):
-        Segmenter(headless)
-    ensemble = Segmenter(headless, method="ensemble")(POINTS)
+        amvnet.load(headless)
+    ensemble = amvnet.load(headless, method="ensemble")(POINTS)
     assert np.array_equal(ensemble.labels, labels_by("ensemble"))
 
 
@@ -366,7 +366,7 @@ def test_weights_without_head_are_an_ensemble_and_no_more() -> None:
 
 def test_weights_may_be_given_as_a_path(tmp_path: Path) -> None:
     path = save(WEIGHTS, tmp_path / "w.safetensors")
-    assert np.array_equal(Segmenter(path)(POINTS).labels, Segmenter(str(path))(POINTS).labels)
+    assert np.array_equal(amvnet.load(path)(POINTS).labels, amvnet.load(str(path))(POINTS).labels)
 
     f = equal_probabilities()
     assert len(fuse(POINTS, f, f, head=path)) == len(POINTS)
@@ -374,29 +374,29 @@ def test_weights_may_be_given_as_a_path(tmp_path: Path) -> None:
 
 def test_an_unknown_method_is_refused() -> None:
     with pytest.raises(InputError):
-        Segmenter(WEIGHTS, method="vote")  # type: ignore[arg-type]
+        amvnet.load(WEIGHTS, method="vote")  # type: ignore[arg-type]
 
 
 def test_tau_is_that_of_the_weights_unless_it_is_given(result: Segmentation) -> None:
-    same = amvnet.Segmenter(WEIGHTS, tau=THRESHOLD)(POINTS)
+    same = amvnet.load(WEIGHTS, tau=THRESHOLD)(POINTS)
     assert np.array_equal(same.scores, result.scores)
 
     shares = []
     for tau in (0.0, 0.5 * THRESHOLD, THRESHOLD, 1.0):
         rv, bev = both_networks(result)
         cosine = (rv * bev).sum(axis=1) / np.linalg.norm(rv, axis=1) / np.linalg.norm(bev, axis=1)
-        actual = Segmenter(WEIGHTS, tau=tau)(POINTS)
+        actual = amvnet.load(WEIGHTS, tau=tau)(POINTS)
         is_clear = np.abs(cosine - tau) > 1e-4
         assert np.array_equal(actual.uncertain[is_clear], (cosine <= tau)[is_clear])
         shares.append(actual.uncertain.mean())
     assert shares == sorted(shares)
     assert shares[-1] == 1
-    assert np.array_equal(Segmenter(WEIGHTS, tau=0)(POINTS).labels, labels_by("ensemble"))
+    assert np.array_equal(amvnet.load(WEIGHTS, tau=0)(POINTS).labels, labels_by("ensemble"))
 
 
 @pytest.mark.parametrize("tau", [-0.1, 1.01, float("nan")])
 def test_a_tau_that_is_no_cosine_of_probabilities_is_refused(tau: float) -> None:
-    fails(lambda: Segmenter(WEIGHTS, tau=tau), "tau", "0 to 1", str(tau))
+    fails(lambda: amvnet.load(WEIGHTS, tau=tau), "tau", "0 to 1", str(tau))
     f = equal_probabilities()
     fails(lambda: fuse(POINTS, f, f, tau=tau), "tau", "0 to 1", str(tau))
 
@@ -404,11 +404,11 @@ def test_a_tau_that_is_no_cosine_of_probabilities_is_refused(tau: float) -> None
 @pytest.mark.parametrize("device", ["abacus", "cuda:99"])
 def test_an_unknown_device_is_refused(device: str) -> None:
     with pytest.raises(InputError):
-        Segmenter(WEIGHTS, device=device)
+        amvnet.load(WEIGHTS, device=device)
 
 
 def test_rows_by_ring_need_a_ring() -> None:
-    segmenter = Segmenter(fresh_weights(NUSCENES))
+    segmenter = amvnet.load(fresh_weights(NUSCENES))
     with pytest.raises(InputError, match="ring"):
         segmenter(POINTS)
     ring = np.arange(len(POINTS)) % 32
@@ -418,7 +418,7 @@ def test_rows_by_ring_need_a_ring() -> None:
 def test_the_rows_of_a_scan_take_precedence_over_its_elevations_and_rings() -> None:
     """By elevation, the lasers of another sensor would be in other rows."""
     for weights in (WEIGHTS, fresh_weights(NUSCENES)):
-        segmenter = Segmenter(weights)
+        segmenter = amvnet.load(weights)
         height = weights.model.range_view.height
         ring = np.random.default_rng(0).integers(0, height, len(POINTS))
         others = np.random.default_rng(1).integers(0, height, len(POINTS))
@@ -433,11 +433,11 @@ def test_the_rows_of_a_scan_take_precedence_over_its_elevations_and_rings() -> N
 def segmenter_by_ring(weights: Weights) -> Segmenter:
     """Return a segmenter whose rows are the rings of the scans."""
     view = replace(weights.model.range_view, rows="ring")
-    return Segmenter(replace(weights, model=replace(weights.model, range_view=view)))
+    return amvnet.load(replace(weights, model=replace(weights.model, range_view=view)))
 
 
 def test_scans_with_rows_and_without_go_through_the_networks_together() -> None:
-    segmenter = Segmenter(WEIGHTS)
+    segmenter = amvnet.load(WEIGHTS)
     height = WEIGHTS.model.range_view.height
     row = np.random.default_rng(0).integers(0, height, len(POINTS))
     scans = [Scan(POINTS), Scan(POINTS, row=row), Scan(POINTS, ring=row)]
@@ -448,7 +448,7 @@ def test_scans_with_rows_and_without_go_through_the_networks_together() -> None:
 def test_rows_of_other_weights_are_refused() -> None:
     row = np.full(len(POINTS), WEIGHTS.model.range_view.height)
     with pytest.raises(InputError, match="rows from 0 to"):
-        Segmenter(WEIGHTS)(Scan(POINTS, row=row))
+        amvnet.load(WEIGHTS)(Scan(POINTS, row=row))
 
 
 # ---- fusion of scores
@@ -547,13 +547,12 @@ def test_every_exported_name_is_there() -> None:
 
 
 PEAK = """
-import sys, numpy as np
-from amvnet import Segmenter
+import sys, amvnet, numpy as np
 from amvnet.runtime.memory import keep_freed_memory
 keep_freed_memory()
 points = np.random.default_rng(0).normal(size=(int(sys.argv[2]), 4)).astype(np.float32) * 10
 points[:, 3] = 0.5
-Segmenter(sys.argv[1])(points)
+amvnet.load(sys.argv[1])(points)
 with open("/proc/self/status") as file:
     status = dict(line.split(":", 1) for line in file)
 print(1024 * int(status["VmHWM"].split()[0]))

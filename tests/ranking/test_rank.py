@@ -13,15 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amvnet import Scan, Segmentation, Segmenter
+import amvnet
+from amvnet import Scan
 from amvnet.data.datasets.base import Dataset, ScanRecord
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.ranking.clusters import CELL, cluster
 from amvnet.ranking.label_errors import NEAR, Doubts, find_clusters, find_doubts, rank
-from amvnet.scan import AnyArray
 from amvnet.weights.file import save
 
+from fixtures.engines import giving, scripted
 from fixtures.worlds import files, fresh_weights, make_streets, run_cli, without
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -80,22 +81,6 @@ def test_no_points_have_no_clusters() -> None:
 # ---- doubts
 
 
-class FixedScores(Segmenter):
-    """A segmenter whose two networks give the probabilities that a test chooses."""
-
-    def __init__(self, rv: np.ndarray, bev: np.ndarray) -> None:
-        super().__init__(WEIGHTS)
-        self.rv = rv.astype(np.float32)
-        self.bev = bev.astype(np.float32)
-
-    def __call__(
-        self, points: AnyArray | Scan | Path | str, columns: str | None = None
-    ) -> Segmentation:
-        labels = self.rv.argmax(axis=1) + 1
-        uncertain = np.zeros(len(labels), bool)
-        return Segmentation(labels, uncertain, scores=self.rv, rv=self.rv, bev=self.bev)
-
-
 def confident(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
     """Return (N, 19) probabilities: `share` for one class, the rest spread over all."""
     return share * np.eye(19)[ids - 1] + (1 - share) / 19
@@ -103,8 +88,15 @@ def confident(ids: np.ndarray, share: float = 0.9) -> np.ndarray:
 
 def doubts_of(points: np.ndarray, rv: np.ndarray, bev: np.ndarray, labels: np.ndarray) -> Doubts:
     """Return the doubts about the labels of a scan for which the two views predict these ids."""
-    segmenter = FixedScores(confident(rv), confident(bev))
-    return find_doubts(Scan(points, labels), segmenter)
+    return doubts_by_scores(points, confident(rv), confident(bev), labels)
+
+
+def doubts_by_scores(points: np.ndarray, f: np.ndarray, g: np.ndarray, ids: np.ndarray) -> Doubts:
+    """Return the doubts about labels for which the two views have probabilities (N, K)."""
+    points = points.copy()
+    points[:, 3] = 0.5
+    scan = Scan(points, ids)
+    return find_doubts(scan, scripted(WEIGHTS, giving(f[scan.valid], g[scan.valid])))
 
 
 def three_things() -> tuple[np.ndarray, np.ndarray]:
@@ -137,7 +129,7 @@ def test_a_doubt_is_the_agreed_class_in_the_less_certain_view_over_the_label_in_
     f = rng.dirichlet(np.full(19, 0.1), 500)
     g = 0.7 * f + 0.3 * rng.dirichlet(np.full(19, 0.1), 500)
 
-    doubts = find_doubts(Scan(points, labels), FixedScores(f, g))
+    doubts = doubts_by_scores(points, f, g, labels)
 
     for index, label in enumerate(labels):
         agreed = np.argmax(f[index] * g[index])
@@ -282,7 +274,7 @@ def test_each_scan_is_read_only_in_its_turn(world: Path, monkeypatch: pytest.Mon
         events.append(done)
 
     monkeypatch.setattr(type(dataset), "read", recorded_read)
-    rank(dataset, dataset.records(["00", "01"]), Segmenter(WEIGHTS), progress)
+    rank(dataset, dataset.records(["00", "01"]), amvnet.load(WEIGHTS), progress)
 
     assert events.count("read") == 4
     assert [event for event in events if event != "read"] == [0, 1, 2, 3, 4]

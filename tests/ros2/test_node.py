@@ -18,7 +18,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.inference.segmenter import Segmenter
+from amvnet.engines.torch import TorchEngine
 from amvnet.weights.file import save
 
 from fixtures.ros import STORE, FakeNode, install, over_the_wire
@@ -221,7 +221,7 @@ def test_an_error_of_the_program_ends_the_node_with_its_traceback(
         raise ZeroDivisionError("of the test")
 
     node = start()
-    monkeypatch.setattr(Segmenter, "run", fail)
+    monkeypatch.setattr(TorchEngine, "score", fail)
     receive, _ = node.callbacks["points"]
     receive(ros_message(scan(0)))
     node._worker._thread.join(WAIT)

@@ -16,9 +16,9 @@ import torch
 from torch import nn
 
 from amvnet.data.taxonomy import SEMANTICKITTI
-from amvnet.models.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.runtime.distributed import Processes
 from amvnet.training.loaders import EpochSampler, ScanSet, make_loader
+from amvnet.training.sync_batch_norm import SyncedBatchNorm, synchronise_batch_norms
 from amvnet.weights.file import Weights, load, save
 
 from fixtures.worlds import files, make_streets, run_cli, without, write_recipe

@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from amvnet.inference.segmenter import Segmenter
+import amvnet
 from amvnet.models import point_head, polar_net
 from amvnet.runtime.threads import WAITING, run_parts
 from amvnet.weights.file import save
@@ -27,12 +27,12 @@ from fixtures.worlds import fresh_weights, street
 FORKING = """
 import multiprocessing, sys
 import numpy as np, torch
-from amvnet.inference.segmenter import Segmenter
+import amvnet
 
 torch.set_num_threads(2)
 points = np.random.default_rng(0).normal(0, 10, (2000, 4)).astype(np.float32)
 points[:, 3] = 0.3
-segmenter = Segmenter(sys.argv[1])
+segmenter = amvnet.load(sys.argv[1])
 labels = segmenter(points).labels
 
 def same(_):
@@ -147,7 +147,7 @@ def test_the_networks_run_side_by_side_if_threads_sleep(
             threads[name] = threading.get_ident()
         return nullcontext()
 
-    segmenter = Segmenter(fresh_weights())
+    segmenter = amvnet.load(fresh_weights())
     segmenter.model.watch = note
     segmenter(street(0)[0])
     assert len(set(threads.values())) == at_once
@@ -171,7 +171,7 @@ def test_a_scan_is_segmented_alike_however_threads_wait(monkeypatch: pytest.Monk
     monkeypatch.setattr(point_head, "PART", 16)
     monkeypatch.setattr(polar_net, "PART", 16)
     points, _ = street(0)
-    segmenter = Segmenter(fresh_weights())
+    segmenter = amvnet.load(fresh_weights())
 
     results = []
     for policy in ("active", "passive"):

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import amvnet
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.formats.cloud import Cloud
 from amvnet.inference.reading import normaliser_for
-from amvnet.inference.segmenter import Segmenter
 from amvnet.scan import Scan
 from amvnet.sensors.intensity import (
     KEY,
@@ -213,7 +213,7 @@ def test_training_measures_the_intensities_that_weights_carry(tmp_path: Path) ->
 
 def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> None:
     points = scan_points()
-    segmenter = Segmenter(weights_with({}))
+    segmenter = amvnet.load(weights_with({}))
     wrong = points * np.array([1, 1, 1, 255], np.float32)
     fails(lambda: segmenter(wrong), "[0, 1]", "divide")
 
@@ -225,7 +225,7 @@ def test_the_segmenter_refuses_intensities_out_of_range_and_clips_outliers() -> 
     assert wild[7, 3] == 300
 
     raw = {"range_net": {KEY: np.linspace(0, 255, 11).tolist()}}
-    assert len(Segmenter(weights_with(raw))(wrong).labels) == len(points)
+    assert len(amvnet.load(weights_with(raw))(wrong).labels) == len(points)
 
 
 BY_SCAN = TrainedIntensity(QUANTILES["hdl64e"], is_matched=True)
@@ -264,7 +264,7 @@ def test_weights_of_simulated_scans_match_each_scan_however_it_is_given() -> Non
     points = scan_points()
     dark = points.copy()
     dark[:, 3] = points[:, 3] ** 2 / 2
-    segmenter = Segmenter(weights)
+    segmenter = amvnet.load(weights)
     expected = segmenter(points)
     darker = segmenter(dark)
     np.testing.assert_allclose(darker.scores, expected.scores, atol=0.02)

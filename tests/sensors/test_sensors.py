@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import amvnet
 from amvnet.cli.main import main
 from amvnet.data.formats.cloud import Cloud
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
 from amvnet.inference.reading import normaliser_for
-from amvnet.inference.segmenter import Segmenter
 from amvnet.models.views.points import PointBatch
 from amvnet.models.views.range_view import RangeView
 from amvnet.scan import Scan
@@ -189,7 +189,7 @@ def test_the_sensor_of_the_training_gets_the_rows_of_the_training() -> None:
     scan = normaliser_for(weights)(make_cloud(points), "a")
     np.testing.assert_array_equal(scan.points, points)
 
-    segmenter = Segmenter(weights)
+    segmenter = amvnet.load(weights)
     result = segmenter(scan)
     expected = segmenter(points)
     np.testing.assert_array_equal(result.labels, expected.labels)
@@ -515,7 +515,7 @@ def test_scans_of_datasets_are_not_normalised(tmp_path: Path) -> None:
     assert run_cli("predict", data, *options, "--out", tmp_path / "out")[0] == 0
 
     labels = np.fromfile(tmp_path / "out/sequences/00/predictions/000000.label", np.uint32)
-    expected = Segmenter(str(weights))(points).labels
+    expected = amvnet.load(str(weights))(points).labels
     np.testing.assert_array_equal(labels, SEMANTICKITTI.to_raw(expected))
     assert labels[3] == 0
     assert np.delete(expected, 3).all()

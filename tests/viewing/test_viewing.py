@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import amvnet
 from amvnet.data.datasets.nuscenes import NuScenes
 from amvnet.data.datasets.open import open_dataset
 from amvnet.data.datasets.semantickitti import SemanticKitti
 from amvnet.data.palette import WRONG, class_colors
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.evaluation.scoring import labels_by_method
-from amvnet.inference.segmenter import Segmenter
 from amvnet.viewing import page as pages
 from amvnet.viewing.shown_scans import RIGHT, ShownScan
 from amvnet.weights.file import save
@@ -107,7 +107,7 @@ def test_every_scan_is_in_the_page_as_it_is(world: Path, dataset: SemanticKitti)
 
 def test_the_page_has_the_labels_of_every_method(world: Path, dataset: SemanticKitti) -> None:
     page = read_page(world / "p.html")
-    segmenter = Segmenter(world / "w.safetensors")
+    segmenter = amvnet.load(world / "w.safetensors")
     for index, record in enumerate(dataset.records(dataset.sequences("all"))):
         _, planes = page.scan(index)
         labels, uncertain = labels_by_method(segmenter, dataset.read(record))
@@ -120,7 +120,7 @@ def test_the_page_has_the_labels_of_every_method(world: Path, dataset: SemanticK
 def test_the_page_has_the_probabilities_of_every_method(
     world: Path, dataset: SemanticKitti
 ) -> None:
-    segmentation = Segmenter(world / "w.safetensors")(dataset.read(dataset.records(["00"])[0]))
+    segmentation = amvnet.load(world / "w.safetensors")(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
     bev = segmentation.bev
     assert rv is not None
@@ -156,7 +156,7 @@ def test_the_table_of_the_page_is_that_of_evaluate(world: Path, tmp_path: Path) 
 
 
 def test_disagreement_is_one_minus_the_cosine(world: Path, dataset: SemanticKitti) -> None:
-    segmenter = Segmenter(world / "w.safetensors")
+    segmenter = amvnet.load(world / "w.safetensors")
     segmentation = segmenter(dataset.read(dataset.records(["00"])[0]))
     rv = segmentation.rv
     bev = segmentation.bev

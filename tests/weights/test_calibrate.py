@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from amvnet.inference.segmenter import Segmenter
+import amvnet
 from amvnet.scan import Scan
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks/calibrate.py"
@@ -33,8 +33,8 @@ def test_the_ensemble_weighs_the_networks_and_their_labels_stay(
 ) -> None:
     path = calibrated(tmp_path, np.ones(19), "--prior", "0", "--bev", "0.7")
     scan = random_scan(2000)
-    before = Segmenter(WEIGHTS, method="ensemble")(scan)
-    after = Segmenter(path, method="ensemble")(scan)
+    before = amvnet.load(WEIGHTS, method="ensemble")(scan)
+    after = amvnet.load(path, method="ensemble")(scan)
     assert before.rv is not None
     assert before.bev is not None
     assert after.rv is not None
@@ -54,12 +54,12 @@ def test_rare_classes_are_named_less_often(
     tmp_path: Path, random_scan: Callable[..., Scan]
 ) -> None:
     scan = random_scan(2000)
-    before = Segmenter(WEIGHTS, method="rv")(scan).labels
+    before = amvnet.load(WEIGHTS, method="rv")(scan).labels
     named = np.bincount(before, minlength=20)[1:]
     rare = int(named.argmax())
     counts = np.full(19, 1e6)
     counts[rare] = 1e3
 
     path = calibrated(tmp_path, counts, "--prior", "0.5", "--bev", "0.5")
-    after = Segmenter(path, method="rv")(scan).labels
+    after = amvnet.load(path, method="rv")(scan).labels
     assert (after == rare + 1).sum() < 0.9 * named[rare]

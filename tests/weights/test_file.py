@@ -17,11 +17,12 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+import amvnet
 import amvnet.weights
 from amvnet.config.nested import to_dict
 from amvnet.data.taxonomy import NUSCENES, SEMANTICKITTI
 from amvnet.errors import InputError
-from amvnet.inference.segmenter import Segmentation, Segmenter
+from amvnet.inference.segmenter import Segmentation
 from amvnet.weights.file import PARTS, Weights, load, save
 
 from fixtures.worlds import fresh_weights, street, without
@@ -40,11 +41,11 @@ def path(weights: Weights, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def segment(weights: Weights | str) -> Segmentation:
-    return Segmenter(weights)(POINTS)
+    return amvnet.load(weights)(POINTS)
 
 
 def ensemble_scores(weights: Weights) -> np.ndarray:
-    return Segmenter(weights, method="ensemble")(POINTS).scores
+    return amvnet.load(weights, method="ensemble")(POINTS).scores
 
 
 def assert_same_tensors(first: Mapping[str, Tensor], second: Mapping[str, Tensor]) -> None:

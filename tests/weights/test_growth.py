@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from amvnet import Segmenter
+import amvnet
 from amvnet.models.layers import ResidualBlock
 from amvnet.weights.growth import deepened
 
@@ -28,8 +28,8 @@ def test_a_deeper_network_begins_as_the_shallower_one() -> None:
 
     # Only the leak of the added activations differs.
     points, _ = street(0)
-    before = Segmenter(weights, method="rv")(points).scores
-    after = Segmenter(deeper, method="rv")(points).scores
+    before = amvnet.load(weights, method="rv")(points).scores
+    after = amvnet.load(deeper, method="rv")(points).scores
     np.testing.assert_allclose(after, before, atol=0.05)
     assert (after.argmax(axis=1) == before.argmax(axis=1)).mean() > 0.95
 

@@ -62,7 +62,7 @@ def test_pushed_weights_can_be_loaded(hub: Hub) -> None:
     folder = hub.root / "somebody/streets"
     assert sorted(path.name for path in folder.iterdir()) == ["README.md", "model.safetensors"]
 
-    pushed = amvnet.Segmenter(fresh_weights())
+    pushed = amvnet.load(fresh_weights())
     loaded = amvnet.load(NAME)
     assert np.array_equal(loaded(POINTS).labels, pushed(POINTS).labels)
 

@@ -106,12 +106,12 @@ class CloudSegmenter:
             device=settings.device,
             method=settings.method,  # type: ignore[arg-type]  # checked there
             precision=settings.precision,  # type: ignore[arg-type]
-            engine=settings.engine,
+            engine=settings.engine,  # type: ignore[arg-type]
         )
         if segmenter.device == "cpu":
             keep_freed_memory()
         self.taxonomy = segmenter.taxonomy
-        self.hardware = segmenter.hardware
+        self.hardware = segmenter.engine.hardware
         self.usual_uncertain = segmenter.weights.usual_uncertain
         self._topic = topic
         self._normalise = normaliser_for(segmenter.weights, sensor, say)

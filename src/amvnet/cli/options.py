@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from amvnet.inference.listing import ScanOptions
     from amvnet.inference.request import LabellingRequest
     from amvnet.inference.scores import ScorePair
+    from amvnet.inference.segmenter import Segmenter
     from amvnet.runtime.distributed import Processes
     from amvnet.sensors.lidars import Sensor
     from amvnet.weights.file import Weights
@@ -236,6 +237,32 @@ class ScoresChoice:
             ScoreFolder("a", self.scores_a, self.logits in ("a", "both")),
             ScoreFolder("b", self.scores_b, self.logits in ("b", "both")),
         )
+
+
+def load_segmenter(
+    weights: Weights | str, method: MethodName, compute: Compute, tau: float | None = None
+) -> Segmenter:
+    """Return what `amvnet.load` does, for a command, and say what it computes on.
+
+    On a CPU, the process keeps the memory that it frees.
+    """
+    from amvnet import load
+    from amvnet.runtime.memory import keep_freed_memory
+
+    segmenter = load(
+        weights,
+        compute.device,
+        method,
+        compute.precision,
+        compute.engine,
+        tau=tau,
+        say=say,
+    )
+    if compute.at_once is not None:
+        segmenter.at_once = compute.at_once
+    if segmenter.device == "cpu":
+        keep_freed_memory()
+    return segmenter
 
 
 def join_processes(cuda: bool = False) -> Processes:

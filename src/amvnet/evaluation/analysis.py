@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +16,7 @@ from amvnet.evaluation.metrics import Evaluation, metrics
 from amvnet.evaluation.scoring import stream_labelled
 from amvnet.inference.segmentation import expand_labels, expand_to_scan
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.amvnet import replace_uncertain
 from amvnet.models.assertion import Disagreement, cosine_similarity
 from amvnet.models.methods import METHODS
 from amvnet.progress import Progress, no_progress
@@ -110,24 +110,25 @@ def analyze(
 def _analyze_scan(scan: Scan, segmenter: Segmenter, assertion: Disagreement) -> Analysis:
     """Score a scan by every method, and by the head wherever some tau asks for it."""
 
-    def is_asked(f: Tensor, g: Tensor, points: Tensor) -> Tensor:
-        return (_bins(f, g) < SWEPT) | assertion(f, g, points)
-
-    model = copy.copy(segmenter.model)
-    model.assertion = is_asked
     batch = segmenter.batch([scan])
-    scores = model(batch)
-
-    # Every method's labels, and the head's wherever it was asked.
+    scores = segmenter.engine.score(batch)
     f = scores.rv
     g = scores.bev
+    assert f is not None
+    assert g is not None
+
+    # Every method's labels, and the head's wherever some tau asks for it.
     ids = {"rv": expand_labels(f, scan.valid), "bev": expand_labels(g, scan.valid)}
     for name, method in METHODS.items():
         if method.ensemble is not None:
             ids[name] = expand_labels(method.ensemble(f, g), scan.valid)
-    head = expand_labels(scores.merged, scan.valid)
-    uncertain = expand_to_scan(assertion(f, g, batch.points), scan.valid)
-    ids["amvnet"] = np.where(uncertain, head, ids["ensemble"])
+    ids["amvnet"] = expand_labels(scores.merged, scan.valid)
+    uncertain = expand_to_scan(scores.uncertain, scan.valid)
+
+    more = (_bins(f, g) < SWEPT) & ~scores.uncertain
+    h = segmenter.model.refine(batch, f, g, more)
+    assert h is not None
+    head = expand_labels(replace_uncertain(scores.merged, more, h), scan.valid)
 
     # The networks agree on points that they do not see (id 0), whatever tau is.
     bins = np.where(scan.valid, expand_to_scan(_bins(f, g), scan.valid), BINS - 1)

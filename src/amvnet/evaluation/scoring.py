@@ -152,7 +152,7 @@ def labels_by_method(
     are not included are left out. The networks run once.
     """
     batch = segmenter.batch([scan])
-    scores = segmenter.run(batch)
+    scores = segmenter.engine.score(batch)
 
     labels = {}
     for name in methods:

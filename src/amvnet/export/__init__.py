@@ -1,1 +1,1 @@
-"""Networks for other runtimes: ONNX, int8 and engines."""
+"""Networks for other runtimes: ONNX and int8 graphs, and the cache of the engines."""

@@ -17,10 +17,10 @@ from amvnet.errors import InputError
 from amvnet.export.onnx_files import digest, quiet, strip
 from amvnet.inference.listing import list_inputs
 from amvnet.inference.reading import normaliser_for
-from amvnet.inference.segmenter import Segmenter
-from amvnet.onnx_runner import OnnxSegmenter
+from amvnet.onnx_runner import OnnxSegmenter, open_session
 from amvnet.scan import Scan
-from amvnet.sensors.intensity import match_scan
+from amvnet.sensors.intensity import match_scan, trained_intensity
+from amvnet.weights.file import Weights
 
 SIMULATED = "simulated"  # the name of simulated streets, seen by the weights' sensor
 SEED = 20_261_121  # of these streets, far from the seeds of any training
@@ -32,17 +32,17 @@ LEAST_AGREEMENT = 0.9  # of labels before and after; far less than a good calibr
 FIRST_KEPT = {"range_net": True, "polar_map": False}
 
 
-def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
+def calibration_scans(text: str, weights: Weights) -> list[Scan]:
     """Read scans of a dataset, scan files or folders of them, or simulate streets.
 
     Raises:
         InputError: if there are none, one is broken, or the weights' sensor cannot be simulated.
     """
     if text != SIMULATED:
-        return _read(text, segmenter)
+        return _read(text, weights)
     from amvnet.data.datasets.simulated import SENSORS, simulate
 
-    sensor = segmenter.weights.sensor
+    sensor = weights.sensor
     if sensor not in SENSORS:
         raise InputError(
             f"expected weights of {' or '.join(SENSORS)} to simulate for, found {sensor!r}; "
@@ -50,7 +50,7 @@ def calibration_scans(text: str, segmenter: Segmenter) -> list[Scan]:
         )
     with TemporaryDirectory() as folder:
         simulate(folder, sensor=sensor, sequences=SCANS, scans=1, seed=SEED)
-        return _read(folder, segmenter)
+        return _read(folder, weights)
 
 
 def quantise(
@@ -82,7 +82,8 @@ def quantise(
         path = folder / f"{name}.onnx"
         _write(path, recorder.recorded.pop(name))
 
-        agreement = float((_labels(OnnxSegmenter(folder), name, checking) == expected).mean())
+        recorder.replace(name, path)
+        agreement = float((_labels(recorder, name, checking) == expected).mean())
         if agreement < LEAST_AGREEMENT:
             raise InputError(
                 f"{name}: expected {LEAST_AGREEMENT:.0%} of the labels to stay in int8, "
@@ -98,6 +99,10 @@ class _Recorder(OnnxSegmenter):
         super().__init__(folder)
         self.recorded: dict[str, list[dict[str, np.ndarray]]] = {name: [] for name in FIRST_KEPT}
 
+    def replace(self, name: str, path: Path) -> None:
+        """Run the graph of another file, which the description in the folder does not know yet."""
+        self._graphs[name] = open_session(path, path.read_bytes(), ["CPUExecutionProvider"])
+
     def _run(self, name: str, *inputs: np.ndarray) -> np.ndarray:
         if name in self.recorded:
             input_name = self.description["graphs"][name]["inputs"][0]["name"]
@@ -105,15 +110,16 @@ class _Recorder(OnnxSegmenter):
         return super()._run(name, *inputs)
 
 
-def _read(text: str, segmenter: Segmenter) -> list[Scan]:
+def _read(text: str, weights: Weights) -> list[Scan]:
     """Read up to `SCANS` scans, evenly spaced, as the networks take them in `predict`."""
-    normaliser = normaliser_for(segmenter.weights)
-    inputs, _ = list_inputs([text], taxonomy=segmenter.taxonomy, normaliser=normaliser)
+    normaliser = normaliser_for(weights)
+    inputs, _ = list_inputs([text], taxonomy=weights.taxonomy, normaliser=normaliser)
+    intensity = trained_intensity(weights.training, weights.sensor)
     scans = []
     for scan_input in evenly_spaced(inputs, SCANS):
         scan = scan_input.load().scan
         if scan.valid.any():
-            scans.append(match_scan(scan, segmenter.intensity))
+            scans.append(match_scan(scan, intensity))
 
     if not scans:
         raise InputError(

@@ -16,21 +16,22 @@ import torch
 from torch import Tensor, nn
 
 from amvnet.config.nested import to_dict
+from amvnet.config.schema import ModelConfig
+from amvnet.engines.base import build_model
 from amvnet.errors import InputError, import_optional
 from amvnet.export.int8 import FIRST_KEPT, calibration_scans, quantise
 from amvnet.export.onnx_files import digest, quiet, strip
 from amvnet.files import atomic_write, make_folder, publish
 from amvnet.inference.reading import expectation_of
-from amvnet.inference.segmenter import Segmenter
 from amvnet.models.amvnet import AMVNet
-from amvnet.models.methods import widest_method
+from amvnet.models.methods import MethodName, check_method, widest_method
 from amvnet.models.point_head import head_features, point_table
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.views.points import PointBatch
 from amvnet.onnx_runner import DESCRIPTION, FORMAT, GRAPHS
 from amvnet.progress import Progress, no_progress
 from amvnet.scan import FARTHEST, Scan
-from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity
+from amvnet.sensors.intensity import PROBABILITIES, TrainedIntensity, trained_intensity
 from amvnet.sensors.lasers import MEASURES
 from amvnet.sensors.lidars import SENSORS
 from amvnet.sensors.normalise import Expectation
@@ -104,8 +105,8 @@ def export(
     """
     check_libraries()
     loaded = weights if isinstance(weights, Weights) else load(weights)
-    segmenter = Segmenter(loaded, "cpu", widest_method(loaded.parts), "float32")
-    scans = [] if int8 is None else calibration_scans(int8, segmenter)
+    method = check_method(widest_method(loaded.parts), loaded.parts)
+    scans = [] if int8 is None else calibration_scans(int8, loaded)
 
     # Write everything into a temporary folder first.
     out = Path(out)
@@ -113,7 +114,7 @@ def export(
     temporary = out / f".{uuid.uuid4().hex}.part"
     temporary.mkdir()
     try:
-        description = _write_all(segmenter, scans, temporary, progress)
+        description = _write_all(loaded, method, scans, temporary, progress)
         # After an interruption, the old description must not describe new graphs.
         (out / DESCRIPTION).unlink(missing_ok=True)
         graphs: dict[str, dict[str, Any]] = description["graphs"]
@@ -133,19 +134,23 @@ def possible_files(out: Path) -> list[Path]:
 
 
 def _write_all(
-    segmenter: Segmenter, scans: Sequence[Scan], folder: Path, progress: Progress
+    weights: Weights,
+    method: MethodName,
+    scans: Sequence[Scan],
+    folder: Path,
+    progress: Progress,
 ) -> dict[str, Any]:
-    """Write the graphs, with convolutions in int8 if there are scans; describe them."""
+    """Write the graphs of a method, with convolutions in int8 if there are scans; describe them."""
     written: dict[str, dict[str, Any]] = {}
     with torch.no_grad():
-        graphs = _graphs(segmenter)
+        graphs = _graphs(weights, method)
         convolutions = [name for name in graphs if scans and name in FIRST_KEPT]
         total = len(graphs) + len(convolutions)
         for name, graph in graphs.items():
             progress(len(written), total)
             written[name] = _write(graph, name, folder / f"{name}.onnx")
 
-    description = describe_export(segmenter, written)
+    description = describe_export(weights, method, written)
     _save(description, folder / DESCRIPTION)  # the calibration runs the graphs with it
     progress(len(graphs), total)
 
@@ -166,10 +171,11 @@ def check_libraries() -> None:
         import_optional(name, "export")
 
 
-def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, Any]:
+def describe_export(weights: Weights, method: MethodName, graphs: dict[str, Any]) -> dict[str, Any]:
     """Return everything that a program needs to use the graphs, for JSON."""
-    model = segmenter.weights.model
-    taxonomy = segmenter.taxonomy
+    model = weights.model
+    taxonomy = weights.taxonomy
+    trained = trained_intensity(weights.training, weights.sensor)
     classes = []
     rows = zip(("ignored", *taxonomy.classes), taxonomy.train_to_raw, taxonomy.colors, strict=True)
     for train_id, (name, raw, color) in enumerate(rows):
@@ -178,15 +184,15 @@ def describe_export(segmenter: Segmenter, graphs: dict[str, Any]) -> dict[str, A
     description = {
         "format": FORMAT,
         "made_by": f"amvnet {version('amvnet')}, torch {torch.__version__}",
-        "method": segmenter.method,
-        "sensor": segmenter.weights.sensor,
+        "method": method,
+        "sensor": weights.sensor,
         "points": {
             "columns": ["x", "y", "z", "intensity"],
             "farthest": FARTHEST,
-            "intensity": _intensity_range(segmenter.intensity),
+            "intensity": _intensity_range(trained),
         },
-        "intensity": _describe_intensity(segmenter.intensity),
-        "normalise": describe_expectation(expectation_of(segmenter.weights)),
+        "intensity": _describe_intensity(trained),
+        "normalise": describe_expectation(expectation_of(weights)),
         "range_view": to_dict(model.range_view),
         "range_channels": ["x", "y", "z", "intensity", "range", "mask"],
         "polar_view": to_dict(model.polar_view),
@@ -243,21 +249,21 @@ def describe_expectation(expected: Expectation) -> dict[str, Any]:
     }
 
 
-def _graphs(segmenter: Segmenter) -> dict[str, Graph]:
+def _graphs(weights: Weights, method: MethodName) -> dict[str, Graph]:
     """Return the graphs of a method, with example inputs from an artificial scan."""
-    model = segmenter.model.requires_grad_(False)
-    classes = segmenter.taxonomy.size
-    batch = _artificial_scan(segmenter)
+    model = build_model(weights, method).requires_grad_(False)
+    classes = weights.taxonomy.size
+    batch = _artificial_scan(weights.model)
 
     graphs = {}
-    if segmenter.method != "bev":
+    if method != "bev":
         image = model.range_view.project(batch).image.contiguous()
         graphs["range_net"] = Graph(model.range_net, {"image": image}, "scores", _probabilities)
-    if segmenter.method != "rv":
+    if method != "rv":
         graphs |= _polar_graphs(model, batch, classes)
-    if model.point_head is not None and segmenter.method == "amvnet":
+    if model.point_head is not None and method == "amvnet":
         graphs["point_head"] = _head_graph(model, batch, classes)
-    assert tuple(graphs) == GRAPHS[segmenter.method]
+    assert tuple(graphs) == GRAPHS[method]
     return graphs
 
 
@@ -300,10 +306,9 @@ def _head_graph(model: AMVNet, batch: PointBatch, classes: int) -> Graph:
     return Graph(head, {"point": point, "rows": rows}, "scores", _probabilities)
 
 
-def _artificial_scan(segmenter: Segmenter) -> PointBatch:
+def _artificial_scan(model: ModelConfig) -> PointBatch:
     """Return random points all around the sensor, inside and outside the views, with rings."""
     rng = np.random.default_rng(0)
-    model = segmenter.weights.model
     view = model.polar_view
     azimuth = rng.uniform(-np.pi, np.pi, POINTS)
     distance = rng.uniform(1, 1.2 * view.radius_max, POINTS)

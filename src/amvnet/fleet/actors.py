@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from amvnet import load
 from amvnet.config.bounds import Checked, Count
 from amvnet.data.class_maps import ClassMap
 from amvnet.data.formats.cloud import Cloud
@@ -30,7 +31,6 @@ from amvnet.data.formats.rows import UNKNOWN, RowLayout
 from amvnet.data.labels.writers import check_kind
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
-from amvnet.export.engines import make_segmenter
 from amvnet.fleet.manifest import split_name
 from amvnet.fleet.results import describe_drive, parse_estimate
 from amvnet.fleet.storage import Place
@@ -43,6 +43,7 @@ from amvnet.inference.segmentation import Segmentation, uncertain_share
 from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import Compute, MethodName, check_method, check_two_networks
 from amvnet.progress import Say, say_nothing
+from amvnet.runtime.memory import keep_freed_memory
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import Weights
 
@@ -161,9 +162,18 @@ class LabelScans:
 
     def __init__(self, labelling: Labelling) -> None:
         self.labelling = labelling
-        self._segmenter = make_segmenter(
-            labelling.weights, labelling.method, labelling.compute, labelling.tau
+        self._segmenter = load(
+            labelling.weights,
+            labelling.compute.device,
+            labelling.method,
+            labelling.compute.precision,
+            labelling.compute.engine,
+            tau=labelling.tau,
         )
+        if labelling.compute.at_once is not None:
+            self._segmenter.at_once = labelling.compute.at_once
+        if self._segmenter.device == "cpu":
+            keep_freed_memory()
         self._schema = results_schema(labelling.taxonomy)
         self._out = Place.of(labelling.out)
         self._worker = f"{socket.gethostname()}:{os.getpid()}"

@@ -63,7 +63,7 @@ def predict(
             output, or a file of the user would be replaced; at the end, if every scan is broken.
         SomeBroken: at the end, if some of several scans are broken.
     """
-    request = replace(request, precision=segmenter.precision)  # not "auto"
+    request = replace(request, precision=segmenter.engine.precision)  # not "auto"
     classes = request.classes
     normaliser = normaliser_for(request.weights, request.sensor, say)
     options = ScanOptions(sequences, split, request.topic, request.layout)

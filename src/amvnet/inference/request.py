@@ -33,7 +33,7 @@ class LabellingRequest(Checked):
 
     Attributes:
         weights: trained weights.
-        method, tau, precision: as `Segmenter` takes them.
+        method, tau, precision: as `amvnet.load` takes them.
         engine: what runs the networks.
         sensor: what is known of the sensor of scan files; the rest is measured.
         layout: what the columns of files without names hold.

@@ -1,4 +1,4 @@
-"""Points in, labels out: a NumPy interface to the torch model."""
+"""Points in, labels out: a NumPy interface to an engine."""
 
 from __future__ import annotations
 
@@ -7,101 +7,45 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from amvnet.data.laser_order import with_lasers
 from amvnet.data.taxonomy import Taxonomy
+from amvnet.engines.base import Engine
 from amvnet.errors import InputError
 from amvnet.inference.listing import InputScan, ScanOptions, list_inputs
 from amvnet.inference.reading import checked_scan, normaliser_for
 from amvnet.inference.segmentation import Origin, Segmentation, fetch, unpack
-from amvnet.models.amvnet import AMVNet, Scores
-from amvnet.models.assertion import Disagreement
-from amvnet.models.graphs import Captured
-from amvnet.models.layers import freeze
-from amvnet.models.methods import METHODS, MethodName, Precision, check_method
-from amvnet.models.polar_net import PolarNet
-from amvnet.models.precision import InPrecision, check_device, choose_device, choose_precision
-from amvnet.models.streams import TwoStreams, side_by_side
+from amvnet.models.amvnet import AMVNet
+from amvnet.models.methods import MethodName
 from amvnet.models.views.points import PointBatch
-from amvnet.models.voting import vote
-from amvnet.runtime.memory import available_memory, return_freed_memory
-from amvnet.runtime.threads import survive_forks
+from amvnet.runtime.memory import return_freed_memory
 from amvnet.scan import AnyArray, Scan
 from amvnet.sensors.intensity import prepare, trained_intensity
-from amvnet.weights.file import Weights, load
+from amvnet.weights.file import Weights
 
-SCAN_BYTES = 2**30  # that a scan may take; one of 120,000 points takes half, at the paper's size
 LARGE = 1_000_000  # points; memory freed by larger scans is returned: no other scan could use it
 
 
 class Segmenter:
-    """Segments scans with trained weights.
+    """Segments scans with trained weights; `amvnet.load` makes one.
 
     Args:
-        weights: trained weights, or the name or path of a weights file.
-        device: where to compute: "cpu", "cuda", "cuda:1", ..., or "auto": "cuda" if there is one,
-            else "cpu".
-        method: "amvnet", or for comparison "rv" or "bev" (one network), "rv-knn" (the range view
-            with `models.voting`), "ensemble" (geometric mean), "arithmetic" or "maximum".
-        precision: of the two networks: "float32", "bfloat16", on a GPU "float16", or "auto":
-            bfloat16 on a GPU that has it, else float32. Everything else is computed in float32, the
-            projections in float64.
-        tau: points whose class probabilities by the two networks have a cosine similarity of at
-            most this are uncertain, in [0, 1]; None means as the weights say.
-        graphs: on a GPU, capture the networks as CUDA graphs (`models.graphs`), once for each
-            number of scans in a batch.
+        weights: trained weights.
+        engine: scores points by the networks of these weights.
 
     Attributes:
-        weights, device, method, precision, tau: as given, the weights as `Weights`; device and
-            precision are never "auto", but what it stands for.
-        at_once: scans to segment at the same time, each with its share of torch's threads: by
-            default on a CPU, one for each thread, if the memory suffices.
-        intensity: the intensities of the training, to which those of a scan may be brought
-            (`sensors.intensity.match_scan`); None if unknown.
-        model: the networks and the head, on the device.
-
-    Raises:
-        InputError: if the weights lack a part that the method needs, or there is no such method,
-            device or precision, or tau is out of range.
+        weights, engine: as given.
+        at_once: scans to segment at the same time, each with its share of torch's threads; by
+            default as the engine suggests.
+        intensity: the intensities of the training, to which the intensities of a scan may be
+            brought (`sensors.intensity.match_scan`); None if unknown.
     """
 
-    def __init__(
-        self,
-        weights: Weights | Path | str,
-        device: str = "auto",
-        method: MethodName = "amvnet",
-        precision: Precision = "auto",
-        tau: float | None = None,
-        graphs: bool = True,
-    ) -> None:
-        self.weights = weights if isinstance(weights, Weights) else load(weights)
-        self.method = check_method(method, self.weights.parts)
-        self.tau = tau
-        self.device = check_device(choose_device(device))
-        self.precision = choose_precision(precision, self.device)
+    def __init__(self, weights: Weights, engine: Engine) -> None:
+        self.weights = weights
+        self.engine = engine
+        self.at_once = engine.at_once
 
-        self.engine = "torch"
-        self.at_once = 1
-        if self.device == "cpu":
-            self.at_once = max(min(torch.get_num_threads(), available_memory() // SCAN_BYTES), 1)
-
-        self.intensity = trained_intensity(self.weights.training, self.weights.sensor)
-
-        survive_forks()
-
-        self.model: AMVNet = self.weights.build().to(self.device)
-        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        freeze(self.model)
-        _set_up_networks(self.model, self.device, self.precision, graphs)
-
-        if tau is not None:
-            self.model.assertion = Disagreement(tau)
-        ensemble = METHODS[method].ensemble
-        if ensemble is not None:
-            self.model.ensemble = ensemble
-            self.model.point_head = None
+        self.intensity = trained_intensity(weights.training, weights.sensor)
 
     @property
     def taxonomy(self) -> Taxonomy:
@@ -109,19 +53,28 @@ class Segmenter:
         return self.weights.taxonomy
 
     @property
-    def hardware(self) -> str:
-        """The device in words, with the name of a GPU."""
-        if not _is_gpu(self.device):
-            return self.device
-        return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
+    def method(self) -> MethodName:
+        """The method of the labels, one of `METHODS`."""
+        return self.engine.method
+
+    @property
+    def device(self) -> str:
+        """Where the points are: "cpu", "cuda", "cuda:1", ..."""
+        return self.engine.device
+
+    @property
+    def model(self) -> AMVNet:
+        """The method in torch, with the networks as the engine runs them."""
+        return self.engine.model
 
     @property
     def usual_uncertain(self) -> float | None:
         """The share of uncertain points in the validation; None for another tau."""
-        return self.weights.usual_uncertain_at(self.tau)
+        return self.weights.usual_uncertain_at(self.engine.tau)
 
     def __repr__(self) -> str:
-        return f"<Segmenter {self.method} on {self.device}, {self.precision}: {self.weights!r}>"
+        engine = self.engine
+        return f"<Segmenter {self.method} on {self.device}, {engine.precision}: {self.weights!r}>"
 
     def __call__(
         self, points: AnyArray | Scan | Path | str, columns: str | None = None
@@ -170,7 +123,7 @@ class Segmenter:
         is_large = sum(map(len, scans)) >= LARGE
         with return_freed_memory() if is_large else nullcontext():
             batch = self.batch(scans)
-            labels, scores = fetch(self.run(batch))
+            labels, scores = fetch(self.engine.score(batch))
 
         results = []
         for scan, points in zip(scans, batch.slices(), strict=True):
@@ -219,21 +172,6 @@ class Segmenter:
         )
         return replace(result, origin=origin)
 
-    @torch.inference_mode()
-    def run(self, batch: PointBatch) -> Scores:
-        """Score the points of a batch by the method of this segmenter."""
-        model = self.model
-        if METHODS[self.method].has_two_networks:
-            return model(batch)
-        if self.method == "bev":
-            g = model.score_polar(model.polar_view.project(batch))
-            return Scores(g, _nowhere(g), rv=None, bev=g)
-
-        image = model.range_view.project(batch)
-        f = model.score_range(image)
-        y = vote(f, batch, image) if self.method == "rv-knn" else f
-        return Scores(y, _nowhere(y), rv=f, bev=None)
-
     def batch(self, scans: Sequence[Scan]) -> PointBatch:
         """Return the valid points of some scans on the device, as the networks take them.
 
@@ -249,27 +187,3 @@ class Segmenter:
                 scan = with_lasers(scan, self.weights.model.range_view.lasers)
             prepared.append(prepare(scan, self.intensity))
         return PointBatch.of(prepared, self.device)
-
-
-def _is_gpu(device: str) -> bool:
-    return torch.device(device).type == "cuda"
-
-
-def _set_up_networks(model: AMVNet, device: str, precision: Precision, graphs: bool) -> None:
-    """Let the two networks compute in a precision, and at the same time if that is faster."""
-    if _is_gpu(device):
-        model.arrange = TwoStreams(device)
-    elif device == "cpu":
-        model.arrange = side_by_side
-    if _is_gpu(device) and graphs:
-        assert isinstance(model.polar_net, PolarNet)
-        model.range_net = Captured(model.range_net)
-        model.polar_net.run_unet = Captured(model.polar_net.unet)
-    if precision != "float32" or _is_gpu(device):
-        model.range_net = InPrecision(model.range_net, device, precision)
-        model.polar_net = InPrecision(model.polar_net, device, precision)
-
-
-def _nowhere(scores: Tensor) -> Tensor:
-    """Return (P,) uncertain points of a single network: none."""
-    return torch.zeros(len(scores), dtype=torch.bool, device=scores.device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -15,8 +14,8 @@ import torch
 
 from amvnet.inference.segmentation import label_ids
 from amvnet.inference.segmenter import Segmenter
+from amvnet.models.amvnet import AMVNet, Watch, one_after_the_other
 from amvnet.models.methods import geometric_mean
-from amvnet.models.streams import one_after_the_other
 from amvnet.progress import Progress, no_progress
 from amvnet.runtime.memory import peak_memory
 from amvnet.scan import Scan
@@ -70,26 +69,37 @@ def run_once(segmenter: Segmenter, read: Read, write: Write) -> Timing:
         write: writes its (P,) train ids.
     """
     clock = _Clock(segmenter.device)
-    model = copy.copy(segmenter.model)
-    model.watch = clock
-    model.arrange = one_after_the_other
-
     with clock("read"):
         scan = read()
     with clock("project"):
         batch = segmenter.batch([scan])
 
-    scores = model(batch)
+    with _watched(segmenter.model, clock):
+        scores = segmenter.engine.score(batch)
 
     with clock("merge"):
         labels = label_ids(scores.merged).cpu().numpy()
     with clock("write"):
         write(labels)
 
+    assert scores.rv is not None
+    assert scores.bev is not None
     with clock(MEAN):
         label_ids(geometric_mean(scores.rv, scores.bev)).cpu()
 
     return Timing(dict(clock.seconds), len(labels), int(scores.uncertain.sum()))
+
+
+@contextmanager
+def _watched(model: AMVNet, watch: Watch) -> Iterator[None]:
+    """Let a model run its steps one after the other, each watched."""
+    before = model.watch, model.arrange
+    model.watch = watch
+    model.arrange = one_after_the_other
+    try:
+        yield
+    finally:
+        model.watch, model.arrange = before
 
 
 class _Clock:
@@ -119,8 +129,8 @@ def _report(segmenter: Segmenter, timings: Sequence[Timing]) -> dict[str, Any]:
     is_gpu = torch.device(device).type == "cuda"
     memory = torch.cuda.max_memory_allocated(device) if is_gpu else peak_memory()
     return {
-        "engine": segmenter.engine,
-        "precision": segmenter.precision,
+        "engine": segmenter.engine.name,
+        "precision": segmenter.engine.precision,
         "device": device,
         "threads": torch.get_num_threads(),
         "runs": len(timings),

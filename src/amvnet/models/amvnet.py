@@ -15,13 +15,20 @@ from amvnet.models.methods import Ensemble, geometric_mean
 from amvnet.models.point_head import PointHead, nearest_neighbours
 from amvnet.models.polar_net import PolarNet
 from amvnet.models.range_net import RangeNet
-from amvnet.models.streams import Arrangement, one_after_the_other
 from amvnet.models.views.points import PointBatch, concatenate
 from amvnet.models.views.polar_view import PolarGrid, PolarView
 from amvnet.models.views.range_view import RangeImage, RangeView
 
 # Takes the name of a step and returns the context in which the step runs.
 Watch = Callable[[str], AbstractContextManager[Any]]
+Score = Callable[[], Tensor]  # runs one network; returns (P, K)
+# Runs the networks of the range view and of the bird's-eye view, and returns f and g.
+Arrangement = Callable[[Score, Score], tuple[Tensor, Tensor]]
+
+
+def one_after_the_other(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
+    """Run the range view's network first, then the bird's-eye view's."""
+    return score_range(), score_polar()
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -41,13 +40,15 @@ class PolarNet(nn.Module):
         self.drop = DropBlock(config.dropblock, config.dropblock_size)
         self.scores = nn.Conv2d(widths[0], vertical * classes, 1)
 
-        # The captured or exported equivalent of the U-Net; None uses the method.
-        self.run_unet: Callable[[Tensor], Tensor] | None = None
-
     def forward(self, grid: PolarGrid) -> Tensor:
-        pillars = self.compress(self.pool(grid))  # (F, pillar)
-        run_unet = self.unet if self.run_unet is None else self.run_unet
-        decoded = run_unet(grid.to_map(pillars))  # (B, widths[0], R, A)
+        return self.decode(grid, self.unet(self.encode(grid)))
+
+    def encode(self, grid: PolarGrid) -> Tensor:
+        """Return the map of the pillars' features, (B, pillar, R, A)."""
+        return grid.to_map(self.compress(self.pool(grid)))
+
+    def decode(self, grid: PolarGrid, decoded: Tensor) -> Tensor:
+        """Return the logits (M, Z * K), given the map of the U-Net (B, widths[0], R, A)."""
         # Most pillars are empty, and have no point to score.
         return self.score(grid.at_pillars(decoded))
 

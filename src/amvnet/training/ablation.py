@@ -6,13 +6,13 @@ import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from amvnet import load
 from amvnet.config.schema import ModelConfig, Recipe
+from amvnet.engines.precision import choose_device
 from amvnet.evaluation.analysis import SweptRow, swept_row
 from amvnet.evaluation.metrics import metrics
 from amvnet.evaluation.scoring import evaluate, label_by_weights
-from amvnet.inference.segmenter import Segmenter
 from amvnet.models.methods import BOTH_NETWORKS
-from amvnet.models.precision import choose_device
 from amvnet.training.plan import Plan
 from amvnet.training.run import train
 from amvnet.weights.file import Weights
@@ -41,7 +41,7 @@ def sweep_heads(
         recipe = dataclasses.replace(plan.recipe, model=model)
         head_plan = dataclasses.replace(plan, recipe=recipe, out=plan.out / f"{value:g}")
 
-        segmenter = Segmenter(train(head_plan, "head", networks), device)
+        segmenter = load(train(head_plan, "head", networks), device)
         evaluation = evaluate(dataset, plan.scans.val, label_by_weights(dataset, segmenter))
         uncertain = evaluation.uncertain / max(evaluation.asked, 1)
         yield swept_row(value, uncertain, evaluation.matrices["amvnet"][0], dataset.taxonomy)
@@ -85,7 +85,7 @@ def ablate(plan: Plan, device: str = "cpu") -> Iterator[tuple[bool, bool, dict[s
         recipe = _ablated(plan.recipe, gru, weighted)
         path = train(dataclasses.replace(plan, recipe=recipe, out=plan.out / name), "rv")
 
-        segmenter = Segmenter(path, plan.processes.device(choose_device(device)), "rv")
+        segmenter = load(path, plan.processes.device(choose_device(device)), "rv")
         scans = plan.scans
         evaluation = evaluate(
             scans.dataset,

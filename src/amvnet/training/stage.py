@@ -28,7 +28,6 @@ from amvnet.config.schema import HeadTraining, NetworkTraining, TrainingConfig
 from amvnet.data.taxonomy import Taxonomy
 from amvnet.errors import InputError
 from amvnet.evaluation.metrics import metrics
-from amvnet.models.sync_batch_norm import synchronise_batch_norms
 from amvnet.models.views.points import PointBatch
 from amvnet.progress import Say, say_nothing
 from amvnet.runtime.distributed import ALONE, Processes, device_of, environment
@@ -37,6 +36,7 @@ from amvnet.sensors.intensity import TrainedIntensity
 from amvnet.training.callbacks import AverageWeights, EpochLines, KeepWeights, SeedBatches
 from amvnet.training.plan import Plan
 from amvnet.training.run_folder import LAST
+from amvnet.training.sync_batch_norm import synchronise_batch_norms
 from amvnet.weights.file import Weights
 
 MOMENTUM_CYCLE = 0.1  # the one-cycle schedule lowers the momentum by this much

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import LabelledChoice
+from amvnet.cli.options import LabelledChoice, load_segmenter
 from amvnet.config.bounds import Range, Share
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute
@@ -48,7 +48,6 @@ def analyze(
     from amvnet.data.datasets.select import TrainingScans
     from amvnet.evaluation import charts
     from amvnet.evaluation.analysis import analyze as analyze_records
-    from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.training.ablation import sweep_heads, with_neighbours, with_tau
@@ -62,7 +61,7 @@ def analyze(
         )
     loaded = load(weights)
     dataset = open_for_weights(data, loaded)
-    segmenter = make_segmenter(loaded, "amvnet", compute, say=say)
+    segmenter = load_segmenter(loaded, "amvnet", compute)
     records = choice.records(dataset)
 
     # Before any scan is scored, so that no time is wasted if the study cannot be made.

@@ -6,8 +6,8 @@ from json import dumps
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from amvnet.cli.console import progress, say, show
-from amvnet.cli.options import WEIGHTS
+from amvnet.cli.console import progress, show
+from amvnet.cli.options import WEIGHTS, load_segmenter
 from amvnet.config.bounds import Count, Share
 from amvnet.models.methods import Compute
 
@@ -35,12 +35,10 @@ def bench(
     from amvnet.data.datasets.simulated import simulate
     from amvnet.data.formats.find import read_cloud
     from amvnet.data.labels.ids import write_ids
-    from amvnet.export.engines import make_segmenter
     from amvnet.files import atomic_write
     from amvnet.inference.timing import time_runs
-    from amvnet.weights.file import load
 
-    segmenter = make_segmenter(load(weights), "amvnet", compute, tau, say)
+    segmenter = load_segmenter(weights, "amvnet", compute, tau)
 
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)

@@ -21,13 +21,13 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
         seed: of the streets; the default gives streets the built-in weights were not trained on.
         weights: a weights file, or the name of a built-in one.
     """
+    from amvnet import load
     from amvnet.data.datasets.simulated import simulate
     from amvnet.inference.listing import list_inputs
-    from amvnet.inference.segmenter import Segmenter
     from amvnet.viewing.page import write_page
     from amvnet.viewing.shown_scans import show_scans
 
-    segmenter = Segmenter(weights)
+    segmenter = load(weights)
     data = out / "data"
     with progress("simulating") as step:
         simulate(data, sequences=SEQUENCES, scans=SCANS, seed=seed, progress=step)

@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from amvnet.cli.console import progress, say, show
-from amvnet.cli.options import LabelledChoice, join_processes
+from amvnet.cli.console import progress, show
+from amvnet.cli.options import LabelledChoice, join_processes, load_segmenter
 from amvnet.config.bounds import Share
 from amvnet.errors import InputError
 from amvnet.models.methods import PAPER_METHODS, Compute, MethodName, widest_method
@@ -49,12 +49,11 @@ def evaluate(
     """
     from amvnet.data.class_maps import class_map
     from amvnet.data.datasets.open import open_dataset, open_with_classes
+    from amvnet.engines.precision import choose_device
     from amvnet.evaluation.scoring import evaluate as evaluate_records
     from amvnet.evaluation.scoring import label_by_weights, label_from_files
-    from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
     from amvnet.inference.reading import normalised_for
-    from amvnet.models.precision import choose_device
     from amvnet.weights.file import load
 
     processes = join_processes()
@@ -68,7 +67,7 @@ def evaluate(
         parts = [part for part in loaded.parts if part != "point_head" or "amvnet" in methods]
         device = processes.device(choose_device(compute.device, compute.engine))
         compute = replace(compute, device=device)
-        segmenter = make_segmenter(loaded, widest_method(parts), compute, tau, say)
+        segmenter = load_segmenter(loaded, widest_method(parts), compute, tau)
         labeller = label_by_weights(dataset, segmenter, methods, mapping)
     elif predictions is not None and weights is None:
         if tau is not None:

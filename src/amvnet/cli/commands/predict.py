@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice
+from amvnet.cli.options import LabelChoice, ScanChoice, SensorChoice, load_segmenter
 from amvnet.config.bounds import Count
 from amvnet.errors import InputError, import_optional
 from amvnet.models.methods import Compute
@@ -84,14 +84,13 @@ def predict(
         say(f"{counted(written, 'label file')} in {out}; the table of results is in {out}/results")
         return
 
-    from amvnet.export.engines import make_segmenter
     from amvnet.inference.predict import predict as predict_inputs
 
     for text in (*inputs, out):
         if "://" in text:
             raise InputError(f"{text}: expected a path, found a URL; say --ray to use it")
     request = labels.parse(load(weights), choice, known, compute)
-    segmenter = make_segmenter(request.weights, request.method, compute, request.tau, say)
+    segmenter = load_segmenter(request.weights, request.method, compute, request.tau)
 
     with progress("segmenting") as step:
         written = predict_inputs(

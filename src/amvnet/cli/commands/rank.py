@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import LabelledChoice
+from amvnet.cli.options import LabelledChoice, load_segmenter
 from amvnet.models.methods import Compute
 from amvnet.progress import counted
 
@@ -29,7 +29,6 @@ def rank(
         compute: where and how the networks are computed.
         overwrite: replace the table if it exists.
     """
-    from amvnet.export.engines import make_segmenter
     from amvnet.files import check_free, make_folder
     from amvnet.inference.reading import open_for_weights
     from amvnet.ranking.label_errors import rank as rank_records
@@ -42,7 +41,7 @@ def rank(
     loaded = load(weights)
     dataset = open_for_weights(data, loaded)
     records = choice.records(dataset, "all")
-    segmenter = make_segmenter(loaded, "ensemble", compute, say=say)
+    segmenter = load_segmenter(loaded, "ensemble", compute)
 
     with progress("scoring") as step:
         clusters = rank_records(dataset, records, segmenter, step)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from amvnet.cli.console import progress, say
-from amvnet.cli.options import ScanChoice, SensorChoice
+from amvnet.cli.options import ScanChoice, SensorChoice, load_segmenter
 from amvnet.errors import InputError
 from amvnet.models.methods import Compute, widest_method
 from amvnet.progress import counted
@@ -41,7 +41,6 @@ def view(
     """
     from amvnet.data.spacing import evenly_spaced
     from amvnet.data.taxonomy import TAXONOMIES
-    from amvnet.export.engines import make_segmenter
     from amvnet.files import make_folder
     from amvnet.inference.listing import list_inputs
     from amvnet.inference.reading import normaliser_for
@@ -69,7 +68,7 @@ def view(
     normaliser = Normaliser(None, sensor, say)
     if weights is not None:
         loaded = load(weights)
-        segmenter = make_segmenter(loaded, widest_method(loaded.parts), compute, say=say)
+        segmenter = load_segmenter(loaded, widest_method(loaded.parts), compute)
         classes = segmenter.taxonomy
         normaliser = normaliser_for(loaded, sensor, say)
 

@@ -1,24 +1,12 @@
-"""How the two networks run: one after the other, or at the same time."""
+"""The two networks at the same time, on the threads of a CPU or the streams of a GPU."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from amvnet.models.amvnet import Score
 from amvnet.runtime.threads import run_parts
-
-Score = Callable[[], Tensor]  # runs one network; returns (P, K)
-
-
-# Runs the networks of the range view and of the bird's-eye view, and returns f and g.
-Arrangement = Callable[[Score, Score], tuple[Tensor, Tensor]]
-
-
-def one_after_the_other(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:
-    """Run the range view's network first, then the bird's-eye view's."""
-    return score_range(), score_polar()
 
 
 def side_by_side(score_range: Score, score_polar: Score) -> tuple[Tensor, Tensor]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +18,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
+import amvnet
 from amvnet import Scan, Segmenter, load, simulate
 from amvnet import read as read_scan
 from amvnet.data.taxonomy import SEMANTICKITTI
+from amvnet.engines.precision import InPrecision, choose_device, choose_precision
+from amvnet.engines.streams import TwoStreams
 from amvnet.inference.journal import Entry, Journal
 from amvnet.inference.listing import ScanOptions
 from amvnet.inference.pipeline import AHEAD, OutputOptions, Pipeline
@@ -30,20 +34,20 @@ from amvnet.models.assertion import Disagreement
 from amvnet.models.methods import Precision
 from amvnet.models.neighbours import nearest_others
 from amvnet.models.neighbours_gpu import nearest_others_by_blocks, split_into_blocks
-from amvnet.models.precision import InPrecision, choose_device, choose_precision
-from amvnet.models.streams import TwoStreams
 from amvnet.models.views.points import PointBatch
 from amvnet.sensors.lidars import Sensor
 from amvnet.weights.file import save
 
 from fixtures.counted_scans import Counter, counted_scans
+from fixtures.engines import ScriptedEngine, sure_of
 from fixtures.networks import whole_model
 from fixtures.worlds import commands_of, fails, files, fresh_weights, make_streets, run_cli, street
 
 N = 15
+no_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 DEVICES = [
     "cpu",
-    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")),
+    pytest.param("cuda", marks=[pytest.mark.gpu, no_gpu]),
 ]
 
 
@@ -265,8 +269,8 @@ def test_the_merge_of_a_gpu_is_that_of_a_cpu(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_bfloat16_gives_the_labels_of_float32_on_nearly_all_points(simulated_scan: Scan) -> None:
-    exact = Segmenter("sim-hdl64e")(simulated_scan)
-    lower = Segmenter("sim-hdl64e", precision="bfloat16")(simulated_scan)
+    exact = amvnet.load("sim-hdl64e")(simulated_scan)
+    lower = amvnet.load("sim-hdl64e", precision="bfloat16")(simulated_scan)
 
     for name in ("scores", "rv", "bev"):
         assert getattr(lower, name).dtype == np.float32
@@ -349,7 +353,7 @@ def test_on_a_cpu_auto_is_float32_on_the_cpu_and_the_commands_say_so(
     if torch.cuda.is_available():
         pytest.skip("there is a GPU")
     segmenter = load(str(world / "w.safetensors"))
-    assert (segmenter.device, segmenter.precision) == ("cpu", "float32")
+    assert (segmenter.device, segmenter.engine.precision) == ("cpu", "float32")
 
     arguments = ("predict", world / "data", "--weights", world / "w.safetensors")
     assert run_cli(*arguments, "--out", tmp_path) == (0, "")
@@ -359,7 +363,7 @@ def test_on_a_cpu_auto_is_float32_on_the_cpu_and_the_commands_say_so(
 @pytest.mark.parametrize("precision", ["float16", "float64", ""])
 def test_a_precision_that_a_cpu_lacks_is_refused(precision: Any) -> None:
     weights = fresh_weights()
-    fails(lambda: Segmenter(weights, "cpu", precision=precision), "expected", precision)
+    fails(lambda: amvnet.load(weights, "cpu", precision=precision), "expected", precision)
 
 
 class Launches(TorchDispatchMode):
@@ -418,7 +422,7 @@ def test_a_batch_knows_its_scans_without_looking_at_the_points() -> None:
 
 
 def test_several_scans_at_a_time_are_segmented_as_each_alone() -> None:
-    segmenter = Segmenter(fresh_weights())
+    segmenter = amvnet.load(fresh_weights())
     scans = street_scans(300, 350, 400)
     scans[1].points[[0, 9]] = np.nan
 
@@ -489,13 +493,13 @@ def test_an_interrupted_run_goes_on_with_another_batch_but_not_with_other_labels
     assert run_cli(*arguments) == (0, "")
     names = files(tmp_path)
 
-    segmenter = Segmenter(world / "w.safetensors")
+    segmenter = amvnet.load(world / "w.safetensors")
     weights = segmenter.weights
     settings = {
         "weights": {part: weights.digest(part) for part in weights.parts},
         "method": "amvnet",
         "precision": "float32",
-        "tau": segmenter.tau,
+        "tau": segmenter.engine.tau,
         "sensor": repr(Sensor()),
         "layout": repr(ScanOptions().layout),
         "scores": False,
@@ -521,21 +525,15 @@ def test_a_batch_of_no_scans_is_refused(world: Path, tmp_path: Path, batch: int)
 
 
 def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    sizes = []
-    many = Segmenter.many
-
-    def counted(self: Segmenter, scans: list[Scan]) -> object:
-        sizes.append(len(scans))
-        return many(self, scans)
-
-    monkeypatch.setattr(Segmenter, "many", counted)
+    weights = fresh_weights()
+    engine = ScriptedEngine(weights, sure_of(weights.taxonomy.size))
     counter = Counter()
     scans = counted_scans(23, counter)
     pipeline = Pipeline(
         scans,
-        segment_by(Segmenter(fresh_weights())),
+        segment_by(Segmenter(weights, engine)),
         OutputOptions(tmp_path),
         SEMANTICKITTI,
         batch=4,
@@ -543,7 +541,7 @@ def test_batches_of_scans_go_through_the_networks_together_and_few_are_in_memory
     results = list(pipeline.stream(scans, pipeline.write_or_explain))
     done = [result.scan for result in results if isinstance(result, Entry)]
     assert done == [f"{seed}.npz" for seed in range(23)]
-    assert sizes == [4, 4, 4, 4, 4, 3]
+    assert [batch.count for batch in engine.batches] == [4, 4, 4, 4, 4, 3]
     assert counter.most <= 2 * 4 + AHEAD + 2
     assert not counter.in_memory
 
@@ -587,12 +585,30 @@ def test_the_commands_of_the_page_run(
     assert process.stdout.count("|---") > 10
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.gpu
+@no_gpu
 @pytest.mark.parametrize("precision", ["float32", "bfloat16", "float16"])
 def test_a_gpu_gives_the_labels_of_a_cpu(simulated_scan: Scan, precision: str) -> None:
-    expected = Segmenter("sim-hdl64e")(simulated_scan)
-    segmenter = Segmenter("sim-hdl64e", "cuda", precision=precision)  # type: ignore[arg-type]
+    expected = amvnet.load("sim-hdl64e")(simulated_scan)
+    segmenter = amvnet.load("sim-hdl64e", "cuda", precision=precision)  # type: ignore[arg-type]
     least = 0.999 if precision == "float32" else 0.98
 
     for segmentation in segmenter.many([simulated_scan, simulated_scan]):
         assert (segmentation.labels == expected.labels).mean() > least
+
+
+@pytest.mark.gpu
+@no_gpu
+def test_graphs_on_a_gpu_are_captured_and_give_the_scores_without_them(
+    simulated_scan: Scan,
+) -> None:
+    """A warning says that the check has turned the graphs off: here it is an error."""
+    other = Scan(simulated_scan.points[::2])
+    expected_segmenter = amvnet.load("sim-hdl64e", "cuda", graphs=False)
+    segmenter = amvnet.load("sim-hdl64e", "cuda")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        for scans in ([simulated_scan], [other], [simulated_scan, other], [other]):
+            expected = expected_segmenter.many(scans)
+            for actual, right in zip(segmenter.many(scans), expected, strict=True):
+                assert (actual.labels == right.labels).mean() > 0.99

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -16,17 +17,21 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from amvnet.inference import segmenter as segmenter_module
-from amvnet.inference.segmenter import Segmenter
+from amvnet.engines import torch as torch_engine
+from amvnet.engines.graphs import MOST_SHAPES, WARM_UP, Captured, GraphCheck
+from amvnet.engines.precision import InPrecision
+from amvnet.engines.torch import TorchEngine
 from amvnet.models import upsampled_conv
-from amvnet.models.amvnet import AMVNet
-from amvnet.models.graphs import MOST_SHAPES, WARM_UP, Captured
+from amvnet.models.amvnet import Scores, one_after_the_other
 from amvnet.models.layers import freeze
 from amvnet.models.polar_net import PolarNet
-from amvnet.models.precision import InPrecision
+from amvnet.models.views.points import PointBatch
+from amvnet.scan import Scan
 
 from fixtures.networks import POLAR_NET, K, build_range
-from fixtures.worlds import fresh_weights
+from fixtures.worlds import fresh_weights, street
+
+WEIGHTS = fresh_weights()
 
 
 class Unet(nn.Module):
@@ -225,7 +230,7 @@ def test_a_network_is_captured_once_for_each_shape_and_replayed(
 ) -> None:
     net = build().eval()
     counted = Counted(net)
-    network = Captured(counted)
+    network = Captured(counted, GraphCheck())
     with torch.inference_mode():
         inputs = [torch.randn(count, *shape) for count in (1, 2, 1, 2, 1)]
         outputs = [network(x) for x in inputs]
@@ -238,31 +243,9 @@ def test_a_network_is_captured_once_for_each_shape_and_replayed(
     assert counted.count == 2 * (WARM_UP + 1)
 
 
-def test_a_network_that_cannot_be_captured_is_computed_as_it_is_with_one_warning(
-    cuda: list[Recording], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(graph: Recording, **options: object) -> object:
-        raise RuntimeError("operation not permitted when stream is capturing\nmore")
-
-    monkeypatch.setattr(torch.cuda, "graph", fail)
-    net = nn.Linear(3, 2)
-    network = Captured(net)
-    x = torch.randn(4, 3)
-    with torch.inference_mode():
-        with pytest.warns(RuntimeWarning, match=r"\(operation not permitted .* capturing\)"):
-            first = network(x)
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            second = network(x)
-            other_shape = network(x[:2])
-        assert torch.equal(first, net(x))
-        assert torch.equal(second, net(x))
-        assert torch.equal(other_shape, net(x[:2]))
-
-
 def test_gradients_and_further_shapes_are_not_captured(cuda: list[Recording]) -> None:
     net = nn.Linear(3, 2)
-    network = Captured(net)
+    network = Captured(net, GraphCheck())
     network(torch.randn(4, 3)).sum().backward()
     assert net.weight.grad is not None
     assert not cuda
@@ -276,7 +259,7 @@ def test_gradients_and_further_shapes_are_not_captured(cuda: list[Recording]) ->
 
 def test_another_precision_of_products_is_captured_apart(cuda: list[Recording]) -> None:
     """What a graph computes is settled when it is captured."""
-    network = Captured(nn.Linear(3, 2))
+    network = Captured(nn.Linear(3, 2), GraphCheck())
     before = torch.get_float32_matmul_precision()
     try:
         with torch.inference_mode():
@@ -288,25 +271,135 @@ def test_another_precision_of_products_is_captured_apart(cuda: list[Recording]) 
     assert len(cuda) == 2
 
 
-def set_up(graphs_wanted: bool, monkeypatch: pytest.MonkeyPatch) -> AMVNet:
-    """Return a model with its networks set up as for a GPU."""
-    model = Segmenter(fresh_weights()).model
-    monkeypatch.setattr(segmenter_module, "TwoStreams", lambda device: None)
-    segmenter_module._set_up_networks(model, "cuda", "bfloat16", graphs_wanted)
-    return model
+# ---- the check at the start
 
 
-def test_a_segmenter_on_a_gpu_captures_both_networks_unless_told_not_to(
+@pytest.fixture
+def engine_on_gpu(
+    cuda: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., TorchEngine]:
+    """Return a function that makes an engine as for a GPU, which computes on the CPU."""
+
+    def make(graphs: bool = True) -> TorchEngine:
+        with monkeypatch.context() as patch:
+            patch.setattr(torch_engine, "check_device", lambda name: "cpu")
+            patch.setattr(torch_engine, "is_gpu", lambda device: True)
+            patch.setattr(torch_engine, "TwoStreams", lambda device: one_after_the_other)
+            return TorchEngine(WEIGHTS, precision="float32", graphs=graphs)
+
+    return make
+
+
+def batch_of(*seeds: int) -> PointBatch:
+    return PointBatch.of([Scan(street(seed, 300)[0]) for seed in seeds])
+
+
+def check_scores(engine: TorchEngine, batch: PointBatch) -> None:
+    """Check that an engine scores a batch as torch on a CPU does."""
+    expected = TorchEngine(WEIGHTS).score(batch)
+    torch.testing.assert_close(engine.score(batch).merged, expected.merged)
+
+
+def test_an_engine_on_a_gpu_captures_both_networks_unless_told_not_to(
+    cuda: list[Recording], engine_on_gpu: Callable[..., TorchEngine]
+) -> None:
+    check_scores(engine_on_gpu(graphs=False), batch_of(0))
+    assert not cuda
+
+    engine = engine_on_gpu()
+    assert isinstance(engine.model.range_net, InPrecision)
+    assert isinstance(engine.model.polar_net, InPrecision)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for seed in range(3):
+            check_scores(engine, batch_of(seed))
+    assert len(cuda) == 2
+
+
+def test_the_first_batch_of_each_size_is_also_scored_without_graphs(
+    cuda: list[Recording], engine_on_gpu: Callable[..., TorchEngine]
+) -> None:
+    engine = engine_on_gpu()
+    runs: list[bool] = []
+
+    def watch(step: str) -> contextlib.nullcontext[None]:
+        runs.append(step == "RV")
+        return contextlib.nullcontext()
+
+    engine.model.watch = watch
+    for seeds, expected in (((0,), 2), ((1,), 1), ((0, 1), 2), ((1, 2), 1), ((3,), 1)):
+        runs.clear()
+        engine.score(batch_of(*seeds))
+        assert sum(runs) == expected, seeds
+    assert len(cuda) == 4  # two networks, two sizes
+
+
+def wrong_output(graph: Recording) -> None:
+    """Replay a graph, and change what it has computed."""
+    Recording.replay(graph)
+    _, _, _, result = graph.calls[-1]
+    result.copy_(result.flip(1))
+
+
+def nothing(graph: Recording) -> None:
+    """Leave the outputs as the capture had them: the input is not taken."""
+
+
+def not_a_number(graph: Recording) -> None:
+    _, _, _, result = graph.calls[-1]
+    result.fill_(torch.nan)
+
+
+@pytest.mark.parametrize("replay", [wrong_output, nothing, not_a_number])
+def test_graphs_that_give_other_scores_are_turned_off_with_one_warning(
+    replay: Callable[[Recording], None],
+    cuda: list[Recording],
+    engine_on_gpu: Callable[..., TorchEngine],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    model = set_up(True, monkeypatch)
-    assert isinstance(model.range_net, InPrecision)
-    assert isinstance(model.polar_net, InPrecision)
-    assert isinstance(model.range_net.net, Captured)
-    assert isinstance(model.polar_net.net.run_unet, Captured)
+    class Broken(Recording):
+        def replay(self) -> None:
+            replay(self)
 
-    model = set_up(False, monkeypatch)
-    assert isinstance(model.range_net, InPrecision)
-    assert isinstance(model.polar_net, InPrecision)
-    assert not isinstance(model.range_net.net, Captured)
-    assert model.polar_net.net.run_unet is None
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", Broken)
+    engine = engine_on_gpu()
+    with pytest.warns(RuntimeWarning, match="differ .* graphs=False") as caught:
+        check_scores(engine, batch_of(0))
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_scores(engine, batch_of(1))
+        check_scores(engine, batch_of(0, 1))
+    assert len(cuda) == 2
+
+
+def test_networks_that_cannot_be_captured_run_without_graphs_with_one_warning(
+    engine_on_gpu: Callable[..., TorchEngine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(graph: Recording, **options: object) -> object:
+        raise RuntimeError("operation not permitted when stream is capturing\nmore")
+
+    engine = engine_on_gpu()
+    monkeypatch.setattr(torch.cuda, "graph", fail)
+    with pytest.warns(RuntimeWarning, match=r"\(operation not .* capturing\)") as caught:
+        check_scores(engine, batch_of(0))
+    assert len(caught) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_scores(engine, batch_of(0, 1))
+
+
+def test_scores_that_differ_by_rounding_do_not_turn_graphs_off() -> None:
+    generator = torch.Generator().manual_seed(0)
+    f = torch.rand(5000, K, generator=generator).softmax(dim=1)
+    scores = Scores(f, f[:, 0] > 2, f, f)
+    rounded = f.bfloat16().float()
+    for few, is_passed in ((0, True), (4, True), (6, False)):
+        other = rounded.clone()
+        other[:few] = 1 - other[:few]
+        answers = iter([replace(scores, rv=other), scores])
+        check = GraphCheck()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            check.score(lambda batch, answers=answers: next(answers), batch_of(0))  # type: ignore[misc]
+        assert check.is_passed == is_passed

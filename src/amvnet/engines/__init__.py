@@ -1,0 +1,1 @@
+"""What runs the two networks: torch or ONNX Runtime."""

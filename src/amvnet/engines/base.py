@@ -1,0 +1,128 @@
+"""The seam between a segmenter and what runs the two networks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from amvnet.models.amvnet import AMVNet, Scores
+from amvnet.models.assertion import Disagreement
+from amvnet.models.layers import freeze
+from amvnet.models.methods import METHODS, MethodName, Precision, check_method
+from amvnet.models.polar_net import PolarNet
+from amvnet.models.views.points import PointBatch
+from amvnet.models.views.polar_view import PolarGrid
+from amvnet.models.voting import vote
+from amvnet.runtime.memory import available_memory
+from amvnet.runtime.threads import survive_forks
+from amvnet.weights.file import Weights
+
+SCAN_BYTES = 2**30  # memory budget per scan; one of 120,000 points takes half, at the paper's size
+
+Network = Callable[[Tensor], Tensor]
+
+
+class Engine:
+    """Scores the points of scans by a method.
+
+    Torch projects and fuses. A derived class decides what runs the two networks, and builds a model
+    with these networks.
+
+    Args and attributes:
+        name: as `amvnet.load` takes it: "torch", "onnx" or "int8".
+        model: AMVNet, whose two networks the engine runs.
+        method: how the points are scored, one of `METHODS`.
+        tau: the threshold of the assertion, in [0, 1]; None if it is the one of the weights.
+        device: where the points are: "cpu", "cuda", "cuda:1", ...
+        precision: the precision of the two networks.
+
+    Attributes:
+        at_once: scans to segment at the same time, each with its share of torch's threads. By
+            default on a CPU, one for each thread if the memory suffices; else 1.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        model: AMVNet,
+        method: MethodName = "amvnet",
+        *,
+        tau: float | None = None,
+        device: str = "cpu",
+        precision: Precision = "float32",
+    ) -> None:
+        self.name = name
+        self.model = model
+        self.method = method
+        self.tau = tau
+        self.device = device
+        self.precision = precision
+        self.at_once = 1
+        if device == "cpu":
+            self.at_once = max(min(torch.get_num_threads(), available_memory() // SCAN_BYTES), 1)
+        survive_forks()
+
+    @property
+    def hardware(self) -> str:
+        """The device in words."""
+        return self.device
+
+    @torch.inference_mode()
+    def score(self, batch: PointBatch) -> Scores:
+        """Return the scores of the points of a batch, which are on the device."""
+        model = self.model
+        if METHODS[self.method].has_two_networks:
+            return model(batch)
+        if self.method == "bev":
+            g = model.score_polar(model.polar_view.project(batch))
+            return Scores(g, _none_uncertain(g), rv=None, bev=g)
+
+        image = model.range_view.project(batch)
+        f = model.score_range(image)
+        y = vote(f, batch, image) if self.method == "rv-knn" else f
+        return Scores(y, _none_uncertain(y), rv=f, bev=None)
+
+
+class WithUnet(nn.Module):
+    """PolarNet with a U-Net that something else computes; the U-Net has most of the work."""
+
+    def __init__(self, net: PolarNet, unet: Network) -> None:
+        super().__init__()
+        self.net = net
+        self.unet = unet
+
+    def forward(self, grid: PolarGrid) -> Tensor:
+        return self.net.decode(grid, self.unet(self.net.encode(grid)))
+
+
+def build_model(
+    weights: Weights, method: MethodName, tau: float | None = None, device: str = "cpu"
+) -> AMVNet:
+    """Return AMVNet with trained weights, as a method predicts with it; it cannot be trained.
+
+    Args:
+        tau: the threshold of the assertion; None takes the one of the weights.
+
+    Raises:
+        InputError: if the weights lack a part that the method needs, there is no such method, or
+            tau is out of range.
+    """
+    check_method(method, weights.parts)
+    model = weights.build().to(device)
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    freeze(model)
+
+    if tau is not None:
+        model.assertion = Disagreement(tau)
+    ensemble = METHODS[method].ensemble
+    if ensemble is not None:
+        model.ensemble = ensemble
+        model.point_head = None
+    return model
+
+
+def _none_uncertain(scores: Tensor) -> Tensor:
+    """Return (P,) bool, all False: a single network has no uncertain points."""
+    return torch.zeros(len(scores), dtype=torch.bool, device=scores.device)

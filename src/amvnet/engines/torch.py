@@ -1,0 +1,89 @@
+"""PyTorch as the engine: on a CPU, or on a GPU with two streams, CUDA graphs and a precision."""
+
+from __future__ import annotations
+
+import torch
+from torch import nn
+
+from amvnet.engines.base import Engine, WithUnet, build_model
+from amvnet.engines.graphs import Captured, GraphCheck
+from amvnet.engines.precision import InPrecision, check_device, choose_device, choose_precision
+from amvnet.engines.streams import TwoStreams, side_by_side
+from amvnet.models.amvnet import AMVNet, Scores
+from amvnet.models.methods import MethodName, Precision
+from amvnet.models.polar_net import PolarNet
+from amvnet.models.views.points import PointBatch
+from amvnet.weights.file import Weights
+
+
+class TorchEngine(Engine):
+    """Runs the two networks in PyTorch; `Engine` documents the attributes.
+
+    Args:
+        weights: trained weights.
+        method: how the points are scored, one of `METHODS`.
+        tau: the threshold of the assertion, in [0, 1]; None takes the one of the weights.
+        device: "cpu", "cuda", "cuda:1", ..., or "auto": "cuda" if there is a GPU, else "cpu".
+        precision: the precision of the two networks: "float32", "bfloat16", on a GPU "float16", or
+            "auto": bfloat16 on a GPU that has it, else float32. Everything else is computed in
+            float32, the projections in float64.
+        graphs: on a GPU, capture the networks as CUDA graphs (`engines.graphs`), once for each
+            number of scans in a batch.
+
+    Raises:
+        InputError: if the weights lack a part that the method needs, there is no such method,
+            device or precision, or tau is out of range.
+    """
+
+    def __init__(
+        self,
+        weights: Weights,
+        method: MethodName = "amvnet",
+        tau: float | None = None,
+        *,
+        device: str = "auto",
+        precision: Precision = "auto",
+        graphs: bool = True,
+    ) -> None:
+        device = check_device(choose_device(device))
+        precision = choose_precision(precision, device)
+        model = build_model(weights, method, tau, device)
+
+        if is_gpu(device):
+            model.arrange = TwoStreams(device)
+        elif device == "cpu":
+            model.arrange = side_by_side
+
+        self._graphs = _capture(model) if is_gpu(device) and graphs else None
+        if is_gpu(device) or precision != "float32":
+            model.range_net = InPrecision(model.range_net, device, precision)
+            model.polar_net = InPrecision(model.polar_net, device, precision)
+        super().__init__("torch", model, method, tau=tau, device=device, precision=precision)
+
+    @property
+    def hardware(self) -> str:
+        """The device in words, with the name of a GPU."""
+        if not is_gpu(self.device):
+            return self.device
+        return f"{self.device} ({torch.cuda.get_device_name(self.device)})"
+
+    def score(self, batch: PointBatch) -> Scores:
+        """Return the scores of a batch; the first of each size also tests the CUDA graphs."""
+        if self._graphs is None:
+            return super().score(batch)
+        return self._graphs.score(super().score, batch)
+
+
+def is_gpu(device: str) -> bool:
+    """Return whether a device is a GPU."""
+    return torch.device(device).type == "cuda"
+
+
+def _capture(model: AMVNet) -> GraphCheck:
+    """Let a model replay its networks as CUDA graphs, as long as the check that is returned."""
+    check = GraphCheck()
+    polar_net: nn.Module = model.polar_net
+    assert isinstance(polar_net, PolarNet)
+    model.range_net = Captured(model.range_net, check)
+    model.polar_net = WithUnet(polar_net, Captured(polar_net.unet, check))
+    return check
