@@ -197,6 +197,15 @@ def on_the_ground(folder: Path) -> Case:
     return Case(write_bin(folder / "ground.bin", points))
 
 
+def on_a_mound(folder: Path) -> Case:
+    """The ground is 0.6 m lower from 16 m on: how far cells count decides which level it is."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-25, 25, (2, 20_000))
+    z = np.where(np.hypot(x, y) < 16, -1.9, -2.5) + 1.5 * (rng.random(len(x)) < 0.2)
+    points = np.column_stack([x, y, z, rng.random(len(x))])
+    return Case(write_bin(folder / "mound.bin", points))
+
+
 def without_a_ground(folder: Path) -> Case:
     return Case(write_bin(folder / "few.bin", some_points(4000)))
 
@@ -226,6 +235,7 @@ SCANS: tuple[Callable[[Path], Case], ...] = (
     tilted,
     with_y_up_in_millimetres,
     on_the_ground,
+    on_a_mound,
     without_a_ground,
     without_intensity,
     bright,

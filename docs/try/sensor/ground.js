@@ -107,7 +107,7 @@ function bestPlane(low) {
     for (const point of low) {
       const off = offPlane(point, plane);
       if (Math.abs(off) < TOLERANCE) agreeing += point.weight;
-      else if (off < -3 * TOLERANCE) agreeing--;
+      else if (off < -3 * TOLERANCE) agreeing -= point.weight;
     }
     if (agreeing > most) [best, most] = [plane, agreeing];
   }
