@@ -22,15 +22,27 @@ def demo(out: Path = Path("demo"), seed: int = SEED, weights: str = WEIGHTS) -> 
         weights: a weights file, or the name of a built-in one.
     """
     from amvnet import load
-    from amvnet.data.datasets.simulated import simulate
+    from amvnet.data.datasets.simulated import SENSORS, simulate
+    from amvnet.errors import InputError
     from amvnet.inference.listing import list_inputs
     from amvnet.viewing.page import write_page
     from amvnet.viewing.shown_scans import show_scans
 
     segmenter = load(weights)
-    data = out / "data"
+    classes = segmenter.taxonomy.classes
+    sensors = [name for name, taxonomy in SENSORS.items() if taxonomy.classes == classes]
+    if not sensors:
+        raise InputError(
+            f"--weights {weights}: expected the classes of SemanticKITTI or nuScenes, which "
+            f"simulated streets have, found {', '.join(classes)[:200]}; use amvnet view and "
+            "amvnet evaluate on scans with these classes"
+        )
+    # Scans of another seed in the same folder would be taken for those of this one.
+    data = out / "data" / f"{sensors[0]}-{seed}"
     with progress("simulating") as step:
-        simulate(data, sequences=SEQUENCES, scans=SCANS, seed=seed, progress=step)
+        simulate(
+            data, sensor=sensors[0], sequences=SEQUENCES, scans=SCANS, seed=seed, progress=step
+        )
 
     scans, taxonomy = list_inputs([str(data)], taxonomy=segmenter.taxonomy)
     page = out / "index.html"
