@@ -279,7 +279,8 @@ def test_no_script_runs_but_the_package_s_own(world: Path) -> None:
 
 def hostile_page(path: Path) -> Page:
     points, raw = street(5)
-    shown = replace(make_scan(points, labels=SEMANTICKITTI.to_train(raw)), name=HOSTILE)
+    truth = SEMANTICKITTI.to_train(raw)  # with a table of scores
+    shown = replace(make_scan(points, truth, labels=truth), name=HOSTILE)
     taxonomy = replace(SEMANTICKITTI, classes=(HOSTILE, *SEMANTICKITTI.classes[1:]))
     pages.write_page(path, [shown], taxonomy, HOSTILE)
     return read_page(path)
@@ -293,6 +294,7 @@ def test_names_stay_names(tmp_path: Path) -> None:
     assert page.texts["<title>"] == HOSTILE
     assert page.about["title"] == HOSTILE
     assert page.about["classes"][1] == HOSTILE
+    assert page.about["table"] is not None
     assert page.about["scans"][0]["name"] == HOSTILE
 
 
